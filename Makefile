@@ -6,7 +6,7 @@
 #                                       Nothing else is taken from there: with --extra-index-url, a package of any
 #                                       name could be.
 #   make demo PIP_ARGS=--no-cache-dir   other options of pip
-#   make test TESTS=tests/channel       a part of the tests
+#   make test TESTS=tests/propagation       a part of the tests
 
 VENV ?= .venv
 PIP_ARGS ?=
@@ -14,8 +14,8 @@ TORCH_INDEX ?=
 TESTS ?=
 EXTRAS := test
 CONSTRAINTS := constraints.txt
-FAST_TESTS := $(addprefix tests/,antennas channel effects export footprints importing inference links paths \
-	report scene survey trace test_layout.py)
+
+FAST_TESTS := $(addprefix tests/,effects geo importing inference io links maps propagation report scene trace test_layout.py)
 
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
@@ -96,12 +96,12 @@ $(VENV):
 # Tracing needs a libLLVM that Dr.Jit can use. The package finds one or says how to install it; with apt, and the
 # right to use it without a question, it is installed here. Who names one in DRJIT_LIBLLVM_PATH has that one.
 llvm: $(INSTALLED)
-	@if ! $(BIN)/python -m radiotwin.llvm > /dev/null 2>&1 && [ -z "$$DRJIT_LIBLLVM_PATH" ] \
+	@if ! $(BIN)/python -m radiotwin.runtime.llvm > /dev/null 2>&1 && [ -z "$$DRJIT_LIBLLVM_PATH" ] \
 		&& $(CAN_APT); then \
 		$(SUDO) apt-get update -q; \
 		for package in libllvm19 libllvm20 libllvm21 libllvm18 libllvm17; do \
 			$(APT_INSTALL) $$package && break; done; fi >&2 || true
-	@$(BIN)/python -m radiotwin.llvm
+	@$(BIN)/python -m radiotwin.runtime.llvm
 
 clean:
 	rm -rf $(VENV) $(VENV)-flower build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

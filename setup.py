@@ -1,7 +1,7 @@
 """Put the published scenes into the wheel; everything else is declared in pyproject.toml.
 
 The scenes stay in the folder `scenes` of the source tree, where an editable install finds them
-(`radiotwin.published.published_scene`).
+(`radiotwin.scene.folder.published_scene`).
 """
 
 from pathlib import Path

@@ -10,9 +10,9 @@ from pathlib import Path
 import xarray
 
 import radiotwin as rt
-from radiotwin import llvm
-from radiotwin.export import write_csv
+from radiotwin.maps.export import write_csv
 from radiotwin.report import write_picture
+from radiotwin.runtime import llvm
 
 out = Path("city_to_map")
 rt.build_preset("small", out / "scene")

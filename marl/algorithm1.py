@@ -15,14 +15,13 @@ from marl.heuristics import HeuristicPolicy, waypoint_actions
 from marl.learner import Learner, make_learner
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy
-from marl.randomness import stream
 from marl.resume import has_checkpoint, restored
-from marl.settings import LearnerSettings, RunSettings
+from marl.settings import LearnerSettings, RunSettings, stream
 from radiotwin.errors import BadInput
-from radiotwin.measurements import Measurements
-from radiotwin.radiomap import RadioMap
+from radiotwin.links.measurements import Measurements
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey.campaign import declared_devices, heading_deg, link_table
 from radiotwin.scene import Scene
-from radiotwin.survey.campaign import declared_devices, heading_deg, link_table
 from radiotwin.twin import Twin, fit_twin
 from radiotwin.twin.shadowing import with_shadowing
 

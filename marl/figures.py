@@ -15,9 +15,9 @@ from matplotlib.ticker import LogFormatter
 
 from marl.flights import Flights
 from marl.mission import Known, Mission
-from radiotwin.files import atomic_path
+from radiotwin.io.files import atomic_path
 from radiotwin.scene import Scene
-from radiotwin.scene.preview import height_grid
+from radiotwin.scene.plot import height_grid
 
 IDLE_COLOUR = "#555555"
 COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9",  # Okabe and Ito

@@ -10,11 +10,11 @@ from marl.environment import ACTION_COUNT, Frame, feasible
 from marl.flights import Policy
 from marl.learner import Learner
 from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
+from radiotwin.maps.survey.campaign import fly
 from radiotwin.scene import Scene
-from radiotwin.survey.campaign import fly
 
 PATTERN = "random-waypoint"
-"""Pattern of `radiotwin.survey` that `waypoint_actions` flies."""
+"""Pattern of `radiotwin.maps.survey` that `waypoint_actions` flies."""
 
 
 class HeuristicPolicy:

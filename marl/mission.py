@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from radiotwin.budgets import MAP_VALUES
 from radiotwin.errors import BadInput
-from radiotwin.radiomap import RadioMap
+from radiotwin.io.budgets import MAP_VALUES
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey.grid import HOVER_COST, MOVE_COST, UNREACHABLE, FlightGrid
+from radiotwin.maps.survey.truth import LOS_LAW
 from radiotwin.scene import Scene
 from radiotwin.scene.config import UavConfig
-from radiotwin.survey.grid import HOVER_COST, MOVE_COST, UNREACHABLE, FlightGrid
-from radiotwin.survey.statistical import LOS_LAW
 
 HOVER, NORTH, WEST, SOUTH, EAST, NO_OP = range(6)
 MOVES = np.array([(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1), (0, 0)], dtype=np.int64)

@@ -10,8 +10,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
 from marl.settings import PRESETS, RUNS, Choices, LearnerSettings, RunSettings, check_together
-from radiotwin.command import with_options
 from radiotwin.errors import BadInput
+from radiotwin.runtime.command import with_options
 
 Settings = TypeVar("Settings", bound=BaseModel)
 

@@ -12,13 +12,13 @@ from numba import njit
 from scipy.stats import norm
 from typing_extensions import override
 
+from marl.checkpoint import require_fields, require_plan
 from marl.environment import ACTION_COUNT, Frame, assign, feasible
 from marl.flights import Policy
 from marl.learner import Learner, Setup
 from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
-from marl.randomness import stream
-from marl.stored import require_fields, require_plan
-from radiotwin.progress import progress
+from marl.settings import stream
+from radiotwin.runtime.console import progress
 
 MAX_WAYPOINTS = 8  # of a UAV
 START_TEMPERATURE, END_TEMPERATURE = 0.02, 0.0003  # of the annealing, in collected share

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from marl.checkpoint import Damaged
+from marl.checkpoint import Damaged, require_count, require_fields, require_plan, require_tensors
 from marl.environment import ACTION_COUNT, Frame
 from marl.features import global_state, observation_size, observe, state_size
 from marl.flights import Flights, Policy, evaluate
@@ -21,12 +21,10 @@ from marl.gru import gru
 from marl.learner import Learner, Setup
 from marl.mission import Mission
 from marl.planner import PlanPolicy, plan
-from marl.randomness import stream
 from marl.replicas import Replicas
-from marl.settings import LearnerSettings
-from marl.stored import require_count, require_fields, require_plan, require_tensors
+from marl.settings import LearnerSettings, stream
 from marl.training import AgentPolicy
-from radiotwin.channel.adam import Adam
+from radiotwin.propagation.laws.adam import Adam
 
 MAX_GRADIENT_NORM = 10.0
 MIN_GAIN = 0.02  # of the collected share, for a new plan to replace the one before

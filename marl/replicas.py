@@ -14,9 +14,8 @@ from marl.checkpoint import Damaged
 from marl.threads import keep_memory, limit_threads
 from marl.training import Trainer
 from radiotwin.errors import RunFailed
-from radiotwin.processes import die_with_parent
-from radiotwin.signals import kept_from_children
-from radiotwin.threads import usable_cores
+from radiotwin.io.signals import kept_from_children
+from radiotwin.runtime.processes import die_with_parent, usable_cores
 
 
 class Replicas:

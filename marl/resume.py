@@ -7,13 +7,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from marl.checkpoint import NAME, OLD_NAME, Damaged, load_checkpoint, refuse_damaged, refuse_old
+from marl.checkpoint import (
+    NAME,
+    OLD_NAME,
+    Damaged,
+    load_checkpoint,
+    refuse_damaged,
+    refuse_old,
+    require_count,
+    require_fields,
+)
 from marl.learner import Learner
 from marl.settings import RunSettings
-from marl.stored import require_count, require_fields
-from radiotwin.measurement_columns import MAX_LEVEL_DB
+from radiotwin.links.measurements import MAX_LEVEL_DB
+from radiotwin.maps.survey.grid import HOVER_COST
 from radiotwin.scene import Scene
-from radiotwin.survey.grid import HOVER_COST
 from radiotwin.twin import Twin
 
 _COUNTS = ("round", "real_episodes", "simulated_episodes", "located", "evaluation_flights")

@@ -14,22 +14,19 @@ from marl.figures import choose_flight, draw_curve, draw_trajectories
 from marl.flights import evaluate, track_table
 from marl.learner import make_learner
 from marl.mission import Known, Mission, make_mission
-from marl.randomness import stream
 from marl.registry import learner_class
-from marl.settings import LearnerSettings, RunSettings
-from marl.sizes import check_sizes
-from marl.threads import keep_memory, limit_threads
-from radiotwin.cells import write_csv
-from radiotwin.console import print_rows
-from radiotwin.content_hash import content_hash
-from radiotwin.cuda import torch_device
+from marl.settings import LearnerSettings, RunSettings, stream
+from marl.threads import check_sizes, keep_memory, limit_threads
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_file, atomic_path, is_temporary
-from radiotwin.inputs import read_bytes, read_json, require_plain
-from radiotwin.progress import progress
-from radiotwin.radiomap import RadioMap
+from radiotwin.io.cells import write_csv
+from radiotwin.io.content_hash import content_hash
+from radiotwin.io.files import atomic_file, atomic_path, is_temporary
+from radiotwin.io.inputs import read_bytes, read_json, require_plain
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import read_truth
+from radiotwin.runtime.console import print_rows, progress
+from radiotwin.runtime.cuda import torch_device
 from radiotwin.scene import Scene
-from radiotwin.survey import read_truth
 
 if TYPE_CHECKING:
     from marl.event_log import EventLog

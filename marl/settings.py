@@ -1,16 +1,23 @@
-"""Settings of a run and of learning, checked when they are given; each becomes an option."""
+"""Settings of a run and of learning, checked when they are given; each becomes an option.
+
+Random numbers: an independent stream for every purpose, all from one seed.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
 from marl.registry import LEARNERS, learner_class
 from radiotwin.errors import BadInput
-from radiotwin.published import published_scene
+from radiotwin.scene.folder import published_scene
+
+PURPOSES = ("learning", "real flight", "decisions", "choice", "twin evaluation",
+            "truth evaluation", "planning")
 
 
 class LearnerSettings(BaseModel):
@@ -151,3 +158,15 @@ def check_together(run: RunSettings, learner: LearnerSettings) -> None:
         able = ", ".join(name for name in LEARNERS if learner_class(name).learns)
         raise BadInput(f"guide {run.guide}: {run.algorithm} does not learn, so nothing can be "
                        f"guided; it is for algorithm {able} only")
+
+
+def stream(seed: int, purpose: str, number: int = 0) -> np.random.Generator:
+    """Return the generator of a purpose.
+
+    Args:
+        seed: of the run.
+        purpose: one of `PURPOSES`.
+        number: of the replica, flight or round, where there are several.
+    """
+    # Counted from 1, because numpy takes [1, 2, 0] for [1, 2].
+    return np.random.default_rng([seed, PURPOSES.index(purpose) + 1, number + 1])

@@ -6,13 +6,12 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from marl.checkpoint import require_array, require_count, require_fields, require_generator
 from marl.environment import ACTION_COUNT, Environment, Frame, empty_frame
 from marl.features import observe
 from marl.flights import Flights, fly
 from marl.mission import MAX_SNR_DB, Mission
-from marl.randomness import stream
-from marl.settings import LearnerSettings
-from marl.stored import require_array, require_count, require_fields, require_generator
+from marl.settings import LearnerSettings, stream
 
 GUIDED_SHARE = 0.25  # of the training flights, with the planner's help
 

@@ -9,28 +9,23 @@ from importlib import import_module, util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from radiotwin.alignment import in_scene_frame
-    from radiotwin.build import build_scene
-    from radiotwin.closeloop.corrected_scene import write_corrected_scene
-    from radiotwin.closeloop.corrected_twin import corrected_twin
-    from radiotwin.closeloop.criteria import SelectionCriteria
-    from radiotwin.closeloop.residual_table import residuals
-    from radiotwin.closeloop.residuals import Residuals
-    from radiotwin.closeloop.result_file import make_report
+    from radiotwin.cli.demo import run_demo
+    from radiotwin.cli.doctor import diagnose
+    from radiotwin.closeloop.output.corrected_scene import write_corrected_scene
+    from radiotwin.closeloop.output.corrected_twin import corrected_twin
+    from radiotwin.closeloop.output.residuals import Residuals, residuals
+    from radiotwin.closeloop.output.result_file import make_report
     from radiotwin.closeloop.run import Loop, close_loop
-    from radiotwin.compare import Comparison, compare_models, score_map, split_flights
-    from radiotwin.comparison_output import compare_held_out
+    from radiotwin.closeloop.verdict.criteria import SelectionCriteria
     from radiotwin.coverage import CoverageSettings, predict_coverage
-    from radiotwin.demo import run_demo
-    from radiotwin.doctor import diagnose
     from radiotwin.errors import BadInput, RunFailed
     from radiotwin.importing import import_measurements
-    from radiotwin.map_difference import MapDifference
-    from radiotwin.measurements import Measurements, read_measurements
-    from radiotwin.paths.listing import list_paths
-    from radiotwin.pieces import cache_content, clear_cache, keep_pieces
-    from radiotwin.point_gains import export_ns3
-    from radiotwin.radiomap import RadioMap
+    from radiotwin.links.alignment import in_scene_frame
+    from radiotwin.links.measurements import Measurements, read_measurements
+    from radiotwin.maps.difference import MapDifference
+    from radiotwin.maps.radiomap import RadioMap
+    from radiotwin.maps.survey import fly_survey, read_truth, segmented_truth
+    from radiotwin.propagation.paths.listing import list_paths
     from radiotwin.report import (
         export_map,
         read_run,
@@ -38,48 +33,51 @@ if TYPE_CHECKING:
         write_comparison_folder,
         write_report,
     )
+    from radiotwin.report.comparison import compare_held_out
+    from radiotwin.runtime.pieces import cache_content, clear_cache, keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.scene.export import export_scene
     from radiotwin.scene.presets import build_preset
-    from radiotwin.survey import fly_survey, read_truth, segmented_truth
+    from radiotwin.scene.readers.any_source import build_scene
     from radiotwin.trace import SolverSettings, choose_quality, read_points, trace_map, trace_points
     from radiotwin.twin import Twin, fit_twin
+    from radiotwin.twin.compare import Comparison, compare_models, score_map, split_flights
     from radiotwin.twin.locate import locate_devices, position_errors
+    from radiotwin.twin.point_gains import export_ns3
 
 __version__: str  # found when it is asked for, as all names
 
 _MODULES = {
-    "alignment": ["in_scene_frame"],
-    "build": ["build_scene"],
-    "closeloop.corrected_scene": ["write_corrected_scene"],
-    "closeloop.corrected_twin": ["corrected_twin"],
-    "closeloop.criteria": ["SelectionCriteria"],
-    "closeloop.residual_table": ["residuals"],
-    "closeloop.residuals": ["Residuals"],
-    "closeloop.result_file": ["make_report"],
+    "cli.demo": ["run_demo"],
+    "cli.doctor": ["diagnose"],
+    "closeloop.output.corrected_scene": ["write_corrected_scene"],
+    "closeloop.output.corrected_twin": ["corrected_twin"],
+    "closeloop.output.residuals": ["Residuals", "residuals"],
+    "closeloop.output.result_file": ["make_report"],
     "closeloop.run": ["Loop", "close_loop"],
-    "compare": ["Comparison", "compare_models", "score_map", "split_flights"],
-    "comparison_output": ["compare_held_out"],
+    "closeloop.verdict.criteria": ["SelectionCriteria"],
     "coverage": ["CoverageSettings", "predict_coverage"],
-    "demo": ["run_demo"],
-    "doctor": ["diagnose"],
     "errors": ["BadInput", "RunFailed"],
     "importing": ["import_measurements"],
-    "map_difference": ["MapDifference"],
-    "measurements": ["Measurements", "read_measurements"],
-    "paths.listing": ["list_paths"],
-    "pieces": ["cache_content", "clear_cache", "keep_pieces"],
-    "point_gains": ["export_ns3"],
-    "radiomap": ["RadioMap"],
+    "links.alignment": ["in_scene_frame"],
+    "links.measurements": ["Measurements", "read_measurements"],
+    "maps.difference": ["MapDifference"],
+    "maps.radiomap": ["RadioMap"],
+    "maps.survey": ["fly_survey", "read_truth", "segmented_truth"],
+    "propagation.paths.listing": ["list_paths"],
     "report": ["export_map", "read_run", "write_closeloop_folder", "write_comparison_folder",
                "write_report"],
+    "report.comparison": ["compare_held_out"],
+    "runtime.pieces": ["cache_content", "clear_cache", "keep_pieces"],
     "scene": ["Scene"],
     "scene.export": ["export_scene"],
     "scene.presets": ["build_preset"],
-    "survey": ["fly_survey", "read_truth", "segmented_truth"],
+    "scene.readers.any_source": ["build_scene"],
     "trace": ["SolverSettings", "choose_quality", "read_points", "trace_map", "trace_points"],
     "twin": ["Twin", "fit_twin"],
+    "twin.compare": ["Comparison", "compare_models", "score_map", "split_flights"],
     "twin.locate": ["locate_devices", "position_errors"],
+    "twin.point_gains": ["export_ns3"],
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

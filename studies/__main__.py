@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.console import complain, say, show_warnings_plainly
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.files import atomic_path
+from radiotwin.io.files import atomic_path
+from radiotwin.runtime.console import complain, say, show_warnings_plainly
 from studies import runner
 
 Flag = typer.Option

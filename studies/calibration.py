@@ -5,7 +5,7 @@ those of the two traced cities whose maps are right within a survey's error (`te
 the others of which are left for the studies `hidden` and `null`; and campaigns over open ground.
 
     python -m studies calibration --resume      # rows: the loop on each case
-    python -m studies.calibration               # rows -> radiotwin/closeloop/calibration.json
+    python -m studies.calibration               # rows -> radiotwin/closeloop/search/calibration.json
 """
 
 import json
@@ -13,11 +13,11 @@ import warnings
 from pathlib import Path
 
 from radiotwin import close_loop
-from radiotwin.closeloop import posterior
-from radiotwin.closeloop.scoring import CandidateScore
-from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.removed_obstacle import RemovedObstacle
-from radiotwin.files import atomic_path
+from radiotwin.closeloop.search import posterior
+from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
+from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
+from radiotwin.io.files import atomic_path
 from studies.calibration_fit import calibration_figures, calibration_table, fitted
 from studies.foreign_roc import by_mistake_of_the_map, undeclared_besides
 from studies.runner import RECORDS, Study, read_rows

@@ -19,11 +19,11 @@ import pandas as pd
 from scipy.stats import t as student
 
 from radiotwin import BadInput, Loop, Measurements, Scene, close_loop, make_report
-from radiotwin.alignment import in_scene_frame
-from radiotwin.footprints import MapOptions, build_scene_from_map
 from radiotwin.importing import import_files, read_settings
-from radiotwin.measurements import read_measurements
+from radiotwin.links.alignment import in_scene_frame
+from radiotwin.links.measurements import read_measurements
 from radiotwin.scene.build import BuildOptions
+from radiotwin.scene.readers import MapOptions, build_scene_from_map
 from studies.closeloop import counted, summary
 from studies.closeloop_real import (
     AZIMUTHS_DEG,

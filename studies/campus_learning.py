@@ -12,12 +12,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from radiotwin import Measurements, Scene, close_loop, make_report
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.channel.regression_kriging import RegressionKriging
-from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
-from radiotwin.closeloop.corrected_twin import corrected_twin
+from radiotwin.closeloop.output.corrected_twin import corrected_twin
+from radiotwin.closeloop.predict.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
 from radiotwin.links import LinkData, prepare_links
+from radiotwin.propagation.laws.kriging import RegressionKriging
+from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from studies.campus import campus, share_within, with_azimuths
 from studies.closeloop import counted, summary
 from studies.closeloop_real import AZIMUTHS_DEG, azimuth_errors_deg

@@ -7,13 +7,13 @@ The antennas are told (published azimuths), so that no search has a part in the 
 import numpy as np
 import pandas as pd
 
-from radiotwin.channel.followed_paths import interaction_gains
-from radiotwin.channel.residual_field import ResidualField
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.residuals import rmse_db
-from radiotwin.effects.sector_antenna import SectorPattern, sector_pattern_db
+from radiotwin.closeloop.crossfit import make_folds
+from radiotwin.closeloop.output.residuals import rmse_db
+from radiotwin.effects.catalogue.sector_antenna import SectorPattern, sector_pattern_db
 from radiotwin.links import LinkData, prepare_links
-from radiotwin.links.indoors import SURE, chance_inside
+from radiotwin.links.checks import SURE, chance_inside
+from radiotwin.propagation.laws.followed_paths import interaction_gains
+from radiotwin.propagation.laws.kriging import ResidualField
 from studies.campus import SPLITS, campus
 from studies.closeloop_real import AZIMUTHS_DEG
 from studies.runner import Study

@@ -16,15 +16,13 @@ import pandas as pd
 import trimesh
 
 from radiotwin import Measurements, Scene, close_loop, make_report
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.declared import take_declared
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.selection import SelectionResult
-from radiotwin.effects.fold_model import FoldModel
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.search.declared import take_declared
+from radiotwin.closeloop.search.selection import SelectionResult
 from radiotwin.effects.registry import catalogue
 from radiotwin.links import prepare_links
 from radiotwin.scene.citymap import CityMap
+from radiotwin.twin.model.fold_model import FoldModel
 from studies.runner import Study
 from studies.tables import markdown
 from tests.undeclared.cases import FAMILIES, OUTSIDE, SEEDS, Case, case, stored

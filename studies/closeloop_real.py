@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import BadInput, Loop, Measurements, close_loop, make_report, read_measurements
-from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.effects.effect_model import EffectModel
-from radiotwin.effects.sector_antenna import SectorAntenna
-from radiotwin.localize import calibrate_radii, locate, whole_area
+from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
+from radiotwin.twin.localize import calibrate_radii, locate, whole_area
+from radiotwin.twin.model.effect_model import EffectModel
 from studies.closeloop import counted, summary
 from studies.runner import Study
 from studies.tables import markdown, number

@@ -20,12 +20,11 @@ from marl.heuristics import HeuristicPolicy
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy, plan
 from marl.qmix import QNetworks
-from marl.randomness import stream
 from marl.replanning import ReplanPolicy
-from marl.settings import LearnerSettings
+from marl.settings import LearnerSettings, stream
 from marl.training import AgentPolicy, Trainer
 from radiotwin import Scene, segmented_truth
-from radiotwin.progress import progress
+from radiotwin.runtime.console import progress
 from studies import tables
 from studies.runner import Study
 from studies.twins import LONG

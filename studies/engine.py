@@ -1,4 +1,4 @@
-"""Accuracy and cost of the path engine (`radiotwin.paths`): `engine`.
+"""Accuracy and cost of the path engine (`radiotwin.propagation.paths`): `engine`.
 
 Accuracy: links without line of sight above -128 dB, against Sionna RT with a million rays, as it is
 released and without the two faults that `studies.mended_sionna` describes. Paths of both are
@@ -17,9 +17,9 @@ import pandas as pd
 import trimesh
 
 from radiotwin import Scene
-from radiotwin.files import scratch_folder
-from radiotwin.paths import path_powers
-from radiotwin.paths.candidates import CandidateSearch, candidate_search
+from radiotwin.io.files import scratch_folder
+from radiotwin.propagation.paths import path_powers
+from radiotwin.propagation.paths.candidates import CandidateSearch, candidate_search
 from radiotwin.scene.build import BuildOptions, build_scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.trace.settings import SolverSettings

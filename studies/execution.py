@@ -15,9 +15,8 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import Scene, SolverSettings
-from radiotwin.execution import Executor, Job, Resources, open_executor
-from radiotwin.execution.pool import Death, Pool, Worker
-from radiotwin.execution.worker import Outcome
+from radiotwin.runtime.execution import Executor, Job, Resources, open_executor
+from radiotwin.runtime.execution.job import Death, Outcome, Pool, Worker
 from radiotwin.trace import trace_gains
 from studies.runner import Study
 from studies.tables import markdown, scene_folder
@@ -67,7 +66,7 @@ def measure_workers(seed: int, settings: dict) -> dict:
 
 @contextmanager
 def _opened(workers: str, cluster: str | None) -> Iterator[Executor]:
-    from radiotwin.execution.local import LocalPool
+    from radiotwin.runtime.execution.local import LocalPool
 
     if workers != "1 process":
         with open_executor(workers, cluster) as executor:

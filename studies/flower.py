@@ -20,8 +20,8 @@ from marl.fedqmix.settings import FederationSettings
 from marl.fedqmix.shared import Shared, write_app
 from marl.settings import PRESETS, RunSettings
 from radiotwin import Scene, fly_survey
-from radiotwin.files import scratch_folder
-from radiotwin.survey import read_truth
+from radiotwin.io.files import scratch_folder
+from radiotwin.maps.survey import read_truth
 from studies.runner import Study
 from studies.tables import markdown, number, scene_folder, with_sd
 

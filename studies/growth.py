@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from radiotwin.cells import write_csv
-from radiotwin.files import scratch_folder
+from radiotwin.io.cells import write_csv
+from radiotwin.io.files import scratch_folder
 from radiotwin.scene import Scene
 from studies.load import make_town, run_measured
 from studies.runner import Study

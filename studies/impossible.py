@@ -15,11 +15,11 @@ import trimesh
 from shapely import affinity, box
 
 from radiotwin import SolverSettings
-from radiotwin.files import scratch_folder
+from radiotwin.io.files import scratch_folder
 from radiotwin.scene.build import build_scene
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import itu_material
-from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.trace.solver import Antennas, PathGains
 from studies.runner import Study
 from studies.tables import markdown, scene_folder

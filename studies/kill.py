@@ -23,9 +23,9 @@ from tensorboard.backend.event_processing.event_file_loader import EventFileLoad
 
 from marl.checkpoint import NAME as CHECKPOINT
 from marl.checkpoint import load_checkpoint
-from radiotwin.cells import write_csv
 from radiotwin.errors import RunFailed
-from radiotwin.files import scratch_folder
+from radiotwin.io.cells import write_csv
+from radiotwin.io.files import scratch_folder
 from studies.runner import Study
 from studies.tables import markdown
 

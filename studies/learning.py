@@ -16,8 +16,8 @@ from marl.mission import Known, make_mission
 from marl.registry import learner_class
 from marl.settings import PRESETS, RUNS, LearnerSettings, RunSettings
 from radiotwin import Scene, segmented_truth
-from radiotwin.cuda import torch_device
-from radiotwin.progress import progress
+from radiotwin.runtime.console import progress
+from radiotwin.runtime.cuda import torch_device
 from studies import tables
 from studies.runner import RECORDS, Study, read_rows
 from studies.tables import RATIO, Curve, last, markdown, number, over_seeds, with_sd, worlds

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from radiotwin.cells import write_csv
 from radiotwin.errors import RunFailed
-from radiotwin.files import scratch_folder
+from radiotwin.io.cells import write_csv
+from radiotwin.io.files import scratch_folder
+from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.scene import Scene
 from radiotwin.scene.config import LatticeConfig, write_config
 from radiotwin.scene.presets import build_preset
-from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 from studies.runner import Study
 from studies.tables import markdown

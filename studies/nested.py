@@ -1,9 +1,10 @@
 """Is evidence what it claims to be? Laplace's approximation against nested sampling: `nested`.
 
 Ten campaigns over open ground with something hidden in them, plain to see or less. For each the
-evidence that `close-loop` weighs (radiotwin/closeloop/hypotheses.py), and that of nested sampling
-over the effect's numbers and the two variances of the rest: exact levels at every draw, dense
-matrices, and a library of its own (dynesty; Speagle 2020, MNRAS 493). `pip install dynesty==3.1.0`.
+evidence that `close-loop` weighs (radiotwin/closeloop/search/hypotheses.py), and that of nested
+sampling over the effect's numbers and the two variances of the rest: exact levels at every draw,
+dense matrices, and a library of its own (dynesty; Speagle 2020, MNRAS 493). `pip install
+dynesty==3.1.0`.
 """
 
 from collections.abc import Callable
@@ -14,21 +15,19 @@ import pandas as pd
 from scipy.linalg import cho_factor, solve_triangular
 from scipy.spatial.distance import cdist
 
-from radiotwin.closeloop.bases import LogDistanceBase
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.hypotheses import Hypotheses
+from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
+from radiotwin.closeloop.search.hypotheses import Hypotheses
 from radiotwin.effects.base import Effect
-from radiotwin.effects.body_shadowing import BodyShadowing
-from radiotwin.effects.clock_offset import ReceiverClockOffset
-from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.fold_model import FoldModel
-from radiotwin.effects.foliage import Foliage
-from radiotwin.effects.interference import Interference
-from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.effects.catalogue.body_shadowing import BodyShadowing
+from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
+from radiotwin.effects.catalogue.foliage import Foliage
+from radiotwin.effects.catalogue.interference import Interference
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.correlated_evidence import BOUNDS
 from radiotwin.links import prepare_links
+from radiotwin.twin.model.fitting import add_effect
+from radiotwin.twin.model.fold_model import FoldModel
 from studies.runner import Study
 from studies.tables import markdown
 from tests import worlds

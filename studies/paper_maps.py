@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from radiotwin.files import atomic_folder
+from radiotwin.io.files import atomic_folder
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import parse_config, write_config
-from radiotwin.scene.generator import building_meshes
 from radiotwin.scene.materials import Material
-from radiotwin.scene.writer import CityShape, write_city
+from radiotwin.scene.presets import building_meshes
 
 MARGIN_M = 100.0  # of ground around the extent
 

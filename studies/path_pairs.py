@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from scipy.constants import speed_of_light
 
-from radiotwin.paths.candidates import candidate_search
-from radiotwin.paths.coefficients import slabs_of
-from radiotwin.paths.fields import VERTICAL
-from radiotwin.paths.images import PathBuffer
-from radiotwin.paths.powers import PATH_CHUNK, WEDGES, clear_paths_gains
+from radiotwin.propagation.paths.candidates import candidate_search
+from radiotwin.propagation.paths.coefficients import slabs_of
+from radiotwin.propagation.paths.fields import VERTICAL
+from radiotwin.propagation.paths.images import PathBuffer
+from radiotwin.propagation.paths.powers import PATH_CHUNK, WEDGES, clear_paths_gains
 from radiotwin.scene import Scene
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import Antennas, PathGains

@@ -15,9 +15,9 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import Scene, SolverSettings
-from radiotwin.execution.worker import peak_bytes
-from radiotwin.files import atomic_path
-from radiotwin.scene.reader import read_city
+from radiotwin.io.files import atomic_path
+from radiotwin.runtime.execution.job import peak_bytes
+from radiotwin.scene.city_files import read_city
 from radiotwin.trace import trace_gains
 from radiotwin.trace.link_job import Links, SolveTiles, link_pieces
 from radiotwin.trace.tiles import (

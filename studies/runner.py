@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 
 import radiotwin
 from radiotwin.errors import BadInput
-from radiotwin.execution import Job, open_executor
-from radiotwin.files import atomic_path
+from radiotwin.io.files import atomic_path
+from radiotwin.runtime.execution import Job, open_executor
 
 SCHEMA, RECORDS = "radiotwin.study/1", Path(__file__).parents[1] / "docs" / "results"
 MODULES = {"models": "models", "curve": "learning", "federation": "learning", "tuning": "learning",

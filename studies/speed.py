@@ -24,10 +24,10 @@ from marl.replicas import Replicas
 from marl.settings import PRESETS
 from marl.training import Replay, Trainer
 from radiotwin import Scene, close_loop, fit_twin, fly_survey, segmented_truth
-from radiotwin.channel import channel_named
 from radiotwin.links import LinkGeometry, link_geometry
-from radiotwin.localize import LocalizeSettings, localize
+from radiotwin.propagation.laws import channel_named
 from radiotwin.scene.presets import preset_boxes
+from radiotwin.twin.localize import LocalizeSettings, localize
 from studies.runner import Study
 from studies.tables import markdown, scene_folder
 from tests.undeclared.cases import case

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from marl.figures import COLOURS, MARKERS
 from radiotwin import RadioMap, Scene
-from radiotwin.survey import read_truth
+from radiotwin.maps.survey import read_truth
 
 RATIO = "share of all data collected in the truth"
 

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import Scene, SolverSettings
-from radiotwin.files import scratch_folder
+from radiotwin.io.files import scratch_folder
 from radiotwin.scene.build import BuildOptions, build_scene
 from radiotwin.trace import trace_gains
 from radiotwin.trace.settings import FINER

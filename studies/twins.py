@@ -18,8 +18,7 @@ from marl.heuristics import PATTERN, HeuristicPolicy
 from marl.learner import make_learner
 from marl.mission import Known, Mission
 from marl.planner import PlanPolicy, plan
-from marl.randomness import stream
-from marl.settings import PRESETS, LearnerSettings, RunSettings
+from marl.settings import PRESETS, LearnerSettings, RunSettings, stream
 from radiotwin import (
     Measurements,
     RadioMap,
@@ -33,7 +32,7 @@ from radiotwin import (
     score_map,
     trace_map,
 )
-from radiotwin.progress import progress
+from radiotwin.runtime.console import progress
 from studies import tables
 from studies.runner import Study
 from studies.tables import markdown, number, over_seeds, quantiles, with_sd, worlds

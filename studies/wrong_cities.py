@@ -14,10 +14,10 @@ import trimesh
 from shapely import Polygon, affinity, box
 
 from radiotwin import Scene
-from radiotwin.files import scratch_folder
+from radiotwin.io.files import scratch_folder
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
 from radiotwin.scene.materials import Material, itu_material
-from radiotwin.scene.writer import CityShape, write_city
 
 SIDE_M = 400.0  # of the square that is flown over, and that devices stand in
 GROUNDS = ("asphalt_concrete", "medium_dry_ground", "concrete", "wet_ground", "asphalt_concrete")

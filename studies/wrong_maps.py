@@ -19,10 +19,10 @@ from shapely import distance, points, union_all
 
 from marl.figures import COLOURS
 from radiotwin import Measurements, Scene, SolverSettings, Twin, fit_twin
-from radiotwin.channel.path_kriging import PathKriging
-from radiotwin.files import atomic_path, scratch_folder
 from radiotwin.inference.gaussian import mean_if_detected
-from radiotwin.pieces import keep_pieces
+from radiotwin.io.files import atomic_path, scratch_folder
+from radiotwin.propagation.laws.path_kriging import PathKriging
+from radiotwin.runtime.pieces import keep_pieces
 from radiotwin.trace import trace_gains
 from studies import tables
 from studies.runner import Study

@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 
 from marl.fedqmix.__main__ import app as planning
-from radiotwin import console, signals
 from radiotwin.cli import main
-from radiotwin.exits import exit_status
+from radiotwin.io import signals
+from radiotwin.runtime import console
+from radiotwin.runtime.exits import exit_status
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
 COLUMNS = 100

@@ -4,7 +4,7 @@ import uuid
 
 import pytest
 
-from radiotwin import cuda, llvm
+from radiotwin.runtime import cuda, llvm
 
 GPU_TRIALS = {"tracing": cuda.tracing_refusal, "training": cuda.torch_refusal}
 

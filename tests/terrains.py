@@ -5,7 +5,7 @@ import numpy as np
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.terrain import HeightGrid, triangulate
 
-LAT_M, LON_M = 110_608, 109_640  # metres in a degree at latitude 10°, as the maps of tests/footprints have them
+LAT_M, LON_M = 110_608, 109_640  # metres in a degree at latitude 10°, as the maps of tests/scene/readers have them
 
 
 def write_dem(path, height, crs="EPSG:4326+5773", half_m=800.0, pixel_m=10.0, dtype="float32", **more):

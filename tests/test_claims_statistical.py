@@ -15,8 +15,8 @@ import pytest
 
 from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.links import link_geometry
+from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.scene import Scene
-from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 
 pytestmark = pytest.mark.slow

@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.compare import compare_models, split_flights
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import fly_survey
 from radiotwin.scene import Scene
-from radiotwin.survey import fly_survey
+from radiotwin.twin.compare import compare_models, split_flights
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 
 ROOT = Path(__file__).parents[1]
 
@@ -23,9 +23,9 @@ def test_the_site_builds(tmp_path):
         env=os.environ | {"EXECUTE_EXAMPLES": "false", "NO_MKDOCS_2_WARNING": "1"})
     assert result.returncode == 0, result.stderr
     reference = (tmp_path / "site" / "reference.html").read_text(encoding="utf-8")
-    for name in ("radiotwin.twin.fit_twin", "radiotwin.twin.Twin.predict", "radiotwin.radiomap.RadioMap.load",
-                 "radiotwin.closeloop.criteria.SelectionCriteria", "marl.parallel_env.HarvestEnv",
-                 "radiotwin.footprints.build.build_scene_from_map"):
+    for name in ("radiotwin.twin.fit_twin", "radiotwin.twin.Twin.predict", "radiotwin.maps.radiomap.RadioMap.load",
+                 "radiotwin.closeloop.verdict.criteria.SelectionCriteria", "marl.parallel_env.HarvestEnv",
+                 "radiotwin.scene.readers.build.build_scene_from_map"):
         assert f'id="{name}"' in reference
     results = (tmp_path / "site" / "results.html").read_text(encoding="utf-8")
     for picture in re.findall(r'<img [^>]*src="([^"]+)"', results):

@@ -13,8 +13,8 @@ import pytest
 from pyproj import Geod
 
 import radiotwin as rt
+from radiotwin.io.forms import Origin
 from radiotwin.scene.lattice import Lattice
-from radiotwin.tables import Origin
 
 matplotlib.use("Agg")
 ORIGIN = Origin(latitude_deg=47.5, longitude_deg=8.7)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from radiotwin import budgets
+from radiotwin.io import budgets
 
 ROOT = Path(__file__).parents[1]
 

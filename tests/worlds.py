@@ -7,13 +7,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.baselines import grow_trees
-from radiotwin.closeloop.predictor import CombinedPrediction
+from radiotwin.closeloop.predict.baselines import grow_trees
+from radiotwin.closeloop.predict.predictor import CombinedPrediction
 from radiotwin.links import LinkData
-from radiotwin.measurements import Measurements
-from radiotwin.radiomap import RadioMap
+from radiotwin.links.measurements import Measurements
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import fly_survey
 from radiotwin.scene import Scene
-from radiotwin.survey import fly_survey
 
 FLIGHTS, SLOTS, RECEIVERS, DEVICES = 6, 60, 2, 5
 RBM = Path(__file__).parents[1] / "scenes" / "rbm"
@@ -86,7 +86,7 @@ def quick_report(monkeypatch):
     for module in ("baselines", "predictor"):
         monkeypatch.setattr(f"radiotwin.closeloop.{module}.grow_trees", grown)
     for most in ("MAX_MEMBERS", "MAX_PLACES"):
-        monkeypatch.setattr(f"radiotwin.closeloop.typical_patterns.{most}", 1)
+        monkeypatch.setattr(f"radiotwin.closeloop.verdict.sensitivity.{most}", 1)
 
 
 @pytest.fixture(scope="session")

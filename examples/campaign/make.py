@@ -19,9 +19,9 @@ from shapely import affinity, transform
 from shapely.geometry import Point, Polygon, box, mapping
 
 import radiotwin as rt
-from radiotwin.footprints import MapOptions, build_scene_from_map
-from radiotwin.geodesy import to_geographic
-from radiotwin.tables import Origin
+from radiotwin.geo.geodesy import to_geographic
+from radiotwin.io.forms import Origin
+from radiotwin.scene.readers import MapOptions, build_scene_from_map
 from radiotwin.trace.points import trace_gains
 
 ORIGIN = Origin(latitude_deg=47.05, longitude_deg=8.30, altitude_m=0.0)

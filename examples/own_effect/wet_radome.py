@@ -9,7 +9,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from radiotwin.effects import EffectParams, Estimate, GainEffect, Parameter, Term
-from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.effects.base import LevelAt, ResidualView
 from radiotwin.links import LinkData
 
 

@@ -1,6 +1,6 @@
 """`python -m marl.fedqmix`: Algorithm 1 of the paper with any learner, and a comparison."""
 
-from radiotwin import signals
+from radiotwin.io import signals
 
 if __name__ == "__main__":
     signals.handle()  # before anything that takes time
@@ -13,10 +13,10 @@ import typer
 from marl.fedqmix.settings import EngineSettings, FederationSettings
 from marl.options import checked, settings_of, with_settings
 from marl.settings import LearnerSettings, RunSettings
-from radiotwin.command import with_output_options
-from radiotwin.console import say, show_warnings_plainly
 from radiotwin.errors import BadInput
-from radiotwin.exits import exit_status
+from radiotwin.runtime.command import with_output_options
+from radiotwin.runtime.console import say, show_warnings_plainly
+from radiotwin.runtime.exits import exit_status
 
 
 @with_settings(RunSettings, LearnerSettings, EngineSettings, FederationSettings)

@@ -2,15 +2,20 @@
 
 It does what `marl.algorithm1` does, driven from outside: the mean of all replicas comes in, and the
 weights that it becomes here go out. Nothing else is returned.
+
+FedProx: a term of the loss that keeps a replica near the mean it set out from.
 """
 
 import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+import torch
+from torch import Tensor
 from typing_extensions import override
 
 from marl.algorithm1 import (
@@ -22,26 +27,59 @@ from marl.algorithm1 import (
     round_row,
     twin_mission,
 )
-from marl.checkpoint import NAME, Damaged, load_checkpoint, refuse_damaged, save_checkpoint
+from marl.checkpoint import (
+    NAME,
+    Damaged,
+    load_checkpoint,
+    refuse_damaged,
+    require_count,
+    require_fields,
+    save_checkpoint,
+)
 from marl.fedqmix.federation import Weights, require_weights
-from marl.fedqmix.proximal import ProximalNetworks
 from marl.flights import evaluate
 from marl.learner import Setup
 from marl.mission import Known, Mission
-from marl.qmix import QMIX
-from marl.randomness import stream
+from marl.qmix import QMIX, QNetworks
 from marl.resume import check_rows, check_table, require_number, stored_twin
-from marl.settings import LearnerSettings, RunSettings
-from marl.sizes import check_sizes
-from marl.stored import require_count, require_fields
-from radiotwin.alignment import in_scene_frame
-from radiotwin.cells import write_csv
+from marl.settings import LearnerSettings, RunSettings, stream
+from marl.threads import check_sizes
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
-from radiotwin.measurements import Measurements, read_measurements
+from radiotwin.io.cells import write_csv
+from radiotwin.io.files import atomic_path
+from radiotwin.links.alignment import in_scene_frame
+from radiotwin.links.measurements import Measurements, read_measurements
+from radiotwin.maps.survey import read_truth
 from radiotwin.scene import Scene
-from radiotwin.survey import read_truth
 from radiotwin.twin import Twin, fit_twin
+
+
+class ProximalNetworks(QNetworks):
+    """QMIX's networks with the proximal term µ/2 ‖w - w^t‖² (Li et al., MLSys 2020, Eq. 2).
+
+    Args:
+        *arguments: of `QNetworks`.
+        mu: µ.
+    """
+
+    def __init__(self, *arguments: Any, mu: float) -> None:
+        super().__init__(*arguments)
+        self.mu = mu
+        self._keep()
+
+    def _keep(self) -> None:
+        self._mean = [weight.detach().clone() for weight in self.parameters()]
+
+    @override
+    def set_weights(self, weights: dict[str, np.ndarray]) -> None:
+        super().set_weights(weights)
+        self._keep()
+
+    @override
+    def penalty(self) -> Tensor:
+        distances = [(weight - mean).square().sum()
+                     for weight, mean in zip(self.parameters(), self._mean)]
+        return self.mu / 2 * torch.stack(distances).sum()
 
 
 @dataclass(frozen=True)

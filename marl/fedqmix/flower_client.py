@@ -17,10 +17,10 @@ from marl.fedqmix.client import Client, Party
 from marl.fedqmix.flower_records import arrays_of, weights_of
 from marl.fedqmix.shared import Shared
 from marl.threads import keep_memory, limit_threads
-from radiotwin.cuda import torch_device
 from radiotwin.errors import BadInput
-from radiotwin.inputs import read_json
-from radiotwin.processes import die_with_parent
+from radiotwin.io.inputs import read_json
+from radiotwin.runtime.cuda import torch_device
+from radiotwin.runtime.processes import die_with_parent
 
 PARTIES = "RADIOTWIN_PARTIES"
 ERROR_CODE = 2  # of Flower: the ClientApp raised an exception

@@ -23,10 +23,10 @@ from marl.fedqmix.client import rounds_of
 from marl.fedqmix.federation import Weights, require_weights, weighted_mean
 from marl.fedqmix.flower_records import arrays_of, weights_of
 from marl.fedqmix.shared import Shared, initial_weights
-from radiotwin.cells import write_csv
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.files import atomic_file, atomic_path
-from radiotwin.processes import die_with_parent
+from radiotwin.io.cells import write_csv
+from radiotwin.io.files import atomic_file, atomic_path
+from radiotwin.runtime.processes import die_with_parent
 
 FOLDER = "RADIOTWIN_FEDERATION"
 WEIGHTS, ROUNDS, DONE = "weights", "rounds.csv", "done.json"

@@ -15,17 +15,15 @@ from marl.fedqmix.shared import Shared, initial_weights, write_app
 from marl.figures import draw_curve
 from marl.mission import Known, make_mission
 from marl.settings import LearnerSettings, RunSettings
-from marl.sizes import check_sizes
-from marl.threads import keep_memory, limit_threads
-from radiotwin.alignment import in_scene_frame
-from radiotwin.console import notice, print_rows, say
-from radiotwin.cuda import torch_device
+from marl.threads import check_sizes, keep_memory, limit_threads
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.files import atomic_file, is_temporary, scratch_folder
-from radiotwin.measurements import read_measurements
-from radiotwin.progress import progress
+from radiotwin.io.files import atomic_file, is_temporary, scratch_folder
+from radiotwin.links.alignment import in_scene_frame
+from radiotwin.links.measurements import read_measurements
+from radiotwin.maps.survey import read_truth, segmented_truth
+from radiotwin.runtime.console import notice, print_rows, progress, say
+from radiotwin.runtime.cuda import torch_device
 from radiotwin.scene import Scene
-from radiotwin.survey import read_truth, segmented_truth
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from marl.qmix import QNetworks
 from marl.settings import LearnerSettings, RunSettings, check_together
 from radiotwin import __version__
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_file
+from radiotwin.io.files import atomic_file
 
 OWN = ("scene", "truth", "device")  # of `RunSettings`: each party has its own
 _Settings = TypeVar("_Settings", bound=BaseModel)

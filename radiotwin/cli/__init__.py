@@ -2,7 +2,7 @@
 
 import os
 
-from radiotwin import signals
+from radiotwin.io import signals
 
 
 def main() -> None:
@@ -12,7 +12,7 @@ def main() -> None:
     # what can be done side by side has threads and workers of its own. Read when it is loaded.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from radiotwin.cli.commands import app
-    from radiotwin.exits import exit_status
-    from radiotwin.interruption import after_interrupt
+    from radiotwin.io.signals import after_interrupt
+    from radiotwin.runtime.exits import exit_status
 
     signals.leave(exit_status(app, after_interrupt))

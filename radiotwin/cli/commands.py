@@ -7,8 +7,8 @@ import typer
 
 from radiotwin import __version__
 from radiotwin.cli import coverage, importing, loop, model, report, scenes, tools, world
-from radiotwin.command import add_output_options
-from radiotwin.console import show_warnings_plainly
+from radiotwin.runtime.command import add_output_options
+from radiotwin.runtime.console import show_warnings_plainly
 
 app = typer.Typer(
     name="radiotwin", no_args_is_help=True, pretty_exceptions_enable=False,

@@ -15,12 +15,12 @@ from radiotwin.cli.options import (
     parse_numbers,
     split_names,
 )
-from radiotwin.console import print_rows, result, say
 from radiotwin.errors import BadInput
+from radiotwin.runtime.console import print_rows, result, say
 
 if TYPE_CHECKING:
     from radiotwin.coverage import Coverage
-    from radiotwin.radiomap import RadioMap
+    from radiotwin.maps.radiomap import RadioMap
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
 
@@ -86,8 +86,8 @@ def coverage(
     from radiotwin.coverage import CoverageSettings, RateModel, predict_coverage, read_transmitters
     from radiotwin.coverage.areas import read_areas
     from radiotwin.coverage.output import FILES, available_formats, write_formats, write_tables
-    from radiotwin.files import atomic_folder, require_writable
-    from radiotwin.inputs import keep_inputs
+    from radiotwin.io.files import atomic_folder, require_writable
+    from radiotwin.io.inputs import keep_inputs
     from radiotwin.report import write_coverage_pictures
     from radiotwin.scene.build import check_target
 
@@ -121,7 +121,7 @@ def coverage(
 
 def _world(source: Path, scene: Path | None, model: str | None) -> "Scene":
     """Return the scene of a source, once the options that go with it are checked."""
-    from radiotwin.map_file import is_map
+    from radiotwin.maps.form import is_map
     from radiotwin.scene import Scene
 
     if (source / "scene.toml").exists():
@@ -142,8 +142,8 @@ def _world(source: Path, scene: Path | None, model: str | None) -> "Scene":
 @contextmanager
 def _gains(source: Path, world: "Scene", model: str | None) -> "Iterator[Twin | RadioMap | str]":
     """Open the twin or the radio map, or give the name of the law."""
-    from radiotwin.export.place import check_map_place
-    from radiotwin.radiomap import RadioMap
+    from radiotwin.maps.export.tables import check_map_place
+    from radiotwin.maps.radiomap import RadioMap
 
     if (source / "scene.toml").exists():
         yield model or "p1411"

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from radiotwin.cli.options import parse_origin
-from radiotwin.console import print_rows, say
 from radiotwin.errors import BadInput
+from radiotwin.runtime.console import print_rows, say
 
 if TYPE_CHECKING:
     from radiotwin.importing.settings import Settings
@@ -111,7 +111,7 @@ def import_(
     counts what was left out.
     """
     from radiotwin.importing import import_files, parse_columns, read_settings
-    from radiotwin.progress import progress
+    from radiotwin.runtime.console import progress
 
     given: dict[str, Any] = {
         "format": format, "only": _choices(only), "sheet": sheet,

@@ -16,7 +16,7 @@ from radiotwin.cli.options import (
     in_frame_of,
     keep_scene_apart,
 )
-from radiotwin.console import notice, print_rows, say
+from radiotwin.runtime.console import notice, print_rows, say
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -52,17 +52,20 @@ def close_loop(
 
     They are added to the model, and the error before and after is reported.
     """
-    from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
+    from radiotwin.closeloop.output.corrected_scene import (
+        check_corrected_target,
+        write_corrected_scene,
+    )
     from radiotwin.closeloop.run import close_loop as run
-    from radiotwin.execution import AUTO, open_executor
-    from radiotwin.measurements import read_measurements
-    from radiotwin.pieces import keep_pieces
-    from radiotwin.progress import progress
+    from radiotwin.links.measurements import read_measurements
     from radiotwin.report import (
         check_closeloop_folder,
         closeloop_summary,
         write_closeloop_folder,
     )
+    from radiotwin.runtime.console import progress
+    from radiotwin.runtime.execution import AUTO, open_executor
+    from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.twin.locate import NOT_BY_PATHS
 
@@ -153,14 +156,14 @@ def locate(
 
     It works with or without a 3D map.
     """
-    from radiotwin.cells import write_csv
-    from radiotwin.files import atomic_path, require_suffix, require_writable
-    from radiotwin.inputs import keep_inputs
-    from radiotwin.localize.without_map import MIN_LINKS
-    from radiotwin.measurements import read_measurements
+    from radiotwin.io.cells import write_csv
+    from radiotwin.io.files import atomic_path, require_suffix, require_writable
+    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.links.measurements import read_measurements
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
     from radiotwin.twin import Twin
+    from radiotwin.twin.localize.without_map import MIN_LINKS
     from radiotwin.twin.locate import (
         check_can_locate,
         locate_devices,

@@ -20,12 +20,12 @@ from radiotwin.cli.options import (
     open_model,
     split_names,
 )
-from radiotwin.console import notice, print_rows, result, say
 from radiotwin.errors import BadInput
+from radiotwin.runtime.console import notice, print_rows, result, say
 
 if TYPE_CHECKING:
-    from radiotwin.compare import Comparison
     from radiotwin.twin import TwinDevice
+    from radiotwin.twin.compare import Comparison
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -60,9 +60,9 @@ def fit(
 
     The channel is learnt from the anchors; then the unknown devices are located with it.
     """
-    from radiotwin.execution import open_executor
-    from radiotwin.measurements import read_measurements
-    from radiotwin.pieces import keep_pieces
+    from radiotwin.links.measurements import read_measurements
+    from radiotwin.runtime.execution import open_executor
+    from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin, check_twin_target, fit_twin
 
@@ -108,8 +108,8 @@ def map_(
 
     It holds the gain of every device over the scene's lattice.
     """
-    from radiotwin.inputs import keep_inputs
-    from radiotwin.map_file import is_map
+    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.maps.form import is_map
     from radiotwin.report import check_map_target, export_map
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
@@ -164,15 +164,15 @@ def compare(
     Published laws that hold at the scene's frequency are among them, fitted to nothing.
     With --truth they are compared with the truth map, too.
     """
-    from radiotwin.compare import split_flights
-    from radiotwin.comparison_output import compare_held_out
-    from radiotwin.execution import open_executor
-    from radiotwin.files import require_writable
-    from radiotwin.measurements import read_measurements
-    from radiotwin.pieces import keep_pieces
+    from radiotwin.io.files import require_writable
+    from radiotwin.links.measurements import read_measurements
+    from radiotwin.maps.survey import read_truth
     from radiotwin.report import write_comparison_folder
+    from radiotwin.report.comparison import compare_held_out
+    from radiotwin.runtime.execution import open_executor
+    from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.scene import Scene
-    from radiotwin.survey import read_truth
+    from radiotwin.twin.compare import split_flights
 
     require_writable(out / "compare.json")
     world = Scene.load(scene)

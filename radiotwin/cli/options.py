@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from radiotwin.errors import BadInput
-from radiotwin.inputs import is_within
+from radiotwin.io.inputs import is_within
 
 if TYPE_CHECKING:
-    from radiotwin.measurements import Measurements
-    from radiotwin.radiomap import RadioMap
+    from radiotwin.io.forms import Origin
+    from radiotwin.links.measurements import Measurements
+    from radiotwin.maps.radiomap import RadioMap
     from radiotwin.scene import Scene
-    from radiotwin.tables import Origin
     from radiotwin.twin import Twin
 
 MeasurementFile = Annotated[Path, typer.Argument(
@@ -72,8 +72,8 @@ def open_model(path: Path) -> "Iterator[RadioMap | Twin]":
     Raises:
         BadInput: it is neither.
     """
-    from radiotwin.map_file import is_map
-    from radiotwin.radiomap import RadioMap
+    from radiotwin.maps.form import is_map
+    from radiotwin.maps.radiomap import RadioMap
     from radiotwin.twin import Twin
 
     if not is_map(path):
@@ -101,7 +101,7 @@ def parse_origin(text: str | None) -> "Origin | None":
     Raises:
         BadInput: anything else, or a place that is not on the earth.
     """
-    from radiotwin.tables import as_origin
+    from radiotwin.io.forms import as_origin
 
     if text is None:
         return None
@@ -127,7 +127,7 @@ def in_frame_of(scene: "Scene | None", measurements: "Measurements",
     Raises:
         BadInput: not two numbers, no scene, or frames that cannot be related.
     """
-    from radiotwin.alignment import in_scene_frame
+    from radiotwin.links.alignment import in_scene_frame
 
     shift_m = None if shift is None else _numbers(shift)
     if shift_m is not None and len(shift_m) != 2:

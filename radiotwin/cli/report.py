@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.console import say
+from radiotwin.runtime.console import say
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -30,7 +30,7 @@ def report(
 
     It shows the city in 3D with maps, flights and devices, and tables, and needs no network.
     """
-    from radiotwin.files import require_suffix, require_writable
+    from radiotwin.io.files import require_suffix, require_writable
     from radiotwin.report import read_run, write_report
 
     out = out or run / "report.html"

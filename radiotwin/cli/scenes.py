@@ -18,8 +18,8 @@ from radiotwin.cli.options import (
     parse_origin,
     split_names,
 )
-from radiotwin.console import console, result, say
 from radiotwin.errors import BadInput
+from radiotwin.runtime.console import console, result, say
 
 Bounds = tuple[float, float, float, float]
 
@@ -96,7 +96,7 @@ def build_scene(
 
     A report lists its contents and all problems that were found.
     """
-    from radiotwin.build import build_scene as build
+    from radiotwin.scene.readers.any_source import build_scene as build
     from radiotwin.scene.report import print_report
 
     report = build(source, out, frequency_hz=frequency_hz, materials=_pairs(material or []),
@@ -148,11 +148,11 @@ def export(
 
     One loss for each pair: nothing moves.
     """
-    from radiotwin.inputs import keep_inputs
-    from radiotwin.point_gains import export_ns3
+    from radiotwin.io.inputs import keep_inputs
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
     from radiotwin.trace import read_points
+    from radiotwin.twin.point_gains import export_ns3
 
     if to != "ns3":
         raise BadInput(f"--to {to!r} is unknown; allowed is ns3")

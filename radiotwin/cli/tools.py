@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from radiotwin.cli.options import MAX_SEED, ComputeDevice
-from radiotwin.console import console, notice, print_rows, result, say
+from radiotwin.runtime.console import console, notice, print_rows, result, say
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -30,10 +30,10 @@ def demo(
 
     The steps are build, trace, survey, fit and compare; an HTML page shows the result.
     """
+    from radiotwin.cli.demo import run_demo
     from radiotwin.cli.model import print_comparison
-    from radiotwin.cuda import tracing_device
-    from radiotwin.demo import run_demo
-    from radiotwin.pieces import keep_pieces
+    from radiotwin.runtime.cuda import tracing_device
+    from radiotwin.runtime.pieces import keep_pieces
 
     used = tracing_device(device)
     with keep_pieces() as pieces:
@@ -48,7 +48,7 @@ def doctor() -> None:
 
     Each problem comes with its remedy.
     """
-    from radiotwin.doctor import diagnose, print_diagnosis
+    from radiotwin.cli.doctor import diagnose, print_diagnosis
 
     with console.status("checking this machine"):
         diagnosis = diagnose()
@@ -67,7 +67,7 @@ def cache(
     where it was. The folder is that of the environment variable RADIOTWIN_CACHE, and the oldest
     parts are removed when there are more bytes than RADIOTWIN_MAX_CACHE_BYTES.
     """
-    from radiotwin.pieces import cache_content, clear_cache
+    from radiotwin.runtime.pieces import cache_content, clear_cache
 
     content = cache_content()
     parts = content["parts"]

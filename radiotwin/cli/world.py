@@ -20,8 +20,8 @@ from radiotwin.cli.options import (
     Workers,
     split_names,
 )
-from radiotwin.console import notice, print_rows, say
 from radiotwin.errors import BadInput
+from radiotwin.runtime.console import notice, print_rows, say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -63,9 +63,9 @@ def trace(
 
     A killed run is resumed, a finished one is reused.
     """
-    from radiotwin.cuda import tracing_device
-    from radiotwin.execution import open_executor, worker_count
-    from radiotwin.inputs import keep_inputs
+    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.runtime.cuda import tracing_device
+    from radiotwin.runtime.execution import open_executor, worker_count
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
     from radiotwin.trace import trace_map, truth_path
@@ -131,10 +131,10 @@ def gains(
 
     An empty gain has a reason, such as no path.
     """
-    from radiotwin.cuda import tracing_device
-    from radiotwin.execution import open_executor
-    from radiotwin.inputs import keep_inputs
-    from radiotwin.pieces import keep_pieces
+    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.runtime.cuda import tracing_device
+    from radiotwin.runtime.execution import open_executor
+    from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
     from radiotwin.trace import read_points, trace_points
@@ -169,8 +169,8 @@ def paths(
 
     Each link gets its delay spread, K factor and angular spreads. No ray tracer is needed.
     """
-    from radiotwin.inputs import keep_inputs
-    from radiotwin.paths.listing import list_paths
+    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.propagation.paths.listing import list_paths
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
     from radiotwin.trace import read_points
@@ -201,7 +201,7 @@ def _settings(scene: "Scene", points_m: "np.ndarray", devices: list[str] | None,
               quality: str | None, target_db: float | None, **others: str | int | float | None
               ) -> "SolverSettings":
     """Return the settings of a quality, or those that reach a target, with what they cost."""
-    from radiotwin.pieces import keep_pieces
+    from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.trace import SolverSettings, choose_quality
 
     if target_db is None:
@@ -241,10 +241,10 @@ def survey(
 
     Their measurements are written, with a table of the devices.
     """
-    from radiotwin.inputs import keep_inputs
+    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.maps.survey import fly_survey, read_truth
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
-    from radiotwin.survey import fly_survey, read_truth
 
     scene = Scene.load(folder)
     for written in (out, out.parent / "devices.csv"):

@@ -16,9 +16,9 @@ from radiotwin.coverage.radio import location_probability
 from radiotwin.coverage.settings import CoverageSettings
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
-from radiotwin.footprints.gis_files import read_geojson
-from radiotwin.geodesy import to_local
+from radiotwin.geo.geodesy import to_local
 from radiotwin.scene import Scene
+from radiotwin.scene.readers.gis_files import read_geojson
 
 SINR_CLASSES_DB = (20.0, 13.0, 0.0, -5.0)  # excellent, good, fair, poor, as drive tests show it
 RATE_CLASSES = (0.9, 0.5, 0.25, 0.1)  # of the greatest rate

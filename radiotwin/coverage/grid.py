@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from radiotwin.budgets import COVERAGE_CELLS
 from radiotwin.errors import BadInput
+from radiotwin.io.budgets import COVERAGE_CELLS
 from radiotwin.scene.citymap import GROUND_M, CityMap
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.surfaces import Surfaces

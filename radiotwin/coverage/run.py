@@ -34,8 +34,8 @@ from radiotwin.coverage.transmitters import (
     with_defaults,
 )
 from radiotwin.errors import BadInput
-from radiotwin.progress import progress
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 import numpy as np
 from typing_extensions import override
 
-from radiotwin.antennas import Antenna
-from radiotwin.channel import channel_named
-from radiotwin.channel.image_paths import ImagePaths
-from radiotwin.channel.published import PublishedLaw
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.propagation.laws import channel_named
+from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.scene import Scene
+from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.lattice import Lattice
 from radiotwin.twin import Twin
 
@@ -124,7 +124,7 @@ class PathSource(GainSource):
     @override
     def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
                 ) -> tuple[np.ndarray, np.ndarray | None]:
-        from radiotwin.paths.powers import path_powers  # numba is large
+        from radiotwin.propagation.paths.powers import path_powers  # numba is large
 
         each = self._transmitters[row]
         parts = [np.empty(0)]

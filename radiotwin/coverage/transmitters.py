@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from radiotwin.antennas import Antenna, read_pattern
-from radiotwin.budgets import DEVICES
-from radiotwin.cells import as_numbers, read_cells, refuse
 from radiotwin.errors import BadInput
-from radiotwin.frames import between_frames, is_same_frame, read_frame
-from radiotwin.geodesy import to_local
-from radiotwin.inputs import require_within
-from radiotwin.measurement_columns import refuse_limits
+from radiotwin.geo.frames import between_frames, is_same_frame, read_frame
+from radiotwin.geo.geodesy import to_local
+from radiotwin.io.budgets import DEVICES
+from radiotwin.io.cells import as_numbers, read_cells, refuse
+from radiotwin.io.forms import name_fault
+from radiotwin.io.inputs import require_within
+from radiotwin.links.measurements import refuse_limits
 from radiotwin.scene import Scene
-from radiotwin.tables import name_fault
+from radiotwin.scene.antennas import Antenna, read_pattern
 
 _LOCAL, _GLOBAL = ("x_m", "y_m"), ("latitude_deg", "longitude_deg")
 _OPTIONAL = ("tx_power_dbm", "azimuth_deg", "tilt_deg", "load", "frequency_hz")

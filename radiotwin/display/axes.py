@@ -1,4 +1,9 @@
-"""Axes of a plot from above: metres of the local frame, or degrees where its origin is known."""
+"""Axes of a plot from above, and the colours and titles that all plots share.
+
+Axes of a plot from above: metres of the local frame, or degrees where its origin is known.
+
+Colours, colour scales and titles that all plots and figures share.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.geodesy import to_geographic
-from radiotwin.tables import Origin
+from radiotwin.geo.geodesy import to_geographic
+from radiotwin.io.forms import Origin
+from radiotwin.io.texts import shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,6 +23,10 @@ if TYPE_CHECKING:
 
 TICKS = 6  # of an axis in degrees, whose labels are long
 LABEL_SHARE = 0.85  # of the height of the axes that a colour bar takes
+GAIN_COLOURS = "viridis"
+DIFFERENCE_COLOURS = "RdBu_r"  # of model − truth, red: the model predicts more
+RESIDUAL_COLOURS = "RdBu"  # of measured − predicted, red: less was measured than predicted
+RESIDUAL_RANGE_DB = (2.0, 30.0)  # smallest and largest end of a colour scale
 
 
 def new_axes(ax: Axes | None) -> Axes:
@@ -128,3 +138,24 @@ def _edges(along_m: np.ndarray, across_m: np.ndarray) -> np.ndarray:
         step_m = np.diff(across_m)[:1] if len(across_m) > 1 else np.ones(1)
     middle_m = along_m[:-1] + np.diff(along_m) / 2
     return np.concatenate([[along_m[0] - step_m[0] / 2], middle_m, [along_m[-1] + step_m[-1] / 2]])
+
+
+def plain(text: str, max_length: int = 100) -> str:
+    """Return a foreign text for a figure: short, on one line, nothing hidden, and no formula."""
+    return " ".join(shown(text, max_length).split()).replace("$", r"\$")
+
+
+def residual_range_db(residual_db: np.ndarray) -> float:
+    """Return the end of a symmetric colour scale [dB] that 95 % of the finite values are within."""
+    finite = np.abs(residual_db[np.isfinite(residual_db)])
+    high_db = float(np.quantile(finite, 0.95)) if len(finite) else 0.0
+    return float(np.clip(np.ceil(high_db), *RESIDUAL_RANGE_DB))
+
+
+def level_range_db(level_db: np.ndarray) -> tuple[float, float]:
+    """Return the ends of a colour scale [dB] that nearly all finite values are within."""
+    finite = level_db[np.isfinite(level_db)]
+    if not len(finite):
+        return -1.0, 0.0
+    low, high = np.quantile(finite, [0.01, 0.995])
+    return float(low), float(high)

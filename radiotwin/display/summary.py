@@ -1,11 +1,28 @@
-"""Summaries of objects: one line for a terminal, a small table for a notebook."""
+"""Objects as a line, as a small table, and as rows for GIS programs.
+
+Summaries of objects: one line for a terminal, a small table for a notebook.
+
+Tables for GIS programs: rows with a geometry and a reference system, as GeoPandas has them.
+"""
+
+from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
+from typing import TYPE_CHECKING, Any
 
-from radiotwin.texts import shown
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.geo.geodesy import local_crs
+from radiotwin.io.forms import Origin
+from radiotwin.io.texts import shown
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
 
 MAX_CELL = 300  # characters of a cell; names come from strangers' files
 MAX_LINE = 200
@@ -80,3 +97,35 @@ def span(low: float, high: float, unit: str) -> str:
     if not (low <= high):
         return "–"
     return f"{round(low, 1):g} to {round(high, 1):g} {unit}".replace("-", "−")
+
+
+def geo_data_frame(table: pd.DataFrame, origin: Origin | None, *, position_m: np.ndarray | None
+                   = None, geometry: Any = None) -> GeoDataFrame:
+    """Return a table with a geometry in metres of the local frame.
+
+    Its reference system is that of the frame, where the origin is known: `.to_crs(4326)` gives
+    longitude and latitude.
+
+    Args:
+        table: n rows.
+        origin: of the local frame; None: the result has no reference system.
+        position_m: (n, 2) or (n, 3) points [m]; a row with NaN has no geometry.
+        geometry: (n,) shapes in place of points.
+
+    Raises:
+        BadInput: GeoPandas is not installed.
+    """
+    try:
+        import geopandas
+    except ImportError:
+        raise BadInput("a GeoDataFrame needs the package geopandas, which is not installed; "
+                       "install it with `pip install 'radiotwin[geo]'`") from None
+    if geometry is None:
+        import shapely
+
+        assert position_m is not None
+        known = np.isfinite(position_m).all(axis=1)
+        geometry = np.full(len(table), None, dtype=object)
+        geometry[known] = shapely.points(position_m[known])
+    crs = None if origin is None else local_crs(origin)
+    return geopandas.GeoDataFrame(table, geometry=geometry, crs=crs)

@@ -1,4 +1,7 @@
-"""Small helpers that many effects share."""
+"""Small helpers that many effects share.
+
+Powers and decibels.
+"""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -11,6 +14,8 @@ from radiotwin.links import LinkData
 from radiotwin.scene.citymap import CityMap
 
 MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
+NEPERS = np.log(10) / 10  # of power in a decibel
+MIN_POWER = 1e-290  # of which a logarithm is taken
 
 
 class LinkCache:
@@ -101,3 +106,18 @@ def frequent_labels(index: np.ndarray, minimum: int) -> list[int]:
 def robust_sd(values: np.ndarray) -> float:
     """Return the standard deviation of normal values (n,) among which there may be outliers."""
     return MAD_SD * float(np.median(np.abs(values - np.median(values))))
+
+
+def add_power(level_db: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the level of the sum of two powers, and its slope in the first level.
+
+    Args:
+        level_db: (n,) first power [dB].
+        power: (n,) second power, in units of that of 0 dB.
+
+    Returns:
+        (n,) [dB], and (n,) slope.
+    """
+    first = np.maximum(np.exp(level_db * NEPERS), MIN_POWER)
+    total = first + power
+    return np.log(total) / NEPERS, first / total

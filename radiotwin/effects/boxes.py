@@ -1,13 +1,22 @@
-"""Boxes that obstruct links, and where in a city they would explain missing power."""
+"""Boxes that obstruct links, and the buildings of a 3D map.
 
+Boxes that obstruct links, and where in a city they would explain missing power.
+
+The buildings of a 3D map: their faces, positions, and standard deviations of their heights.
+"""
+
+from functools import lru_cache
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from radiotwin.effects.arrays import ends_above
 from radiotwin.effects.params import Length, Metres
 from radiotwin.links import LinkData
+from radiotwin.scene.citymap import CityMap
 
 SAMPLE_M = 5.0  # between points on a link, while it is back-projected
 CELL_M = 12.5  # side of a cell of the back-projection
@@ -21,6 +30,10 @@ GRAZING_DB = 6.0  # loss of a way that touches an edge
 SAME_PLACE_M = 10.0  # devices of one mast
 BESIDE_UNKNOWN = ("only links of devices whose positions are estimated pass it: they may be "
                   "elsewhere")
+WELD_M = 0.05  # vertices closer together belong to one building
+# Standard deviation of a height: the default, and a lower bound. With less, other shadows beside a
+# roof are fitted by small errors of its height.
+HEIGHT_SD_M = 3.0  # one storey
 
 
 class Box(NamedTuple):
@@ -315,3 +328,56 @@ def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray,
     share = np.where(p > 0, share, np.minimum(loss_db, other_db) / GRAZING_DB)
     correction_db = (12 - 20 * np.log10(2 / (1 - alpha / np.pi))) * share
     return loss_db + np.maximum(other_db - correction_db, 0.0)
+
+
+@lru_cache(maxsize=4)
+def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
+    """Group faces that are connected.
+
+    Args:
+        city: a map with f faces.
+
+    Returns:
+        (f,) index of each face's building, and (buildings, 3) centre x, y and height of each [m];
+        read-only, as they are kept for the next call.
+    """
+    welded = np.round(city.vertices / WELD_M).astype(np.int64)
+    vertex = np.unique(welded, axis=0, return_inverse=True)[1].ravel()
+    faces = vertex[city.faces]
+    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])),
+                       shape=(vertex.max() + 1,) * 2)
+    component = connected_components(graph, directed=False)[1]
+    label = np.unique(component[faces[:, 0]], return_inverse=True)[1]
+    low_m, high_m = building_extents_m(city, label)
+    centre_m = np.column_stack([0.5 * (low_m + high_m)[:, :2], high_m[:, 2]])
+    label.flags.writeable = centre_m.flags.writeable = False
+    return label, centre_m
+
+
+def building_extents_m(city: CityMap, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the greatest x, y and z (buildings, 3) of faces by their label (f,)."""
+    corners_m = city.vertices[city.faces]
+    low_m = np.full((label.max() + 1, 3), np.inf)
+    high_m = -low_m
+    np.minimum.at(low_m, label, corners_m.min(axis=1))
+    np.maximum.at(high_m, label, corners_m.max(axis=1))
+    return low_m, high_m
+
+
+def building_height_sds_m(city: CityMap) -> np.ndarray:
+    """Return the standard deviation of the mapped height of each building, a storey at least.
+
+    Args:
+        city: a map.
+
+    Returns:
+        (buildings,), as `buildings` numbers them [m]
+    """
+    label, centres_m = buildings(city)
+    if city.height_sd_m is None:
+        return np.full(len(centres_m), HEIGHT_SD_M)
+    known = np.isfinite(city.height_sd_m)
+    faces = np.bincount(label[known], minlength=len(centres_m))
+    sums = np.bincount(label[known], weights=city.height_sd_m[known], minlength=len(centres_m))
+    return np.maximum(sums / np.maximum(faces, 1), HEIGHT_SD_M)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from radiotwin.effects.arrays import robust_sd
-from radiotwin.effects.residual_view import ResidualView
+from radiotwin.effects.base import ResidualView
 from radiotwin.links import LinkData, correlation_length_m
 from radiotwin.links.correlation import devices_move, step_m
 

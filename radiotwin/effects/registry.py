@@ -5,34 +5,34 @@ A package adds effects under the entry-point group `radiotwin.effects`; a script
 """
 
 from radiotwin.effects.base import Effect
-from radiotwin.effects.body_shadowing import BodyShadowing
-from radiotwin.effects.building_entry import BuildingEntry
-from radiotwin.effects.clock_offset import ReceiverClockOffset
-from radiotwin.effects.declared_sectors import DeclaredSectors, DeclaredSectorsOnPaths
-from radiotwin.effects.detection_limit import DetectionLimit
-from radiotwin.effects.episode import Episode
-from radiotwin.effects.excess_attenuation import ExcessAttenuation
-from radiotwin.effects.faulty_flight import FaultyFlight
-from radiotwin.effects.foliage import Foliage
-from radiotwin.effects.gain_drift import DeviceDrift, ReceiverDrift
-from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
-from radiotwin.effects.ground_reflection import GroundReflection
-from radiotwin.effects.interference import Interference
-from radiotwin.effects.lock_loss import LockLoss
-from radiotwin.effects.mapped_vegetation import MappedVegetation
-from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.noise_floor import NoiseFloor
-from radiotwin.effects.path_strength import Diffraction, WallReflection
-from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
-from radiotwin.effects.receiver_saturation import ReceiverSaturation
-from radiotwin.effects.removed_obstacle import RemovedObstacle
-from radiotwin.effects.roof_heights import RoofHeights
-from radiotwin.effects.sector_antenna import SectorAntenna
-from radiotwin.effects.tilted_dipole import TiltedDipole
-from radiotwin.effects.uncertain_sight import UncertainSight
-from radiotwin.effects.unexplained_trend import ON_MAPS, OVER, UnexplainedTrend
+from radiotwin.effects.catalogue.body_shadowing import BodyShadowing
+from radiotwin.effects.catalogue.building_entry import BuildingEntry
+from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
+from radiotwin.effects.catalogue.declared_sectors import DeclaredSectors, DeclaredSectorsOnPaths
+from radiotwin.effects.catalogue.detection_limit import DetectionLimit
+from radiotwin.effects.catalogue.episode import Episode
+from radiotwin.effects.catalogue.excess_attenuation import ExcessAttenuation
+from radiotwin.effects.catalogue.faulty_flight import FaultyFlight
+from radiotwin.effects.catalogue.foliage import Foliage
+from radiotwin.effects.catalogue.gain_drift import DeviceDrift, ReceiverDrift
+from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.catalogue.ground_reflection import GroundReflection
+from radiotwin.effects.catalogue.interference import Interference
+from radiotwin.effects.catalogue.lock_loss import LockLoss
+from radiotwin.effects.catalogue.mapped_vegetation import MappedVegetation
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
+from radiotwin.effects.catalogue.noise_floor import NoiseFloor
+from radiotwin.effects.catalogue.path_strength import Diffraction, WallReflection
+from radiotwin.effects.catalogue.position_errors import DevicePositionError, ReceiverPositionError
+from radiotwin.effects.catalogue.receiver_saturation import ReceiverSaturation
+from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
+from radiotwin.effects.catalogue.roof_heights import RoofHeights
+from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
+from radiotwin.effects.catalogue.tilted_dipole import TiltedDipole
+from radiotwin.effects.catalogue.uncertain_sight import UncertainSight
+from radiotwin.effects.catalogue.unexplained_trend import ON_MAPS, OVER, UnexplainedTrend
 from radiotwin.errors import BadInput
-from radiotwin.plugins import load_plugins
+from radiotwin.runtime.plugins import load_plugins
 
 ENTRY_POINTS = "radiotwin.effects"
 BUILT_IN: tuple[type[Effect], ...] = (

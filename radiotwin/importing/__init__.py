@@ -1,7 +1,6 @@
 """Import of measurements from logs and tables of any layout, with a report of what was kept."""
 
 from radiotwin.importing.run import import_files, import_measurements
-from radiotwin.importing.settings import Settings
-from radiotwin.importing.settings_file import parse_columns, read_settings
+from radiotwin.importing.settings import Settings, parse_columns, read_settings
 
 __all__ = ["Settings", "import_files", "import_measurements", "parse_columns", "read_settings"]

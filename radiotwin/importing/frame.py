@@ -1,23 +1,26 @@
-"""Conversion of WGS84 or projected positions to the local frame: x east, y north, z up [m]."""
+"""Conversion of WGS84 or projected positions to the local frame: x east, y north, z up [m].
+
+Conversion of lengths to metres.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
-from radiotwin.cells import shown
 from radiotwin.errors import BadInput
-from radiotwin.geodesy import to_local
-from radiotwin.reference_systems import ALLOWED, reference_system
-from radiotwin.tables import Origin
+from radiotwin.geo.geodesy import ALLOWED, reference_system, to_local
+from radiotwin.io.cells import shown
+from radiotwin.io.forms import Origin
 
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
 ORIGIN_DECIMALS = 7  # of a computed origin [degrees]: 1 cm
+METRES = {"m": 1.0, "ft": 0.3048}  # the international foot, exact since 1959
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The local frame about an origin (see `radiotwin.geodesy`); heights are left as they are.
+    """The local frame about an origin (see `radiotwin.geo.geodesy`); heights are left as they are.
 
     Attributes:
         origin: None where all positions are local already.
@@ -137,3 +140,25 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
     degrees[known] = np.column_stack([longitude, latitude])
     return positions.drop(columns=["x", "y"]).assign(longitude=degrees[:, 0],
                                                      latitude=degrees[:, 1])
+
+
+def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
+    """Convert lengths to metres.
+
+    Args:
+        numbers: (n,) in `unit`.
+        unit: of `METRES`; None if it is not declared.
+        column: file and column, for the message.
+
+    Returns:
+        lengths [m], (n,).
+
+    Raises:
+        BadInput: the unit is not declared.
+    """
+    if unit is None:
+        known = numbers[np.isfinite(numbers)]
+        values = f"run from {known.min():g} to {known.max():g}" if len(known) else "are all empty"
+        raise BadInput(f"{column}: length_unit is not given; allowed are {' and '.join(METRES)}. "
+                       f"The values {values}")
+    return numbers * METRES[unit]

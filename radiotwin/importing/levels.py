@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from radiotwin.cells import as_numbers
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.source import EMPTY, Source, as_text
+from radiotwin.io.cells import as_numbers
 
 LEVEL_COLUMN = {"dBm": "rssi_dbm", "mW": "rssi_dbm", "W": "rssi_dbm", "dB": "gain_db"}
 """Unit in the file -> column of `measurements.csv`."""

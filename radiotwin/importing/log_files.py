@@ -1,5 +1,9 @@
-"""The files of an import: named ones, those of a folder, and those in a zip file."""
+"""The files of an import: named ones, those of a folder, and those in a zip file.
 
+Lines of a text, counted and bounded.
+"""
+
+import io
 import os
 import re
 import struct
@@ -11,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath, PurePosixPath
 from typing import IO
 
-from radiotwin.budgets import FILE_BYTES, IMPORT_FILES, Budget
 from radiotwin.errors import BadInput
-from radiotwin.inputs import bounded, is_within, open_gzip, open_input
+from radiotwin.io.budgets import FILE_BYTES, IMPORT_FILES, ROW_BYTES, Budget
+from radiotwin.io.inputs import bounded, is_within, open_gzip, open_input
 
 TEXTS = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".ndjson", ".geojson")
 BINARIES = (".parquet", ".xlsx")
@@ -234,3 +238,31 @@ def _resolved(path: Path) -> Path:
         return path.resolve()
     except (OSError, RuntimeError, ValueError):  # no file can have this name: reading it says so
         return path
+
+
+class Lines:
+    """Iterates over the lines of a text.
+
+    Args:
+        text: opened with `newline=""`.
+        source: of it, for messages.
+
+    Attributes:
+        number: of the line that was read last, from 1.
+    """
+
+    def __init__(self, text: io.TextIOWrapper, source: object) -> None:
+        self._text, self._source, self.number = text, source, 0
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        line = self._text.readline(ROW_BYTES.limit)
+        if not line:
+            raise StopIteration
+        if len(line) == ROW_BYTES.limit and not line.endswith(("\n", "\r")):
+            ROW_BYTES.refuse(f"{self._source}: line {self.number + 1}",
+                             f"a line of {ROW_BYTES.limit:,} characters and more")
+        self.number += 1
+        return line if self.number > 1 else line.removeprefix("\ufeff")

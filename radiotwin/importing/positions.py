@@ -1,21 +1,224 @@
-"""Positions of receivers and devices: from the file's own columns, then from tables."""
+"""Positions of receivers and devices: from columns, from tables, and of devices that moved.
+
+Positions of receivers and devices: from the file's own columns, then from tables.
+
+Tables of positions: names, positions, and the optional columns of `devices.csv`.
+
+Devices at several places over time: each place becomes a device `NAME@1`, `NAME@2`, ….
+
+A device of `devices.csv` has one position.
+"""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.frame import Frame, find_frame, to_geographic
-from radiotwin.importing.places import at_times, place_names
-from radiotwin.importing.position_table import read_positions
-from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings
+from radiotwin.importing.frame import METRES, Frame, find_frame, in_metres, to_geographic
+from radiotwin.importing.problems import Tally
+from radiotwin.importing.read_source import read_source
+from radiotwin.importing.reading import LIMITS_DEG
+from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings, check_position
 from radiotwin.importing.source import Source
-from radiotwin.importing.tally import Tally
-from radiotwin.measurement_columns import MAX_COORDINATE_M
-from radiotwin.measurements import DEVICE_OPTIONAL
+from radiotwin.importing.times import ISO, seconds
+from radiotwin.io.budgets import DEVICES
+from radiotwin.io.cells import listed
+from radiotwin.io.forms import MAX_POSITION_M
+from radiotwin.links.measurements import DEVICE_OPTIONAL, refuse_limits
 
+SINCE, UNTIL = "since_s", "until_s"
+"""Columns of a table of devices: from when until when a device was there [s]; NaN = always."""
+_MAX_PLACES = 1000  # of one device; one that moves all the time has no places
 MOVING_M = 1.0  # a device whose positions differ by more than this is not at rest
+
+
+def numbered(names: pd.Series, since_s: np.ndarray) -> pd.Series:
+    """Return names in which the places of a device are numbered in the order of time.
+
+    Args:
+        names: of devices, (n,).
+        since_s: since when each was there, (n,).
+
+    Returns:
+        `NAME@1`, … where a name occurs more than once, else the name.
+    """
+    order = np.lexsort((np.arange(len(names)), np.nan_to_num(since_s, nan=-np.inf)))
+    number = names.iloc[order].groupby(names.iloc[order]).cumcount() + 1
+    several = names.duplicated(keep=False)
+    return names.mask(several, names + "@" + number.reindex(names.index).astype(str))
+
+
+def at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -> pd.DataFrame:
+    """Name the device of each link after the place where it was at the time.
+
+    Args:
+        source: the log, for messages.
+        links: with `device`, and `time_s`.
+        table: of devices, as of `read_positions`.
+
+    Returns:
+        links; a device that was nowhere at a time keeps its name, and has no position then.
+
+    Raises:
+        BadInput: a device has places over time, and its readings have no times.
+    """
+    if table is None or SINCE not in table:
+        return links
+    place_of = pd.Series(table.index, index=table.index)
+    owner = place_of.str.replace(r"@\d+$", "", regex=True)
+    # Of `numbered` there are several and none without a number; others are called so.
+    numbered_ones = owner.duplicated(keep=False) & ~owner.isin(place_of)
+    owner = owner.where(numbered_ones, place_of).to_numpy()
+    names = links["device"].to_numpy(dtype=object, copy=True)
+    for device in dict.fromkeys(owner[place_of.to_numpy() != owner]):
+        own = np.flatnonzero(links["device"].to_numpy() == device)
+        if not len(own):
+            continue
+        if "time_s" not in links or links["time_s"].iloc[own].isna().any():
+            raise BadInput(f"{source.path}: device {device!r} is at several places over time, and "
+                           "some of its readings have no time; give the column of the time")
+        rows = np.flatnonzero(owner == device)
+        since_s = np.nan_to_num(table[SINCE].to_numpy()[rows], nan=-np.inf)
+        rows, since_s = rows[np.argsort(since_s)], np.sort(since_s)
+        time_s = links["time_s"].to_numpy()[own]
+        place = np.searchsorted(since_s, time_s, side="right") - 1
+        there = place >= 0
+        until_s = table[UNTIL].to_numpy()[rows][place.clip(0)]
+        there &= ~(time_s >= until_s)  # NaN: until the next one
+        names[own[there]] = table.index.to_numpy()[rows[place[there]]]
+    return links.assign(device=names)
+
+
+def place_names(source: Source, links: pd.DataFrame, device_m: np.ndarray,
+                place_m: float) -> np.ndarray:
+    """Name the device of each link after the place where the log says that it was.
+
+    Places are numbered as they occur; a position within `place_m` of one belongs to it.
+
+    Args:
+        source: the log, for messages.
+        links: n rows with `device`.
+        device_m: position of each link's device [m], (n, 3); NaN where unknown.
+        place_m: [m].
+
+    Returns:
+        names, (n,): `NAME@1`, … of devices at more than one place.
+
+    Raises:
+        BadInput: a device is at very many places.
+    """
+    names = links["device"].to_numpy(dtype=object, copy=True)
+    filled_m = np.nan_to_num(device_m)
+    for device, rows in links.groupby(np.array(names), sort=False).indices.items():
+        rows = rows[np.isfinite(device_m[rows, :2]).all(axis=1)]
+        if not len(rows) or (np.ptp(filled_m[rows], axis=0) <= place_m / np.sqrt(3)).all():
+            continue
+        different_m, first, inverse = np.unique(filled_m[rows], axis=0, return_index=True,
+                                                return_inverse=True)
+        place = np.full(len(different_m), -1)
+        centres_m = np.empty((0, 3))
+        for i in np.argsort(first):
+            near = np.linalg.norm(centres_m - different_m[i], axis=1) <= place_m
+            place[i] = np.argmax(near) if near.any() else len(centres_m)
+            if not near.any():
+                centres_m = np.vstack([centres_m, different_m[i]])
+            if len(centres_m) > _MAX_PLACES:
+                raise BadInput(f"{source.path}: device {device!r} is at more than {_MAX_PLACES} "
+                               f"places that are {place_m:g} m apart: it moves all the time. Take "
+                               "it for the receiver, and the other end for the device: the gain "
+                               "is that of both directions")
+        if len(centres_m) > 1:
+            names[rows] = [f"{device}@{number + 1}" for number in place[inverse.ravel()]]
+    return names
+
+
+def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
+    """Read a table of positions.
+
+    Several rows of one device are its places over time: column `since`, and `until` where it was
+    nowhere in between, in ISO 8601. They become devices `NAME@1`, `NAME@2`, ….
+
+    The position is `latitude, longitude` and `altitude` or `height`, or `x, y, z`. A column's name
+    may end in its unit (`latitude_deg`, `height_m`, `z_ft`); lengths without one are in
+    `length_unit`.
+
+    Args:
+        path: of the table.
+        key: column of the names, `device` or `receiver`.
+        settings: `length_unit` and `crs`.
+
+    Returns:
+        columns of `POSITION` [degrees, m] and those of `DEVICE_OPTIONAL` that the table has; the
+        index holds the names.
+
+    Raises:
+        BadInput: names file, row and column.
+    """
+    source = read_source(path)
+    DEVICES.check(len(source), path)
+    names = pd.Series(source.names(key, f"the {key}s' names"), index=source.table.index)
+    source.refuse(key, names, names == "", f"is empty; every {key} needs a name")
+    period: dict[str, np.ndarray] = {}
+    if key == "device" and "since" in source.table:
+        period = _period(source, settings)
+        names = numbered(names, period[SINCE])
+    source.refuse(key, names, names.duplicated(), f"occurs twice; every {key} has one row")
+    columns = {name: (spec, unit) for spec in map(str, source.table)
+               for name, unit in [_quantity_and_unit(spec)] if name}
+    try:
+        check_position(set(columns), "")
+        if not {"latitude", "x"} & set(columns):
+            raise ValueError("there is no position; columns latitude, longitude or x, y are "
+                             f"needed, the table has {listed(source.table.columns)}")
+    except ValueError as error:
+        raise BadInput(f"{path}: {error}") from None
+    positions = pd.DataFrame({name: _quantity(source, name, spec, unit, settings)
+                              for name, (spec, unit) in columns.items()},
+                             index=names.to_numpy(dtype=object))
+    others = {name: source.numbers(name, name) for name in DEVICE_OPTIONAL if name in source.table}
+    for name, numbers in others.items():
+        def refuse(bad: ArrayLike, reason: str, name: str = name) -> None:
+            source.refuse(name, source.table[name], bad, reason)
+
+        refuse_limits(refuse, name, numbers)
+    return to_geographic(positions, settings.crs).assign(**others, **period)
+
+
+def _period(source: Source, settings: Settings) -> dict[str, np.ndarray]:
+    """Return since when, and until when, a device was at a place [s]; NaN where not given."""
+    since_s = seconds(source, "since", ISO, settings.time_zone)
+    until_s = np.full(len(source), np.nan)
+    if "until" in source.table:
+        until_s = seconds(source, "until", ISO, settings.time_zone)
+    source.refuse("until", source.cells("since", "since"), until_s <= since_s,
+                  "is not before the time until which the device was there")
+    return {SINCE: since_s, UNTIL: until_s}
+
+
+def _quantity_and_unit(spec: str) -> tuple[str | None, str | None]:
+    """Return the quantity of `POSITION` in a column, and the unit at the end of its name."""
+    name, _, ending = spec.rpartition("_")
+    if ending in METRES and name in POSITION and name not in LIMITS_DEG:
+        return name, ending
+    if ending == "deg" and name in LIMITS_DEG:
+        return name, None
+    return (spec, None) if spec in POSITION else (None, None)
+
+
+def _quantity(source: Source, name: str, spec: str, unit: str | None,
+              settings: Settings) -> np.ndarray:
+    """Return the numbers of a column [degrees, m, or the unit of the crs], (n,)."""
+    numbers = source.numbers(spec, name)
+    if name in LIMITS_DEG:
+        limit = LIMITS_DEG[name]
+        source.refuse(spec, source.table[spec], abs(numbers) > limit,
+                      f"is no {name}; allowed are -{limit:g} to {limit:g} degrees")
+        return numbers
+    if settings.crs and name in "xy":
+        return numbers
+    return in_metres(numbers, unit or settings.length_unit, f"{source.path}: column {spec}")
 
 
 @dataclass(frozen=True)
@@ -96,7 +299,7 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
 
 
 def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end: str) -> None:
-    far = (np.abs(position_m) > MAX_COORDINATE_M).any(axis=1)
+    far = (np.abs(position_m) > MAX_POSITION_M).any(axis=1)
     if far.any():
         row = int(np.argmax(far))
         raise BadInput(f"{source.path}: {source.where(links.index[row])}: the {end} lies "

@@ -1,26 +1,213 @@
-"""Opening of a file of measurements: the format by its name and its first line."""
+"""Opening of a file of measurements: text, JSON lines or a workbook, by name and first line.
 
+Opening of a file of measurements: the format by its name and its first line.
+
+JSON lines: one object a line, whose nested values become columns with dots in their names.
+
+A sheet of a workbook (.xlsx) as the text of a table.
+"""
+
+import csv
+import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import date, datetime, time
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import pandas as pd
 
-from radiotwin.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, ROWS
-from radiotwin.cells import read_cells
 from radiotwin.errors import BadInput
-from radiotwin.importing.dialect import find_dialect
-from radiotwin.importing.json_lines import read_json_lines
-from radiotwin.importing.log_files import BINARIES, TEXTS, LogFile
+from radiotwin.importing.log_files import BINARIES, TEXTS, Lines, LogFile, open_archive, open_member
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.source import Source
-from radiotwin.importing.text_table import read_text_table
-from radiotwin.importing.xlsx import read_sheet
-from radiotwin.inputs import parse_json
+from radiotwin.importing.text_table import find_dialect, read_text_table
+from radiotwin.io.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, FILE_BYTES, ROWS
+from radiotwin.io.cells import listed, read_cells
+from radiotwin.io.inputs import parse_json
 
+LISTS = ("rxInfo", "rx_metadata", "rxpk", "gateways")
+"""Lists of receptions: a row for each of their objects."""
+_MAX_ROWS = 1_048_576  # of a sheet, by the format
+_BLOCK_BYTES = 2**20
+_PICTURES = ("xl/media/", "xl/embeddings/")
+_DOCTYPES = tuple("<!DOCTYPE".encode(name) for name in ("utf-8", "utf-16-le", "utf-16-be",
+                                                        "utf-32-le", "utf-32-be"))
 _HEAD_BYTES = 2**16  # in which the first line is looked for
+
+
+def read_json_lines(file: LogFile) -> tuple[pd.DataFrame, np.ndarray]:
+    """Read JSON lines.
+
+    Args:
+        file: of text in UTF-8.
+
+    Returns:
+        cells as texts, `""` where a value is null, missing, or a list other than `LISTS`; and the
+        line of each row, from 1.
+
+    Raises:
+        BadInput: a line that is no JSON object, or too many values.
+    """
+    rows: list[dict[str, str]] = []
+    numbers: list[int] = []
+    columns: dict[str, None] = {}  # in the order of their first use
+    cells = 0
+    with file.open() as content, io.TextIOWrapper(content, "utf-8", newline="") as text:
+        lines = Lines(text, file)
+        try:
+            for line in lines:
+                if not line.strip():
+                    continue
+                record = parse_json(line, f"{file}: line {lines.number}")
+                if not isinstance(record, dict):
+                    raise BadInput(f"{file}: line {lines.number} is no JSON object; allowed is "
+                                   "one object a line")
+                for row in _rows(record):
+                    rows.append(row)
+                    numbers.append(lines.number)
+                    columns |= dict.fromkeys(row)
+                    cells += len(row)
+                    # After each: one line may stand for many rows.
+                    COLUMNS.check(len(columns), file)
+                    ROWS.check(len(rows), file)
+                    CELLS.check(len(rows) * len(columns), file)
+                    DOCUMENT_BYTES.check(10 * cells, file)  # each is an object in memory
+        except UnicodeDecodeError:
+            raise BadInput(f"{file} is not text in UTF-8; save it as UTF-8") from None
+    table = pd.DataFrame({name: pd.Series([row.get(name, "") for row in rows], dtype=str)
+                          for name in columns})
+    return table, np.array(numbers, dtype=np.int64)
+
+
+def _rows(record: dict[str, Any]) -> Iterator[dict[str, str]]:
+    """Yield a row for each reception of a record; one where it has no list of them."""
+    flat: dict[str, str] = {}
+    receptions: list[tuple[str, list[Any]]] = []
+    _flatten(record, "", flat, receptions)
+    if not receptions:
+        yield flat
+    for name, items in receptions:
+        for item in items:
+            own: dict[str, str] = {}
+            _flatten(item, f"{name}.", own, [])
+            yield flat | own
+
+
+def _flatten(value: dict[str, Any], prefix: str, flat: dict[str, str],
+             receptions: list[tuple[str, list[Any]]]) -> None:
+    for key, item in value.items():
+        name = f"{prefix}{key}"
+        if isinstance(item, dict):
+            _flatten(item, f"{name}.", flat, receptions)
+        elif isinstance(item, list):
+            if key in LISTS and item and all(isinstance(each, dict) for each in item):
+                receptions.append((name, item))
+        elif item is not None:
+            flat[name] = str(item)
+
+
+@dataclass(frozen=True)
+class Sheet(LogFile):
+    """The text of a sheet, comma-separated; each row is a line.
+
+    Attributes:
+        text: in UTF-8.
+    """
+
+    text: bytes = b""
+
+    @contextmanager
+    def open(self) -> Iterator[IO[bytes]]:
+        """Open it for reading."""
+        yield io.BytesIO(self.text)
+
+
+def read_sheet(file: LogFile, sheet: str | None) -> Sheet:
+    """Read a sheet by openpyxl, row by row; formulas have the values that were saved with them.
+
+    Args:
+        file: `.xlsx`.
+        sheet: name, or None for the first.
+
+    Raises:
+        BadInput: openpyxl is not installed, no such sheet, or the workbook is damaged or too large.
+    """
+    _check(file)
+    try:
+        import openpyxl
+    except ImportError:
+        raise BadInput(f"{file}: workbooks need the package openpyxl; `pip install "
+                       "radiotwin[xlsx]`, or save the sheet as CSV") from None
+    try:
+        book = openpyxl.load_workbook(file.path, read_only=True, data_only=True, keep_links=False)
+        try:
+            names = book.sheetnames
+            if sheet is not None and sheet not in names:
+                raise BadInput(f"{file} has no sheet {sheet!r}; it has {listed(names)}")
+            return Sheet(file.path, file.name, text=_text(file, book[sheet or names[0]]))
+        finally:
+            book.close()
+    except BadInput:
+        raise
+    except Exception as error:  # openpyxl raises those of zipfile, XML and its own
+        raise BadInput(f"{file} cannot be read as a workbook ({str(error)[:200]}); save it again, "
+                       "or as CSV") from None
+
+
+def _check(file: LogFile) -> None:
+    """Refuse a workbook that is large when unpacked, or that declares XML entities."""
+    with open_archive(file.path) as archive:
+        # A part may have any name: what it is, others say of it.
+        entries = archive.infolist()
+        DOCUMENT_BYTES.check(sum(entry.file_size for entry in entries
+                                 if not entry.filename.startswith(_PICTURES)), file)
+        for entry in entries:
+            last, is_named_xml = b"", entry.filename.lower().endswith((".xml", ".rels"))
+            with open_member(archive, entry.filename, file) as content:
+                while block := content.read(_BLOCK_BYTES):
+                    # Entities can stand for any amount of text; UTF-16 would hide them.
+                    text = last + block
+                    if any(each in text for each in _DOCTYPES) or is_named_xml and b"\0" in block:
+                        raise BadInput(f"{file}: {entry.filename[:100]!r} is no XML of a workbook "
+                                       "(it has a DOCTYPE or null characters); save it again")
+                    last = block[-64:]
+
+
+def _text(file: LogFile, sheet: Any) -> bytes:
+    if not hasattr(sheet, "reset_dimensions"):
+        raise BadInput(f"{file}: its sheet {sheet.title!r} is a chart; name one with --sheet")
+    sheet.reset_dimensions()  # which a file may declare as it likes
+    text = io.BytesIO()
+    wrapper = io.TextIOWrapper(text, "utf-8", newline="", write_through=True)
+    writer = csv.writer(wrapper)
+    cells = 0
+    for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
+        if number > _MAX_ROWS:
+            raise BadInput(f"{file}: more than {_MAX_ROWS:,} rows, the most that a sheet has")
+        COLUMNS.check(len(row), f"{file}: row {number}")
+        cells += len(row)
+        CELLS.check(cells, file)
+        writer.writerow([_shown(value) for value in row])
+        FILE_BYTES.check(text.tell(), file)
+    wrapper.flush()
+    return text.getvalue()
+
+
+def _shown(value: object) -> str:
+    """Return a cell as text; dates without a time, and whole numbers without a point."""
+    if value is None:
+        return ""
+    if isinstance(value, datetime):
+        return str(value.date()) if value.time() == time() else value.isoformat(sep=" ")
+    if isinstance(value, (date, time)):
+        return value.isoformat()
+    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
+        return str(int(value))
+    return " ".join(str(value).split("\n")).replace("\r", " ")
 
 
 @dataclass(frozen=True)

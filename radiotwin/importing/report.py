@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from radiotwin.importing.averaging import WAVELENGTHS, in_wavelengths
 from radiotwin.importing.positions import PositionedLinks
+from radiotwin.importing.problems import Tally
 from radiotwin.importing.reading import Logs
+from radiotwin.importing.repeats import WAVELENGTHS, in_wavelengths
 from radiotwin.importing.settings import Settings
-from radiotwin.importing.tally import Tally
-from radiotwin.measurements import Measurements
-from radiotwin.texts import moment
+from radiotwin.io.texts import moment
+from radiotwin.links.measurements import Measurements
 
 SCHEMA = "radiotwin.import/2"
 UNITS = {"_m": "m", "_deg": "°", "_s": "s", "_dbm": "dBm", "_db": "dB"}

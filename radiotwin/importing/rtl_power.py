@@ -9,11 +9,10 @@ import io
 import numpy as np
 import pandas as pd
 
-from radiotwin.budgets import CELLS, COLUMNS, ROWS
 from radiotwin.errors import BadInput
-from radiotwin.importing.lines import Lines
-from radiotwin.importing.log_files import LogFile
+from radiotwin.importing.log_files import Lines, LogFile
 from radiotwin.importing.settings import Settings
+from radiotwin.io.budgets import CELLS, COLUMNS, ROWS
 
 _FIRST = 6  # fields before the bins
 _EDGE = 1e-6  # of a step: an edge of the band on that of a bin

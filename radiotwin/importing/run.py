@@ -10,22 +10,20 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_folder
-from radiotwin.frames import FRAME_FILE
-from radiotwin.importing.averaging import average
-from radiotwin.importing.clocks import clock_notes
+from radiotwin.geo.frames import FRAME_FILE
 from radiotwin.importing.log_files import list_files
 from radiotwin.importing.positions import PositionedLinks, add_positions
+from radiotwin.importing.problems import Tally
 from radiotwin.importing.reading import read_logs
+from radiotwin.importing.repeats import average, stay_representatives
 from radiotwin.importing.report import make_report
-from radiotwin.importing.settings import Settings
-from radiotwin.importing.settings_file import read_settings, write_settings
+from radiotwin.importing.settings import Settings, read_settings, write_settings
 from radiotwin.importing.source import Source
-from radiotwin.importing.tally import Tally
-from radiotwin.importing.thinning import stay_representatives
+from radiotwin.importing.times import clock_notes
 from radiotwin.importing.tracks import add_tracks
-from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements, read_measurements
-from radiotwin.tables import Origin
+from radiotwin.io.files import atomic_folder
+from radiotwin.io.forms import Origin
+from radiotwin.links.measurements import OPTIONAL, REQUIRED, Measurements, read_measurements
 
 FILES = {"measurements.csv", "measurements.csv.gz", "devices.csv", FRAME_FILE, "import.toml",
          "import.json"}

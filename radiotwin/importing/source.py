@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from radiotwin.cells import as_numbers, listed, shown
 from radiotwin.errors import BadInput
-from radiotwin.tables import name_fault
+from radiotwin.io.cells import as_numbers, listed, shown
+from radiotwin.io.forms import name_fault
 
 EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
 """Texts, in lower case, of cells without a value."""

@@ -1,22 +1,258 @@
-"""Cells of a table in a text of any dialect."""
+"""Tables in texts of any dialect: encoding, separator, decimal mark, and lines around the table.
 
+Cells of a table in a text of any dialect.
+
+How a text holds a table: encoding, separator, decimal mark, lines before and after the table.
+"""
+
+import codecs
 import csv
 import io
-from collections import deque
-from collections.abc import Iterator
+import re
+from collections import Counter, deque
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import islice
+from typing import IO
 
 import numpy as np
 import pandas as pd
 
-from radiotwin.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS
 from radiotwin.errors import BadInput
-from radiotwin.importing.dialect import COMMA, Dialect, fits, header_names
-from radiotwin.importing.lines import Lines
-from radiotwin.importing.log_files import LogFile
-from radiotwin.spreadsheet import unquoted, without_quotes
+from radiotwin.importing.log_files import Lines, LogFile
+from radiotwin.importing.settings import DELIMITERS, Settings
+from radiotwin.io.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS
+from radiotwin.io.cells import shown
+from radiotwin.io.texts import unquoted, without_quotes
 
+_BLOCK_BYTES, _TAIL_BYTES = 2**18, 2**16
+_LINES, _HEADER_LINES = 400, 200  # of the beginning that are looked at, and where the header is
+_MAX_TRAILER = 20  # lines after the table; more are a damaged table
+_BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
+         (codecs.BOM_UTF16_BE, "utf-16"))
+_UNDEFINED = b"\x81\x8d\x8f\x90\x9d"  # in Windows-1252
+_POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?")
+COMMA = re.compile(r"[+-]?(\d+,\d+|,\d+)([eE][+-]?\d+)?")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
+_NAMES = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "vertical bars"}
 _CHUNK_CELLS = 2_000_000  # of which a table is made at a time
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a text holds a table.
+
+    Attributes:
+        encoding: as Python names it.
+        delimiter: one of `DELIMITERS`.
+        decimal: `.` or `,`.
+        before: lines before the header.
+        after: lines after the last row, blank ones not counted.
+        repeated: a name of a column that occurs more than once, or `""`.
+        names: of the columns where there is no header.
+    """
+
+    encoding: str = "utf-8"
+    delimiter: str = ","
+    decimal: str = "."
+    before: int = 0
+    after: int = 0
+    repeated: str = ""
+    names: tuple[str, ...] = ()
+
+    def described(self) -> str:
+        """Return what differs from comma-separated UTF-8, or `""`."""
+        parts = [f"separated by {_NAMES[self.delimiter]}" * (self.delimiter != ","),
+                 "decimal commas" * (self.decimal == ","),
+                 f"encoding {self.encoding}" * (not self.encoding.startswith("utf-8")),
+                 "no header" * bool(self.names), _lines(self.before, "before the header"),
+                 _lines(self.after, "after the table")]
+        if self.repeated:
+            parts.append(f"column {shown(self.repeated)} occurs more than once: the others are "
+                         f"{self.repeated}.2, …")
+        return ", ".join(filter(None, parts))
+
+
+def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collection[str]],
+                 names: Sequence[str]) -> Dialect:
+    """Find how a text holds a table; what is declared is not looked for.
+
+    Args:
+        file: of text.
+        settings: with what is declared.
+        expected: sets of columns, of which the header is likely to have one, in lower case.
+        names: of the columns, if the text has no header.
+
+    Raises:
+        BadInput: it is no text, not in the declared encoding, or its decimal mark is ambiguous.
+    """
+    with file.open() as content:
+        head, tail, whole, encoding = _scan(content, file, settings.encoding)
+    every = _split(head.decode(encoding, "replace").removeprefix("\ufeff"))
+    lines = (every if whole else every[:-1])[:_LINES]
+    if names:
+        before = settings.lines_before_header or 0
+        delimiter = settings.delimiter or _delimiter(lines[before:], len(names))
+        header, first = list(names), before
+    else:
+        before, delimiter = _header(lines, settings, expected)
+        header = _fields(lines[before], delimiter) if before < len(lines) else []
+        first = before + 1
+    rows = [_fields(line, delimiter) for line in lines[first:]]
+    decimal = settings.decimal or _decimal(file, delimiter, rows)
+    after = settings.lines_after_table
+    if after is None:
+        last = _split(tail.decode(encoding, "replace"))
+        after = _trailer(every[first:] if whole else last[1:], delimiter, header)
+    stripped = [name.strip() for name in header]
+    repeated = next((name for i, name in enumerate(stripped) if name and name in stripped[:i]), "")
+    return Dialect(encoding, delimiter, decimal, before, after, repeated, tuple(names))
+
+
+def fits(row: Sequence[str], columns: int) -> bool:
+    """Return whether a row has as many fields as the header; some programs end it with one more."""
+    return len(row) == columns or (len(row) == columns + 1 and not row[-1].strip())
+
+
+def header_names(fields: Sequence[str]) -> list[str]:
+    """Return names of columns: without a last empty one, empty and repeated ones numbered."""
+    names = [re.sub("[\u200b\ufeff]", "", name).strip() for name in fields]  # of no width
+    if len(names) > 1 and not names[-1]:
+        names = names[:-1]
+    names = [name or f"column {number}" for number, name in enumerate(names, start=1)]
+    used, count = set(names), Counter[str]()
+    for i, name in enumerate(names):
+        count[name] += 1
+        if count[name] > 1:
+            while f"{name}.{count[name]}" in used:
+                count[name] += 1
+            names[i] = f"{name}.{count[name]}"
+            used.add(names[i])
+    return names
+
+
+def _lines(number: int, where: str) -> str:
+    return f"{number} line{'s' * (number > 1)} {where}" if number else ""
+
+
+def _scan(content: IO[bytes], file: LogFile,
+          declared: str | None) -> tuple[bytes, bytes, bool, str]:
+    """Return the beginning, the end, whether the beginning is all, and the encoding."""
+    head = tail = content.read(_BLOCK_BYTES)
+    encoding = codecs.lookup(declared).name if declared else next(
+        (name for bom, name in _BOMS if head.startswith(bom)), "utf-8")
+    decoder = codecs.getincrementaldecoder(encoding)()
+    readable, undefined, whole, block = True, False, True, head
+    while block:
+        if b"\0" in block and not encoding.startswith("utf-16"):  # as `codecs` spells it
+            raise BadInput(f"{file} is not text (it has null characters); allowed are text, "
+                           "Parquet and XLSX. If it is UTF-16 without a mark, give --encoding "
+                           "utf-16-le")
+        undefined = undefined or bool(block.translate(None, delete=_UNDEFINED) != block)
+        try:
+            if readable:
+                decoder.decode(block)
+        except UnicodeDecodeError:
+            readable = False
+        block = content.read(_BLOCK_BYTES)
+        if block:
+            whole, tail = False, (tail + block)[-_TAIL_BYTES:]
+    try:
+        decoder.decode(b"", True)
+    except UnicodeDecodeError:
+        readable = False
+    if not readable and (declared or encoding != "utf-8"):
+        raise BadInput(f"{file} is not text in {encoding}; give another --encoding, or leave it "
+                       "out to have it found")
+    if not readable:
+        encoding = "latin-1" if undefined else "cp1252"
+    if encoding == "utf-16":  # the end of the file has no mark of the order of bytes
+        encoding = "utf-16-le" if head.startswith(codecs.BOM_UTF16_LE) else "utf-16-be"
+    return head, tail, whole, encoding
+
+
+def _split(text: str) -> list[str]:
+    """Return the lines of a text as its reader counts them, which `str.splitlines` does not."""
+    lines = re.split(r"\r\n|\r|\n", text)
+    return lines if lines[-1] else lines[:-1]
+
+
+def _fields(line: str, delimiter: str) -> list[str]:
+    try:
+        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+    except csv.Error:
+        return []
+
+
+def _delimiter(lines: list[str], columns: int) -> str:
+    """Return the delimiter with which most lines have so many fields."""
+    return max(DELIMITERS, key=lambda each: sum(fits(_fields(line, each), columns)
+                                                for line in lines))
+
+
+def _header(lines: list[str], settings: Settings,
+            expected: Sequence[Collection[str]]) -> tuple[int, str]:
+    """Return the index of the header and the delimiter that give the largest table.
+
+    A line with more of the expected names comes first.
+    """
+    delimiters = [settings.delimiter] if settings.delimiter else list(DELIMITERS)
+    places = range(min(len(lines), _HEADER_LINES))
+    if settings.lines_before_header is not None:
+        places = range(settings.lines_before_header, settings.lines_before_header + 1)
+    best, result = (-1.0, 0), (settings.lines_before_header or 0, delimiters[0])
+    for delimiter in delimiters:
+        rows = [_fields(line, delimiter) for line in lines]
+        counts = [len(row) for row in rows]
+        for place in places:
+            if place >= len(rows) or counts[place] < 2:
+                continue
+            names = header_names(rows[place])
+            if sum(map(_is_number, names)) > len(names) / 2:
+                continue
+            known = {name.lower() for name in names}
+            found = max((len(known & set(each)) / len(each) for each in expected if each),
+                        default=0.0)
+            good = sum(fits(row, len(names)) for row in rows[place + 1:])
+            bad = sum(count > 0 for count in counts[place + 1:]) - good
+            score = (found, len(names) * (1 + good - bad))
+            if score > best:
+                best, result = score, (place, delimiter)
+    return result
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _decimal(file: LogFile, delimiter: str, rows: list[list[str]]) -> str:
+    """Return the decimal mark; a comma that may separate thousands is ambiguous."""
+    cells = [cell.strip() for row in rows for cell in row]
+    commas = [cell for cell in cells if COMMA.fullmatch(cell)]
+    if not commas:
+        return "."
+    if all(_THOUSANDS.fullmatch(cell) for cell in commas):
+        raise BadInput(f"{file}: {shown(commas[0])} may be a number with a decimal comma, or one "
+                       "with separated thousands; give --decimal , for the first, or --decimal . "
+                       "and write the number without its comma")
+    return "." if delimiter == "," and any(map(_POINT.fullmatch, cells)) else ","
+
+
+def _trailer(lines: list[str], delimiter: str, header: list[str]) -> int:
+    """Return the number of lines at the end that are no rows of the table, such as a summary."""
+    columns, count = len(header_names(header)), 0
+    for line in reversed(lines):
+        fields = _fields(line, delimiter)
+        if not any(field.strip() for field in fields):
+            continue
+        if fits(fields, columns) or line.count('"') % 2:
+            return count if count <= _MAX_TRAILER else 0
+        count += 1
+    return 0  # no row is left: reading says what is wrong
 
 
 def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.ndarray]:

@@ -2,8 +2,7 @@
 
 from radiotwin.links.correlation import correlation_length_m
 from radiotwin.links.evidence import design_effect, evidence_blocks, places, with_evidence
-from radiotwin.links.geometry import LinkGeometry, link_geometry
-from radiotwin.links.link_data import LinkData
+from radiotwin.links.link_data import LinkData, LinkGeometry, link_geometry
 from radiotwin.links.prepare import join_links, prepare_links
 from radiotwin.links.sites import site_of
 from radiotwin.links.variables import residual_variable, residual_variables

@@ -1,4 +1,14 @@
-"""Checks of measured data: levels, names, positions and units that are probably not meant."""
+"""Checks of measured data: levels, names, positions, heights and receivers inside buildings.
+
+Checks of measured data: levels, names, positions and units that are probably not meant.
+
+Heights of receivers that were probably meant from another zero: the sea's, or the ground's.
+
+How probable it is that a receiver is inside a building, where its position is off by metres.
+
+A position inside a wall may be that of a phone on the pavement, and one on the pavement that of a
+phone behind the wall. So where positions come from satellites, a line on the map does not decide.
+"""
 
 from collections.abc import Iterable, Sequence
 
@@ -6,14 +16,22 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.frames import is_same_frame, place
-from radiotwin.links.heights import height_notes
-from radiotwin.links.indoors import POSITION_SD_M, SURE, chance_inside
+from radiotwin.geo.frames import is_same_frame, place
+from radiotwin.io.texts import percent
 from radiotwin.links.link_data import LinkData
-from radiotwin.measurements import MAX_APART_M, Measurements
+from radiotwin.links.measurements import MAX_APART_M, Measurements
 from radiotwin.scene import Scene
-from radiotwin.texts import percent
+from radiotwin.scene.citymap import CityMap
 
+MAX_FLOWN_M = 500.0  # above the ground: more than three times what UAVs may (120 m, EU 2019/947)
+HIGH_M = 200.0  # above the ground, from which altitudes above the sea are suspected
+_NEARLY_ALL = 0.95  # of the receivers
+POSITION_SD_M = 4.0
+"""Of a phone's position, in x and in y: phones are right within 4.9 m under open sky (van Diggelen
+and Enge 2015, 'The world's first GPS MOOC and worldwide laboratory using smartphones', ION GNSS+),
+and somewhat less so between buildings."""
+RINGS, DIRECTIONS = 4, 8  # of equally probable places around a position
+SURE = 0.9  # probability from which on a receiver is taken to be inside
 MIN_LINKS = 60  # that anything can be learnt from; half of them detected
 MIN_LINKS_OF_RECEIVER = 5
 CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions so close to each other are hardly in metres
@@ -24,6 +42,63 @@ GROUND_M, ROOFS = 0.5, 0.95  # above it something is built; share of its corners
 BURIED = "its height, or that of the map's ground, is off; z counts from the scene's datum"
 COPIED = "they are in the file twice"
 INDOORS = "it was indoors (see building_entry), or its position or the wall is off by metres"
+
+
+def height_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
+    """Return a note where heights look as if they counted from another zero than the scene's.
+
+    Args:
+        receiver_m: (n, 3), z above the datum of the scene [m]; NaN where unknown.
+        scene: the 3D map.
+    """
+    known = np.isfinite(receiver_m).all(axis=1)
+    if not known.any():
+        return []
+    z_m = receiver_m[known, 2]
+    clearance_m = z_m - scene.city.ground_height_m(*receiver_m[known, :2].T)
+    origin = scene.config.origin
+    datum_m = 0.0 if origin is None else origin.altitude_m
+    if np.mean(clearance_m < 0) > 0.5:
+        for raised_m, remedy in (
+                (z_m, "the scene's z counts from its datum, so add the ground's height"),
+                (z_m + datum_m, "import them as height, not as altitude")):
+            if np.mean((raised_m >= 0) & (raised_m <= MAX_FLOWN_M)) >= _NEARLY_ALL:
+                low_m, high_m = raised_m.min(), raised_m.max()
+                return [f"most receivers are below the ground; {low_m:.0f} to {high_m:.0f} m would "
+                        f"be plausible as heights above the ground: if they are, {remedy}"]
+        return ["most receivers are below the ground, by up to "
+                f"{-clearance_m.min():.0f} m: is the altitude of the ground right (--origin "
+                "LAT,LON,ALT), and is it above the same zero (the sea's level and the ellipsoid "
+                "are tens of metres apart)?"]
+    lowest_m = float(np.quantile(clearance_m, 1 - _NEARLY_ALL))
+    if lowest_m > HIGH_M:
+        return [f"receivers are {lowest_m:.0f} m and more above the ground: if those are altitudes "
+                "above the sea, import them as altitude, with the ground's in --origin LAT,LON,ALT"]
+    return []
+
+
+def chance_inside(city: CityMap, position_m: np.ndarray,
+                  sd_m: float = POSITION_SD_M) -> np.ndarray:
+    """Return the probability that ends of links are inside buildings.
+
+    Args:
+        city: 3D map.
+        position_m: (n, 3) where they are said to be [m].
+        sd_m: standard deviation of that in x and in y, normal and independent [m].
+
+    Returns:
+        (n,) share of equally probable places that are inside: rings of a normal distribution.
+    """
+    places_m, own = np.unique(position_m, axis=0, return_inverse=True)
+    share = (np.arange(RINGS) + 0.5) / RINGS
+    radius_m = sd_m * np.sqrt(-2 * np.log1p(-share))  # quantiles of the Rayleigh distribution
+    low = np.flatnonzero(places_m[:, 2] < city.vertices[:, 2].max(initial=-np.inf))
+    chance = np.zeros(len(places_m))
+    for ring in range(RINGS):
+        for turn in (np.arange(DIRECTIONS) + ring / RINGS) * (2 * np.pi / DIRECTIONS):
+            shift_m = radius_m[ring] * np.array([np.cos(turn), np.sin(turn), 0.0])
+            chance[low] += city.inside(places_m[low] + shift_m)
+    return chance[own.ravel()] / (RINGS * DIRECTIONS)
 
 
 def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
@@ -61,7 +136,7 @@ def require_one_frame(measurements: Measurements, scene: Scene | None) -> None:
     if here is not None and there is not None and not is_same_frame(here, there):
         raise BadInput(f"the measurements are in the frame about {place(here)}, the scene is in "
                        f"that about {place(there)}; convert them with "
-                       "radiotwin.alignment.in_scene_frame")
+                       "radiotwin.links.alignment.in_scene_frame")
 
 
 def check_names(measurements: Measurements) -> list[str]:

@@ -1,6 +1,12 @@
 """Measured links as numbers.
 
 What was read, where both ends were, and all that a residual may depend on.
+
+Clocks: whether the times of different flights can be compared.
+
+Geometry of links: the two ends, line of sight, and the 3D map between them if there is one.
+
+Predicted levels of links.
 """
 
 from __future__ import annotations
@@ -14,16 +20,151 @@ import numpy as np
 import pandas as pd
 from scipy.constants import speed_of_light
 
-from radiotwin.links.clocks import Tracks, clocks_restart
-from radiotwin.links.geometry import REFERENCE_DISTANCE_M, LinkGeometry
+from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 
+Tracks = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
+"""(receiver, flight) -> times (t,) in order [s] and positions (t, 3) then [m]."""
+ELSEWHERE_M = 20.0  # a receiver is not at two places so far apart at one time
+MIN_ELSEWHERE = 0.5  # share of the common times of two flights
+SAME_START_S = 1.0  # flights that all begin within it begin when their clock does
+MIN_FLIGHT_S = 10.0  # shorter ones may begin together by chance
+MAX_FLIGHTS = 40  # of a receiver, of which neighbours are compared
+RESTART_NOTE = ("time_s begins anew in each flight (flights of one receiver overlap): only times "
+                "within a flight are compared, and no change from flight to flight is looked for")
+REFERENCE_DISTANCE_M = 1.0  # of the log-distance law; shorter links count as this long
 ROOF_SAMPLES = 60  # points along a link at which the roofs below it are looked up
 ROOF_CHUNK = 5000  # links a time: bounds the memory of that to 10 MB
-
 _OF_EACH_LINK = ("level_db", "limit_db", "receiver_m", "device", "receiver", "flight", "time_s",
                  "heading_deg", "pitch_deg", "roll_deg", "quality", "known_los", "time_in_flight_s",
                  "evidence")
+
+
+def clocks_restart(tracks: Tracks) -> bool:
+    """Return whether some receiver's clock begins anew in each flight.
+
+    Then two of its flights begin at one time, or it would be at two places at once.
+    """
+    by_receiver: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    for (receiver, _), track in tracks.items():
+        by_receiver.setdefault(receiver, []).append(track)
+    return any(_restarts(sorted(flights, key=lambda track: track[0][0])[:MAX_FLIGHTS])
+               for flights in by_receiver.values() if len(flights) > 1)
+
+
+def _restarts(flights: list[tuple[np.ndarray, np.ndarray]]) -> bool:
+    """Return whether flights of one receiver, by their start, are of a clock that begins anew."""
+    starts_s = np.array([time_s[0] for time_s, _ in flights])
+    lengths_s = np.array([time_s[-1] - time_s[0] for time_s, _ in flights])
+    if np.ptp(starts_s) <= SAME_START_S and (lengths_s > MIN_FLIGHT_S).all():
+        return True
+    return any(_at_two_places(*pair) for pair in zip(flights, flights[1:], strict=False))
+
+
+def _at_two_places(one: tuple[np.ndarray, np.ndarray],
+                   other: tuple[np.ndarray, np.ndarray]) -> bool:
+    (time_s, position_m), (other_s, other_m) = one, other
+    both = (time_s >= other_s[0]) & (time_s <= other_s[-1])
+    if both.sum() < 2:
+        return False
+    there_m = np.column_stack([np.interp(time_s[both], other_s, axis_m) for axis_m in other_m.T])
+    apart_m = np.linalg.norm(position_m[both] - there_m, axis=1)
+    return bool((apart_m > ELSEWHERE_M).mean() > MIN_ELSEWHERE)
+
+
+@dataclass(frozen=True, eq=False)
+class LinkGeometry:
+    """n links between a device and a receiver, as channel models see them.
+
+    Attributes:
+        device_m: (n, 3) position of each link's device [m].
+        receiver_m: (n, 3) position of each link's receiver [m].
+        los: (n,) bool, line of sight.
+        device: (n,) int, identity of the device for models that keep something per device.
+        city: 3D map that `los` was taken from; None without one.
+        frequency_hz: of the radio [Hz]; NaN where it is unknown.
+        estimated: (n,) bool, whether the device's position is an estimate; None: all are declared.
+    """
+
+    device_m: np.ndarray
+    receiver_m: np.ndarray
+    los: np.ndarray
+    device: np.ndarray
+    city: CityMap | None = None
+    frequency_hz: float = float("nan")
+    estimated: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.receiver_m)
+        shapes = {"device_m": (n, 3), "receiver_m": (n, 3), "los": (n,), "device": (n,)}
+        for name, shape in shapes.items():
+            given = np.shape(getattr(self, name))
+            if given != shape:
+                raise ValueError(f"LinkGeometry.{name}: shape {given}, expected {shape}")
+
+    def __len__(self) -> int:
+        return len(self.receiver_m)
+
+    @cached_property
+    def distance_m(self) -> np.ndarray:
+        """(n,) distance between the ends [m], at least `REFERENCE_DISTANCE_M`."""
+        offset = self.receiver_m - self.device_m
+        return np.maximum(np.sqrt(np.einsum("ij,ij->i", offset, offset)), REFERENCE_DISTANCE_M)
+
+    @cached_property
+    def log_distance(self) -> np.ndarray:
+        """(n,) log10(distance / 1 m)."""
+        return np.log10(self.distance_m)
+
+    @cached_property
+    def elevation_rad(self) -> np.ndarray:
+        """(n,) angle at the device up to the receiver [rad], arcsin((z_r - z_d) / d)."""
+        rise_m = self.receiver_m[:, 2] - self.device_m[:, 2]
+        return np.arcsin(np.clip(rise_m / self.distance_m, -1.0, 1.0))
+
+    def select(self, rows: np.ndarray | slice) -> LinkGeometry:
+        """Return the links of a mask, a slice or an index array."""
+        estimated = None if self.estimated is None else self.estimated[rows]
+        return LinkGeometry(self.device_m[rows], self.receiver_m[rows], self.los[rows],
+                            self.device[rows], self.city, self.frequency_hz, estimated)
+
+
+def link_geometry(device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray,
+                  city: CityMap | None) -> LinkGeometry:
+    """Return links between listed devices and receivers, with line of sight from the map.
+
+    Args:
+        device_m: (k, 3) positions of all devices [m].
+        receiver_m: (n, 3) positions of the receivers [m].
+        device: (n,) row of each link's device in `device_m`.
+        city: 3D map; without one every link has line of sight.
+
+    Returns:
+        n links.
+
+    Raises:
+        BadInput: a position that is used is not finite, or `device` points outside `device_m`.
+    """
+    device_m, receiver_m = np.asarray(device_m, float), np.asarray(receiver_m, float)
+    device = np.asarray(device, np.int64)
+    if len(device) and not 0 <= device.min() <= device.max() < len(device_m):
+        raise BadInput(
+            f"links name devices {device.min()} to {device.max()}, but there are {len(device_m)} "
+            "devices: allowed are rows of the device table")
+    ends_m = device_m[device]
+    if not np.isfinite(ends_m).all():
+        rows = np.unique(device[~np.isfinite(ends_m).all(axis=1)])
+        raise BadInput(
+            f"the position of device row {', '.join(map(str, rows[:5]))} is blank or not finite: "
+            "a link needs both ends; give the position, or leave out the links of devices that are "
+            "still to be located")
+    if not np.isfinite(receiver_m).all():
+        row = int(np.flatnonzero(~np.isfinite(receiver_m).all(axis=1))[0])
+        raise BadInput(
+            f"the receiver's position in row {row} is {tuple(map(float, receiver_m[row]))}: x, y "
+            "and z must be finite numbers [m]; fill it in or leave the row out")
+    los = np.ones(len(receiver_m), bool) if city is None else city.line_of_sight(ends_m, receiver_m)
+    return LinkGeometry(ends_m, receiver_m, np.asarray(los, bool), device, city)
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,3 +441,24 @@ class LinkData:
             key = int(self.receiver[rows[0]]), int(self.flight[rows[0]])
             found[key] = time_s, self.receiver_m[rows[first]]
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Expected levels of n links.
+
+    Attributes:
+        mean_db: (n,) mean gain [dB] or power [dBm], also below what can be detected.
+        sd_db: (n,) standard deviation [dB].
+        detection_probability: (n,) that the link is detected.
+    """
+
+    mean_db: np.ndarray
+    sd_db: np.ndarray
+    detection_probability: np.ndarray
+
+    @classmethod
+    def concatenate(cls, parts: list[Prediction]) -> Prediction:
+        """Return the predictions of several sets of links, one after the other."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts])
+                     for name in ("mean_db", "sd_db", "detection_probability")))

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
+from radiotwin.io.texts import percent
 from radiotwin.links.checks import (
     COPIED,
     MIN_LINKS,
@@ -23,12 +24,10 @@ from radiotwin.links.checks import (
     unmapped_ends,
     useless_receivers,
 )
-from radiotwin.links.clocks import RESTART_NOTE
 from radiotwin.links.limits import estimate_limits
-from radiotwin.links.link_data import LinkData
-from radiotwin.measurements import Measurements
+from radiotwin.links.link_data import RESTART_NOTE, LinkData
+from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
-from radiotwin.texts import percent
 
 MAX_EXTENT_M = 100_000.0  # farther apart, two ends are not of one campaign and frame
 MAX_OTHER_FREQUENCY = 0.1  # share; levels by frequency differ by 1 dB and less then

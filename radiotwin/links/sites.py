@@ -1,12 +1,40 @@
-"""Masts: devices that share one site, and those of them that look the same way."""
+"""Links that share a place: masts with several devices, and places where several receivers were.
+
+Masts: devices that share one site, and those of them that look the same way.
+
+Differences between receivers, by readings of one device where both have been.
+
+There, distance, walls and the device are the same, so what differs is the receivers' own. A
+regression over all links does not see it so clearly: receivers that went to different places also
+differ by what a model does not know of these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
+import pandas as pd
+from scipy.spatial import cKDTree
+from scipy.stats import t as student
 
+from radiotwin.links.correlation import devices_move
 from radiotwin.links.link_data import LinkData
 
 SAME_SITE_M = 1.0  # apart at most: sectors of one mast; declared positions are good to that
 SAME_DIRECTION_DEG = 5.0  # azimuths within it are of one antenna, or of two side by side
 MAX_RELATIVES = 4  # more tell nothing new
+SAME_M = 3.0  # a phone's position is known no better outdoors
+PLACE_M = 30.0  # readings so close to each other err alike: the median of a square counts as one
+MIN_PAIRS, MIN_PLACES = 30, 6  # to say anything
+MIN_DEVICES = 3  # of which differences may scatter, too
+MAX_RECEIVERS = 40  # bounds the number of differences to 780
+ABOVE_LIMIT_DB = 10.0  # pairs are this far above the limits, in the mean: so blanks choose none
+MAX_Z = 3.0  # places farther off count as this many robust standard deviations
+MAD_SD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
+MIN_SD_DB = 0.1
+QUANTILE = 0.95  # upper end of a 90 % interval
 
 
 def site_of(links: LinkData, device: int) -> list[int]:
@@ -51,3 +79,100 @@ def relatives_of(links: LinkData, device: int, heard: set[int]) -> list[int]:
     others = ([other for other in group if other != device and other in heard]
               for group in (antenna_of(links, device), site_of(links, device)))
     return next(filter(None, others), [])[:MAX_RELATIVES]
+
+
+@dataclass(frozen=True)
+class ReceiverDifference:
+    """How much more one receiver reads than another where both have been.
+
+    Attributes:
+        first, second: indices of the receivers.
+        difference_db: reading of the second minus that of the first [dB].
+        low_db, high_db: 90 % interval [dB]; of the widest of places and devices that err alike.
+        pairs: number of readings of the first that have one of the second beside them.
+        places: number of squares of ground they lie in, each device counted by itself.
+    """
+
+    first: int
+    second: int
+    difference_db: float
+    low_db: float
+    high_db: float
+    pairs: int
+    places: int
+
+
+def receiver_differences(links: LinkData) -> list[ReceiverDifference]:
+    """Compare every two receivers that read the same devices at the same places.
+
+    Args:
+        links: n links.
+
+    Returns:
+        the differences that at least `MIN_PAIRS` pairs at `MIN_PLACES` places tell; none where
+        devices move, as receivers then stand apart, or of more than `MAX_RECEIVERS` receivers.
+    """
+    members = np.unique(links.receiver[np.isfinite(links.level_db)])
+    if not 2 <= len(members) <= MAX_RECEIVERS or devices_move(links):
+        return []
+    found = [_difference(links, int(first), int(second))
+             for first, second in combinations(members, 2)]
+    return [each for each in found if each is not None]
+
+
+def _difference(links: LinkData, first: int, second: int) -> ReceiverDifference | None:
+    pairs = _pairs(links, first, second)
+    if len(pairs) < MIN_PAIRS:
+        return None
+    places = pairs.groupby(["device", "x", "y"], as_index=False)["difference_db"].median()
+    if len(places) < MIN_PLACES:
+        return None
+    each_db = places["difference_db"].to_numpy()
+    middle_db = np.median(each_db)
+    most_db = MAX_Z * max(MAD_SD * np.median(np.abs(each_db - middle_db)), MIN_SD_DB)
+    each_db = np.clip(each_db, middle_db - most_db, middle_db + most_db)
+    mean_db = float(each_db.mean())
+    squares = places.groupby(["x", "y"]).ngroup().to_numpy()
+    clusterings = [squares]
+    if places["device"].nunique() >= MIN_DEVICES:
+        clusterings.append(pd.factorize(places["device"])[0])
+    half_db = max(_half_db(each_db - mean_db, label) for label in clusterings)
+    return ReceiverDifference(first, second, mean_db, mean_db - half_db, mean_db + half_db,
+                              len(pairs), len(places))
+
+
+def _pairs(links: LinkData, first: int, second: int) -> pd.DataFrame:
+    """Return each reading of the first with the nearest of the second to the same device."""
+    read = np.isfinite(links.level_db)
+    parts = []
+    for device in np.unique(links.device):
+        mine, other = (np.flatnonzero(read & (links.device == device) & (links.receiver == each))
+                       for each in (first, second))
+        if not (len(mine) and len(other)):
+            continue
+        apart_m, nearest = cKDTree(links.receiver_m[other]).query(
+            links.receiver_m[mine], distance_upper_bound=SAME_M)
+        beside = np.isfinite(apart_m)
+        mine, other = mine[beside], other[nearest[beside]]
+        limit_db = np.maximum(links.limit_db[mine], links.limit_db[other])
+        strong = (links.level_db[mine] + links.level_db[other]) / 2 >= limit_db + ABOVE_LIMIT_DB
+        mine, other = mine[strong], other[strong]
+        x, y = np.floor(links.receiver_m[mine, :2] / PLACE_M).astype(int).T
+        parts.append(pd.DataFrame({
+            "device": device, "x": x, "y": y,
+            "difference_db": links.level_db[other] - links.level_db[mine]}))
+    return pd.concat(parts) if parts else pd.DataFrame()
+
+
+def _half_db(error_db: np.ndarray, label: np.ndarray) -> float:
+    """Return half of the 90 % interval of a mean, of errors (n,) that are alike in clusters (n,).
+
+    Liang and Zeger 1986, 'Longitudinal data analysis using generalized linear models', Biometrika
+    73, with the t quantile of the number of clusters.
+    """
+    sums = np.bincount(label, weights=error_db)
+    clusters = len(sums)
+    if clusters < 2:
+        return 0.0
+    sd_db = np.sqrt(clusters / (clusters - 1) * (sums**2).sum()) / len(error_db)
+    return float(student.ppf(QUANTILE, clusters - 1) * max(sd_db, MIN_SD_DB))

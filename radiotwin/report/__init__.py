@@ -3,14 +3,15 @@
 from radiotwin.report.closeloop_figures import write_closeloop_figures
 from radiotwin.report.closeloop_page import write_closeloop_page
 from radiotwin.report.closeloop_words import closeloop_summary
-from radiotwin.report.comparison_figures import write_comparison_figures
+from radiotwin.report.comparison import write_comparison_figures
 from radiotwin.report.coverage_figures import write_coverage_pictures
 from radiotwin.report.folders import (
     check_closeloop_folder,
+    check_map_target,
+    export_map,
     write_closeloop_folder,
     write_comparison_folder,
 )
-from radiotwin.report.map_export import check_map_target, export_map
 from radiotwin.report.map_figures import write_picture
 from radiotwin.report.run_folder import Run, read_run
 from radiotwin.report.run_page import write_report

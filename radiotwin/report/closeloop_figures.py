@@ -8,8 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from radiotwin.closeloop.run import Loop
-from radiotwin.report.binning import BinMeans, bin_index, bin_means
-from radiotwin.report.closeloop_data import LoopData, collect
+from radiotwin.report.closeloop_data import BinMeans, LoopData, bin_index, bin_means, collect
 from radiotwin.report.closeloop_maps import (
     contribution_map_figure,
     level_map_figure,
@@ -17,7 +16,7 @@ from radiotwin.report.closeloop_maps import (
 )
 from radiotwin.report.effect_figures import effect_figure
 from radiotwin.report.labels import INTERPOLATIONS, effect_picture, name_label
-from radiotwin.report.map_background import MapBackground
+from radiotwin.report.map_figures import MapBackground
 from radiotwin.report.style import AFTER, BEFORE, FITTED, hide_spines, new_figure, save, shorten
 from radiotwin.scene import Scene
 

@@ -2,10 +2,10 @@
 
 from collections import Counter
 
-from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.posterior import NONE, OTHER
+from radiotwin.closeloop.search.posterior import NONE, OTHER
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.io.texts import moment
 from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, variable_label
-from radiotwin.texts import moment
 
 MAX_NAMED = 4  # variables or effects in a sentence
 MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance

@@ -12,7 +12,7 @@ from radiotwin.coverage import Coverage
 from radiotwin.coverage.legends import Legend, drawn_rasters, file_stem, legend_of
 from radiotwin.report.style import new_figure, plain, save
 from radiotwin.scene import Scene
-from radiotwin.scene.preview import height_grid
+from radiotwin.scene.plot import height_grid
 
 BUILDING_M = 2.0  # lowest height that is drawn
 OUTLINE_CELLS = 800  # along the longer side

@@ -11,16 +11,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from radiotwin.display.style import plain
-from radiotwin.report.binning import BinMeans, bin_index, bin_means
-from radiotwin.report.closeloop_data import EffectData
+from radiotwin.display.axes import plain
+from radiotwin.report.closeloop_data import BinMeans, EffectData, bin_index, bin_means
 from radiotwin.report.closeloop_maps import (
     RESIDUAL_LABEL,
     affected_links_figure,
     contribution_map_figure,
 )
 from radiotwin.report.labels import parameter_label
-from radiotwin.report.map_background import MapBackground
+from radiotwin.report.map_figures import MapBackground
 from radiotwin.report.style import AFTER, BEFORE, FITTED, hide_spines, new_figure, shorten
 
 BINS = 24

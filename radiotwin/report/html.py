@@ -18,11 +18,11 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from radiotwin.budgets import PICTURE_BYTES, PICTURE_PIXELS
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_file
-from radiotwin.inputs import read_bytes, require_within
-from radiotwin.texts import shown, shown_data
+from radiotwin.io.budgets import PICTURE_BYTES, PICTURE_PIXELS
+from radiotwin.io.files import atomic_file
+from radiotwin.io.inputs import read_bytes, require_within
+from radiotwin.io.texts import shown, shown_data
 
 MAX_ROWS = 5000  # of a table
 MAX_NOTES = 200

@@ -9,21 +9,21 @@ from typing import Any
 
 import pandas as pd
 
-from radiotwin.alignment import in_known_frame
-from radiotwin.budgets import PAGE_MAPS, PAGE_VALUES
-from radiotwin.closeloop.result_file import read_report
-from radiotwin.compare import Comparison
-from radiotwin.comparison_output import read_comparison
+from radiotwin.closeloop.output.result_file import read_report
 from radiotwin.errors import BadInput
-from radiotwin.inputs import is_within, require_within
-from radiotwin.map_file import NETCDF, ZARR, MapStream
-from radiotwin.measurements import read_measurements
-from radiotwin.radiomap import RadioMap
-from radiotwin.records import Record, read_record, validated
-from radiotwin.run_tables import PLANNING, POSITION, RESIDUALS, TRACK, read_table
+from radiotwin.io.budgets import PAGE_MAPS, PAGE_VALUES
+from radiotwin.io.forms import Record, read_record, validated
+from radiotwin.io.inputs import is_within, require_within
+from radiotwin.io.run_tables import PLANNING, POSITION, RESIDUALS, TRACK, read_table
+from radiotwin.links.alignment import in_known_frame
+from radiotwin.links.measurements import read_measurements
+from radiotwin.maps.form import NETCDF, ZARR, MapStream
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import segmented_truth
+from radiotwin.report.comparison import read_comparison
 from radiotwin.scene import Scene
-from radiotwin.survey import segmented_truth
 from radiotwin.twin import Twin
+from radiotwin.twin.compare import Comparison
 
 TRUTH = "truth"
 TRUTH_MAPS = (f"truth{NETCDF}", f"truth{ZARR}")  # of a scene's folder
@@ -52,7 +52,7 @@ class Run:
         map_step: n where of the maps every n-th position in x and in y was read.
         twin: twin with the estimates of the devices' positions.
         tracks: flight, uav, time_s, x_m, y_m, z_m: one row for each UAV and time.
-        residuals: held-out links of a close-loop, see `radiotwin.closeloop.residual_table`.
+        residuals: held-out links of a close-loop, see `radiotwin.closeloop.output.residuals`.
         closeloop: content of `closeloop.json`.
         closeloop_folder: folder of the close-loop's figures.
         comparison: tables of a comparison; twins and predictions are empty.

@@ -7,19 +7,19 @@ import numpy as np
 from matplotlib import colormaps
 
 from radiotwin import __version__
-from radiotwin.report.city import city_mesh
 from radiotwin.report.closeloop_page import closeloop_context
-from radiotwin.report.comparison_page import comparison_context
+from radiotwin.report.comparison import comparison_context
 from radiotwin.report.html import Table, read_picture, write_page
-from radiotwin.report.layers import (
+from radiotwin.report.run_folder import Run
+from radiotwin.report.viewer import (
     MAX_DEVICES,
     bounds_m,
+    city_mesh,
     device_layer,
     flight_layer,
     link_layer,
     map_layers,
 )
-from radiotwin.report.run_folder import Run
 
 ROUGH_M = 100.0  # 90 % radius above which a device is not said to be found
 SCALES = {"gain": "viridis", "sigma": "cividis", "error": "coolwarm", "link": "coolwarm_r"}

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from radiotwin.display.style import plain
-from radiotwin.files import atomic_file
+from radiotwin.display.axes import plain
+from radiotwin.io.files import atomic_file
 
 LOS_COLOUR, NLOS_COLOUR = "#2a7f9e", "#d1495b"
 BEFORE, AFTER, FITTED, FOUND = "#c2571a", "#1f6f8b", "#22272c", "#7a0177"

@@ -9,12 +9,15 @@ import numpy as np
 import pandas as pd
 import trimesh
 
-from radiotwin.budgets import DEVICES, UAVS
-from radiotwin.cells import write_csv
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_folder
-from radiotwin.geodesy import local_crs
+from radiotwin.geo.geodesy import local_crs
+from radiotwin.io.budgets import DEVICES, UAVS
+from radiotwin.io.cells import write_csv
+from radiotwin.io.files import atomic_folder
+from radiotwin.io.forms import MAX_COORDINATE_M, Origin
 from radiotwin.scene import Scene
+from radiotwin.scene.checks import Problem
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import (
     Extent,
@@ -23,10 +26,15 @@ from radiotwin.scene.config import (
     parse_config,
     write_config,
 )
-from radiotwin.scene.folder import check_target, keep_declarations
+from radiotwin.scene.folder import (
+    check_target,
+    find_source,
+    keep_declarations,
+    scene_name,
+    source_text,
+)
 from radiotwin.scene.importer import ImportedCity, import_city
-from radiotwin.scene.material_mapping import settle
-from radiotwin.scene.materials import constants
+from radiotwin.scene.materials import constants, settle
 from radiotwin.scene.placement import (
     BuiltGrid,
     building_bounds,
@@ -39,13 +47,9 @@ from radiotwin.scene.placement import (
     place_uavs,
 )
 from radiotwin.scene.preview import draw_preview
-from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport, MaterialUse
-from radiotwin.scene.sources import find_source, scene_name, source_text
 from radiotwin.scene.terrain import TerrainConfig
 from radiotwin.scene.vegetation import VegetationConfig
-from radiotwin.scene.writer import CityShape, write_city
-from radiotwin.tables import MAX_COORDINATE_M, Origin
 
 MIN_STEP_M = 0.01  # of a lattice
 

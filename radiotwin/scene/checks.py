@@ -1,17 +1,61 @@
-"""Plausibility checks of a city's geometry: axis, units, ground, open meshes."""
+"""Problems of a city: plausibility checks of its geometry, and how a finding is worded.
+
+Plausibility checks of a city's geometry: axis, units, ground, open meshes.
+
+Findings about a city, each with a message that says what was found and what to do.
+"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from radiotwin.scene.problems import Problem, error, listed, warning
 from radiotwin.scene.surfaces import Surfaces
 
+Severity = Literal["error", "warning", "fixed"]
 _TO_Z_UP = {  # rotation that makes the axis point up
     "x": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=float),
     "y": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=float),
     "z": np.eye(3),
 }
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One finding.
+
+    Attributes:
+        severity: `error`: tracing would fail; `warning`: tracing works, but the result may not be
+            the intended one; `fixed`: corrected in the scene that is written.
+        shape: Name of the shape or material concerned, or "" for the whole city.
+        message: What was found, and what to do or what was done.
+    """
+
+    severity: Severity
+    shape: str
+    message: str
+
+
+def error(message: str, shape: str = "") -> Problem:
+    """Return a finding that makes tracing fail."""
+    return Problem("error", shape, message)
+
+
+def warning(message: str, shape: str = "") -> Problem:
+    """Return a finding that leaves the scene traceable but may not be intended."""
+    return Problem("warning", shape, message)
+
+
+def fixed(message: str, shape: str = "") -> Problem:
+    """Return a finding that has been corrected."""
+    return Problem("fixed", shape, message)
+
+
+def listed(names: Sequence[str], most: int = 3) -> str:
+    """Return `'a', 'b', 'c' and 7 more`: names for a message about many shapes at once."""
+    text = ", ".join(repr(name) for name in names[:most])
+    return text if len(names) <= most else f"{text} and {len(names) - most} more"
 
 
 def upright(vertices: np.ndarray, up: str) -> np.ndarray:

@@ -15,10 +15,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from radiotwin.errors import BadInput, RunFailed
+from radiotwin.runtime.processes import in_threads
+from radiotwin.scene.city_files import read_triangles
 from radiotwin.scene.materials import Material
-from radiotwin.scene.reader import read_triangles
 from radiotwin.scene.vegetation import Vegetation
-from radiotwin.threads import in_threads
 
 SKIN_M = 0.01  # step past a surface before the next is looked for [m]
 GROUND_M = 0.05  # faces this close to z = 0 are the ground [m]

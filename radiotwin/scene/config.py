@@ -17,15 +17,15 @@ from pydantic import (
     model_validator,
 )
 
-from radiotwin.budgets import DEVICES, UAVS
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
-from radiotwin.geodesy import local_crs
-from radiotwin.inputs import read_toml
+from radiotwin.geo.geodesy import local_crs
+from radiotwin.io.budgets import DEVICES, UAVS
+from radiotwin.io.files import atomic_path
+from radiotwin.io.forms import MAX_COORDINATE_M, Metres, Number, Origin, Table
+from radiotwin.io.inputs import read_toml
 from radiotwin.scene.lattice import check_lattice, positions
 from radiotwin.scene.terrain import TerrainConfig
 from radiotwin.scene.vegetation import VegetationConfig
-from radiotwin.tables import MAX_COORDINATE_M, Metres, Number, Origin, Table
 
 ANTENNA_HEIGHT_M = 1.5  # of a device above the ground [m]: a person, a meter, a low pole
 _MAX_MESSAGES = 10

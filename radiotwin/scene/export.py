@@ -6,14 +6,13 @@ import numpy as np
 import pandas as pd
 import trimesh
 
-from radiotwin.cells import write_csv
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_folder, atomic_path
+from radiotwin.io.cells import write_csv
+from radiotwin.io.files import atomic_folder, atomic_path
 from radiotwin.scene import Scene
 from radiotwin.scene.build import check_target
+from radiotwin.scene.city_files import CityShape, read_city, write_city
 from radiotwin.scene.materials import Material
-from radiotwin.scene.reader import read_city
-from radiotwin.scene.writer import CityShape, write_city
 
 _MODEL_SUFFIXES = (".glb", ".gltf", ".obj")
 # Axes of glTF 2.0 (section 3.4): y up

@@ -11,15 +11,21 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from radiotwin.errors import BadInput
-from radiotwin.progress import progress
+from radiotwin.runtime.console import progress
 from radiotwin.scene import checks
-from radiotwin.scene.material_mapping import map_materials, materials_by_name
-from radiotwin.scene.materials import Material
+from radiotwin.scene.checks import Problem, error, fixed, listed, warning
+from radiotwin.scene.materials import (
+    RESERVED_NAMES,
+    Material,
+    Names,
+    map_materials,
+    materials_by_name,
+    safe_name,
+    unique_name,
+)
 from radiotwin.scene.meshes import MeshBudget, RawMesh, clean, load_shape
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 from radiotwin.scene.models import UP_AXES, read_model
-from radiotwin.scene.names import RESERVED_NAMES, Names, safe_name, unique_name
-from radiotwin.scene.problems import Problem, error, fixed, listed, warning
 from radiotwin.scene.surfaces import FLAT_M, Surfaces
 
 _MAX_DISTANCE_M = 100e3  # from the origin: beyond, float32 rounds positions to 8 mm and more

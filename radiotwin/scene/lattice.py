@@ -6,8 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from radiotwin.budgets import POSITIONS
 from radiotwin.errors import BadInput
+from radiotwin.io.budgets import POSITIONS
 
 
 def check_lattice(x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float, step_m: float,

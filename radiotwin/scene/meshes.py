@@ -10,12 +10,11 @@ from pathlib import Path
 import mapbox_earcut
 import numpy as np
 
-from radiotwin.budgets import CORNERS, DOCUMENT_BYTES, FACES, SHAPES, VERTICES
 from radiotwin.errors import BadInput
-from radiotwin.inputs import read_bytes
-from radiotwin.scene.mitsuba_xml import DeclaredShape
+from radiotwin.io.budgets import CORNERS, DOCUMENT_BYTES, FACES, SHAPES, VERTICES
+from radiotwin.io.inputs import read_bytes
+from radiotwin.scene.mitsuba_xml import DeclaredShape, read_vector
 from radiotwin.scene.ply import read_ply
-from radiotwin.scene.xml_tree import read_vector
 
 WELD_M = 1e-4  # vertices equal when rounded to this are one; float32 resolves 6e-5 m at 1 km
 # Height of a triangle over its longest side below which its normal is numerical noise

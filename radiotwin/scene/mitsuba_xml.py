@@ -1,26 +1,242 @@
-"""Mitsuba 3 / Sionna RT scene files, read without Mitsuba.
+"""Mitsuba 3 and Sionna RT scene files, read without Mitsuba and by an allowlist.
+
+Mitsuba 3 / Sionna RT scene files, read without Mitsuba.
 
 Read: `ply`, `obj`, `cube`, `rectangle` and `sphere` shapes (also within `merge`), `to_world`
 transforms, materials by reference or inline, `<default>` parameters, `<include>` and `<path>`
 within the file's folder. Cameras, lights and integrators have no meaning for radio and are
-skipped. A scene folder may say less, see `radiotwin.scene.city_rules`. This is the only reader of
+skipped. A scene folder may say less, see `radiotwin.scene.mitsuba_xml`. This is the only reader of
 scene XML: nothing of a file reaches Mitsuba but the triangles and materials that are read here.
+
+XML as a tree of elements that know their line, and the numbers in their attributes.
+
+Allowlist of the elements, types and attributes in `city.xml` of a scene folder.
+
+- Read: `scene`; `bsdf` and `shape` of the types below; `ref`; `transform` with `translate`,
+  `rotate`, `scale`, `matrix`; `string`, `float`, `integer`, `boolean`, `rgb`, `point`, `vector`.
+- Ignored, with all that is in them: `integrator`, `sensor` and `emitter` beside the shapes. They
+  have no meaning for radio.
+- Refused: every other element, attribute or type, so `default`, `include`, `path`, `alias`,
+  `texture`; a `$` in a value; a number that is none.
+
+None of it reaches Mitsuba, which would load files and plugins that it names: the ray tracer gets a
+file that `radiotwin.scene.city_files` writes from the triangles and materials that were read.
 """
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from radiotwin.budgets import DOCUMENT_BYTES, SEARCH_FOLDERS, SHAPES
 from radiotwin.errors import BadInput
-from radiotwin.inputs import require_within
-from radiotwin.scene.city_rules import check_city
-from radiotwin.scene.xml_tree import Node, XmlReader, read_numbers, read_vector, shown
+from radiotwin.io.budgets import DOCUMENT_BYTES, ELEMENTS, FILES, NESTING, SEARCH_FOLDERS, SHAPES
+from radiotwin.io.inputs import require_within
+from radiotwin.io.safe_xml import parse_elements
 
+SHAPE_TYPES = ("ply", "obj", "cube", "rectangle", "sphere", "merge")
+# The last four are colours of older files: the name of such a material says what it is made of.
+BSDF_TYPES = ("itu-radio-material", "radio-material", "diffuse", "twosided", "principled",
+              "roughconductor")
+IGNORED = ("integrator", "sensor", "emitter")
+_BUILD = "build the scene with `radiotwin build-scene`"
+_VALUES = ("string", "float", "integer", "boolean", "rgb")
+_STEPS = ("translate", "rotate", "scale", "matrix")
+_CHILDREN: dict[str, tuple[str, ...]] = {
+    "scene": ("bsdf", "shape"),
+    "bsdf": ("bsdf", *_VALUES),
+    "shape": ("shape", "bsdf", "ref", "transform", "point", "vector", *_VALUES),
+    "transform": _STEPS,
+}
+_ATTRIBUTES: dict[str, tuple[str, ...]] = {
+    "scene": ("version",),
+    "bsdf": ("type", "id", "name"),
+    "shape": ("type", "id", "name"),
+    "ref": ("id", "name"),
+    "transform": ("name",),
+    "rotate": ("value", "angle", "x", "y", "z"),
+    "matrix": ("value",),
+    **dict.fromkeys(("translate", "scale"), ("value", "x", "y", "z")),
+    **dict.fromkeys(("point", "vector"), ("name", "value", "x", "y", "z")),
+    **dict.fromkeys(_VALUES, ("name", "value")),
+}
+_COUNTS = {"float": (1,), "integer": (1,), "rgb": (1, 3)}
 MAX_INCLUDE_DEPTH = 15  # the limit of Mitsuba
 MAX_NAME = 1000  # characters of a file's name with its folders: no system has longer ones
+
+
+@dataclass(slots=True)
+class Node:
+    """An XML element with its position in the file."""
+
+    tag: str
+    attributes: dict[str, str]
+    file: Path
+    line: int
+    children: list["Node"] = field(default_factory=list)
+
+    @property
+    def position(self) -> str:
+        """File and line, for messages."""
+        return f"{self.file}, line {self.line}"
+
+    def get(self, tag: str, name: str) -> str | None:
+        """Return the value of the child `<tag name="name" value="...">`, or None."""
+        for node in self.children:
+            if node.tag == tag and node.attributes.get("name") == name:
+                return node.attributes.get("value")
+        return None
+
+    def number(self, name: str, default: float) -> float:
+        """Return the value of the child `<float name="name">`, or the default."""
+        text = self.get("float", name)
+        return default if text is None else float(read_numbers(self, text, (1,))[0])
+
+    def walk(self) -> Iterator["Node"]:
+        """Yield this element and all below it in the file's order, without recursion."""
+        waiting = [self]
+        while waiting:
+            node = waiting.pop()
+            yield node
+            waiting += reversed(node.children)
+
+
+class XmlReader:
+    """Reads files into trees within one budget of bytes and elements for all of them.
+
+    Args:
+        path: First file, which messages about the budget name.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._bytes = self._elements = self._files = 0
+
+    def read(self, path: Path) -> Node:
+        """Parse one file.
+
+        Args:
+            path: XML file.
+
+        Returns:
+            The root element.
+
+        Raises:
+            BadInput: No such file, malformed XML (with line and column), declared entities, too
+                large, or nested too deep.
+        """
+        self._files += 1
+        FILES.check(self._files, self._path)
+        top = Node("", {}, path, 0)
+        open_nodes = [top]
+        limits = ELEMENTS.limit, NESTING.limit
+
+        def start(tag: str, attributes: dict[str, str], line: int) -> None:
+            self._elements += 1
+            node = Node(tag, attributes, path, line)
+            if self._elements > limits[0] or len(open_nodes) > limits[1]:
+                ELEMENTS.check(self._elements, self._path)
+                NESTING.check(len(open_nodes), node.position)
+            open_nodes[-1].children.append(node)
+            open_nodes.append(node)
+
+        def end(tag: str) -> None:
+            open_nodes.pop()
+
+        self._bytes += parse_elements(path, start, end, DOCUMENT_BYTES)
+        DOCUMENT_BYTES.check(self._bytes, f"{self._path} with the files that it includes")
+        return top.children[0]
+
+
+def read_numbers(node: Node, text: str, counts: tuple[int, ...]) -> np.ndarray:
+    """Return the finite numbers in a text.
+
+    Args:
+        node: Element that has the text, for the message.
+        text: Numbers separated by blanks or commas.
+        counts: How many there may be.
+
+    Raises:
+        BadInput: Something else, or another count.
+    """
+    words = text.replace(",", " ").split(maxsplit=max(counts))
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        values = None
+    # Python reads 1_000 and digits of other scripts, too; the programs that exchange scenes do not
+    if (values is None or len(values) not in counts or not np.isfinite(values).all()
+            or "_" in text or not text.isascii()):
+        allowed = " or ".join(str(count) for count in counts)
+        raise BadInput(f"{node.position}: <{node.tag}> has {shown(text)} where {allowed} finite "
+                       "number(s) should be")
+    return values
+
+
+def read_vector(node: Node, default: float) -> np.ndarray:
+    """Return the (3,) of `value="x, y, z"`, of `value="s"`, or of x=, y=, z=.
+
+    Args:
+        node: Element with these attributes.
+        default: Value of an axis that is not given.
+
+    Raises:
+        BadInput: Something else than finite numbers.
+    """
+    if "value" in node.attributes:
+        return np.broadcast_to(read_numbers(node, node.attributes["value"], (1, 3)), 3)
+    return np.array([read_numbers(node, node.attributes.get(axis, str(default)), (1,))[0]
+                     for axis in "xyz"])
+
+
+def shown(text: str) -> str:
+    """Return a text for a message: quoted, control characters escaped, the end of a long one cut.
+
+    Args:
+        text: As it stands in the file.
+    """
+    return repr(text if len(text) <= 60 else text[:60] + "…")
+
+
+def check_city(root: Node) -> None:
+    """Check that `city.xml` of a scene folder says only what is allowed.
+
+    Args:
+        root: Its `<scene>`; elements that are ignored are removed from it.
+
+    Raises:
+        BadInput: Names file and line of what is not allowed.
+    """
+    root.children = [child for child in root.children if child.tag not in IGNORED]
+    waiting = [root]
+    while waiting:
+        node = waiting.pop()
+        _check_attributes(node)
+        allowed = _CHILDREN.get(node.tag, ())
+        for child in node.children:
+            if child.tag not in allowed:
+                raise BadInput(f"{child.position}: <{child.tag[:60]}> is not allowed in "
+                               f"<{node.tag}> of a scene folder; {_BUILD}")
+        waiting += reversed(node.children)
+
+
+def _check_attributes(node: Node) -> None:
+    for name, value in node.attributes.items():
+        if name not in _ATTRIBUTES[node.tag]:
+            raise BadInput(f"{node.position}: <{node.tag}> has {shown(name)}, which is not "
+                           f"allowed in a scene folder; {_BUILD}")
+        if "$" in value:
+            raise BadInput(f"{node.position}: {name}={shown(value)} has a $, which is not allowed "
+                           f"in a scene folder; {_BUILD}")
+    kind, types = node.attributes.get("type", ""), {"shape": SHAPE_TYPES, "bsdf": BSDF_TYPES}
+    if kind not in types.get(node.tag, (kind,)):
+        raise BadInput(f"{node.position}: a {node.tag} of type {shown(kind)} is not read; allowed "
+                       f"are {', '.join(types[node.tag])}; {_BUILD}")
+    if node.tag in _COUNTS:
+        read_numbers(node, node.attributes.get("value", ""), _COUNTS[node.tag])
+    elif node.tag in ("point", "vector"):
+        read_vector(node, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,22 +1,37 @@
-"""Models of cities as meshes: OBJ, glTF 2.0, STL and PLY, from any program.
+"""Models of cities as meshes, from any program: OBJ, STL, PLY and glTF.
+
+Models of cities as meshes: OBJ, glTF 2.0, STL and PLY, from any program.
 
 Their coordinates are metres, and z points up; in glTF, by its specification, y. Materials are
 names; what else they hold (colours, pictures) has no meaning for radio, and no file that they name
 is opened, except the buffers of a `.gltf`, in its own folder.
+
+Reader of the triangles in glTF 2.0 files [1], binary (`.glb`) or JSON (`.gltf`).
+
+Only triangles, their places and the names of objects and materials are read, each checked against
+the bytes that are there: a header can claim any number of vertices, and a graph of objects can hold
+itself. General readers, trimesh's too, believe the former and open the pictures.
+
+[1] https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
 
+import base64
+import binascii
 import io
+import struct
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from radiotwin.budgets import DOCUMENT_BYTES, FACES, SHAPES
 from radiotwin.errors import BadInput
-from radiotwin.inputs import check_input, read_bytes
-from radiotwin.scene.gltf import read_gltf
+from radiotwin.io.budgets import DOCUMENT_BYTES, FACES, FILE_BYTES, FILES, SHAPES, VERTICES
+from radiotwin.io.inputs import check_input, parse_json, read_bytes, require_within
 from radiotwin.scene.meshes import (
     MeshBudget,
     RawMesh,
@@ -26,10 +41,229 @@ from radiotwin.scene.meshes import (
 )
 from radiotwin.scene.ply import read_ply
 
+_MAGIC, _JSON, _BINARY = b"glTF", b"JSON", b"BIN\0"
+_TYPES: dict[int, np.dtype[Any]] = {5121: np.dtype("<u1"), 5123: np.dtype("<u2"),
+                                   5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
+_COMPONENTS = {"SCALAR": 1, "VEC3": 3}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression",
+               "KHR_mesh_quantization")
+Part = tuple[str, str | None, np.ndarray, np.ndarray]
 UP_AXES = {".obj": "z", ".glb": "y", ".gltf": "y", ".stl": "z", ".ply": "z"}
 """Suffix -> axis that points up where nothing else is said: that of glTF is fixed [1]."""
 # [1] https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#coordinate-system-and-units
 _STL_HEADER, _STL_FACE = 84, 50  # bytes
+
+
+def read_gltf(path: Path) -> list[Part]:
+    """Read the objects of a glTF file in the places that it gives them.
+
+    Args:
+        path: `.glb` or `.gltf` file.
+
+    Returns:
+        Name, name of the material or None, (v, 3) vertices and (f, 3) faces of each, y up.
+
+    Raises:
+        BadInput: no such file, not glTF 2.0, damaged, compressed, or too large.
+    """
+    data = read_bytes(path, "glTF model")
+    text, binary = _chunks(path, data) if data[:4] == _MAGIC else (data, None)
+    DOCUMENT_BYTES.check(len(text), path)
+    try:
+        document = parse_json(text.decode("utf-8-sig"), path)
+        if str(document["asset"]["version"]).partition(".")[0] != "2":
+            raise ValueError(f"its version is {document['asset']['version']!r}, not 2.0")
+        return list(_Document(path, document, binary).parts())
+    except BadInput:
+        raise
+    except (ValueError, TypeError, LookupError, AttributeError, OverflowError) as error:
+        raise BadInput(f"{path} is not a readable glTF 2.0 model ({error!s:.120}); export it again"
+                       ) from None
+
+
+def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
+    """Return the JSON and the binary chunk of a `.glb` file."""
+    chunks: dict[bytes, bytes] = {}
+    at = 12
+    while at + 8 <= len(data):
+        length, kind = struct.unpack_from("<I4s", data, at)
+        if at + 8 + length > len(data):
+            raise BadInput(f"{path} is not a readable glTF 2.0 model: it is cut off "
+                           f"({len(data):,} bytes, {at + 8 + length:,} are announced); export it "
+                           "again")
+        chunks.setdefault(kind, data[at + 8:at + 8 + length])
+        at += 8 + length
+    if _JSON not in chunks:
+        raise BadInput(f"{path} is not a readable glTF 2.0 model: it has no JSON chunk; export it "
+                       "again")
+    return chunks[_JSON], chunks.get(_BINARY)
+
+
+class _Document:
+    """The parts of one file."""
+
+    def __init__(self, path: Path, document: dict[str, Any], binary: bytes | None) -> None:
+        self.path, self.document = path, document
+        required = [str(name) for name in document.get("extensionsRequired") or []]
+        if compressed := [name for name in required if name in _COMPRESSED]:
+            raise BadInput(f"{path}: its meshes are compressed ({compressed[0]}), which is not "
+                           "read; export it without compression")
+        self.buffers = self._buffers(binary)
+
+    def _all(self, key: str) -> list[Any]:
+        found = self.document.get(key) or []
+        if not isinstance(found, list):
+            raise ValueError(f"{key} is no list")
+        return found
+
+    def _at(self, key: str, index: Any) -> Any:
+        if isinstance(index, bool) or not isinstance(index, int) or index < 0:
+            raise ValueError(f"{index!r:.20} is no index of {key}")
+        return self._all(key)[index]
+
+    def _buffers(self, binary: bytes | None) -> list[bytes]:
+        buffers, size = [], 0
+        FILES.check(len(self._all("buffers")), self.path)
+        for number, known in enumerate(self._all("buffers")):
+            uri = known.get("uri")
+            if uri is None:
+                if number or binary is None:
+                    raise ValueError(f"buffer {number} has no content")
+                buffers.append(binary)
+            elif uri.startswith("data:"):
+                buffers.append(self._decoded(uri))
+            else:
+                name = unquote(uri)
+                if ":" in name or "\\" in name:
+                    raise BadInput(f"{self.path}: its buffer {uri[:60]!r} is no file beside it; "
+                                   "export it with everything in one file (.glb)")
+                beside = require_within(self.path.absolute().parent, self.path.parent / name,
+                                        str(self.path))
+                buffers.append(read_bytes(beside, "buffer of a glTF model"))
+            size += len(buffers[-1])
+            FILE_BYTES.check(size, f"{self.path} with its buffers")
+        return buffers
+
+    @staticmethod
+    def _decoded(uri: str) -> bytes:
+        head, comma, content = uri.partition(",")
+        if not comma or not head.endswith(";base64"):
+            raise ValueError("a buffer is not in base64")
+        try:
+            return base64.b64decode(content, validate=True)
+        except binascii.Error as error:
+            raise ValueError(f"a buffer is not in base64: {error}") from None
+
+    def parts(self) -> Iterator[Part]:
+        """Yield what the scene's objects are made of."""
+        vertices = parts = 0
+        for name, mesh, to_world in self._placed():
+            for primitive in self._at("meshes", mesh)["primitives"]:
+                parts += 1
+                SHAPES.check(parts, self.path)
+                points = self._accessor(primitive["attributes"]["POSITION"], "VEC3")
+                vertices += len(points)
+                VERTICES.check(vertices, self.path)
+                faces = self._faces(primitive, len(points))
+                if faces is None:
+                    continue
+                if not np.isfinite(points).all():
+                    raise ValueError(f"{name!r:.60} has a corner that is not finite")
+                moved = points @ to_world[:3, :3].T + to_world[:3, 3]
+                mirrored = np.linalg.det(to_world[:3, :3]) < 0
+                material = primitive.get("material")
+                yield (name, None if material is None else self._name("materials", material),
+                       moved, faces[:, ::-1] if mirrored else faces)
+
+    def _placed(self) -> Iterator[tuple[str, int, np.ndarray]]:
+        """Yield name, mesh and transform of each node of the scene; each node stands once."""
+        scenes = self._all("scenes")
+        roots = self._at("scenes", self.document.get("scene", 0)).get("nodes") or [] if scenes \
+            else list(range(len(self._all("nodes"))))
+        waiting = [(node, np.eye(4)) for node in reversed(roots)]
+        seen: set[int] = set()
+        while waiting:
+            index, above = waiting.pop()
+            node = self._at("nodes", index)
+            if index in seen:
+                if not scenes:
+                    continue
+                raise ValueError(f"node {index} stands in its graph twice")
+            seen.add(index)
+            to_world = above @ _transform(node)
+            if not np.isfinite(to_world).all():
+                raise ValueError(f"node {index} has a transform that is not finite")
+            if node.get("mesh") is not None:
+                name = node.get("name") or self._name("meshes", node["mesh"])
+                yield str(name)[:200], node["mesh"], to_world
+            waiting += [(child, to_world) for child in reversed(node.get("children") or [])]
+
+    def _name(self, key: str, index: Any) -> str:
+        return str(self._at(key, index).get("name") or f"{key}_{index}")[:200]
+
+    def _faces(self, primitive: dict[str, Any], points: int) -> np.ndarray | None:
+        """Return (f, 3) indices; None of points and lines."""
+        mode = primitive.get("mode", _TRIANGLES)
+        if mode not in (_TRIANGLES, _STRIP, _FAN):
+            return None
+        if primitive.get("indices") is None:
+            index = np.arange(points)
+        else:
+            index = self._accessor(primitive["indices"], "SCALAR").astype(np.int64).reshape(-1)
+        if len(index) and not 0 <= index.min() <= index.max() < points:
+            raise ValueError(f"a face names corner {index.max()}, there are {points} (counted from "
+                             "0)")
+        if mode == _TRIANGLES:
+            if len(index) % 3:
+                raise ValueError("its triangles have not three corners each")
+            return index.reshape(-1, 3)
+        if mode == _FAN:
+            first = np.broadcast_to(index[:1], len(index[2:]))
+            return np.stack([first, index[1:-1], index[2:]], axis=1)
+        strip = np.stack([index[:-2], index[1:-1], index[2:]], axis=1)
+        strip[1::2] = strip[1::2, [1, 0, 2]]
+        return strip
+
+    def _accessor(self, index: Any, kind: str) -> np.ndarray:
+        """Return (n, components) numbers, a view of the bytes that are there."""
+        known = self._at("accessors", index)
+        if known["type"] != kind or "sparse" in known or known.get("bufferView") is None:
+            raise ValueError(f"accessor {index} is sparse, empty, or not of type {kind}")
+        dtype = _TYPES[known["componentType"]]
+        if (dtype.kind == "f") != (kind == "VEC3"):
+            raise ValueError(f"accessor {index} is of component type {known['componentType']}")
+        view = self._at("bufferViews", known["bufferView"])
+        buffer = self.buffers[view["buffer"]]
+        width = _COMPONENTS[kind] * dtype.itemsize
+        stride = view.get("byteStride") or width
+        start = view.get("byteOffset", 0) + known.get("byteOffset", 0)
+        count = known["count"]
+        if not all(isinstance(value, int) and value >= 0 for value in (start, count)) \
+                or not (isinstance(stride, int) and width <= stride <= 252) \
+                or count and start + stride * (count - 1) + width > len(buffer):
+            raise ValueError(f"accessor {index} claims {count!r:.20} values, which are not there")
+        found: np.ndarray = np.ndarray((count, _COMPONENTS[kind]), dtype, buffer, start,
+                                       (stride, dtype.itemsize)) if count else \
+            np.zeros((0, _COMPONENTS[kind]), dtype)
+        return found.astype(float) if dtype.kind == "f" else found
+
+
+def _transform(node: dict[str, Any]) -> np.ndarray:
+    """Return the (4, 4) transform of a node: a matrix, or translation × rotation × scale [1]."""
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=float).reshape(4, 4).T
+    made = np.eye(4)
+    if "rotation" in node:
+        x, y, z, w = np.array(node["rotation"], dtype=float).reshape(4)
+        made[:3, :3] = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+    if "scale" in node:
+        made[:3, :3] *= np.array(node["scale"], dtype=float).reshape(3)
+    if "translation" in node:
+        made[:3, 3] = np.array(node["translation"], dtype=float).reshape(3)
+    return made
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,22 +1,31 @@
-"""Maps as they might be: each wall and each roof of a 3D map moved by a random error.
+"""How wrong a map may be: declared accuracy of heights, and maps with random errors.
+
+Maps as they might be: each wall and each roof of a 3D map moved by a random error.
 
 Surveyed maps have walls off by decimetres to metres, and heights by metres where they were counted
 from storeys. What such errors do to a prediction is seen by predicting over several such maps.
+
+How well a scene made from a map knows the heights of its buildings: from `buildings.csv`.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from radiotwin.io.cells import as_numbers, read_cells, refuse
+from radiotwin.io.inputs import require_within
 from radiotwin.scene.citymap import CityMap
 
 SAME_CORNER_M = 0.01  # corners closer than this are one [m]
 MIN_HEIGHT_SHARE = 0.2  # of a building's height that is left, whatever the error
 _GROUND_M = 0.05  # faces below are ground, and stay
+_MAX_SD_M, _MAX_AREA_M2 = 1000.0, 1e9
 
 
 def building_of_vertex(city: CityMap) -> np.ndarray:
@@ -79,3 +88,34 @@ def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int
         corners_m[:, 2] += base_m
         vertices_m[rows] = corners_m
     return city.with_vertices(vertices_m)
+
+
+def shape_height_sds_m(folder: Path) -> dict[str, float] | None:
+    """Return the standard deviation of the height of each shape [m], as `buildings.csv` has it.
+
+    A shape is a block of buildings that touch: it has their mean, by area.
+
+    Args:
+        folder: of a scene.
+
+    Returns:
+        shape -> standard deviation; None: the folder has no such table, or one of an earlier
+        version, without the column `height_sd_m`.
+
+    Raises:
+        BadInput: the table cannot be read, lies outside the folder, or has an impossible value.
+    """
+    path = folder / "buildings.csv"
+    if not path.is_file():
+        return None
+    require_within(folder, path, str(folder))
+    table = read_cells(path, optional=("shape", "area_m2", "height_sd_m"))
+    if not {"shape", "area_m2", "height_sd_m"} <= set(table.columns):
+        return None
+    numbers = {name: as_numbers(table[name]) for name in ("area_m2", "height_sd_m")}
+    for name, most in (("area_m2", _MAX_AREA_M2), ("height_sd_m", _MAX_SD_M)):
+        refuse(path, name, table[name], ~((numbers[name] > 0) & (numbers[name] <= most)),
+               f"is impossible; allowed are numbers above 0, up to {most:g}")
+    areas_m2 = pd.Series(numbers["area_m2"]).groupby(table["shape"]).sum()
+    sums = pd.Series(numbers["area_m2"] * numbers["height_sd_m"]).groupby(table["shape"]).sum()
+    return dict((sums / areas_m2).items())

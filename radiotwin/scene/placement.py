@@ -7,8 +7,9 @@ from itertools import cycle, product
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
-from radiotwin.budgets import DEVICES, UAVS
 from radiotwin.errors import BadInput
+from radiotwin.io.budgets import DEVICES, UAVS
+from radiotwin.io.forms import MAX_COORDINATE_M
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import (
     ANTENNA_HEIGHT_M,
@@ -19,7 +20,6 @@ from radiotwin.scene.config import (
 )
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.surfaces import Surfaces
-from radiotwin.tables import MAX_COORDINATE_M
 
 _DEVICE_CLEARANCE_M = 10.0  # free ground around a device [m]
 _UAV_CLEARANCE_M = 2.0  # free air beside the start of a UAV [m]

@@ -10,11 +10,17 @@ import pandas as pd
 import xarray as xr
 
 from radiotwin.display import PlotFrame, geo_data_frame, new_axes
-from radiotwin.display.axes import METRES, add_colour_bar, add_legend, draw_cells, draw_points
-from radiotwin.display.style import plain
+from radiotwin.display.axes import (
+    METRES,
+    add_colour_bar,
+    add_legend,
+    draw_cells,
+    draw_points,
+    plain,
+)
 from radiotwin.errors import BadInput
+from radiotwin.scene.city_files import read_city
 from radiotwin.scene.citymap import GROUND_M
-from radiotwin.scene.reader import read_city
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from radiotwin.budgets import COLUMNS, CORNERS, DOCUMENT_BYTES, FACES, VERTICES
 from radiotwin.errors import BadInput
-from radiotwin.inputs import read_bytes
+from radiotwin.io.budgets import COLUMNS, CORNERS, DOCUMENT_BYTES, FACES, VERTICES
+from radiotwin.io.inputs import read_bytes
 
 _TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
           "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",

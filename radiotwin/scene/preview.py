@@ -10,15 +10,9 @@ from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from radiotwin.files import atomic_path
+from radiotwin.io.files import atomic_path
 from radiotwin.scene import Scene
-from radiotwin.scene.plot import (
-    GROUND_COLOUR,
-    Bounds,
-    draw_devices,
-    draw_vegetation,
-    height_grid,
-)
+from radiotwin.scene.plot import GROUND_COLOUR, Bounds, draw_devices, draw_vegetation, height_grid
 
 
 def draw_preview(scene: Scene, path: Path | str) -> None:

@@ -9,9 +9,9 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from radiotwin.console import print_table
 from radiotwin.errors import BadInput
-from radiotwin.scene.problems import Problem
+from radiotwin.runtime.console import print_table
+from radiotwin.scene.checks import Problem
 from radiotwin.scene.scene import Scene
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "fixed": "green"}

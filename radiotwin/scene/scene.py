@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from radiotwin.antennas import Antenna, Pattern, read_pattern
-from radiotwin.budgets import SHAPES
 from radiotwin.display.summary import Summarised, Summary, count, some
 from radiotwin.errors import BadInput
-from radiotwin.inputs import open_input, read_bytes, require_within
+from radiotwin.io.budgets import SHAPES
+from radiotwin.io.inputs import open_input, read_bytes, require_within
+from radiotwin.scene.antennas import Antenna, Pattern, read_pattern
+from radiotwin.scene.city_files import mesh_paths
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
-from radiotwin.scene.height_errors import shape_height_sds_m
 from radiotwin.scene.lattice import Lattice
-from radiotwin.scene.reader import mesh_paths
+from radiotwin.scene.perturbation import shape_height_sds_m
 from radiotwin.scene.vegetation import Vegetation
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from radiotwin.display import PlotFrame
-    from radiotwin.radiomap import RadioMap
+    from radiotwin.maps.radiomap import RadioMap
 
 _BLOCK_BYTES = 2**20
 

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial import Delaunay
 
-from radiotwin.tables import Number, Table
+from radiotwin.io.forms import Number, Table
 
 Kind = Literal["geoid", "ellipsoid", "unknown"]
 BORDER_NODES = 8  # of the first triangulation, along each side

@@ -8,8 +8,8 @@ import shapely
 from pydantic import Field, field_validator
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.budgets import VEGETATION_CORNERS, VEGETATION_MEETINGS
-from radiotwin.tables import Metres, Number, Table
+from radiotwin.io.budgets import VEGETATION_CORNERS, VEGETATION_MEETINGS
+from radiotwin.io.forms import Metres, Number, Table
 
 GroundHeight = Callable[[np.ndarray, np.ndarray], np.ndarray]
 KINDS = ("wood", "park", "tree_row")

@@ -1,6 +1,6 @@
 """Ray tracing with Sionna RT: the physical truth. Tracing needs libLLVM; importing does not."""
 
-from radiotwin.trace.pilot import Rung, choose_quality
+from radiotwin.trace.plan import Rung, choose_quality
 from radiotwin.trace.points import read_points, trace_gains, trace_points
 from radiotwin.trace.run import trace_map, truth_path
 from radiotwin.trace.settings import QUALITIES, SolverSettings

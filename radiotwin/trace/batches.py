@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
-from radiotwin.inputs import read_bytes, require_within
-from radiotwin.interruption import note_finished
+from radiotwin.io.files import atomic_path
+from radiotwin.io.inputs import read_bytes, require_within
+from radiotwin.io.signals import note_finished
 
 
 class BatchStore:

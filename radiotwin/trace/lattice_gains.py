@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from radiotwin.execution import Executor
+from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
 from radiotwin.trace.link_job import KeptBatches, Links, link_job, link_pieces

@@ -8,17 +8,17 @@ import numpy as np
 import pandas as pd
 from scipy.constants import speed_of_light
 
-from radiotwin.antennas import Antenna
-from radiotwin.budgets import ROWS
-from radiotwin.cells import as_numbers, listed, read_cells, write_csv
 from radiotwin.errors import BadInput
-from radiotwin.execution import Executor
-from radiotwin.files import atomic_path, require_suffix, require_writable
-from radiotwin.geodesy import to_local
-from radiotwin.pieces import KeptParts
+from radiotwin.geo.geodesy import to_local
+from radiotwin.io.budgets import ROWS
+from radiotwin.io.cells import as_numbers, listed, read_cells, write_csv
+from radiotwin.io.files import atomic_path, require_suffix, require_writable
+from radiotwin.io.forms import MAX_COORDINATE_M, Origin
+from radiotwin.runtime.execution import Executor
+from radiotwin.runtime.pieces import KeptParts
 from radiotwin.scene import Scene
+from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import CityMap
-from radiotwin.tables import MAX_COORDINATE_M, Origin
 from radiotwin.trace.link_job import Links, link_job, link_pieces
 from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings

@@ -9,17 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from radiotwin.budgets import MAP_VALUES
 from radiotwin.errors import BadInput
-from radiotwin.execution import Executor
-from radiotwin.inputs import require_within
-from radiotwin.map_writing import check_target
-from radiotwin.radiomap import RadioMap
+from radiotwin.io.budgets import MAP_VALUES
+from radiotwin.io.inputs import require_within
+from radiotwin.maps.file import check_target
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
-from radiotwin.trace.gates import check_gains
+from radiotwin.trace.gates import check_gains, noise_figures
 from radiotwin.trace.lattice_gains import solve_finer, solve_lattice
-from radiotwin.trace.noise import noise_figures
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.sionna_scene import library_versions
 from radiotwin.trace.solver import IMPOSSIBLE_DB

@@ -8,15 +8,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from radiotwin import llvm
-from radiotwin.cuda import Device
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.files import scratch_folder
+from radiotwin.io.files import scratch_folder
+from radiotwin.io.signals import deferred
+from radiotwin.runtime import llvm
+from radiotwin.runtime.cuda import Device
+from radiotwin.runtime.processes import allowed_cores
+from radiotwin.scene.city_files import CityShape, read_city, write_city
 from radiotwin.scene.materials import permittivity, ranges_text
-from radiotwin.scene.reader import read_city
-from radiotwin.scene.writer import CityShape, write_city
-from radiotwin.signals import deferred
-from radiotwin.threads import allowed_cores
 
 log = logging.getLogger(__name__)
 City = Path | str | Sequence[CityShape] | None

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.scene import Scene
+from radiotwin.scene.city_files import CityShape
 from radiotwin.scene.materials import Material
-from radiotwin.scene.writer import CityShape
 from radiotwin.trace.settings import SolverSettings
 
 MANY_SHAPES = 5_000

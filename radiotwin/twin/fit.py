@@ -6,11 +6,7 @@ import warnings
 
 import numpy as np
 
-from radiotwin.channel import channel_named
-from radiotwin.channel.image_paths import ImagePaths
-from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.errors import BadInput
-from radiotwin.execution import Executor
 from radiotwin.links import join_links, prepare_links
 from radiotwin.links.checks import (
     COPIED,
@@ -18,12 +14,15 @@ from radiotwin.links.checks import (
     refuse_empty_levels,
     refuse_misplaced_anchors,
 )
-from radiotwin.localize import LocalizeSettings
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
+from radiotwin.propagation.laws import channel_named
+from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.propagation.laws.path_kriging import PathKriging
+from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_links
-from radiotwin.twin.fit_paths import fit_along_paths
-from radiotwin.twin.fit_wrong_map import fit_over_wrong_map
+from radiotwin.twin.fit_paths import fit_along_paths, fit_over_wrong_map
+from radiotwin.twin.localize import LocalizeSettings
 from radiotwin.twin.twin import Twin
 
 # Of more links, so many are fitted. Measured on simulated links: with all of a million, the levels
@@ -39,12 +38,14 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
              executor: Executor | None = None) -> Twin:
     """Learn the channel from the anchors' links, then locate the unknown devices with it.
 
-    A published law (`radiotwin.channel.published`) is taken as it stands and needs no anchor.
+    A published law (`radiotwin.propagation.laws.published`) is taken as it stands and needs no
+    anchor.
 
     Args:
         measurements: links to anchors and unknown devices.
         scene: its map and extent, and the receivers' sensitivity.
-        model: name of a channel model (`radiotwin.channel.channel_models`); `raytrace` stands for
+        model: name of a channel model (`radiotwin.propagation.laws.channel_models`); `raytrace`
+        stands for
             `image_paths`, which follows paths over the 3D map, and `path_kriging` allows for errors
             of that.
         seed: of the channel's and the search's random numbers.

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 
 import radiotwin
-from radiotwin.channel import ChannelModel, check_fit_data, fit_once
-from radiotwin.channel.base import MIN_DETECTED
-from radiotwin.channel.published import PublishedLaw
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry, link_geometry
 from radiotwin.links.prepare import ASSUMED_HEIGHT_M
-from radiotwin.localize import (
+from radiotwin.propagation.laws import ChannelModel, check_fit_data, fit_once
+from radiotwin.propagation.laws.base import MIN_DETECTED
+from radiotwin.propagation.laws.published import PublishedLaw
+from radiotwin.runtime.pieces import kept
+from radiotwin.scene import Scene
+from radiotwin.twin.localize import (
     DeviceEstimate,
     LocalizeSettings,
     TwinDevice,
     localize,
     read_device,
 )
-from radiotwin.pieces import kept
-from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
 
 

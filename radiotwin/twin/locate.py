@@ -6,17 +6,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from radiotwin.alignment import in_known_frame
-from radiotwin.cells import as_numbers, read_cells, refuse
-from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
-from radiotwin.geodesy import to_geographic, to_local
+from radiotwin.geo.geodesy import to_geographic, to_local
+from radiotwin.io.cells import as_numbers, read_cells, refuse
+from radiotwin.io.forms import Origin
 from radiotwin.links import LinkData, prepare_links
-from radiotwin.localize import PositionEstimate, locate, misfit, whole_area
-from radiotwin.measurements import Measurements
-from radiotwin.progress import progress
+from radiotwin.links.alignment import in_known_frame
+from radiotwin.links.measurements import Measurements
+from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
-from radiotwin.tables import Origin
+from radiotwin.twin.localize import PositionEstimate, locate, misfit, whole_area
+from radiotwin.twin.model.effect_model import EffectModel
 from radiotwin.twin.twin import Twin
 
 NOT_BY_PATHS = ("and following paths from every position where a device may be takes too long: "

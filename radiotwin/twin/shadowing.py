@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from radiotwin.channel.residual_field import ResidualField
 from radiotwin.inference.gaussian import standardised
-from radiotwin.measurements import Measurements
-from radiotwin.radiomap import RadioMap
+from radiotwin.links.measurements import Measurements
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.propagation.laws.kriging import ResidualField
 from radiotwin.twin.twin import Twin
 
 MAX_LINKS = 300  # of a device, in the estimate

@@ -1,44 +1,149 @@
-"""Twins as folders: `twin.json`, and the channel in a file of its own."""
+"""Twins as folders: `twin.json`, and the channel in a file of its own.
+
+The content of `twin.json`, typed and bounded: the bounds are far beyond what is measured.
+"""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from radiotwin.channel import ChannelModel
-from radiotwin.channel.image_paths import ImagePaths, stored_diffuse
-from radiotwin.channel.registry import BUILT_IN
-from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.channel.store import decode_both, encode_channel
-from radiotwin.effects.blend import Blend
-from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
-from radiotwin.effects.effect_model import EffectModel, Unheard
-from radiotwin.effects.fold_model import FittedEffect
+from radiotwin.effects.params import Seconds
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_folder, require_writable
-from radiotwin.inputs import parse_json, read_bytes, read_text, require_within
+from radiotwin.io.files import atomic_folder, require_writable
+from radiotwin.io.forms import MAX_POSITION_M, Origin
+from radiotwin.io.inputs import parse_json, read_bytes, read_text, require_within
 from radiotwin.links import LinkData
-from radiotwin.localize import TwinDevice
-from radiotwin.twin.record import (
-    CHANNEL_FILE,
-    SCHEMA,
-    SCHEMA_1,
-    DeviceRecord,
-    FittedRecord,
-    TwinRecord,
-    UnheardRecord,
-)
+from radiotwin.propagation.laws import ChannelModel
+from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB
+from radiotwin.propagation.laws.image_paths import ImagePaths, stored_diffuse
+from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
+from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_channel
+from radiotwin.twin.localize import TwinDevice
+from radiotwin.twin.model.blend import Blend
+from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
+from radiotwin.twin.model.effect_model import EffectModel, Unheard
+from radiotwin.twin.model.fold_model import FittedEffect
 
+SCHEMA, SCHEMA_1 = "radiotwin.twin/2", "radiotwin.twin/1"
+CHANNEL_FILE = "channel.safetensors"
+_Coordinate = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
+_Decibels = Annotated[float, Field(ge=-MAX_DB, le=MAX_DB)]
+_SdDb = Annotated[float, Field(ge=1e-9, le=MAX_SD_DB)]
+_Name = Annotated[str, Field(min_length=1, max_length=1000)]
+_Scalar = str | int | float | bool | None
+_Json = _Scalar | list[_Scalar] | dict[str, _Scalar]
 TWIN_FILE = "twin.json"
 TWIN_FILES = {TWIN_FILE, CHANNEL_FILE, "report.html"}  # the last is what `radiotwin report` makes
-
-
 _VERSION_1 = ("base", "coefficients", "dof", "scale_db", "receivers", "parts", "first_s",
               "device_spread_db", "temper", "shadowing", "rest")  # of the effects
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class DeviceRecord(_Strict):
+    """A device; null where a position or a radius is not known."""
+
+    device: _Name
+    x_m: _Coordinate | None
+    y_m: _Coordinate | None
+    z_m: _Coordinate | None
+    role: Literal["anchor", "unknown"]
+    located: bool
+    credible_radius_m: Annotated[float, Field(ge=0, le=MAX_POSITION_M)] | None
+    second_mode: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)] | None
+
+
+class EffectRecord(_Strict):
+    """A fitted effect; `params` are checked by the effect's own `Params`."""
+
+    name: str
+    variant: str
+    params: dict[str, Any]
+    coefficients: list[_Decibels]
+
+
+class UnheardRecord(_Strict):
+    """Mean and uncertainty of devices without a reading."""
+
+    devices: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    mean_db: _Decibels
+    sd_db: Annotated[float, Field(ge=0, le=MAX_SD_DB)]
+
+
+class FittedRecord(_Strict):
+    """Levels, effects and errors fitted upon the channel."""
+
+    level_coefficients: Annotated[list[_Decibels], Field(min_length=2, max_length=4)]
+    scale_db: Annotated[list[_SdDb], Field(min_length=1, max_length=2)]
+    dof: Annotated[float, Field(gt=2, le=1e6)]
+    effects: list[EffectRecord]
+    receivers: list[_Name]
+    first_s: Seconds | None
+    device_sd_db: Annotated[float, Field(ge=0, le=MAX_SD_DB)]
+    likelihood_power: Annotated[float, Field(gt=0, le=1)]
+    shadowing: dict[str, Any] | None
+    radius_factor: Annotated[float, Field(ge=1, le=1e6)] = 1.0
+    typical_misfit: Annotated[float, Field(ge=0, le=1e6)] | None = None
+    blend: dict[str, Any] | None = None
+    unheard: UnheardRecord | None = None
+
+    @field_validator("receivers")
+    @classmethod
+    def _unique(cls, receivers: list[str]) -> list[str]:
+        if len(set(receivers)) < len(receivers):
+            raise ValueError("a receiver is listed twice")
+        return receivers
+
+
+class ChannelRecord(_Strict):
+    """Where the channel is, and what it is."""
+
+    model: str
+    file: Literal["channel.safetensors"]
+
+
+class _Provenance(BaseModel):
+    """Fields of the provenance that are read; the others are only kept."""
+
+    model_config = ConfigDict(strict=True)
+
+    scene: str | None = None
+    scene_hash: str | None = None
+    origin: Origin | None = None
+
+
+class TwinRecord(_Strict):
+    """Content of `twin.json`."""
+
+    schema_: Literal["radiotwin.twin/1", "radiotwin.twin/2"] = Field(alias="schema")
+    channel: ChannelRecord
+    devices: Annotated[list[DeviceRecord], Field(min_length=1)]
+    level: Literal["gain_db", "rssi_dbm"]
+    limit_db: _Decibels | None
+    provenance: dict[str, _Json]
+    fitted: FittedRecord | None = None
+
+    @field_validator("devices")
+    @classmethod
+    def _unique(cls, devices: list[DeviceRecord]) -> list[DeviceRecord]:
+        names = [device.device for device in devices]
+        if len(set(names)) < len(names):
+            raise ValueError("a device is listed twice")
+        return devices
+
+    @field_validator("provenance")
+    @classmethod
+    def _readable(cls, provenance: dict[str, Any]) -> dict[str, Any]:
+        _Provenance.model_validate(provenance)
+        return provenance
 
 
 def write_twin(folder: Path | str, channel: ChannelModel, devices: list[TwinDevice], level: str,

@@ -1,4 +1,7 @@
-"""The twin: a channel, the positions of all devices, and effects and errors fitted upon them."""
+"""The twin: a channel, the positions of all devices, and effects and errors fitted upon them.
+
+Draw where a twin has its devices.
+"""
 
 from __future__ import annotations
 
@@ -11,34 +14,70 @@ import numpy as np
 import pandas as pd
 
 import radiotwin
-from radiotwin.channel import ChannelModel
-from radiotwin.channel.path_kriging import PathKriging
-from radiotwin.channel.regression_kriging import RegressionKriging
-from radiotwin.channel.residual_field import ResidualField
-from radiotwin.display import Summary, geo_data_frame
+from radiotwin.display import PlotFrame, Summary, geo_data_frame, new_axes
+from radiotwin.display.axes import add_legend, draw_points, plain
 from radiotwin.display.summary import Summarised, count, some
-from radiotwin.effects.correlated_shadowing import NAME as SHADOWING
-from radiotwin.effects.effect_model import EffectModel
-from radiotwin.effects.fold_model import FittedEffect
 from radiotwin.errors import BadInput
-from radiotwin.frames import is_same_frame, place
+from radiotwin.geo.frames import is_same_frame, place
 from radiotwin.inference.gaussian import detection_probability
+from radiotwin.io.forms import Origin
 from radiotwin.links import LinkData
-from radiotwin.links.prediction import Prediction
-from radiotwin.localize import TwinDevice
-from radiotwin.map_file import MapStream
-from radiotwin.radiomap import RadioMap
+from radiotwin.links.link_data import Prediction
+from radiotwin.maps.form import MapStream
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.propagation.laws import ChannelModel
+from radiotwin.propagation.laws.kriging import RegressionKriging, ResidualField
+from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
-from radiotwin.tables import Origin
-from radiotwin.twin.plot import plot_positions
+from radiotwin.scene.plot import MARKS
+from radiotwin.twin.localize import TwinDevice
+from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
+from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.model.fold_model import FittedEffect
 from radiotwin.twin.store import decode_twin, encode_twin, read_twin, write_twin
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
     from matplotlib.axes import Axes
 
+MAX_NAMES = 40  # more names would hide the map
+_TURN = np.linspace(0.0, 2 * np.pi, 73)
 CHUNK, CHUNK_WITH_EFFECTS = 200_000, 20_000  # links predicted at once: bounds memory
+
+
+def plot_positions(devices: list[TwinDevice], ax: Axes | None, origin: Origin | None,
+                   scene: Scene | None, geographic: bool | None) -> Axes:
+    """Draw devices with the circles of their 90 % radii; see `Twin.plot`."""
+    frame, ax = PlotFrame.choose(origin, geographic), new_axes(ax)
+    if scene is not None:
+        scene.draw_outlines(ax, frame)
+    placed = [each for each in devices if np.isfinite([each.x_m, each.y_m]).all()]
+    for role, marker, size, colour, label in MARKS:
+        for sure in (True, False):
+            some = [each for each in placed if each.role == role and each.located == sure]
+            if not some:
+                continue
+            name = label if role == "anchor" else "located" if sure else "best guess, not located"
+            x_m, y_m = np.array([(each.x_m, each.y_m) for each in some]).T
+            draw_points(ax, frame, x_m, y_m, marker=marker, s=size, label=name, zorder=4,
+                        facecolors=colour if sure else "white", edgecolors="black" if sure
+                        else colour, linewidths=0.7 if sure else 1.5)
+    wide = [each for each in placed if each.located and 0 < each.credible_radius_m < np.inf]
+    for number, each in enumerate(wide):
+        ring = frame.at(each.x_m + each.credible_radius_m * np.cos(_TURN),
+                        each.y_m + each.credible_radius_m * np.sin(_TURN))
+        ax.plot(*ring, color="#f08a00", linewidth=1.2, zorder=3,
+                label="" if number else "90 % radius")
+    for each in placed[:MAX_NAMES]:
+        x, y = frame.at(each.x_m, each.y_m)
+        ax.annotate(plain(each.device, 24), (float(x), float(y)), xytext=(5, 5),
+                    textcoords="offset points", fontsize=8, zorder=5)
+    frame.prepare(ax)
+    add_legend(ax)
+    missing = len(devices) - len(placed)
+    ax.set_title(f"{len(devices)} devices" + f", {missing} without a position" * bool(missing))
+    return ax
 
 
 @dataclass(frozen=True, eq=False, repr=False)

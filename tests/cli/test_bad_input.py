@@ -5,8 +5,8 @@ import shutil
 import pandas as pd
 import pytest
 
-from radiotwin import cuda
-from radiotwin.measurements import read_measurements
+from radiotwin.links.measurements import read_measurements
+from radiotwin.runtime import cuda
 
 
 @pytest.fixture(scope="module")

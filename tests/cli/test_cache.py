@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 
-from radiotwin.pieces import PieceStore, pieces_folder
-from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.maps.survey import fly_survey, segmented_truth
+from radiotwin.runtime.pieces import PieceStore, pieces_folder
 
 MAIN = "from radiotwin.cli import main; main()"
 
@@ -67,8 +67,8 @@ def test_the_next_run_says_what_it_took_and_writes_the_same(small_scene, flown, 
 
 
 def test_ctrl_c_in_what_keeps_nothing_says_so():
-    text = ("import radiotwin.cli.tools as tools, radiotwin.doctor, time;"
-            "radiotwin.doctor.diagnose = lambda: (print('ready', flush=True), time.sleep(60));" + MAIN)
+    text = ("import radiotwin.cli.tools as tools, radiotwin.cli.doctor, time;"
+            "radiotwin.cli.doctor.diagnose = lambda: (print('ready', flush=True), time.sleep(60));" + MAIN)
     child = subprocess.Popen([sys.executable, "-c", text, "doctor"], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                              text=True, env=os.environ)
     assert child.stdout is not None and child.stdout.readline() == "ready\n"

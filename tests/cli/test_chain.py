@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from radiotwin.compare import published_models
+from radiotwin.twin.compare import published_models
 
 
 @pytest.fixture(scope="module")

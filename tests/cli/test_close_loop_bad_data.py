@@ -305,8 +305,8 @@ def test_a_corrected_scene_needs_a_scene_and_something_to_correct(close_loop, sm
 def test_a_moved_anchor_stands_in_the_corrected_scene_where_it_was_found(small_scene, tmp_path):
     """Named here whatever its probability, which is low: these few flights have been at 11 places only."""
     from radiotwin import Measurements, close_loop
-    from radiotwin.closeloop.corrected_scene import write_corrected_scene
-    from radiotwin.closeloop.criteria import SelectionCriteria
+    from radiotwin.closeloop.output.corrected_scene import write_corrected_scene
+    from radiotwin.closeloop.verdict.criteria import SelectionCriteria
     from radiotwin.scene import Scene
 
     shutil.copytree(small_scene.folder, tmp_path / "declared")

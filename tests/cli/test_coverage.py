@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from radiotwin.geodesy import to_geographic
-from radiotwin.radiomap import RadioMap
+from radiotwin.geo.geodesy import to_geographic
+from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 
-TOWN = Path(__file__).parents[1] / "footprints" / "town.osm"
+TOWN = Path(__file__).parents[1] / "scene" / "readers" / "town.osm"
 SITES = "device,x_m,y_m,z_m,tx_power_dbm\nroof,-60,-60,40,30\nmast,60,60,40,30\n"
 
 
@@ -74,9 +74,9 @@ def test_a_twin_and_the_map_that_it_makes_agree(run, town, tmp_path, twin_in):
 
 @pytest.fixture
 def twin_in():
-    from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-    from radiotwin.localize import TwinDevice
+    from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
     from radiotwin.twin import Twin
+    from radiotwin.twin.localize import TwinDevice
 
     def make(folder):
         lines = {"lines": np.array([[-40.0, -3.5, 7.0], [-40.0, -2.1, 4.0]])}

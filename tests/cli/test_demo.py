@@ -28,8 +28,8 @@ def city_xml(tmp_path):
 
 @pytest.mark.llvm
 def test_the_whole_chain_ends_in_a_page(run, city_xml, monkeypatch):
-    monkeypatch.setattr("radiotwin.demo.DEVICES", 4)
-    monkeypatch.setattr("radiotwin.demo.FLIGHTS", 3)
+    monkeypatch.setattr("radiotwin.cli.demo.DEVICES", 4)
+    monkeypatch.setattr("radiotwin.cli.demo.FLIGHTS", 3)
     folder = city_xml.parent
     result = run("demo --scene city.xml -o out", cwd=folder)
     assert result.returncode == 0, result.stderr

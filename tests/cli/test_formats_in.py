@@ -11,9 +11,9 @@ import pytest
 import shapely
 import trimesh
 
-from tests.footprints import city_models as made
+from tests.scene.readers import city_models as made
 
-TOWN = Path(__file__).parents[1] / "footprints" / "town.osm"
+TOWN = Path(__file__).parents[1] / "scene" / "readers" / "town.osm"
 SQUARE = np.array([[0, 0], [20, 0], [20, 20], [0, 20]]) + [691_000, 5_336_000]
 HOUSES = [(0, 0, 1.2), (40, 0, 1.2)]
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from radiotwin.geodesy import to_geographic
-from radiotwin.measurements import read_measurements
-from radiotwin.tables import Origin
+from radiotwin.geo.geodesy import to_geographic
+from radiotwin.io.forms import Origin
+from radiotwin.links.measurements import read_measurements
 
-TOWN = Path(__file__).parents[1] / "footprints" / "town.osm"
+TOWN = Path(__file__).parents[1] / "scene" / "readers" / "town.osm"
 ELSEWHERE = Origin(latitude_deg=47.52, longitude_deg=8.72)
 FIT = "fit {}/measurements.csv --scene scene --model log_distance -o {}"
 

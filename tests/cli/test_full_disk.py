@@ -1,6 +1,6 @@
 """A full disk: every command that writes says so in one message, keeps the old output, and leaves nothing else.
 
-Where the machine allows no mount (only root may), the tests of `tests/test_files.py`, whose writes fail, remain.
+Where the machine allows no mount (only root may), the tests of `tests/io/test_files.py`, whose writes fail, remain.
 """
 
 import contextlib
@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import RunFailed
-from radiotwin.export import EXPORTERS
-from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.maps.export import EXPORTERS
+from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.trace.batches import BatchStore
 from tests.command_line import run_planning
 

@@ -13,7 +13,7 @@ import pytest
 
 from radiotwin.cli.importing import _tables
 from radiotwin.importing.settings import Settings
-from radiotwin.measurements import read_measurements
+from radiotwin.links.measurements import read_measurements
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "import"
 SAMPLES = Path(__file__).parents[1] / "importing" / "samples"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-TOWN = Path(__file__).parents[1] / "footprints" / "town.osm"
+TOWN = Path(__file__).parents[1] / "scene" / "readers" / "town.osm"
 BOX = "<way id='1'><nd ref='1'/><nd ref='2'/><nd ref='3'/><nd ref='1'/><tag k='building' v='yes'/></way>"
 NODES = "<node id='1' lat='1' lon='1'/><node id='2' lat='1' lon='1.001'/><node id='3' lat='1.001' lon='1'/>"
 GEO = '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry": {"type": \
@@ -75,7 +75,7 @@ def test_crs_is_for_maps_that_name_none(run, tmp_path):
 def test_geoparquet_and_multipatches_become_scenes(run, tmp_path):
     import pandas as pd
 
-    from tests.footprints import test_geoparquet, test_multipatches
+    from tests.scene.readers import test_geoparquet, test_multipatches
 
     test_geoparquet.write(tmp_path / "a.parquet", test_geoparquet.UTM, crs={"id": {"authority": "EPSG", "code": 32632}}, height=[12.5])
     test_multipatches.write(tmp_path, *test_multipatches.house())

@@ -12,8 +12,8 @@ import typer
 from typer.testing import CliRunner
 
 from radiotwin.cli.commands import app
-from radiotwin.command import TABLES, add_output_options
-from radiotwin.console import print_rows, say
+from radiotwin.runtime.command import TABLES, add_output_options
+from radiotwin.runtime.console import print_rows, say
 from tests.command_line import run_planning
 
 COMMAND = Path(sys.executable).with_name("radiotwin")

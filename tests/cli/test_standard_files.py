@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 
 

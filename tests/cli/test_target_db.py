@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
 from radiotwin.trace import SolverSettings
-from radiotwin.trace.pilot import Rung
+from radiotwin.trace.plan import Rung
 
 
 @pytest.fixture

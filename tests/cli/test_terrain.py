@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from tests.footprints.conftest import Map
+from tests.scene.readers.conftest import Map
 from tests.terrains import write_dem
 
 pytest.importorskip("rasterio")

@@ -7,12 +7,10 @@ No code of radiotwin makes their levels: laws, antennas and errors are written o
 import numpy as np
 import pandas as pd
 
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.effects.fitting import add_effect
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
 from radiotwin.links import prepare_links
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
+from radiotwin.twin.model.fitting import add_effect
 
 FLIGHTS, POINTS, STEP_M = 8, 90, 12.0
 MASTS_M = np.array([[170.0, 280.0, 25.0], [360.0, 140.0, 30.0], [380.0, 400.0, 20.0]])

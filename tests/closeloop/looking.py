@@ -1,9 +1,7 @@
 """Evidence in a world over open ground."""
 
-from radiotwin.closeloop.bases import LogDistanceBase
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.hypotheses import Hypotheses
+from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
+from radiotwin.closeloop.search.hypotheses import Hypotheses
 from radiotwin.links import prepare_links
 
 

@@ -7,9 +7,9 @@ import pytest
 from sklearn.ensemble import HistGradientBoostingRegressor
 from threadpoolctl import ThreadpoolController
 
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.closeloop.advice import compare_with_baselines
-from radiotwin.closeloop.baselines import (
+from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.output.result_file import compare_with_baselines
+from radiotwin.closeloop.predict.baselines import (
     BOOSTING,
     EXTRA_TREES,
     Part,
@@ -17,12 +17,12 @@ from radiotwin.closeloop.baselines import (
     held_out_baselines,
     published_laws,
 )
-from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.effects.fold_model import FoldModel
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.links import prepare_links
-from radiotwin.links.features import feature_count, link_features
+from radiotwin.links.variables import feature_count, link_features
+from radiotwin.propagation.laws.log_distance import LogDistance
+from radiotwin.twin.model.fold_model import FoldModel
 
 
 @pytest.fixture

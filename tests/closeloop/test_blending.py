@@ -6,15 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.blending import held_out_coverage, make_blend
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.predictor import CombinedPrediction
-from radiotwin.effects.blend import FORESTS
-from radiotwin.effects.effect_model import EffectModel
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.predict.blending import held_out_coverage, make_blend
+from radiotwin.closeloop.predict.predictor import CombinedPrediction
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
+from radiotwin.twin.model.blend import FORESTS
+from radiotwin.twin.model.effect_model import EffectModel
 from radiotwin.twin.twin import Twin
 from tests.worlds import fly, measured
 

@@ -9,27 +9,27 @@ import pandas as pd
 import pytest
 import trimesh
 
-from radiotwin.closeloop.corrected_scene import (
+from radiotwin.closeloop.output.corrected_scene import (
     _free_position,
     _moved,
     check_corrected_target,
     write_corrected_scene,
 )
-from radiotwin.effects.gain_drift import ReceiverDrift
-from radiotwin.effects.mapped_buildings import buildings
-from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.position_errors import DevicePositionError
-from radiotwin.effects.removed_obstacle import RemovedObstacle
-from radiotwin.effects.roof_heights import Roof, RoofHeights
-from radiotwin.effects.sector_antenna import SectorAntenna
+from radiotwin.effects.boxes import buildings
+from radiotwin.effects.catalogue.gain_drift import ReceiverDrift
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
+from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
+from radiotwin.effects.catalogue.roof_heights import Roof, RoofHeights
+from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.errors import BadInput
-from radiotwin.footprints import MapOptions, build_scene_from_map
-from radiotwin.footprints.material_table import STANDARD, with_pairs
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import itu_material
-from radiotwin.scene.writer import CityShape, write_city
+from radiotwin.scene.readers import MapOptions, build_scene_from_map
+from radiotwin.scene.readers.material_table import STANDARD, with_pairs
 from radiotwin.trace import SolverSettings, trace_gains
 from tests.terrains import incline, terrain_map
 

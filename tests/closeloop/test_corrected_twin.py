@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import corrected_twin
-from radiotwin.effects.gain_offsets import ReceiverGainOffset
-from radiotwin.effects.position_errors import DevicePositionError
-from radiotwin.effects.unexplained_trend import UnexplainedTrend
+from radiotwin.closeloop.output import corrected_twin
+from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
+from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
 from tests.closeloop.drives import drive, fitted
 
 

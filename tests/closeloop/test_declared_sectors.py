@@ -12,25 +12,23 @@ import pandas as pd
 import pytest
 
 import radiotwin as rt
-from radiotwin.closeloop.baselines import EXTRA_TREES, grow_trees
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.corrected_twin import corrected_twin
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.declared import take_declared
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.selection import SelectionResult
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.output.corrected_twin import corrected_twin
+from radiotwin.closeloop.predict.baselines import EXTRA_TREES, grow_trees
+from radiotwin.closeloop.search.declared import take_declared
+from radiotwin.closeloop.search.selection import SelectionResult
 from radiotwin.effects.base import GainEffect
-from radiotwin.effects.blend import Blend
-from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
-from radiotwin.effects.declared_sectors import DeclaredSectors
-from radiotwin.effects.effect_model import EffectModel
+from radiotwin.effects.catalogue.declared_sectors import DeclaredSectors
+from radiotwin.effects.catalogue.sector_antenna import SectorPattern
 from radiotwin.effects.registry import BUILT_IN
-from radiotwin.effects.sector_antenna import SectorPattern
-from radiotwin.effects.uncertainty import estimates, linearise
 from radiotwin.links import prepare_links
-from radiotwin.links.features import link_features
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
+from radiotwin.links.variables import link_features
 from radiotwin.report.closeloop_figures import waterfall_figure
+from radiotwin.twin.model.blend import Blend
+from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
+from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.model.uncertainty import estimates, linearise
 
 MASTS_M = np.array([[150.0, 200.0, 25.0], [420.0, 330.0, 25.0]])
 AZIMUTHS_DEG = (20.0, 140.0, 260.0)

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.ends import ends_of
-from radiotwin.effects.clock_offset import ReceiverClockOffset
-from radiotwin.effects.fold_model import FittedEffect
-from radiotwin.effects.foliage import Foliage
-from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
-from radiotwin.effects.position_errors import DevicePositionError
-from radiotwin.effects.sector_antenna import SectorAntenna, SectorPattern
+from radiotwin.closeloop.search.scoring import ends_of
+from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
+from radiotwin.effects.catalogue.foliage import Foliage
+from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
+from radiotwin.effects.catalogue.sector_antenna import SectorAntenna, SectorPattern
 from radiotwin.links import prepare_links
+from radiotwin.twin.model.fold_model import FittedEffect
 
 
 @pytest.mark.parametrize("effect, params, coefficients, devices, receivers", [

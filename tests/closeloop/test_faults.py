@@ -7,26 +7,25 @@ import pandas as pd
 import pytest
 
 import radiotwin as rt
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.change_points import with_effect
-from radiotwin.closeloop.cross_validation import (
+from radiotwin.closeloop.crossfit import (
     CrossValidatedModel,
     cross_validate,
+    make_bases,
+    make_folds,
     same_effects,
     training_parts,
 )
-from radiotwin.closeloop.faults import _without, drop_idle_faults
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.scoring import CandidateScore
-from radiotwin.closeloop.selection import SelectionResult
+from radiotwin.closeloop.search.faults import _without, drop_idle_faults, with_effect
+from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.closeloop.search.selection import SelectionResult
 from radiotwin.effects.base import Term
-from radiotwin.effects.episode import Episode
-from radiotwin.effects.faulty_flight import FaultyFlight
-from radiotwin.effects.fold_model import AppliedEffect
-from radiotwin.effects.gain_drift import Drift, ReceiverDrift
+from radiotwin.effects.catalogue.episode import Episode
+from radiotwin.effects.catalogue.faulty_flight import FaultyFlight
+from radiotwin.effects.catalogue.gain_drift import Drift, ReceiverDrift
 from radiotwin.effects.params import Estimate
 from radiotwin.links import prepare_links
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
+from radiotwin.twin.model.fold_model import AppliedEffect
 
 LOSS_DB, BEGIN_S, END_S = 9.0, 330.0, 365.0
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.crossfit import make_folds
 from radiotwin.links import prepare_links
 
 

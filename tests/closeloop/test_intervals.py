@@ -5,16 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import intervals
-from radiotwin.closeloop.effect_size import effect_size_db
-from radiotwin.closeloop.intervals import effect_parameters
+from radiotwin.closeloop.verdict import intervals
+from radiotwin.closeloop.verdict.intervals import effect_parameters, effect_size_db
 from radiotwin.effects.boxes import Box
-from radiotwin.effects.excess_attenuation import ExcessAttenuation
-from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.catalogue.excess_attenuation import ExcessAttenuation
+from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
+from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.effects.params import Allowed, Parameter
-from radiotwin.effects.position_errors import DevicePositionError
-from radiotwin.effects.sector_antenna import SectorAntenna
-from radiotwin.effects.uncertainty import estimates, linearise
+from radiotwin.twin.model.uncertainty import estimates, linearise
 from tests.closeloop.drives import MASTS_M, drive, fitted
 
 AZIMUTH_DEG, WIDTH_DEG, BACK_DB = 200.0, 70.0, 20.0

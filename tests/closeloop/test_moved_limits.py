@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.bases import LogDistanceBase
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.selection import SelectionResult, forward_selection
-from radiotwin.effects.detection_limit import DetectionLimit
-from radiotwin.effects.gain_offsets import ReceiverGainOffset
+from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
+from radiotwin.closeloop.search.selection import SelectionResult, forward_selection
+from radiotwin.effects.catalogue.detection_limit import DetectionLimit
+from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.links import prepare_links
 from radiotwin.links.limits import limits_to_explain
 

@@ -2,13 +2,11 @@
 
 import pytest
 
-from radiotwin.closeloop.bases import LogDistanceBase
-from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.selection import SelectionResult, forward_selection
-from radiotwin.effects.gain_offsets import ReceiverGainOffset
-from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
+from radiotwin.closeloop.search.selection import SelectionResult, forward_selection
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.links import prepare_links
 
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.posterior import NONE, OTHER, features, judge, probability_of
-from radiotwin.closeloop.scoring import CandidateScore
-from radiotwin.closeloop.sensitivity import needed_nats
-from radiotwin.effects.clock_offset import ReceiverClockOffset
-from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
-from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.closeloop.search.posterior import NONE, OTHER, features, judge, probability_of
+from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.sensitivity import needed_nats
+from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
+from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.inference.correlated_evidence import Columns
+from radiotwin.twin.model.fitting import add_effect
 from tests.closeloop.looking import looked_at
 
 CRITERIA = SelectionCriteria()
@@ -69,7 +69,7 @@ def test_evidence_is_that_of_all_numbers_an_effect_may_have(open_ground, monkeyp
     model, hypotheses = looked_at(open_ground, seed, change)
     found, fit = add_effect(model.whole, effect, model.fits[0])
     by_laplace = hypotheses.of_named(found, fit)
-    monkeypatch.setattr("radiotwin.closeloop.hypotheses._slopes",
+    monkeypatch.setattr("radiotwin.closeloop.search.hypotheses._slopes",
                         lambda model, fit: Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0)))
     applied = found.effects[-1]
     varied = effect.variation(applied.params)

@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import cross_validation, predictor
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.predictor import combined_prediction
+from radiotwin.closeloop import crossfit as cross_validation
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
+from radiotwin.closeloop.predict import predictor
+from radiotwin.closeloop.predict.predictor import combined_prediction
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.links import prepare_links
 
 

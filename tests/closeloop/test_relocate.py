@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import relocate
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.relocate import is_better, relocate_devices
-from radiotwin.effects.fold_model import FoldModel
-from radiotwin.effects.gain_offsets import ReceiverGainOffset
+from radiotwin.closeloop.crossfit import make_bases
+from radiotwin.closeloop.search import relocate
+from radiotwin.closeloop.search.relocate import is_better, relocate_devices
+from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
+from radiotwin.twin.model.fold_model import FoldModel
 from tests.closeloop.drives import MASTS_M, drive, fitted
 
 WRONG_M = np.array([25.0, -30.0])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.result_file import (
+from radiotwin.closeloop.output.result_file import (
     errors,
     make_report,
     read_report,
@@ -17,7 +17,7 @@ from radiotwin.closeloop.result_file import (
     write_report,
 )
 from radiotwin.closeloop.run import close_loop
-from radiotwin.effects.gain_offsets import ReceiverGainOffset
+from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.errors import BadInput
 from radiotwin.report import closeloop_summary, write_closeloop_page
 

@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin import pieces
-from radiotwin.closeloop.result_file import make_report
+from radiotwin.closeloop.output.result_file import make_report
 from radiotwin.closeloop.run import close_loop
-from radiotwin.effects import fitting
 from radiotwin.effects.registry import catalogue
-from radiotwin.pieces import PieceStore, keep_pieces
-from tests.execution.jobs import needs_ray, two_workers
+from radiotwin.runtime import pieces
+from radiotwin.runtime.pieces import PieceStore, keep_pieces
+from radiotwin.twin.model import fitting
+from tests.runtime.execution.jobs import needs_ray, two_workers
 
 
 class Killed(BaseException):

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.closeloop.result_file import make_report
+from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.output.result_file import make_report
 from radiotwin.closeloop.run import best_base, close_loop
 from radiotwin.errors import BadInput
 

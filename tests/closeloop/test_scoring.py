@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.channel.log_distance import LogDistance, LogDistanceLine
-from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.scoring import Candidate, fit_candidate
+from radiotwin.closeloop.search.scoring import Candidate, fit_candidate
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.effects.boxes import Box
-from radiotwin.effects.fold_model import FoldModel
-from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
+from radiotwin.propagation.laws.log_distance import LogDistance, LogDistanceLine
 from radiotwin.scene.citymap import CityMap
+from radiotwin.twin.model.fold_model import FoldModel
 
 DEVICES_M, MOVED_M = np.array([[0.0, 0.0, 10.0], [300.0, 200.0, 10.0]]), np.array([[14.0, -18.0, 0.0], [0.0, 0.0, 0.0]])
 

@@ -6,17 +6,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import posterior, selection
-from radiotwin.closeloop.bases import LogDistanceBase
-from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.cross_validation import CrossValidatedModel, cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.pairs import Passed
-from radiotwin.closeloop.posterior import Step
+from radiotwin.closeloop.crossfit import (
+    CrossValidatedModel,
+    LogDistanceBase,
+    cross_validate,
+    make_folds,
+    training_parts,
+)
 from radiotwin.closeloop.run import close_loop
-from radiotwin.closeloop.scoring import CandidateScore, score_model
-from radiotwin.closeloop.selection import SelectionResult, forward_selection
-from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.closeloop.search import posterior, selection
+from radiotwin.closeloop.search.posterior import Step
+from radiotwin.closeloop.search.scoring import CandidateScore, score_model
+from radiotwin.closeloop.search.selection import Passed, SelectionResult, forward_selection
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.links import prepare_links
 
 

@@ -5,12 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.result_file import _for_json
-from radiotwin.closeloop.sensitivity import detectable, needed_nats
-from radiotwin.closeloop.typical_patterns import MIN_LINKS, median_azimuth_deg, typical_patterns
-from radiotwin.effects.faulty_flight import FaultyFlight
-from radiotwin.effects.position_errors import MIN_MOVE_M
+from radiotwin.closeloop.output.result_file import _for_json
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.sensitivity import (
+    MIN_LINKS,
+    detectable,
+    median_azimuth_deg,
+    needed_nats,
+    typical_patterns,
+)
+from radiotwin.effects.catalogue.faulty_flight import FaultyFlight
+from radiotwin.effects.catalogue.position_errors import MIN_MOVE_M
 from tests.closeloop.looking import looked_at
 
 CRITERIA = SelectionCriteria()
@@ -33,10 +38,10 @@ def nothing_hidden(seen):
 @pytest.fixture
 def sizes(monkeypatch):
     """`sizes(view, hypotheses, *names)`: of those families only, and of two members, as searches take their time."""
-    monkeypatch.setattr("radiotwin.closeloop.typical_patterns.MAX_MEMBERS", 2)
+    monkeypatch.setattr("radiotwin.closeloop.verdict.sensitivity.MAX_MEMBERS", 2)
 
     def make(view, hypotheses, *names, criteria=CRITERIA):
-        monkeypatch.setattr("radiotwin.closeloop.sensitivity.typical_patterns", lambda view: (
+        monkeypatch.setattr("radiotwin.closeloop.verdict.sensitivity.typical_patterns", lambda view: (
             each for each in typical_patterns(view) if each.effect.name in names))
         return {each.name: each.size for each in detectable(view, hypotheses, criteria)}
     return make

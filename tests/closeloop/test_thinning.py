@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import thinning
-from radiotwin.closeloop.result_file import make_report
-from radiotwin.closeloop.run import close_loop
-from radiotwin.closeloop.thinning import thin_links
+from radiotwin.closeloop import run as thinning
+from radiotwin.closeloop.output.result_file import make_report
+from radiotwin.closeloop.run import close_loop, thin_links
 from radiotwin.links import prepare_links
 
 

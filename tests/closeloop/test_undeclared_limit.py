@@ -6,15 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.bases import LogDistanceBase
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.result_file import errors
+from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
+from radiotwin.closeloop.output.result_file import errors
 from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
 from radiotwin.links.limits import limits_to_explain
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
 
 LIMIT_DBM, DEFAULT_DBM, LINKS = -140.0, -120.0, 2000
 DEVICE_M = [(20.0, 20.0, 10.0), (150.0, 130.0, 10.0)]

@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.corrected_twin import corrected_twin
-from radiotwin.closeloop.result_file import make_report
+from radiotwin.closeloop.output.corrected_twin import corrected_twin
+from radiotwin.closeloop.output.result_file import make_report
 from radiotwin.closeloop.run import close_loop
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
 from radiotwin.report.closeloop_data import collect
 from radiotwin.twin import Twin
 
@@ -100,7 +100,7 @@ def test_a_building_that_the_map_lacks_is_found_and_goes_into_the_twin(small_sce
 
 @pytest.mark.usefixtures("short_report")
 def test_a_building_that_is_gone_is_named(small_scene):
-    from radiotwin.effects.mapped_buildings import buildings
+    from radiotwin.effects.boxes import buildings
     from radiotwin.scene.citymap import CityMap
 
     label, centres_m = buildings(small_scene.city)

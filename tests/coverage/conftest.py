@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.channel.log_distance import LogDistance, LogDistanceLine
-from radiotwin.localize import TwinDevice
+from radiotwin.propagation.laws.log_distance import LogDistance, LogDistanceLine
 from radiotwin.scene import Scene
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import parse_config, write_config
 from radiotwin.scene.materials import itu_material
-from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.twin import Twin
+from radiotwin.twin.localize import TwinDevice
 
 FREQUENCY_HZ = 2e9
 FREE_SPACE_AT_1_M_DB = 20 * math.log10(299_792_458.0 / FREQUENCY_HZ / (4 * math.pi))

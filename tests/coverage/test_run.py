@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import shapely
 
-from radiotwin.antennas import Antenna, Pattern
 from radiotwin.coverage import CoverageSettings, Transmitter, predict_coverage
 from radiotwin.coverage.areas import Area, _covered
 from radiotwin.coverage.grid import CoverageGrid, ground_of
 from radiotwin.errors import BadInput
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import coverage_figures
+from radiotwin.scene.antennas import Antenna, Pattern
 from radiotwin.scene.lattice import Lattice
 
 FREE_SPACE_AT_1_M_DB = 20 * math.log10(299_792_458.0 / 2e9 / (4 * math.pi))

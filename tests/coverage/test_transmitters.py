@@ -8,9 +8,9 @@ from radiotwin.coverage.transmitters import (
     with_defaults,
 )
 from radiotwin.errors import BadInput
-from radiotwin.frames import write_frame
-from radiotwin.geodesy import to_geographic, to_local
-from radiotwin.tables import Origin
+from radiotwin.geo.frames import write_frame
+from radiotwin.geo.geodesy import to_geographic, to_local
+from radiotwin.io.forms import Origin
 
 PATTERN = "azimuth_deg,elevation_deg,gain_dbi\n" + "".join(
     f"{azimuth},{elevation},{10 - azimuth / 20}\n" for azimuth in (0, 90, 180, 270) for elevation in (-90, 0, 90))

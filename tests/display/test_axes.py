@@ -9,7 +9,7 @@ from pyproj import Geod
 from radiotwin.display import PlotFrame
 from radiotwin.display.axes import draw_cells
 from radiotwin.errors import BadInput
-from radiotwin.tables import Origin
+from radiotwin.io.forms import Origin
 
 matplotlib.use("Agg")
 ORIGIN = Origin(latitude_deg=60.0, longitude_deg=10.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import radiotwin as rt
-from radiotwin.closeloop.result_file import scores
-from radiotwin.effects.residual_view import ResidualView
+from radiotwin.closeloop.output.result_file import scores
+from radiotwin.effects.base import ResidualView
 from tests.worlds import make_links, open_ground
 
 __all__ = ["make_links", "open_ground"]

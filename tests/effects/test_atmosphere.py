@@ -6,9 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from radiotwin.effects.atmosphere import TABLE, max_gas_db_km, max_rain_db_km
-from radiotwin.effects.excess_attenuation import ExcessAttenuation, max_at_ground_db_km
-from radiotwin.effects.vegetation import max_loss_db, specific_db_m
+from radiotwin.effects.catalogue.excess_attenuation import ExcessAttenuation, max_at_ground_db_km
+from radiotwin.effects.losses import (
+    TABLE,
+    max_gas_db_km,
+    max_loss_db,
+    max_rain_db_km,
+    specific_db_m,
+)
 
 
 @pytest.mark.parametrize("ghz, k, alpha", [  # ITU-R P.838-3, Table 5, horizontal polarisation

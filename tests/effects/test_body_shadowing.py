@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.effects.body_shadowing import Body, BodyShadowing
+from radiotwin.effects.catalogue.body_shadowing import Body, BodyShadowing
 from radiotwin.effects.params import Estimate
 
 

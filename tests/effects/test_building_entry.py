@@ -7,11 +7,11 @@ import pytest
 import trimesh
 from scipy.stats import norm
 
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.effects.building_entry import BuildingEntry, entry_loss_db
-from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.catalogue.building_entry import BuildingEntry, entry_loss_db
+from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.scene.citymap import CityMap
+from radiotwin.twin.model.fitting import add_effect
+from radiotwin.twin.model.fold_model import FoldModel
 
 
 @pytest.mark.parametrize("ghz, elevation_deg, building, values", [

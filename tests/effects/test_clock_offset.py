@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.effects.clock_offset import ReceiverClockOffset
+from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
 
 DEVICES_M = np.array([[0.0, 0, 1.5], [150, 40, 1.5], [-80, 160, 1.5]])
 SLOTS, FLIGHTS, SPEED_M_S = 60, 2, 8.0

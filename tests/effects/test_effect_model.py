@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.effects.effect_model import EffectModel, device_sd_db
-from radiotwin.effects.fold_model import FittedEffect, FoldModel
-from radiotwin.effects.lock_loss import LockLoss
-from radiotwin.effects.path_strength import WallReflection
-from radiotwin.effects.roof_heights import RoofHeights
+from radiotwin.effects.catalogue.lock_loss import LockLoss
+from radiotwin.effects.catalogue.path_strength import WallReflection
+from radiotwin.effects.catalogue.roof_heights import RoofHeights
 from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.inference.censored_regression import FitResult
+from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.scene.citymap import CityMap
+from radiotwin.twin.model.effect_model import EffectModel, device_sd_db
+from radiotwin.twin.model.fold_model import FittedEffect, FoldModel
 
 
 def test_positions_are_sought_without_what_follows_paths_or_many_maps():

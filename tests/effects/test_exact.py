@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.effects import fitting
-from radiotwin.effects.clock_offset import ReceiverClockOffset
-from radiotwin.effects.fitting import add_effect, along_paths
-from radiotwin.effects.fold_model import FoldModel
-from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
-from radiotwin.effects.removed_obstacle import RemovedObstacle, only_blocker
+from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
+from radiotwin.effects.catalogue.position_errors import DevicePositionError, ReceiverPositionError
+from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle, only_blocker
 from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.scene.citymap import CityMap
+from radiotwin.twin.model import fitting
+from radiotwin.twin.model.fitting import add_effect, along_paths
+from radiotwin.twin.model.fold_model import FoldModel
 
 FAR_M, NEAR_M = [-300.0, 300, 60], [60.0, 0, 10]
 

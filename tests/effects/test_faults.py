@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from radiotwin.effects.catalogue.episode import Episode, _is_same, _Window
+from radiotwin.effects.catalogue.faulty_flight import FaultyFlight
 from radiotwin.effects.comparison import by_precision, compared_db, mean_by_precision
-from radiotwin.effects.episode import Episode, _is_same, _Window
-from radiotwin.effects.faulty_flight import FaultyFlight
 
 FLIGHTS, SLOTS, DEVICES, NOISE_DB, HIDDEN_DB = 6, 60, 5, 2.0, 12.0
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from radiotwin.effects.foliage import Foliage, VegetationLoss
-from radiotwin.effects.vegetation import max_loss_db
+from radiotwin.effects.catalogue.foliage import Foliage, VegetationLoss
+from radiotwin.effects.losses import max_loss_db
 
 
 @pytest.fixture

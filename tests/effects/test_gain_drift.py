@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.effects.gain_drift import DeviceDrift, Drift, ReceiverDrift
+from radiotwin.effects.catalogue.gain_drift import DeviceDrift, Drift, ReceiverDrift
 
 SLOTS, FLIGHT_S = 200, 300.0
 

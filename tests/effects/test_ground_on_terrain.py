@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from radiotwin.effects.boxes import Box
-from radiotwin.effects.ground_reflection import bounces_on_terrain, two_ray_db
-from radiotwin.effects.interference import Interference
-from radiotwin.effects.missing_obstacle import _with_box
-from radiotwin.effects.removed_obstacle import RemovedObstacle, only_blocker
+from radiotwin.effects.catalogue.ground_reflection import bounces_on_terrain, two_ray_db
+from radiotwin.effects.catalogue.interference import Interference
+from radiotwin.effects.catalogue.missing_obstacle import _with_box
+from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle, only_blocker
 from tests.terrains import incline, ridge, terrain_map
 
 

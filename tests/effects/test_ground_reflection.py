@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.effects.effect_model import EffectModel
-from radiotwin.effects.fold_model import FittedEffect
-from radiotwin.effects.ground_reflection import GroundReflection, two_ray_db
-from radiotwin.effects.interference import Interference
-from radiotwin.effects.lock_loss import LockLoss
+from radiotwin.effects.catalogue.ground_reflection import GroundReflection, two_ray_db
+from radiotwin.effects.catalogue.interference import Interference
+from radiotwin.effects.catalogue.lock_loss import LockLoss
 from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin import Twin, TwinDevice
+from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.model.fold_model import FittedEffect
 
 FREQUENCY_HZ = 2.4e9
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.effects.interference import Interference
+from radiotwin.effects.catalogue.interference import Interference
 from radiotwin.scene.citymap import CityMap
 
 

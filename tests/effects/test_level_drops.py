@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.effects.lock_loss import LockLoss
+from radiotwin.effects.catalogue.lock_loss import LockLoss
 
 SCALE_DB, SLOTS, DEVICES, DROP_DB = 3.0, 300, 5, 20.0
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from radiotwin.effects.excess_attenuation import ExcessAttenuation
-from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.catalogue.excess_attenuation import ExcessAttenuation
+from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.effects.params import Estimate
 
 DEVICES_M = np.array([[0.0, 0, 1.5], [100, 0, 1.5], [0, 100, 1.5]])

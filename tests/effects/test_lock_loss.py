@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.effects.lock_loss import LockLoss
+from radiotwin.effects.catalogue.lock_loss import LockLoss
 
 LIMIT_DB, SCALE_DB, SLOTS, DEVICES = -110.0, 2.0, 400, 5
 

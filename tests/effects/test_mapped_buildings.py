@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.effects.mapped_buildings import (
+from radiotwin.effects.boxes import (
     HEIGHT_SD_M,
     building_extents_m,
     building_height_sds_m,

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.fold_model import FoldModel
-from radiotwin.effects.mapped_vegetation import MappedVegetation
+from radiotwin.closeloop.crossfit import make_bases
+from radiotwin.effects.catalogue.mapped_vegetation import MappedVegetation
 from radiotwin.effects.registry import effect_named
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
+from radiotwin.twin.model.fitting import add_effect
+from radiotwin.twin.model.fold_model import FoldModel
 
 WOOD = [(100.0, 0.0), (220.0, 0.0), (220.0, 300.0), (100.0, 300.0)]
 HEIGHT_M, SPECIFIC_DB_M, MOST_DB = 15.0, 0.2, 1.37 * 2400.0**0.42  # A_m of ITU-R P.833-10 at 2.4 GHz

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.channel.followed_paths import path_gains
-from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.effects.boxes import Box, stands_on
-from radiotwin.effects.fitting import along_paths
-from radiotwin.effects.fold_model import FoldModel
-from radiotwin.effects.foliage import Foliage
-from radiotwin.effects.missing_obstacle import SHAPES, MissingObstacle
-from radiotwin.effects.refining import refine
+from radiotwin.effects.catalogue.foliage import Foliage
+from radiotwin.effects.catalogue.missing_obstacle import SHAPES, MissingObstacle
+from radiotwin.propagation.laws.followed_paths import path_gains
+from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
+from radiotwin.twin.model.fitting import along_paths, refine
+from radiotwin.twin.model.fold_model import FoldModel
 
 
 def test_where_no_link_has_line_of_sight_nothing_can_be_missing(make_links, view):

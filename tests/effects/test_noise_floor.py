@@ -5,17 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.closeloop.selection import fit_candidate, score_candidate
-from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.fold_model import FoldModel
-from radiotwin.effects.noise_floor import NoiseFloor
-from radiotwin.effects.refining import refine
-from radiotwin.execution import Executor
+from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.search.selection import fit_candidate, score_candidate
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.effects.catalogue.noise_floor import NoiseFloor
 from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.links import evidence_blocks
+from radiotwin.propagation.laws.log_distance import LogDistance
+from radiotwin.runtime.execution import Executor
+from radiotwin.twin.model.fitting import add_effect, refine
+from radiotwin.twin.model.fold_model import FoldModel
 
 LIMIT_DB, FLOOR_DB, RAISED = -112.0, -97.0, 1
 RECEIVERS, LINKS = 3, 500

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
+from radiotwin.effects.catalogue.position_errors import DevicePositionError, ReceiverPositionError
 
 DEVICES_M = np.array([[0.0, 0, 1.5], [150, 40, 1.5]])
 

@@ -31,7 +31,7 @@ def installed(monkeypatch):
             return [EntryPoint(name, effect, group) if isinstance(effect, str)
                     else SimpleNamespace(name=name, value=f"package:{name}", load=lambda effect=effect: effect)
                     for name, effect in points.items()]
-        monkeypatch.setattr("radiotwin.plugins.entry_points", entry_points)
+        monkeypatch.setattr("radiotwin.runtime.plugins.entry_points", entry_points)
     monkeypatch.setattr(registry, "_registered", [])
     install()
     return install

@@ -6,10 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.effects.relatives import Relatives, RelativesState
-from radiotwin.effects.sector_levels import GROUP_SD_DB, level_groups, own_sd_db, unheard_sd_db
+from radiotwin.effects.catalogue.declared_sectors import (
+    GROUP_SD_DB,
+    level_groups,
+    own_sd_db,
+    unheard_sd_db,
+)
 from radiotwin.links import LinkData
 from radiotwin.links.sites import antenna_of, relatives_of
+from radiotwin.twin.model.correlated_shadowing import Relatives, RelativesState
 
 MASTS_M = np.array([[100.0, 100, 25], [400, 300, 25]])
 # Two masts of two directions, two carriers of each; and a device by itself.

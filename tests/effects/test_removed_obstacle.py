@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.effects.boxes import Box
-from radiotwin.effects.mapped_buildings import buildings
-from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.removed_obstacle import RemovedObstacle
+from radiotwin.effects.boxes import Box, buildings
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
+from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
 from radiotwin.scene.citymap import CityMap
 from tests.scene.test_citymap import clip_interval
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.effects.roof_crossings import SAMPLES, roof_crossings
+from radiotwin.effects.catalogue.roof_heights import SAMPLES, roof_crossings
 from radiotwin.scene.citymap import CityMap
 
 

@@ -4,13 +4,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.fold_model import FoldModel
+from radiotwin.closeloop.crossfit import make_bases
+from radiotwin.effects.catalogue.roof_heights import (
+    Roof,
+    RoofHeights,
+    beside_the_others,
+    surely_off,
+)
 from radiotwin.effects.params import QUANTILE_90
-from radiotwin.effects.roof_heights import Roof, RoofHeights, beside_the_others, surely_off
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
+from radiotwin.twin.model.fitting import add_effect
+from radiotwin.twin.model.fold_model import FoldModel
 
 CORNERS_M = [(-80.0, -20.0), (-15.0, -15.0), (50.0, -25.0), (-40.0, 60.0)]  # south-western, of blocks of 30 by 30 m
 MAPPED_M = (20.0, 18.0, 22.0, 15.0)
@@ -149,7 +154,7 @@ def test_only_links_over_a_roof_change_and_by_no_more_than_both_classes_differ(w
 
 
 def _number(corner_m):
-    from radiotwin.effects.mapped_buildings import buildings
+    from radiotwin.effects.boxes import buildings
 
     centres_m = buildings(city())[1]
     return int(np.argmin(np.hypot(*(centres_m[:, :2] - np.add(corner_m, 15.0)).T)))

@@ -5,12 +5,12 @@ import pytest
 import trimesh
 from scipy.stats import norm
 
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.effects import uncertain_sight
-from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.fold_model import FoldModel
-from radiotwin.effects.uncertain_sight import UncertainSight
+from radiotwin.closeloop.crossfit import make_bases
+from radiotwin.effects.catalogue import uncertain_sight
+from radiotwin.effects.catalogue.uncertain_sight import UncertainSight
 from radiotwin.scene.citymap import CityMap
+from radiotwin.twin.model.fitting import add_effect
+from radiotwin.twin.model.fold_model import FoldModel
 
 BEHIND_DB = 20.0
 

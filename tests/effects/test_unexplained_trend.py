@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
 from radiotwin.effects.registry import effect_named
-from radiotwin.effects.unexplained_trend import UnexplainedTrend
 from radiotwin.errors import BadInput
 
 

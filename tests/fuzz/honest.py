@@ -21,7 +21,7 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 
-from tests.footprints import city_models
+from tests.scene.readers import city_models
 
 SQUARE = [[8.001, 50.001], [8.002, 50.001], [8.002, 50.002], [8.001, 50.002], [8.001, 50.001]]
 RUN = "scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false --planner-iterations 50 --hidden 8"
@@ -127,7 +127,7 @@ def _write_maps(folder: Path) -> None:
     shape = {"type": "Polygon", "coordinates": [SQUARE]}
     feature = {"type": "Feature", "properties": {"building": "yes", "height": "12"}, "geometry": shape}
     (folder / "town.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
-    (folder / "town.osm").write_bytes((Path(__file__).parents[1] / "footprints" / "town.osm").read_bytes())
+    (folder / "town.osm").write_bytes((Path(__file__).parents[1] / "scene" / "readers" / "town.osm").read_bytes())
     import pyogrio  # an extra, in the test extra, too
     import rasterio
     import shapely

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from radiotwin.importing import import_files, read_settings
-from radiotwin.measurements import read_measurements
+from radiotwin.links.measurements import read_measurements
 
 SAMPLES = Path(__file__).parent / "samples"
 

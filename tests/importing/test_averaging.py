@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.importing.averaging import average, in_wavelengths
+from radiotwin.importing.repeats import average, in_wavelengths
 
 
 def track(x_m, level_db, **others):

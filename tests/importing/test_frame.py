@@ -7,7 +7,7 @@ from scipy.integrate import quad
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.frame import Frame, find_frame, to_geographic
-from radiotwin.tables import Origin
+from radiotwin.io.forms import Origin
 
 A_M, F = 6378137.0, 1 / 298.257223563
 E2 = F * (2 - F)

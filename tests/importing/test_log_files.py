@@ -9,7 +9,7 @@ import pytest
 from radiotwin.errors import BadInput
 from radiotwin.importing import import_files, read_settings
 from radiotwin.importing.log_files import list_files
-from radiotwin.measurements import read_measurements
+from radiotwin.links.measurements import read_measurements
 
 MAPPING = {"level": "level", "device": "device", "x": "x", "y": "y", "time": "t"}
 GIVEN = {"level_unit": "dBm", "length_unit": "m", "time_format": "epoch s"}

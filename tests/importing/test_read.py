@@ -9,7 +9,7 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.read_source import read_source
-from radiotwin.importing.settings_file import read_settings
+from radiotwin.importing.settings import read_settings
 
 TEXT = "device,x,y,level\na,0,0,-80\nb,3,4,-90\n"
 

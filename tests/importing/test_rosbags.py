@@ -11,7 +11,7 @@ import pytest
 from radiotwin.cli import main
 from radiotwin.errors import BadInput
 from radiotwin.importing.tracks.rosbag import read_rosbag
-from radiotwin.measurements import read_measurements
+from radiotwin.links.measurements import read_measurements
 
 rosbags = pytest.importorskip("rosbags")
 START = int(pd.Timestamp("2024-03-01 10:00:00Z").timestamp())

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from radiotwin.effects.noise_floor import floored
+from radiotwin.effects.catalogue.noise_floor import floored
 from radiotwin.inference.censored_regression import (
     CensoredRegression,
     FitResult,

@@ -10,7 +10,7 @@ from radiotwin.inference.dependence import (
     levels_of,
     permutation_p_value,
 )
-from radiotwin.inference.evidence import FLIPS, sign_flip_p_value
+from radiotwin.inference.held_out import FLIPS, sign_flip_p_value
 
 SERIES, LENGTH = 12, 60
 

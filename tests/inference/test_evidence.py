@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
+from radiotwin.inference.held_out import cross_fit_p_value, sign_flip_p_value
 
 
 def test_the_cross_fit_p_value_bounds_the_probability_of_a_gain_that_is_chance():

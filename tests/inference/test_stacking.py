@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.inference.stacking import combine, convex_weights
+from radiotwin.inference.held_out import combine, convex_weights
 
 
 def test_weights_are_not_negative_and_sum_to_one():

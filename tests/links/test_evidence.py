@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.thinning import thin_piles
+from radiotwin.closeloop.crossfit import make_folds
+from radiotwin.closeloop.run import thin_piles
 from radiotwin.links import (
     LinkData,
     correlation_length_m,
@@ -15,7 +15,7 @@ from radiotwin.links import (
     residual_variables,
     with_evidence,
 )
-from radiotwin.links.clocks import clocks_restart
+from radiotwin.links.link_data import clocks_restart
 
 
 def flown(seed, length_m, noise_sd=0.5, flights=6, devices=3, slots=60, step_m=10.0, side_m=600.0, restart=False):

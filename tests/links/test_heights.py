@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin.io.forms import Origin
 from radiotwin.links import prepare_links
-from radiotwin.links.heights import height_notes
-from radiotwin.measurements import Measurements
-from radiotwin.tables import Origin
+from radiotwin.links.checks import height_notes
+from radiotwin.links.measurements import Measurements
 from tests.terrains import terrain_map
 
 FLIGHT_M = np.column_stack([np.linspace(-100, 100, 50), np.zeros(50), np.linspace(30, 80, 50)])

@@ -7,8 +7,7 @@ import pytest
 import trimesh
 from scipy.stats import norm
 
-from radiotwin.links.checks import check_positions
-from radiotwin.links.indoors import chance_inside
+from radiotwin.links.checks import chance_inside, check_positions
 from radiotwin.scene.citymap import CityMap
 
 

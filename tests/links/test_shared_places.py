@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from radiotwin.links import LinkData
-from radiotwin.links.shared_places import receiver_differences
+from radiotwin.links.sites import receiver_differences
 
 OFFSET_DB, SQUARE_M = -4.0, 100.0
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from radiotwin.links import variogram
-from radiotwin.links.variogram import Trend, Variogram, pairs_of_links
+from radiotwin.links import correlation as variogram
+from radiotwin.links.correlation import Trend, Variogram, pairs_of_links
 
 
 def tracks(seed, flights=4, slots=80, side_m=400.0):

@@ -10,7 +10,7 @@ import torch
 from hypothesis import strategies as st
 
 from marl.mission import Known, Mission, make_mission
-from radiotwin.survey import segmented_truth
+from radiotwin.maps.survey import segmented_truth
 
 FAR = 2**60  # moves home from a cell without a way
 STEPS = [(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1), (0, 0)]  # hover, north, west, south, east, no-op: (row, column)

@@ -22,7 +22,7 @@ from marl.planner import PlanPolicy
 from marl.settings import PRESETS, RunSettings
 from marl.training import Trainer
 from radiotwin.errors import BadInput
-from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 
 LEARNER = PRESETS["fast"].model_copy(update={"parallel": 10, "batch": 8, "replay": 60, "federate_every": 20,

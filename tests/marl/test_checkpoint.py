@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from marl.checkpoint import load_checkpoint, save_checkpoint
-from radiotwin.array_file import write_arrays
 from radiotwin.errors import BadInput
+from radiotwin.io.array_file import write_arrays
 
 
 def test_every_type_of_value_comes_back(tmp_path):

@@ -12,16 +12,15 @@ import torch
 import marl.replicas
 from marl.algorithm1 import run_algorithm
 from marl.fedqmix import federation
-from marl.fedqmix.client import Client, Party, rounds_of
+from marl.fedqmix.client import Client, Party, ProximalNetworks, rounds_of
 from marl.fedqmix.federation import average, require_weights
-from marl.fedqmix.proximal import ProximalNetworks
 from marl.fedqmix.session import FederatedSession, federate
 from marl.fedqmix.settings import EngineSettings, FederationSettings, check_federation
 from marl.fedqmix.shared import Shared, initial_weights
 from marl.settings import PRESETS, RunSettings
 from radiotwin.errors import BadInput
-from radiotwin.exits import exit_status
-from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.maps.survey import fly_survey, segmented_truth
+from radiotwin.runtime.exits import exit_status
 
 LEARNER = PRESETS["fast"].model_copy(update={
     "parallel": 4, "batch": 4, "replay": 16, "hidden": 8, "mixing_width": 4, "federate_every": 8,

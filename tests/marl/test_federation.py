@@ -11,7 +11,7 @@ from marl.replicas import Replicas
 from marl.settings import PRESETS
 from marl.training import Trainer
 from radiotwin.errors import RunFailed
-from radiotwin.survey import segmented_truth
+from radiotwin.maps.survey import segmented_truth
 
 SETTINGS = PRESETS["fast"].model_copy(update={"parallel": 4, "batch": 4, "replay": 8, "hidden": 8, "mixing_width": 4})
 

@@ -14,7 +14,7 @@ import pytest
 
 from marl.checkpoint import load_checkpoint
 from marl.options import settings_of
-from radiotwin import cuda
+from radiotwin.runtime import cuda
 
 SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "
          "--planner-iterations 300 ")

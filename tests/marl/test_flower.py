@@ -28,13 +28,17 @@ from marl.checkpoint import load_checkpoint  # noqa: E402
 from marl.fedqmix import flower_client  # noqa: E402
 from marl.fedqmix.client import Party  # noqa: E402
 from marl.fedqmix.federation import average  # noqa: E402
-from marl.fedqmix.flower_records import arrays_of  # noqa: E402
-from marl.fedqmix.flower_run import Federation, Processes, free_port  # noqa: E402
+from marl.fedqmix.flower_records import arrays_of
+from marl.fedqmix.flower_run import (  # noqa: E402
+    Federation,
+    Processes,
+    free_port,
+    make_node_key,  # noqa: E402
+)
 from marl.fedqmix.flower_server import Record, make_strategy  # noqa: E402
-from marl.fedqmix.keys import make_node_key  # noqa: E402
 from marl.fedqmix.session import FederatedSession, federate  # noqa: E402
 from marl.fedqmix.settings import EngineSettings, FederationSettings  # noqa: E402
-from marl.fedqmix.shared import Shared, initial_weights, write_app  # noqa: E402
+from marl.fedqmix.shared import Shared, initial_weights, write_app
 from marl.settings import PRESETS, RunSettings  # noqa: E402
 from radiotwin.errors import RunFailed  # noqa: E402
 

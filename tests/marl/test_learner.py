@@ -14,7 +14,7 @@ from marl.registry import LEARNERS, learner_class
 from marl.session import Session
 from marl.settings import LearnerSettings, RunSettings, check_together
 from radiotwin.errors import BadInput
-from radiotwin.survey import segmented_truth
+from radiotwin.maps.survey import segmented_truth
 
 DOCS = Path(__file__).parents[2] / "docs" / "marl.md"
 

@@ -7,9 +7,9 @@ import pytest
 
 from marl.mission import Known, make_mission
 from radiotwin.errors import BadInput
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import segmented_truth
 from radiotwin.scene import Scene
-from radiotwin.survey import segmented_truth
 
 
 def changed(scene, **parts):

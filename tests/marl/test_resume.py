@@ -14,7 +14,7 @@ from marl.mission import Known, make_mission
 from marl.resume import _blocks, restored
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
-from radiotwin.survey import segmented_truth
+from radiotwin.maps.survey import segmented_truth
 
 RUN = RunSettings(truth="segmented", twin="log-distance", algorithm="qmix", guide="planner", real_episodes=2, episodes=4,
                   planner_iterations=50, flights=2, seed=1)

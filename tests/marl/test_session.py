@@ -12,8 +12,8 @@ from marl.mission import Known, make_mission
 from marl.session import Session, _world
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
-from radiotwin.radiomap import RadioMap
-from radiotwin.survey import segmented_truth
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import segmented_truth
 from radiotwin.twin import Twin
 
 WORLD = {"city": "a", "scene.toml": "b", "truth": "c", "truth besides gain_db": "e"}

@@ -4,7 +4,7 @@ import pytest
 
 from marl.options import settings_of
 from marl.settings import LearnerSettings, RunSettings
-from marl.sizes import check_sizes
+from marl.threads import check_sizes
 from radiotwin.errors import BadInput
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from radiotwin.measurements import Measurements, read_measurements
+from radiotwin.links.measurements import Measurements, read_measurements
 
 DATA = Path(os.environ.get("RADIOTWIN_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from radiotwin.measurements import read_measurements
+from radiotwin.links.measurements import read_measurements
 from radiotwin.scene import Scene
 
 COMMAND = Path(sys.executable).with_name("radiotwin")

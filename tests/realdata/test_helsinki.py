@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.footprints import build_scene_from_map
-from radiotwin.localize import TwinDevice
+from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
+from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.twin import Twin
+from radiotwin.twin.localize import TwinDevice
 
 pytestmark = pytest.mark.slow
 

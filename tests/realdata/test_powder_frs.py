@@ -6,8 +6,8 @@ import pytest
 from scipy.stats import wilcoxon
 
 from radiotwin import close_loop, make_report
-from radiotwin.effects.effect_model import EffectModel
-from radiotwin.localize import locate, whole_area
+from radiotwin.twin.localize import locate, whole_area
+from radiotwin.twin.model.effect_model import EffectModel
 from studies.closeloop_real import floor_errors_db, permuted
 
 pytestmark = pytest.mark.slow

@@ -1,7 +1,7 @@
 """Two phones on one campus: compared where both were, in spite of the places where only one was."""
 
 from radiotwin.links import prepare_links
-from radiotwin.links.shared_places import receiver_differences
+from radiotwin.links.sites import receiver_differences
 
 
 def test_they_differ_by_some_decibels_and_not_alike_for_every_sector(duke):

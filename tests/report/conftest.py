@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.scene import Scene
-from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

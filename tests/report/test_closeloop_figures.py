@@ -6,35 +6,34 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.closeloop.result_file import make_report
+from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.output.result_file import make_report
 from radiotwin.closeloop.run import Loop, close_loop
-from radiotwin.closeloop.selection import SelectionResult
-from radiotwin.effects.body_shadowing import BodyShadowing
-from radiotwin.effects.clock_offset import ReceiverClockOffset
-from radiotwin.effects.detection_limit import DetectionLimit
-from radiotwin.effects.excess_attenuation import ExcessAttenuation
-from radiotwin.effects.foliage import Foliage
-from radiotwin.effects.gain_drift import DeviceDrift, ReceiverDrift
-from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
-from radiotwin.effects.interference import Interference
-from radiotwin.effects.lock_loss import LockLoss
-from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.noise_floor import NoiseFloor
-from radiotwin.effects.path_strength import WallReflection
-from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
-from radiotwin.effects.receiver_saturation import ReceiverSaturation
-from radiotwin.effects.removed_obstacle import RemovedObstacle
-from radiotwin.effects.sector_antenna import SectorAntenna
-from radiotwin.effects.tilted_dipole import TiltedDipole
-from radiotwin.measurements import Measurements
-from radiotwin.report.binning import bin_index, bin_means
-from radiotwin.report.closeloop_data import collect
+from radiotwin.closeloop.search.selection import SelectionResult
+from radiotwin.effects.catalogue.body_shadowing import BodyShadowing
+from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
+from radiotwin.effects.catalogue.detection_limit import DetectionLimit
+from radiotwin.effects.catalogue.excess_attenuation import ExcessAttenuation
+from radiotwin.effects.catalogue.foliage import Foliage
+from radiotwin.effects.catalogue.gain_drift import DeviceDrift, ReceiverDrift
+from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.catalogue.interference import Interference
+from radiotwin.effects.catalogue.lock_loss import LockLoss
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
+from radiotwin.effects.catalogue.noise_floor import NoiseFloor
+from radiotwin.effects.catalogue.path_strength import WallReflection
+from radiotwin.effects.catalogue.position_errors import DevicePositionError, ReceiverPositionError
+from radiotwin.effects.catalogue.receiver_saturation import ReceiverSaturation
+from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
+from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
+from radiotwin.effects.catalogue.tilted_dipole import TiltedDipole
+from radiotwin.links.measurements import Measurements
+from radiotwin.report.closeloop_data import bin_index, bin_means, collect
 from radiotwin.report.closeloop_figures import dependence_figure, write_closeloop_figures
 from radiotwin.report.closeloop_maps import residual_map_figure
 from radiotwin.report.closeloop_page import write_closeloop_page
 from radiotwin.report.effect_figures import effect_figure
-from radiotwin.report.map_background import MapBackground
+from radiotwin.report.map_figures import MapBackground
 from radiotwin.report.style import save
 
 

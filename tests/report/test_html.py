@@ -18,7 +18,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from radiotwin.errors import BadInput
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import html, read_run, write_closeloop_page, write_report
 from radiotwin.report.html import Table
 

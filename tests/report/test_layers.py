@@ -6,9 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.radiomap import RadioMap
-from radiotwin.report import Run, city, layers, read_run
-from radiotwin.report.packing import NOT_DETECTED, pack, pack_db
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.report import Run, read_run
+from radiotwin.report import viewer as city
+from radiotwin.report import viewer as layers
+from radiotwin.report.viewer import NOT_DETECTED, pack, pack_db
 from radiotwin.twin import Twin, TwinDevice
 
 

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import map_figures
 
 

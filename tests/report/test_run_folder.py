@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import read_run, write_report
 
 VERSION_1 = Path(__file__).parents[1] / "closeloop" / "version_1" / "closeloop.json"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import Run, read_run, write_report
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin import Twin, TwinDevice

@@ -6,8 +6,7 @@ import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.generator import building_meshes
-from radiotwin.scene.presets import preset_boxes
+from radiotwin.scene.presets import building_meshes, preset_boxes
 
 
 def city_of(boxes) -> CityMap:

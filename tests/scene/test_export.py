@@ -11,9 +11,8 @@ import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
+from radiotwin.scene.city_files import CityShape, read_city, write_city
 from radiotwin.scene.export import Y_UP, export_scene
-from radiotwin.scene.reader import read_city
-from radiotwin.scene.writer import CityShape, write_city
 
 POINTS_M = np.array([[x, y, z] for x in (10.0, 130.0, 250.0) for y in (20.0, 170.0, 290.0) for z in (2.0, 55.0)])
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.scene.generator import building_meshes, draw_buildings
-from radiotwin.scene.presets import PRESETS, preset_boxes
+from radiotwin.scene.presets import PRESETS, building_meshes, draw_buildings, preset_boxes
 
 
 @pytest.mark.parametrize("name", PRESETS)

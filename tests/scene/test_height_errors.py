@@ -5,13 +5,13 @@ import pickle
 import numpy as np
 import pytest
 
-from radiotwin.content_hash import content_hash
 from radiotwin.effects.boxes import Box
-from radiotwin.effects.missing_obstacle import _with_box
+from radiotwin.effects.catalogue.missing_obstacle import _with_box
 from radiotwin.errors import BadInput
+from radiotwin.io.content_hash import content_hash
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.generator import building_meshes
-from radiotwin.scene.height_errors import shape_height_sds_m
+from radiotwin.scene.perturbation import shape_height_sds_m
+from radiotwin.scene.presets import building_meshes
 
 
 def table(folder, *rows, header="building,shape,area_m2,height_sd_m"):

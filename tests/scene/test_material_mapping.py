@@ -1,10 +1,15 @@
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.material_mapping import map_materials, settle
-from radiotwin.scene.materials import Material, itu_material
+from radiotwin.scene.materials import (
+    Material,
+    itu_material,
+    map_materials,
+    safe_name,
+    settle,
+    unique_name,
+)
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
-from radiotwin.scene.names import safe_name, unique_name
 
 
 def mapped(city, bsdf, identifier, overrides=None):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.budgets import SHAPES, VERTICES
 from radiotwin.errors import BadInput
+from radiotwin.io.budgets import SHAPES, VERTICES
 from radiotwin.scene import meshes, models
 from radiotwin.scene.build import BuildOptions, build_scene
 from radiotwin.scene.importer import import_city

@@ -7,9 +7,8 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
+from radiotwin.scene.city_files import read_city, read_triangles, write_city
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.reader import read_city, read_triangles
-from radiotwin.scene.writer import write_city
 
 FOREIGN = """
   <integrator type="no-such-plugin"/>

@@ -4,7 +4,7 @@ import sys
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.sources import find_source, scene_name, source_text
+from radiotwin.scene.folder import find_source, scene_name, source_text
 
 
 def test_sionna_scene_is_found():

@@ -1,9 +1,9 @@
 import pytest
 import trimesh
 
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import Material, itu_material
-from radiotwin.scene.writer import CityShape, write_city
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.xml_tree import Node, XmlReader, read_numbers, read_vector, shown
+from radiotwin.scene.mitsuba_xml import Node, XmlReader, read_numbers, read_vector, shown
 
 
 def node(tmp_path, **attributes):

@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.scoring import CandidateScore
-from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.removed_obstacle import RemovedObstacle
+from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
+from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
 from studies import calibration, calibration_fit
 
 WEIGHTS = np.array([0.5, 0.6, 0.1, 0.2, -0.8, -0.3])

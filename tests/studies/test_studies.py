@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from marl.mission import Known, make_mission
-from radiotwin.survey import segmented_truth
+from radiotwin.maps.survey import segmented_truth
 from studies import (
     closeloop,
     closeloop_real,

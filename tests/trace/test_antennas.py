@@ -5,9 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from radiotwin.antennas import read_pattern
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
+from radiotwin.scene.antennas import read_pattern
 from radiotwin.trace import SolverSettings, trace_map, trace_points
 from radiotwin.trace.solver import PathGains
 

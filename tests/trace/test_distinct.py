@@ -5,9 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.trace.distinct import distinct_paths
 from radiotwin.trace.settings import SolverSettings
-from radiotwin.trace.solver import IMPOSSIBLE_DB, PathGains
+from radiotwin.trace.solver import IMPOSSIBLE_DB, PathGains, distinct_paths
 
 FREQUENCY_HZ, LIGHT = 2.4e9, 299_792_458.0
 SPECULAR, DIFFRACTION = 1, 8

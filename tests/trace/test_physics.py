@@ -7,8 +7,8 @@ import pytest
 import trimesh
 from scipy.special import fresnel
 
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.materials import Material
-from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains
 

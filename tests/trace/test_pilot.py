@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from radiotwin import pieces
 from radiotwin.errors import BadInput, RunFailed
+from radiotwin.runtime import pieces
 from radiotwin.trace import choose_quality
 
 
@@ -30,7 +30,7 @@ def rays(monkeypatch):
             return gain_db
 
     Rays.calls.clear()
-    monkeypatch.setattr("radiotwin.trace.pilot.PathGains", Rays)
+    monkeypatch.setattr("radiotwin.trace.plan.PathGains", Rays)
     return Rays
 
 

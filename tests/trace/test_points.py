@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin import pieces
 from radiotwin.errors import BadInput
-from radiotwin.tables import Origin
+from radiotwin.io.forms import Origin
+from radiotwin.runtime import pieces
 from radiotwin.trace import SolverSettings, read_points, trace_gains, trace_points
 
 SETTINGS = SolverSettings(batch_receivers=4)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.radiomap import RadioMap
+from radiotwin.io.forms import Origin
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey.truth import read_truth
 from radiotwin.scene import Scene
 from radiotwin.scene.config import write_config
 from radiotwin.scene.ply import read_ply, write_ply
-from radiotwin.survey.truth import read_truth
-from radiotwin.tables import Origin
 from radiotwin.trace import SolverSettings, trace_map
 from radiotwin.trace.run import truth_path
 

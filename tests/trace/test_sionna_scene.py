@@ -11,7 +11,7 @@ import pytest
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
 from radiotwin.scene.build import build_scene
-from radiotwin.scene.reader import read_city
+from radiotwin.scene.city_files import read_city
 from radiotwin.trace.sionna_scene import import_sionna, load_city
 
 ROOT = Path(__file__).parents[2]

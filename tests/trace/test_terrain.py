@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from radiotwin.footprints import MapOptions, build_scene_from_map
+from radiotwin.io.forms import Origin
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
-from radiotwin.tables import Origin
+from radiotwin.scene.readers import MapOptions, build_scene_from_map
 from radiotwin.trace import SolverSettings
 from radiotwin.trace.points import read_points, trace_points
-from tests.footprints.conftest import Map
+from tests.scene.readers.conftest import Map
 from tests.terrains import ridge, write_dem
 
 SETTINGS = SolverSettings(samples_per_src=20_000, batch_receivers=16, max_num_paths_per_src=20_000)

@@ -5,9 +5,8 @@ import pytest
 import trimesh
 
 from radiotwin.errors import BadInput
+from radiotwin.scene.city_files import CityShape, read_city
 from radiotwin.scene.materials import Material
-from radiotwin.scene.reader import read_city
-from radiotwin.scene.writer import CityShape
 from radiotwin.trace import SolverSettings, trace_gains, trace_map
 from radiotwin.trace.lattice_gains import lattice_pieces
 from radiotwin.trace.tiles import (

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from radiotwin.execution import open_executor
+from radiotwin.runtime.execution import open_executor
 from radiotwin.scene import Scene
 from radiotwin.trace import SolverSettings, trace_gains, trace_map
-from tests.execution.jobs import PLACES, processes_with, two_workers, wait_until
+from tests.runtime.execution.jobs import PLACES, processes_with, two_workers, wait_until
 
 pytestmark = pytest.mark.llvm
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 from tests.command_line import run
 from tests.worlds import narrow_street, open_ground, quick_report

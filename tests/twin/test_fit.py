@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin, fit, fit_twin
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from radiotwin import pieces
-from radiotwin.compare import predict
 from radiotwin.errors import BadInput
-from radiotwin.localize import Relocation
-from radiotwin.measurements import Measurements
-from radiotwin.radiomap import RadioMap
-from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.links.measurements import Measurements
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import fly_survey, segmented_truth
+from radiotwin.runtime import pieces
 from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin.compare import predict
+from radiotwin.twin.localize import Relocation
 
 
 @pytest.fixture(scope="module")

@@ -6,17 +6,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.channel.image_paths import ImagePaths
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.closeloop.corrected_twin import corrected_twin
+from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.run import close_loop
-from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
 from radiotwin.inference.censored_line import LogDistanceLine
-from radiotwin.measurements import Measurements
-from radiotwin.tables import Origin
+from radiotwin.io.forms import Origin
+from radiotwin.links.measurements import Measurements
+from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin import locate as module
+from radiotwin.twin.model.effect_model import EffectModel
 
 LIMIT_DB, GATEWAYS, PACKETS = -115.0, 30, 3
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from radiotwin.channel.tr36777 import UrbanMacro
-from radiotwin.compare import compare_models, published_models, split_flights
 from radiotwin.errors import BadInput
 from radiotwin.links import link_geometry
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
+from radiotwin.propagation.laws.aerial import UrbanMacro
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin.compare import compare_models, published_models, split_flights
 
 
 def with_levels(scene, flown, rng):

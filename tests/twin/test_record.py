@@ -10,7 +10,7 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
-from radiotwin.measurements import read_measurements
+from radiotwin.links.measurements import read_measurements
 from radiotwin.twin import Twin
 
 VERSION_1 = Path(__file__).parent / "version_1"

@@ -4,10 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.measurements import Measurements
-from radiotwin.radiomap import RadioMap
+from radiotwin.links.measurements import Measurements
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.scene.lattice import Lattice
-from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 from radiotwin.twin.shadowing import fit_shadowing, with_shadowing
 

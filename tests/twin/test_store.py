@@ -10,20 +10,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.channel import followed_paths
-from radiotwin.closeloop.corrected_twin import corrected_twin
+from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.run import close_loop
 from radiotwin.effects import catalogue
-from radiotwin.effects.effect_model import EffectModel
-from radiotwin.effects.fold_model import FittedEffect
-from radiotwin.effects.roof_heights import Roof
+from radiotwin.effects.catalogue.roof_heights import Roof
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
-from radiotwin.measurements import read_measurements
-from radiotwin.paths import path_powers
+from radiotwin.links.measurements import read_measurements
+from radiotwin.propagation.laws import followed_paths
+from radiotwin.propagation.paths import path_powers
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import Material
 from radiotwin.twin import Twin, check_twin_target, fit_twin
+from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.model.fold_model import FittedEffect
 
 VERSION_1 = Path(__file__).parent / "version_1"  # made with radiotwin 0.1, see its README.md
 ATOL_DB = 1e-3  # paths are found in another order, and their field is computed in another
@@ -103,8 +103,8 @@ def old_scene(small_scene, monkeypatch):
     """The scene of half-spaces of concrete, which version 0.1 took all surfaces for: a slab too thick to look through."""
     thick = Material("concrete", itu="concrete", thickness_m=100.0)
     monkeypatch.setattr("radiotwin.scene.citymap.CONCRETE", thick)
-    monkeypatch.setattr("radiotwin.effects.missing_obstacle.CONCRETE", thick)
-    monkeypatch.setattr("radiotwin.paths.powers.path_powers", partial(path_powers, wedge="luebbers"))
+    monkeypatch.setattr("radiotwin.effects.catalogue.missing_obstacle.CONCRETE", thick)
+    monkeypatch.setattr("radiotwin.propagation.paths.powers.path_powers", partial(path_powers, wedge="luebbers"))
     scene = replace(small_scene)
     scene.__dict__["city"] = CityMap(small_scene.city.vertices, small_scene.city.faces, [thick])
     return scene

@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.compare import predict
-from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
 from radiotwin.inference.censored_line import LogDistanceLine
-from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.maps.survey import fly_survey, segmented_truth
+from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.twin import Twin, TwinDevice
+from radiotwin.twin.compare import predict
+from radiotwin.twin.model.effect_model import EffectModel
 
 LINE = LogDistanceLine(-40.0, -2.5, 2.0)
 

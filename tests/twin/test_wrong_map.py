@@ -5,16 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.compare import predict
 from radiotwin.links import prepare_links
-from radiotwin.localize.estimate import TwinDevice
-from radiotwin.radiomap import RadioMap
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import fly_survey
+from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.scene.citymap import CityMap
-from radiotwin.survey import fly_survey
-from radiotwin.twin import Twin, fit_twin, fit_wrong_map
+from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin import fit_paths as fit_wrong_map
+from radiotwin.twin.compare import predict
 from radiotwin.twin.fit_links import fit_links
-from radiotwin.twin.fit_wrong_map import LOST_M, _calibrated, _with_copies
+from radiotwin.twin.fit_paths import LOST_M, _calibrated, _with_copies
+from radiotwin.twin.localize.estimate import TwinDevice
 
 SHIFT_M = np.array([2.5, -1.5])
 

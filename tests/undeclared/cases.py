@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 from tests.undeclared import clocks, tables
 from tests.undeclared.cities import declared_scene

@@ -15,11 +15,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import trimesh
 
-from radiotwin.files import atomic_path
+from radiotwin.io.files import atomic_path
 from radiotwin.scene import Scene
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
 from radiotwin.scene.materials import Material, permittivity
-from radiotwin.scene.writer import CityShape, write_city
 from tests.undeclared.shapes import corners_of, fits, prism, turned
 
 SCENES = Path(__file__).parent / "scenes.zip"

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
 
 CASES = 60
 WAVES = 300  # of a field of shadowing

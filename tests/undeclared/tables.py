@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from radiotwin.files import atomic_path
+from radiotwin.io.files import atomic_path
 from tests.undeclared.worlds import World
 
 PATH = Path(__file__).parent / "traces.npz"

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from radiotwin.measurements import read_measurements
+from radiotwin.links.measurements import read_measurements
 from tests.undeclared import cases, tables
 from tests.undeclared.cases import FAMILIES, OUTSIDE, SEEDS
 from tests.undeclared.cities import CITIES, RADIO, buildings, declared_scene

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from radiotwin.budgets import ROWS
-from radiotwin.cells import shown
 from radiotwin.errors import BadInput
 from radiotwin.importing.tracks.fixes import Fixes, make_fixes
-from radiotwin.safe_xml import parse_elements
+from radiotwin.io.budgets import ROWS
+from radiotwin.io.cells import shown
+from radiotwin.io.safe_xml import parse_elements
 
 _MAX_TEXT = 100  # characters of a time or a height
 

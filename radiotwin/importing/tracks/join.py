@@ -6,19 +6,19 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from radiotwin.cells import listed
 from radiotwin.errors import BadInput
-from radiotwin.importing.lengths import METRES
+from radiotwin.importing.frame import METRES
+from radiotwin.importing.problems import Tally
 from radiotwin.importing.read_source import read_source
 from radiotwin.importing.settings import HEIGHTS, Settings, TrackFile
 from radiotwin.importing.source import Source
-from radiotwin.importing.tally import Tally
 from radiotwin.importing.times import ISO, seconds
 from radiotwin.importing.tracks.fixes import COLUMNS, Fixes, make_fixes
 from radiotwin.importing.tracks.gpx import read_gpx
 from radiotwin.importing.tracks.nmea import read_nmea
 from radiotwin.importing.tracks.rosbag import is_rosbag, read_rosbag
 from radiotwin.importing.tracks.ulog import read_ulog
+from radiotwin.io.cells import listed
 
 _READERS = {".gpx": read_gpx, ".nmea": read_nmea, ".nma": read_nmea, ".ulg": read_ulog}
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from radiotwin.budgets import ROWS
 from radiotwin.errors import BadInput
-from radiotwin.importing.lines import Lines
+from radiotwin.importing.log_files import Lines
 from radiotwin.importing.tracks.fixes import Fixes, make_fixes
-from radiotwin.inputs import open_gzip
+from radiotwin.io.budgets import ROWS
+from radiotwin.io.inputs import open_gzip
 
 _DAY_S = 86_400.0
 _CENTURY = 80  # years below it are of this century

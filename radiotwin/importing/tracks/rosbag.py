@@ -1,29 +1,325 @@
-"""Positions of a ROS bag: messages of type sensor_msgs/NavSatFix, decoded by rosbags.
+"""Positions from recordings of ROS: bags of ROS 1, tables of ROS 2, and MCAP.
+
+Positions of a ROS bag: messages of type sensor_msgs/NavSatFix, decoded by rosbags.
 
 rosbags makes Python code of the message definitions that a bag brings along, and runs it. Those of
 a stranger's bag are not given to it: the type is decoded by the definition that rosbags has.
+
+Messages of a ROS 1 bag, format 2.0 (https://wiki.ros.org/Bags/Format/2.0).
+
+A bag is a sequence of records: length and fields of a header, length and data. Chunks hold
+connections (topic and type) and messages. Its index is not used: it is what a recording that was
+cut off lacks, and a few bytes of it can name one chunk many times.
+
+Messages of a ROS 2 bag in SQLite (.db3), of any version of its tables.
+
+Messages of an MCAP file (https://mcap.dev/spec).
+
+A file is a sequence of records: type (1 byte), length (8 bytes), content. Its index is not used: it
+is what a recording that was cut off lacks, and it can name any place of the file.
+
+Chunks of recordings, decompressed within budgets.
+
+A few bytes of bz2, lz4 or Zstandard can stand for gigabytes, and readers of ROS bags decompress a
+chunk whole.
+
+A message of a recording as its container has it.
 """
 
+import bz2
+import io
+import sqlite3
+import struct
+import sys
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from radiotwin.budgets import ENTRIES, ROWS
-from radiotwin.cells import listed
 from radiotwin.errors import BadInput
-from radiotwin.importing.tracks.bag_message import FIX, BagMessage
 from radiotwin.importing.tracks.fixes import Fixes, make_fixes
-from radiotwin.importing.tracks.mcap import mcap_messages
-from radiotwin.importing.tracks.ros1_bag import ros1_messages
-from radiotwin.importing.tracks.ros2_tables import ros2_table_messages
-from radiotwin.inputs import require_within
+from radiotwin.io.budgets import BAG_CHUNK_BYTES, ENTRIES, FILE_BYTES, ROW_BYTES, ROWS
+from radiotwin.io.cells import listed
+from radiotwin.io.inputs import open_input, require_within
+from radiotwin.io.sqlite_tables import open_tables, require_table, scan
+
+FIX = "sensor_msgs/msg/NavSatFix"
+"""Type of the messages that are read."""
+_MAGIC = b"#ROSBAG V2.0\n"
+_MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7  # values of the field `op`
+_STANDARD_MD5 = ("2d3a8cd499b9b4a0249fb98fd05cfa48", "*")  # of NavSatFix
+Fields = dict[bytes, bytes]
+_ZSTD = b"\x28\xb5\x2f\xfd"  # a message that was compressed by itself; CDR begins with 0
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK, _DATA_END = 3, 4, 5, 6, 15
+_ENCODINGS = {"cdr": False, "ros1": True}
+_COLUMNS = 4  # time [s], latitude, longitude [degrees], altitude [m]
+
+
+class Chunks:
+    """Decompresses the chunks of one recording.
+
+    Args:
+        path: of the recording, for messages.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._total = path, 0
+
+    def open(self, compression: str, data: bytes) -> bytes:
+        """Decompress a chunk.
+
+        Args:
+            compression: `none` or nothing, `bz2`, `lz4`, `zstd`.
+            data: of the chunk.
+
+        Raises:
+            BadInput: unknown compression, damaged, or more than the budget of a chunk or a file.
+        """
+        if compression in ("none", ""):
+            result = data
+        elif compression in _MAKERS:
+            decompressor = _MAKERS[compression]()
+            try:
+                result = decompressor.decompress(data, max_length=BAG_CHUNK_BYTES.limit + 1)
+            except Exception as error:  # lz4 and zstd each have their own
+                raise BadInput(f"{self._path}: a chunk is damaged ({str(error)[:100]}); fetch it "
+                               "again") from None
+            BAG_CHUNK_BYTES.check(len(result), f"{self._path}: a chunk, decompressed")
+            if not decompressor.eof:
+                raise BadInput(f"{self._path}: a chunk is cut off; fetch it again")
+        else:
+            raise BadInput(f"{self._path}: a chunk is compressed by {compression[:20]!r}; readable "
+                           "are none, bz2, lz4 and zstd: record it again, or convert it")
+        self._total += len(result)
+        FILE_BYTES.check(self._total, f"{self._path}, decompressed")
+        return result
+
+
+def _lz4() -> Any:
+    from lz4.frame import LZ4FrameDecompressor
+
+    return LZ4FrameDecompressor()
+
+
+def _zstd() -> Any:
+    if sys.version_info >= (3, 14):
+        from compression import zstd
+    else:
+        from backports import zstd
+    return zstd.ZstdDecompressor()
+
+
+_MAKERS: dict[str, Callable[[], Any]] = {"bz2": bz2.BZ2Decompressor, "lz4": _lz4, "zstd": _zstd}
+
+
+class BagMessage(NamedTuple):
+    """A message that is not decoded yet.
+
+    Attributes:
+        topic: that it was sent to.
+        time_ns: when it was recorded, since 1970.
+        data: serialised.
+        is_ros1: whether as ROS 1 does, else CDR as ROS 2.
+    """
+
+    topic: str
+    time_ns: int
+    data: bytes
+    is_ros1: bool
+
+
+def is_fix(kind: str) -> bool:
+    """Return whether a type, as ROS 1 or ROS 2 names it, is that of the messages to read."""
+    return kind in (FIX, "sensor_msgs/NavSatFix")
+
+
+def ros1_messages(path: Path) -> Iterator[BagMessage]:
+    """Yield the position messages of a ROS 1 bag; one that was cut off ends with its last chunk.
+
+    Args:
+        path: of the bag.
+
+    Raises:
+        BadInput: no such bag, damaged, or too large.
+    """
+    topics: dict[bytes, str] = {}
+    chunks = Chunks(path)
+    with open_input(path, "ROS bag (.bag)") as file:
+        if file.read(len(_MAGIC)) != _MAGIC:
+            raise BadInput(f"{path} is no ROS 1 bag of format 2.0; fetch it again, or convert it "
+                           "(rosbag migrate)")
+        try:
+            for fields, data in _records(path, file, (_CHUNK,)):
+                chunk = chunks.open(fields[b"compression"].decode("ascii", "replace"), data)
+                yield from _messages(path, chunk, topics)
+        except (KeyError, struct.error) as error:
+            raise BadInput(f"{path} is damaged ({error}); fetch it again") from None
+
+
+def _messages(path: Path, chunk: bytes, topics: dict[bytes, str]) -> Iterator[BagMessage]:
+    """Yield the messages of a chunk; adds to the topics, by the number of their connection."""
+    for fields, data in _records(path, io.BytesIO(chunk), (_MESSAGE, _CONNECTION)):
+        if fields[b"op"][0] == _MESSAGE:
+            topic = topics.get(fields[b"conn"])
+            if topic is not None:
+                seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
+                yield BagMessage(topic, seconds * 10**9 + nanoseconds, data, True)
+            continue
+        declared = _fields(data)
+        if is_fix(declared[b"type"].decode("utf-8", "replace")):
+            topic = fields[b"topic"].decode("utf-8", "replace")
+            if declared[b"md5sum"].decode("ascii", "replace") not in _STANDARD_MD5:
+                raise BadInput(f"{path}: topic {topic[:60]!r} has a NavSatFix of its own, not that "
+                               "of sensor_msgs; convert its positions to GPX or a table")
+            topics[fields[b"conn"]] = topic
+            ENTRIES.check(len(topics), path)
+
+
+def _records(path: Path, file: IO[bytes],
+             wanted: Collection[int]) -> Iterator[tuple[Fields, bytes]]:
+    """Yield fields and data of the wanted records, up to one that is cut off."""
+    while len(start := file.read(4)) == 4:
+        size, = struct.unpack("<I", start)
+        ROW_BYTES.check(size, f"{path}: a record's header")
+        header, length = file.read(size), file.read(4)
+        if len(header) < size or len(length) < 4:
+            return
+        fields = _fields(header)
+        size, = struct.unpack("<I", length)
+        if fields[b"op"][:1] and fields[b"op"][0] in wanted:
+            BAG_CHUNK_BYTES.check(size, f"{path}: a chunk")
+            data = file.read(size)
+            if len(data) < size:
+                return
+            yield fields, data
+        else:
+            file.seek(size, io.SEEK_CUR)
+
+
+def _fields(header: bytes) -> Fields:
+    """Return the fields of a header, each with its length before `name=value`."""
+    fields, at = {}, 0
+    while at < len(header):
+        size, = struct.unpack_from("<I", header, at)
+        name, _, value = header[at + 4:at + 4 + size].partition(b"=")
+        fields[name] = value
+        at += 4 + size
+    return fields
+
+
+def ros2_table_messages(path: Path) -> Iterator[BagMessage]:
+    """Yield the position messages of a ROS 2 bag in SQLite.
+
+    Args:
+        path: of the `.db3` file.
+
+    Raises:
+        BadInput: no such bag, damaged, or too large.
+    """
+    chunks = Chunks(path)
+    try:
+        with open_tables(path, "ROS 2 bag (.db3)") as database:
+            for name in ("topics", "messages"):
+                require_table(database, name)
+            topics = {number: str(name)[:1000] for number, name, kind, encoding in scan(
+                database, "topics", ["id", "name", "type", "serialization_format"])
+                if is_fix(str(kind)) and encoding == "cdr"}
+            for number, time_ns, data in scan(
+                    database, "messages", ["topic_id", "timestamp", "data"], ROWS):
+                if number in topics and isinstance(data, bytes) and isinstance(time_ns, int):
+                    is_compressed = data.startswith(_ZSTD)
+                    yield BagMessage(topics[number], time_ns,
+                                     chunks.open("zstd" if is_compressed else "", data), False)
+    except sqlite3.Error as error:
+        raise BadInput(f"{path} is not a readable ROS 2 bag ({error}); fetch it again") from None
+
+
+def mcap_messages(path: Path) -> Iterator[BagMessage]:
+    """Yield the position messages of an MCAP file; one that was cut off ends with its last chunk.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        BadInput: no such file, damaged, or too large.
+    """
+    walk = _Walk(path)
+    with open_input(path, "recording (.mcap)") as file:
+        if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
+            raise BadInput(f"{path} is no MCAP file; fetch it again")
+        try:
+            yield from walk.messages(file)
+        except (struct.error, UnicodeDecodeError) as error:
+            raise BadInput(f"{path} is damaged ({error}); fetch it again") from None
+
+
+class _Walk:
+    """Knows the channels of positions that have been met."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._chunks = Chunks(path)
+        self._schemas: set[int] = set()
+        self._channels: dict[int, tuple[str, bool]] = {}  # topic, and whether of ROS 1
+
+    def messages(self, file: IO[bytes], is_chunk: bool = False) -> Iterator[BagMessage]:
+        begin = file.tell()
+        end = file.seek(0, io.SEEK_END)
+        file.seek(begin)
+        while len(start := file.read(9)) == 9:
+            kind, size = struct.unpack("<BQ", start)
+            if kind == _DATA_END:
+                return
+            wanted = kind in (_SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK)
+            if not wanted or kind == _MCAP_CHUNK and is_chunk:
+                if size > end - file.tell():
+                    return
+                file.seek(size, io.SEEK_CUR)
+                continue
+            BAG_CHUNK_BYTES.check(size, f"{self._path}: a chunk")
+            body = file.read(size)
+            if len(body) < size:
+                return
+            if kind == _MCAP_CHUNK:
+                yield from self.messages(io.BytesIO(self._chunk(body)), True)
+            elif kind == _MCAP_MESSAGE:
+                number, _, time_ns = struct.unpack_from("<HIQ", body)
+                if number in self._channels:
+                    topic, is_ros1 = self._channels[number]
+                    yield BagMessage(topic, time_ns, body[22:], is_ros1)
+            else:
+                self._declare(kind, body)
+
+    def _chunk(self, body: bytes) -> bytes:
+        compression, at = _text(body, 28)  # after the first and last time, the size and the CRC
+        size, = struct.unpack_from("<Q", body, at)
+        return self._chunks.open(compression, body[at + 8:at + 8 + size])
+
+    def _declare(self, kind: int, body: bytes) -> None:
+        """Note a schema of positions, or a channel that has one."""
+        number, = struct.unpack_from("<H", body)
+        if kind == _SCHEMA:
+            if is_fix(_text(body, 2)[0]):
+                self._schemas.add(number)
+            return
+        schema, = struct.unpack_from("<H", body, 2)
+        topic, at = _text(body, 4)
+        encoding, _ = _text(body, at)
+        if schema in self._schemas and encoding in _ENCODINGS:
+            self._channels[number] = topic[:1000], _ENCODINGS[encoding]
+
+
+def _text(body: bytes, at: int) -> tuple[str, int]:
+    """Return a text with its length before it, and where it ends."""
+    size, = struct.unpack_from("<I", body, at)
+    return body[at + 4:at + 4 + size].decode(), at + 4 + size
+
 
 _CONTAINERS: dict[str, Callable[[Path], Iterator[BagMessage]]] = {
     ".bag": ros1_messages, ".mcap": mcap_messages, ".db3": ros2_table_messages}
-_COLUMNS = 4  # time [s], latitude, longitude [degrees], altitude [m]
 
 
 def is_rosbag(path: Path) -> bool:

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 
-from radiotwin.measurements import Measurements
+from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 from tests.undeclared.foreign.deck import ATTITUDE, CASES, DRAWS, TIMED, dealt
 from tests.undeclared.foreign.layouts import SPLITS

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
 from radiotwin.scene.materials import Material, permittivity
-from radiotwin.scene.writer import CityShape, write_city
 from tests.undeclared.foreign.layouts import GROUND, Building
 from tests.undeclared.foreign.worlds import World
 from tests.undeclared.shapes import prism

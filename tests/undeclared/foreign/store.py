@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from radiotwin.files import atomic_path
+from radiotwin.io.files import atomic_path
 from tests.undeclared.foreign.paths import Paths
 from tests.undeclared.foreign.worlds import World, all_names, world
 

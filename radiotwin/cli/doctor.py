@@ -1,0 +1,176 @@
+"""Checks of this machine: what works, and how to mend what does not."""
+
+import os
+import platform
+import re
+import shutil
+import sys
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+
+from rich.console import Console
+
+from radiotwin.runtime import cuda, llvm
+from radiotwin.runtime.cuda import FREE_SPACE_GAIN_DB, TOLERANCE_DB, TrialFailed, trace_trial_link
+from radiotwin.runtime.processes import usable_cores
+
+GIB = 2**30
+MIN_MEMORY_GIB = 4  # twice what tracing scenes/rbm takes (docs/results.md)
+MIN_DISK_GIB = 2
+_REMEDY = "install the versions of sionna-rt, mitsuba and drjit that constraints.txt names"
+
+Rows = list[tuple[str, str]]
+
+
+@dataclass
+class Diagnosis:
+    """Findings about this machine.
+
+    Attributes:
+        sections: heading -> rows of (item, finding).
+        problems: what keeps something from working, with the remedy; one line each.
+        cautions: what does not, but may later.
+    """
+
+    sections: dict[str, Rows] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    cautions: list[str] = field(default_factory=list)
+
+    @property
+    def healthy(self) -> bool:
+        """Whether everything works."""
+        return not self.problems
+
+
+def diagnose() -> Diagnosis:
+    """Check everything that radiotwin needs; what may crash runs in a process of its own."""
+    diagnosis = Diagnosis()
+    diagnosis.sections["System"] = [
+        ("Python", f"{platform.python_version()} ({sys.executable})"),
+        ("platform", platform.platform()),
+    ]
+    diagnosis.sections["Machine"] = _check_machine(diagnosis)
+    diagnosis.sections["GPU"] = _check_gpu()
+    diagnosis.sections["Packages"] = _check_packages(diagnosis)
+    diagnosis.sections["libLLVM"] = _check_llvm(diagnosis)
+    diagnosis.sections["Tracing"] = (
+        _check_tracing(diagnosis) if llvm.available()
+        else [("rays", "cannot be traced; everything else works")])
+    return diagnosis
+
+
+def print_diagnosis(diagnosis: Diagnosis, console: Console) -> None:
+    """Print findings about this machine, and remedies.
+
+    Args:
+        diagnosis: to print.
+        console: to print on.
+    """
+    def say(text: str, style: str | None = None) -> None:  # neither wraps paths nor reads markup
+        console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+    for heading, rows in diagnosis.sections.items():
+        say(heading, "bold")
+        width = max(len(item) for item, _ in rows)
+        for item, finding in rows:
+            say(f"  {item:<{width}}  {finding}")
+    say("What to do", "bold")
+    for lines, style in ((diagnosis.problems, "red"), (diagnosis.cautions, "yellow")):
+        for line in lines:
+            say(f"  - {line}".replace("\n", "\n    "), style)
+    if diagnosis.healthy:
+        say("  Everything works.", "green")
+
+
+def _check_machine(diagnosis: Diagnosis) -> Rows:
+    cores = usable_cores()
+    memory_gib = _memory_gib()
+    disk_gib = shutil.disk_usage(Path.cwd()).free / GIB
+    if memory_gib is not None and memory_gib < MIN_MEMORY_GIB:
+        diagnosis.cautions.append(f"{memory_gib:.1f} GiB of memory: tracing a city takes up to "
+                                  f"{MIN_MEMORY_GIB} GiB")
+    if disk_gib < MIN_DISK_GIB:
+        diagnosis.cautions.append(f"{disk_gib:.1f} GiB of disk free here: have {MIN_DISK_GIB} GiB "
+                                  "before you trace cities")
+    return [
+        ("cores", str(cores)),
+        ("memory", "unknown" if memory_gib is None else f"{memory_gib:.1f} GiB"),
+        ("free disk here", f"{disk_gib:.1f} GiB"),
+    ]
+
+
+def _memory_gib() -> float | None:
+    """Return the memory of the machine, or its container's limit [GiB]; None if unknown."""
+    try:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):  # Windows
+        return None
+    try:
+        memory = min(memory, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    except (OSError, ValueError):  # no container, or "max"
+        pass
+    return memory / GIB
+
+
+def _check_gpu() -> Rows:
+    """List graphics processors, and what `--device auto` uses."""
+    rows = [("GPU", str(gpu)) for gpu in cuda.gpus()] or [("GPU", "none is listed by nvidia-smi")]
+    for work, refusal in (("tracing", cuda.tracing_refusal), ("training", cuda.torch_refusal)):
+        try:
+            reason = refusal()
+        except (ImportError, OSError) as error:
+            reason = f"torch cannot be imported: {error}"
+        rows.append((work, f"on the processor: {reason}" if reason else "on the GPU"))
+    return rows
+
+
+def _check_packages(diagnosis: Diagnosis) -> Rows:
+    """List the packages that radiotwin declares, with their installed versions."""
+    try:
+        rows = [("radiotwin", version("radiotwin"))]
+        requirements = requires("radiotwin") or []
+    except PackageNotFoundError:
+        diagnosis.problems.append("radiotwin runs from a folder and is not installed: pip install "
+                                  "-e .")
+        return [("radiotwin", "not installed")]
+    listed = {"radiotwin"}  # extras name each other, and a package may be of several
+    for requirement in requirements:
+        name = re.findall(r"^[\w.-]+", requirement)[0]
+        if name in listed:
+            continue
+        listed.add(name)
+        extra = re.search(r"extra == ['\"]([\w-]+)", requirement)
+        try:
+            rows.append((name, version(name)))
+        except PackageNotFoundError:
+            rows.append((name, f"not installed (extra '{extra[1]}')" if extra else "MISSING"))
+            if not extra and ";" not in requirement:
+                diagnosis.problems.append(f"the package {name} is missing: pip install "
+                                          f"'{requirement}'")
+    return rows
+
+
+def _check_llvm(diagnosis: Diagnosis) -> Rows:
+    chosen = llvm.choose()
+    rows = [(str(candidate), "works, chosen" if candidate == chosen
+             else llvm.rejection(candidate) or "works") for candidate in llvm.find()]
+    if os.environ.get(llvm.VARIABLE):
+        rows.append((llvm.VARIABLE, os.environ[llvm.VARIABLE]))
+    if chosen is None:
+        diagnosis.problems.append(llvm.advice())
+    return rows or [("libLLVM", "none found")]
+
+
+def _check_tracing(diagnosis: Diagnosis) -> Rows:
+    """Trace one link in free space and compare it with Friis' equation."""
+    item = "one link of 100 m at 2.4 GHz"
+    try:
+        gain_db = trace_trial_link("cpu")
+    except TrialFailed as reason:
+        diagnosis.problems.append(f"tracing fails ({reason}): {_REMEDY}")
+        return [(item, f"fails: {reason}")]
+    if not abs(gain_db - FREE_SPACE_GAIN_DB) <= TOLERANCE_DB:  # NaN, too
+        diagnosis.problems.append(f"tracing gives {gain_db:.2f} dB, free space has "
+                                  f"{FREE_SPACE_GAIN_DB:.2f} dB: {_REMEDY}")
+    return [(item, f"{gain_db:.2f} dB (free space: {FREE_SPACE_GAIN_DB:.2f} dB)")]

@@ -1,0 +1,454 @@
+"""A base model of all links and of each fold's others: the bases, the folds, and both together.
+
+One model of all links and one of each fold's others, side by side.
+
+Which links are held out together.
+
+The models whose residual is examined: kinds of twin that can be fitted to any of the links.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import ClassVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from typing_extensions import override
+
+from radiotwin.errors import BadInput
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.inference.held_out import deal_groups
+from radiotwin.inference.student import mean_if_detected
+from radiotwin.links import LinkData, with_evidence
+from radiotwin.links.correlation import moving_end_m
+from radiotwin.links.evidence import fitting_width_m
+from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
+from radiotwin.scene import Scene
+from radiotwin.twin.fit_links import fit_known, fit_links, reliable_m
+from radiotwin.twin.fit_paths import LOST_M, best_dof, fit_paths, relocation_from
+from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
+from radiotwin.twin.model.fold_model import AppliedEffect, FoldModel
+from radiotwin.twin.twin import Twin
+
+WAYS = ("flight", "block", "quadrant", "device")
+MIN_FLIGHTS = 4  # that most devices and receivers must be in, for flights to be held out
+MAX_FOLDS = 6
+BLOCK_M = 60.0  # side of a block on the ground
+MIN_BLOCKS = 10
+MIN_CLUSTERS = 6  # places that are held out one by one
+STRETCHES = 4  # of each fold, where nothing moves
+MAX_ENDS = 500  # more are positions of one end that moves, and need not return
+MAX_RADIUS_M = 100.0  # of a device's circle by the law, for paths to be followed to locate it
+
+
+@dataclass(frozen=True, eq=False)
+class Folds:
+    """A partition of n links.
+
+    Attributes:
+        by: one of `WAYS`.
+        index: (n,) fold of each link; -1 = never held out.
+    """
+
+    by: str
+    index: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Number of folds."""
+        return int(self.index.max()) + 1
+
+
+def make_folds(links: LinkData, seed: int, by: str = "auto") -> Folds:
+    """Return which links are held out together.
+
+    Args:
+        links: n links.
+        seed: of which go together.
+        by: one of `WAYS`; or `auto`: by flight where most links are of devices and receivers that
+            are in at least `MIN_FLIGHTS`, else by blocks on the ground.
+
+    Raises:
+        BadInput: an unknown way, or one that these data do not allow.
+    """
+    rng = np.random.default_rng(seed)
+    if by == "auto":
+        by = "flight" if _flights_are_alike(links) else "block"
+    if by == "flight":
+        return Folds(by, deal_groups(_require_several(links.flight, by), MAX_FOLDS, rng))
+    if by == "quadrant":
+        return Folds(by, deal_groups(_require_several(_quadrants(links), by), MAX_FOLDS, rng))
+    if by == "device":
+        # A device whose position is to be found from its own links cannot be left out.
+        known = np.isin(links.device, sorted(links.anchors))
+        _require_several(links.device[known], by)
+        index = np.full(len(links), -1)
+        index[known] = deal_groups(links.device[known], MAX_FOLDS, rng)
+        return Folds(by, index)
+    if by != "block":
+        raise BadInput(f"links cannot be held out by {by!r}; allowed are auto, {', '.join(WAYS)}")
+    return Folds(by, deal_groups(_blocks(links), MAX_FOLDS, rng))
+
+
+def _blocks(links: LinkData) -> np.ndarray:
+    """Return labels (n,) of squares of ground of the end that moves, or of stretches of time.
+
+    Where `BLOCK_M` is too wide for `MIN_BLOCKS`, squares are smaller. Clusters of positions that no
+    square parts are held out as they are; where there are too few of them, stretches are.
+    """
+    width_m = fitting_width_m(links, BLOCK_M, MIN_BLOCKS)
+    cell = np.floor(moving_end_m(links)[:, :2] / width_m).astype(np.int64)
+    block = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    if block.max() + 1 >= MIN_CLUSTERS:
+        return block
+    order = np.lexsort((np.arange(len(links)), links.time_s, links.flight))
+    stretch = np.empty(len(links), dtype=int)
+    stretch[order] = np.arange(len(links)) * MAX_FOLDS * STRETCHES // len(links)
+    return stretch
+
+
+def _quadrants(links: LinkData) -> np.ndarray:
+    """Return labels (n,) of the four parts of the area on either side of its middle link.
+
+    Each is a piece of ground that no other link is near to: what is learnt has to extrapolate.
+    """
+    end_m = moving_end_m(links)[:, :2]
+    east, north = (end_m > np.median(end_m, axis=0)).T
+    return 2 * east + north
+
+
+def _require_several(index: np.ndarray, by: str) -> np.ndarray:
+    if len(np.unique(index)) < 2:
+        declared = " declared" * (by == "device")
+        raise BadInput(f"links cannot be held out by {by}: there are fewer than two{declared}; "
+                       "hold them out by block, or leave the choice to auto")
+    return index
+
+
+def _flights_are_alike(links: LinkData) -> bool:
+    if len(np.unique(links.flight)) < MIN_FLIGHTS:
+        return False
+    seen = np.bincount(links.flight[np.isfinite(links.level_db)])
+    if seen.max() > 0.5 * seen.sum():  # what is left without that flight would say little
+        return False
+    for end in (links.device, links.receiver):
+        pairs = np.unique(np.column_stack([end, links.flight]), axis=0)
+        ends, row = np.unique(end, return_inverse=True)
+        flights = np.bincount(np.searchsorted(ends, pairs[:, 0]))
+        if len(ends) <= MAX_ENDS and np.median(flights[row]) < MIN_FLIGHTS:
+            return False
+    return True
+
+
+class Base(ABC):
+    """A kind of twin.
+
+    Attributes:
+        max_radius_m: devices with a wider circle say nothing about the channel [m].
+    """
+
+    name: ClassVar[str]
+    max_radius_m: ClassVar[float] = np.inf
+
+    @abstractmethod
+    def fit(self, links: LinkData) -> Twin:
+        """Fit to links.
+
+        Raises:
+            BadInput: they are too few or of no use.
+        """
+
+    def device_m(self, twin: Twin) -> np.ndarray:
+        """Return positions (k, 3) of a twin's devices that may be relied on [m]; else NaN."""
+        return reliable_m(twin.devices, self.max_radius_m)
+
+
+class LogDistanceBase(Base):
+    """One exponent and one intercept for all links (ITU-R P.1411: basic transmission loss)."""
+
+    name = "log-distance"
+
+    def __init__(self, scene: Scene | None, seed: int) -> None:
+        self._scene, self._seed = scene, seed
+
+    @override
+    def fit(self, links: LinkData) -> Twin:
+        if np.isfinite(links.device_m).all():
+            return fit_known(links, LogDistance, self._seed)
+        assert self._scene is not None  # without one, links of unlocated devices are left out
+        return fit_links(links, self._scene, LogDistance, self._seed)
+
+
+class TwinBase(Base):
+    """The segmented law, and devices where it locates them."""
+
+    name = "twin"
+    max_radius_m = LOST_M
+
+    def __init__(self, scene: Scene | None, seed: int) -> None:
+        self.scene, self._seed = scene, seed
+        # The base that follows paths asks for the same fits again.
+        self._fitted: WeakKeyDictionary[LinkData, Twin] = WeakKeyDictionary()
+
+    @override
+    def fit(self, links: LinkData) -> Twin:
+        if links not in self._fitted:
+            if self.scene is None:
+                self._fitted[links] = fit_known(links, SegmentedLogDistance, self._seed)
+            else:
+                self._fitted[links] = fit_links(links, self.scene, SegmentedLogDistance, self._seed)
+        return self._fitted[links]
+
+
+class RaytraceBase(Base):
+    """Paths over the 3D map, and unknown devices where they explain the levels best.
+
+    A device stays where the law has it if that is less sure than `MAX_RADIUS_M`: one that is surely
+    elsewhere, because of what the map lacks, would be taken for an effect. All parts of the links
+    are fitted in one process, as they ask for the same paths.
+    """
+
+    name = "raytrace"
+    max_radius_m = LOST_M
+
+    def __init__(self, law: TwinBase) -> None:
+        assert law.scene is not None
+        self._law, self._scene = law, law.scene
+        self._relocation = relocation_from(law.scene, MAX_RADIUS_M)
+
+    @override
+    def fit(self, links: LinkData) -> Twin:
+        return fit_paths(links, self._scene, self._law.fit(links), self._relocation)
+
+
+BASES = (TwinBase.name, RaytraceBase.name, LogDistanceBase.name)
+
+
+def make_bases(scene: Scene | None, seed: int) -> dict[str, Base]:
+    """Return every kind of base that a scene allows, by name."""
+    twin = TwinBase(scene, seed)
+    bases: dict[str, Base] = {twin.name: twin, LogDistanceBase.name: LogDistanceBase(scene, seed)}
+    if scene is not None:
+        bases[RaytraceBase.name] = RaytraceBase(twin)
+    return bases
+
+
+@dataclass(eq=False)
+class CrossValidatedModel:
+    """A base with effects, of all links and of each fold's others.
+
+    Attributes:
+        whole: learnt from all links.
+        folds: learnt from all but one fold each.
+        fits: the whole's fit, then the folds'.
+        index: (n,) fold of each link.
+        twin: the base as it was fitted to all links.
+        shadowing: the whole's, then the folds', of what all effects leave over; empty = none.
+    """
+
+    whole: FoldModel
+    folds: list[FoldModel]
+    fits: list[FitResult]
+    index: np.ndarray
+    twin: Twin
+    shadowing: list[CorrelatedShadowing] = field(default_factory=list)
+
+    @property
+    def models(self) -> list[FoldModel]:
+        """The whole, then the folds."""
+        return [self.whole, *self.folds]
+
+    @property
+    def links(self) -> LinkData:
+        """The n links, with the devices where the base has them."""
+        return self.whole.links
+
+    def extended(self, models: list[FoldModel], fits: list[FitResult]) -> CrossValidatedModel:
+        """Return the same base with other effects: the whole, then the folds."""
+        return CrossValidatedModel(models[0], models[1:], fits, self.index, self.twin)
+
+    def with_shadowing(self, shadowing: list[CorrelatedShadowing]) -> CrossValidatedModel:
+        """Return the same with interpolated shadowing: the whole's, then the folds'."""
+        return CrossValidatedModel(self.whole, self.folds, self.fits, self.index, self.twin,
+                                   shadowing)
+
+    def held_out(self, of: Callable[[FoldModel, FitResult], np.ndarray]) -> np.ndarray:
+        """Return a value (n,) of each link, from the fold that has not seen it."""
+        result = np.full(len(self.index), np.nan)
+        for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
+            own = self.index == number
+            result[own] = of(model, fit)[own]
+        return result
+
+    @cached_property
+    def held_out_reading(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) predicted reading and (n,) its error scale [dB], with shadowing; NaN = none."""
+        mean_db, scale_db, unheard_db = self._held_out_parts
+        shift, left = self.held_out_shadowing
+        return mean_db + shift * scale_db, np.hypot(scale_db * left, unheard_db)
+
+    @property
+    def held_out_scales(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) error scale without shadowing, and (n,) sd of unheard levels [dB]; NaN = none."""
+        return self._held_out_parts[1:]
+
+    @cached_property
+    def _held_out_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        mean_db, scale_db, unheard_db = np.full((3, len(self.index)), np.nan)
+        for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
+            own = self.index == number
+            mean_db[own], scale_db[own], unheard_db[own] = (
+                each[own] for each in model.predict_parts(fit))
+        return mean_db, scale_db, unheard_db
+
+    @cached_property
+    def held_out_nll(self) -> np.ndarray:
+        """(n,) negative log-likelihood [nats]; NaN where there is none."""
+        reading = self.held_out_reading
+        return self.held_out(lambda model, fit: np.where(
+            model.usable, model.regression().nll_at(*reading), np.nan))
+
+    @cached_property
+    def held_out_mean_db(self) -> np.ndarray:
+        """(n,) predicted level of a link that is detected [dB]; NaN where there is none."""
+        reading = self.held_out_reading
+        return self.held_out(lambda model, fit: np.where(
+            model.usable, mean_if_detected(*reading, model.limit_db, model.dof,
+                                           model.losses), np.nan))
+
+    @cached_property
+    def unforeseen(self) -> np.ndarray:
+        """(n,) bool, links on which a fault acts that was not there when their fold learnt.
+
+        What happens on a flight cannot be known before it: such links say nothing of the rest.
+        """
+        found = np.zeros(len(self.index), dtype=bool)
+        for number, fold in enumerate(self.folds):
+            for applied, place in zip(self.whole.effects, same_effects(self.whole, fold),
+                                      strict=True):
+                if applied.effect.within_flights and place is None:
+                    found |= (self.index == number) & applied.acts
+        return found
+
+    def rmse_db(self, rows: np.ndarray | None = None) -> float:
+        """Return the held-out RMSE of the detected links of a mask (n,), or of all [dB]."""
+        error = self.links.level_db - self.held_out_mean_db
+        error = error if rows is None else error[rows]
+        return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
+
+    @cached_property
+    def held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) what shadowing adds [error scales], and (n,) the share left of the scale."""
+        shift, left = np.zeros(len(self.index)), np.ones(len(self.index))
+        for number, shadowing in enumerate(self.shadowing[1:]):
+            own = np.flatnonzero(self.index == number)
+            shift[own], left[own] = shadowing.at(self.folds[number].links.select(own))
+        return shift, left
+
+
+def same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
+    """Return the place in a fold of each effect of the whole; None for what it has not found.
+
+    Of several of a kind those are the same that act on the same links: one faulty flight is not
+    another. Where a fold has as many, each is one of them, if in another order.
+    """
+    places: list[int | None] = [None] * len(whole.effects)
+    for effect in dict.fromkeys(each.effect for each in whole.effects):
+        of_whole, of_fold = ([place for place, each in enumerate(model.effects)
+                              if each.effect is effect] for model in (whole, fold))
+        for place, found in _on_the_same_links(whole, fold, of_whole, of_fold):
+            places[place] = found
+    return places
+
+
+def _on_the_same_links(whole: FoldModel, fold: FoldModel, of_whole: list[int],
+                       of_fold: list[int]) -> list[tuple[int, int]]:
+    """Return pairs of places of one kind of effect whose links overlap most, all in all."""
+    as_many = len(of_whole) == len(of_fold)
+    if as_many and len(of_whole) == 1:
+        return [(of_whole[0], of_fold[0])]
+    # Where nothing tells them apart, the order in which they were found does.
+    shared = np.eye(len(of_whole), len(of_fold)) * 1e-9
+    for row, place in enumerate(of_whole):
+        acts = whole.effects[place].acts
+        for column, found in enumerate(of_fold):
+            others = fold.effects[found].acts
+            shared[row, column] += (acts & others).sum() / max((acts | others).sum(), 1)
+    return [(of_whole[row], of_fold[column])
+            for row, column in zip(*linear_sum_assignment(shared, maximize=True), strict=True)
+            if as_many or shared[row, column] > 1e-9]
+
+
+def without_quality(model: CrossValidatedModel) -> CrossValidatedModel:
+    """Return a model whose links do not know their own quality, as no map does.
+
+    Each has the median of its fold's training links instead; nothing is fitted again.
+    """
+    if model.links.quality is None:
+        return model
+
+    def blind(each: FoldModel) -> FoldModel:
+        quality = each.links.quality
+        assert quality is not None
+        known = quality[each.train & np.isfinite(quality)]
+        usual = float(np.median(known)) if len(known) else np.nan
+        links = replace(each.links, quality=np.full(len(quality), usual))
+        effects = [applied if "quality" not in applied.effect.uses
+                   else AppliedEffect(applied.effect, applied.params, applied.effect.term(
+                       links, applied.params, each.level_at)) for applied in each.effects]
+        return replace(each, links=links, effects=effects)
+
+    models = [blind(each) for each in model.models]
+    return model.extended(models, model.fits).with_shadowing(model.shadowing)
+
+
+def training_parts(links: LinkData, folds: Folds) -> list[LinkData]:
+    """Return the links outside each fold; the same objects serve every base."""
+    return [links.select(folds.index != number) for number in range(folds.count)]
+
+
+def cross_validate(links: LinkData, base: Base, folds: Folds,
+                   parts: list[LinkData]) -> CrossValidatedModel:
+    """Fit a base to all links, and to those outside each fold.
+
+    Args:
+        links: n links.
+        base: kind of model.
+        folds: of the links.
+        parts: `training_parts` of both.
+
+    Raises:
+        BadInput: links that the base cannot be fitted to.
+    """
+    twin = base.fit(links)
+    device_m = base.device_m(twin)
+    dof = best_dof(links, twin.channel, device_m)
+    whole = FoldModel.build(links, twin.channel, dof, device_m=device_m)
+    links = _with_evidence(links, whole)
+    whole = replace(whole, links=replace(whole.links, evidence=links.evidence, notes=links.notes,
+                                         known_los=whole.links.los))
+    models = []
+    for number, part in enumerate(parts):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the fit to all links has warned already
+            fitted = base.fit(part)
+        models.append(FoldModel.build(links, fitted.channel, dof, device_m=base.device_m(fitted),
+                                      train=folds.index != number))
+    fits = [model.fit() for model in (whole, *models)]
+    return CrossValidatedModel(whole, models, fits, folds.index, twin)
+
+
+def _with_evidence(links: LinkData, whole: FoldModel) -> LinkData:
+    """Return links with pieces of evidence that fit the base's residual, if they have none yet."""
+    if links.evidence is not None:
+        return links
+    view, z = whole.view(whole.fit()), np.full(len(links), np.nan)
+    z[whole.train] = view.residual_db / view.scale_db
+    located = with_evidence(whole.links, z)
+    return replace(links, evidence=located.evidence, notes=located.notes)

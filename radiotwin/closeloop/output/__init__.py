@@ -1,0 +1,1 @@
+"""What a loop leaves: closeloop.json, corrected scene, twin and residuals."""

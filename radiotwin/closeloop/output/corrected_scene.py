@@ -1,0 +1,379 @@
+"""The declared scene corrected by what the loop found.
+
+Boxes are added, buildings taken out, roofs raised and lowered, anchors moved, antennas declared.
+
+Sector antennas that the loop found, as antennas that a scene declares.
+
+`buildings.csv` of a corrected scene: without what is gone, with roofs as estimated.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import trimesh
+from pydantic import ValidationError
+
+from radiotwin.closeloop.run import Loop
+from radiotwin.effects.boxes import Box, building_extents_m, buildings
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
+from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
+from radiotwin.effects.catalogue.roof_heights import Roof, RoofHeights, surely_off
+from radiotwin.effects.catalogue.sector_antenna import (
+    SectorAntenna,
+    SectorPattern,
+    sector_pattern_db,
+)
+from radiotwin.errors import BadInput
+from radiotwin.io.cells import as_numbers, read_cells, write_csv
+from radiotwin.io.files import atomic_folder, require_writable
+from radiotwin.io.inputs import is_within, require_within
+from radiotwin.links import site_of
+from radiotwin.scene import Scene
+from radiotwin.scene.city_files import CityShape, read_city, write_city
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.config import DeviceConfig, SceneConfig, write_config
+from radiotwin.scene.folder import SCENE_FILES, check_target
+from radiotwin.scene.materials import itu_material, safe_name, traceable, unique_name
+from radiotwin.scene.preview import draw_preview
+
+ANTENNAS = "antennas"
+AZIMUTH_DEG, ELEVATION_DEG = np.arange(0.0, 360.0, 5.0), np.arange(-90.0, 91.0, 2.0)
+DECIMALS = 2  # of a gain [dBi] and an azimuth
+SOURCE = "close-loop"  # of an estimated height, in `height_from`
+MIN_SD_M = 0.1
+CONTENT = SCENE_FILES | {ANTENNAS}  # of a corrected scene
+BOX_MATERIAL = "concrete"  # the likeliest of a building of unknown material
+CLEARANCE_M = 0.5  # between walls and positions that are known to be outside [m]
+MAX_SHIFT_M = 60.0  # by which a device is moved out of a building [m]
+
+
+def found_antennas(loop: Loop) -> dict[str, SectorPattern]:
+    """Return device -> pattern of the sector antennas that were found.
+
+    Args:
+        loop: whose accepted effects are looked at.
+    """
+    names = loop.after.whole.links.device_names
+    return {names[device]: pattern for each in loop.after.whole.effects
+            if isinstance(each.effect, SectorAntenna)
+            for device, pattern in each.params.devices.items()}
+
+
+def with_antennas(config: SceneConfig, loop: Loop,
+                  scene: Scene) -> tuple[SceneConfig, dict[str, SectorPattern], list[str]]:
+    """Return a scene's configuration with the antennas that were found.
+
+    An anchor of the measurements that the scene does not declare is declared with its antenna, if
+    it is within the extent and outside buildings.
+
+    Args:
+        config: to add them to.
+        loop: that found them.
+        scene: that it was run with.
+
+    Returns:
+        the configuration, file in the scene's folder -> pattern, and a sentence for each.
+    """
+    links, devices = loop.after.whole.links, {each.device: each for each in config.devices}
+    bounds, files, changes = config.extent.bounds, {}, []
+    for name, pattern in found_antennas(loop).items():
+        x_m, y_m, z_m = links.device_m[links.device_names.index(name)].tolist()
+        device = devices.get(name)
+        if device is None:
+            within = bounds[0] <= x_m <= bounds[1] and bounds[2] <= y_m <= bounds[3]
+            if not within or scene.city.inside(np.array([[x_m, y_m, z_m]]))[0]:
+                changes.append(f"{name} has a sector antenna, and is not in the scene: it stands "
+                               "outside the extent or in a building")
+                continue
+            try:
+                device = DeviceConfig(device=name, x_m=round(x_m, 2), y_m=round(y_m, 2),
+                                      z_m=round(z_m, 2), role="anchor")
+            except ValidationError:  # measurements may call and place a device as they like
+                changes.append(f"{name!r} has a sector antenna, and is not in the scene: scene.toml"
+                               " has devices above z = 0, whose names are of letters, digits and "
+                               "_.+-")
+                continue
+        others = {Path(each.antenna).stem.lower() for each in devices.values()
+                  if each.antenna is not None and each.device != name}
+        file = f"{ANTENNAS}/{unique_name(f'found_{safe_name(name)}', others)}.csv"
+        azimuth_deg = round(pattern.azimuth_deg % 360, DECIMALS)
+        devices[name] = device.model_copy(update={
+            "antenna": file, "azimuth_deg": azimuth_deg, "tilt_deg": None})
+        files[file] = pattern
+        changes.append(f"{name} has a sector antenna that looks to {azimuth_deg:.0f}° and is "
+                       f"{pattern.beamwidth_deg:.0f}° wide")
+    return config.model_copy(update={"devices": list(devices.values())}), files, changes
+
+
+def write_antenna(pattern: SectorPattern, path: Path) -> None:
+    """Write a pattern about its own boresight, with its tilt, as lossless: its mean power is 1.
+
+    Args:
+        pattern: as it was found; what the data did not determine is as it was fitted.
+        path: `.csv`, as `radiotwin.scene.antennas.read_pattern` reads it.
+    """
+    elevation, azimuth = (axis.ravel() for axis in np.meshgrid(ELEVATION_DEG, AZIMUTH_DEG,
+                                                               indexing="ij"))
+    ahead = pattern.model_copy(update={"azimuth_deg": 0.0})
+    gain_db = sector_pattern_db(azimuth, elevation, ahead)
+    weight = np.cos(np.radians(elevation))
+    mean = (weight @ 10 ** (gain_db / 10)) / weight.sum()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_csv(pd.DataFrame({
+        "azimuth_deg": azimuth, "elevation_deg": elevation,
+        "gain_dbi": np.round(gain_db - 10 * np.log10(mean), DECIMALS)}), path)
+
+
+def stretch(roof: Roof, base_m: float) -> float:
+    """Return how much taller a building that stands on `base_m` is than on the map, a ratio."""
+    off_m = roof.true_offset_m
+    return 1.0 + off_m / max(roof.height_m - base_m, abs(off_m))
+
+
+def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[str],
+                        roofs: list[Roof], base_m: np.ndarray) -> pd.DataFrame | None:
+    """Return the table of a scene's buildings as they are after the correction.
+
+    Args:
+        scene: before it.
+        shapes_of: the shapes in `city.xml` of each building, as `buildings` numbers them.
+        left: shapes that the corrected scene still has.
+        roofs: whose heights are corrected.
+        base_m: (buildings,) what each stands on, before it [m].
+
+    Returns:
+        all its columns as texts; None where the scene has no such table.
+
+    Raises:
+        BadInput: the table cannot be read, or lies outside the folder.
+    """
+    path = scene.folder / "buildings.csv"
+    if not path.is_file():
+        return None
+    table = read_cells(require_within(scene.folder, path, str(scene.folder)))
+    if "shape" not in table:
+        return table
+    table = table[table["shape"].isin(left)].reset_index(drop=True)
+    if not {"top_m", "height_from", "height_sd_m"} <= set(table.columns):
+        return table
+    top_m = as_numbers(table["top_m"])
+    for roof in roofs:
+        own_m = float(base_m[roof.building])
+        for row in np.flatnonzero(table["shape"].isin(shapes_of[roof.building])):
+            raised_m = own_m + stretch(roof, own_m) * (top_m[row] - own_m)
+            table.loc[row, ["top_m", "height_from", "height_sd_m"]] = [
+                f"{raised_m:.3f}", SOURCE, f"{max(roof.offset_sd_m, MIN_SD_M):.1f}"]
+    return table
+
+
+def check_corrected_target(folder: Path, scene: Scene | None, report_folder: Path) -> None:
+    """Refuse, before the long work, a folder that no corrected scene can be written to.
+
+    Args:
+        folder: to write.
+        scene: declared scene; None: there is none.
+        report_folder: where the loop's report goes.
+
+    Raises:
+        BadInput: there is no scene, or the folder cannot be replaced.
+    """
+    if scene is None:
+        raise BadInput("--write-scene corrects a declared scene, and none was given; give it with "
+                       "--scene, or leave --write-scene out")
+    for other, what in ((scene.folder, "the declared scene"),
+                        (report_folder, "the report (--out)")):
+        if is_within(other, folder):
+            raise BadInput(f"--write-scene {folder}: {what} is in {other}, which the corrected "
+                           "scene would replace; choose another folder")
+    check_target(folder, CONTENT)
+    require_writable(folder / "scene.toml")
+
+
+def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
+    """Write a copy of the scene in which buildings, roofs, anchors and antennas are as found.
+
+    Args:
+        loop: whose accepted effects are the corrections.
+        scene: declared scene that the loop was run with.
+        folder: to write; a scene that is already in it is replaced.
+
+    Returns:
+        corrections, a sentence each; where there are none, nothing is written.
+
+    Raises:
+        BadInput: the folder cannot be written or holds something else, or the result is no scene.
+    """
+    effects = loop.after.whole.effects
+    label, centres_m = buildings(scene.city)
+    gone = [each.params.building for each in effects if isinstance(each.effect, RemovedObstacle)]
+    keep = ~np.isin(label, gone)
+    city = scene.city.without(~keep) if keep.any() else None
+    config, moves = _moved(loop, scene, city)
+    free_m = np.array([*((d.x_m, d.y_m, d.z_m) for d in config.devices),
+                       *((x_m, y_m, scene.altitude_m(x_m, y_m, uav.altitude_m))
+                         for uav in config.uavs
+                         for x_m, y_m in ((uav.start_x_m, uav.start_y_m),
+                                          (uav.terminal_x_m, uav.terminal_y_m)))])
+    boxes = [_pulled_back(Box(*each.params.box), free_m.reshape(-1, 3) - [
+                 0.0, 0.0, float(scene.city.ground_height_m(*each.params.box[:2]))])
+             for each in effects if isinstance(each.effect, MissingObstacle)]
+    changes = [f"a box of {box.length_m:.0f} x {box.width_m:.0f} m, {box.height_m:.0f} m high, "
+               f"stands at ({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
+    above_m = centres_m[:, 2] - scene.city.ground_height_m(*centres_m[:, :2].T)
+    changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(
+        *centres_m[building, :2], above_m[building]) for building in gone]
+    roofs = [roof for each in effects if isinstance(each.effect, RoofHeights)
+             for roof in surely_off(each.params.roofs) if roof.building not in gone]
+    changes += [f"the roof at ({roof.x_m:.0f}, {roof.y_m:.0f}) m is "
+                f"{above_m[roof.building] + roof.true_offset_m:.1f} m high, and "
+                f"{above_m[roof.building]:.1f} m on the map"
+                for roof in roofs]
+    config, antennas, found = with_antennas(config, loop, scene)
+    changes += moves + found
+    if not changes:
+        return []
+    check_target(folder, CONTENT)
+    earlier = config.provenance.get("corrected")
+    corrected = "; ".join(([earlier] if earlier else []) + changes)
+    provenance = config.provenance | {"corrected": corrected}
+    with atomic_folder(folder) as temporary:
+        base_m = building_extents_m(scene.city, label)[0][:, 2]
+        shapes_of, left = _write_city(scene, temporary, keep, boxes, roofs, base_m)
+        table = corrected_buildings(scene, shapes_of, left, roofs, base_m)
+        if table is not None:
+            write_csv(table, temporary / "buildings.csv")
+        scene.copy_antennas(temporary)
+        for file, pattern in antennas.items():
+            write_antenna(pattern, temporary / file)
+        write_config(config.model_copy(update={"provenance": provenance}), temporary / "scene.toml")
+        draw_preview(Scene.load(temporary), temporary / "preview.png")
+    return changes
+
+
+def _moved(loop: Loop, scene: Scene, city: CityMap | None) -> tuple[SceneConfig, list[str]]:
+    """Return the configuration with anchors moved to the nearest free position, and the changes."""
+    links = loop.after.whole.links
+    found_m: dict[str, np.ndarray] = {}
+    for each in loop.after.whole.effects:
+        if isinstance(each.effect, DevicePositionError):
+            for row in site_of(links, each.params.device):
+                name = links.device_names[row]
+                found_m[name] = found_m.get(name, links.device_m[row, :2]) + each.params.move_m
+    devices, changes = [], []
+    for device in scene.config.devices:
+        if device.device in found_m:
+            free_m = _free_position(found_m[device.device], device, scene, city)
+            x_m, y_m = found_m[device.device] if free_m is None else free_m[:2]
+            way = f"from ({device.x_m:.0f}, {device.y_m:.0f}) to ({x_m:.0f}, {y_m:.0f}) m"
+            if free_m is None:
+                changes.append(f"{device.device} is not moved {way}: there is no place outside of "
+                               f"buildings within {MAX_SHIFT_M:.0f} m")
+            else:
+                changes.append(f"{device.device} is moved {way}")
+                device = device.model_copy(update=dict(zip(("x_m", "y_m", "z_m"), free_m,
+                                                           strict=True)))
+        devices.append(device)
+    return scene.config.model_copy(update={"devices": devices}), changes
+
+
+def _free_position(position_m: np.ndarray, device: DeviceConfig, scene: Scene,
+                   city: CityMap | None) -> tuple[float, float, float] | None:
+    """Return the position nearest to one (2,) [m], within the extent and outside buildings.
+
+    The device stays as high above the ground as it is. None where no such position is near.
+    """
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    low_m, high_m = (x_min, y_min), (x_max, y_max)
+    radius_m, angle = (axis.ravel() for axis in np.meshgrid(
+        np.arange(0, MAX_SHIFT_M), np.radians(np.arange(0, 360, 10)), indexing="ij"))
+    around_m = radius_m[:, None] * np.column_stack([np.sin(angle), np.cos(angle)])
+    tried_m = np.round(np.clip(np.clip(position_m, low_m, high_m) + around_m, low_m, high_m), 2)
+    ground_m = scene.city.ground_height_m
+    above_m = device.z_m - float(ground_m(device.x_m, device.y_m))
+    z_m = np.round(above_m + ground_m(*tried_m.T), 3)
+    free = z_m > 0  # as scene.toml has it
+    if city is not None:
+        for aside_m in CLEARANCE_M * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]):
+            free &= ~city.inside(np.column_stack([tried_m + aside_m, z_m]))
+    if not free.any():
+        return None
+    nearest = int(free.argmax())
+    return float(tried_m[nearest, 0]), float(tried_m[nearest, 1]), float(z_m[nearest])
+
+
+def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
+    """Shrink a box until no point (n, 3) [m] is inside, for each on the side that costs least."""
+    turn = np.radians(box.turn_deg)
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    high = np.array([0.5 * box.length_m, 0.5 * box.width_m, box.height_m])
+    low = np.array([-high[0], -high[1], 0.0])
+    for point in np.column_stack([(points_m[:, :2] - (box.x_m, box.y_m)) @ axes.T, points_m[:, 2]]):
+        if (point <= low - CLEARANCE_M).any() or (point >= high + CLEARANCE_M).any():
+            continue
+        choices = []
+        for axis, side in ((0, low), (0, high), (1, low), (1, high), (2, high)):  # the ground stays
+            pulled = side.copy()
+            pulled[axis] = point[axis] + (CLEARANCE_M if side is low else -CLEARANCE_M)
+            choices.append((pulled, high) if side is low else (low, pulled))
+        low, high = max(choices, key=lambda choice: np.prod(np.maximum(choice[1] - choice[0], 0.0)))
+    x_m, y_m = 0.5 * (low + high)[:2] @ axes + (box.x_m, box.y_m)
+    length_m, width_m = (high - low)[:2]
+    return Box(x_m, y_m, length_m, width_m, high[2], box.turn_deg)
+
+
+def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
+                roofs: list[Roof], base_m: np.ndarray) -> tuple[dict[int, set[str]], set[str]]:
+    """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, roofs, and boxes.
+
+    Returns the names of the shapes of each building, and of those that are left.
+    """
+    label, shapes, first = buildings(scene.city)[0], [], 0
+    shapes_of: dict[int, set[str]] = {}
+    for shape in read_city(scene.xml_path):
+        part = slice(first, first + len(shape.mesh.faces))
+        own, first = keep[part], part.stop
+        for building in np.unique(label[part]).tolist():
+            shapes_of.setdefault(building, set()).add(shape.name)
+        shape = replace(shape, mesh=_with_roofs(shape.mesh, label[part], roofs, base_m))
+        if own.all():
+            shapes.append(shape)
+        elif own.any():
+            used, faces = np.unique(shape.mesh.faces[own], return_inverse=True)
+            mesh = trimesh.Trimesh(shape.mesh.vertices[used], faces.reshape(-1, 3), process=False)
+            shapes.append(replace(shape, mesh=mesh))
+    taken = {name.lower() for shape in shapes for name in (shape.name, shape.material.name)}
+    write_city(folder, [*shapes, *_box_shapes(scene, boxes, taken)])
+    return shapes_of, {shape.name for shape in shapes}
+
+
+def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof],
+                base_m: np.ndarray) -> trimesh.Trimesh:
+    """Return a mesh whose buildings (f,) are stretched to the heights of their roofs.
+
+    They stand on `base_m` (buildings,) [m]; a mesh may hold the roof of one, and not its walls.
+    """
+    vertices_m = np.array(mesh.vertices, dtype=float)
+    for roof in roofs:
+        mine = np.unique(mesh.faces[label == roof.building])
+        if len(mine):
+            own_m = float(base_m[roof.building])
+            vertices_m[mine, 2] = own_m + stretch(roof, own_m) * (vertices_m[mine, 2] - own_m)
+    return trimesh.Trimesh(vertices_m, mesh.faces, process=False)
+
+
+def _box_shapes(scene: Scene, boxes: list[Box], taken: set[str]) -> list[CityShape]:
+    """Return shapes from the lowest point of the map up, with names that are not `taken`."""
+    name = unique_name(f"found_{BOX_MATERIAL}", taken)
+    material = traceable(itu_material(BOX_MATERIAL, name=name), scene.config.radio.frequency_hz)
+    bottom_m = min(float(scene.city.vertices[:, 2].min()), 0.0)
+    shapes = []
+    for box in boxes:
+        turned = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
+        top_m = float(scene.city.ground_height_m(box.x_m, box.y_m)) + box.height_m
+        turned[:3, 3] = box.x_m, box.y_m, 0.5 * (bottom_m + top_m)
+        mesh = trimesh.creation.box((box.length_m, box.width_m, top_m - bottom_m), turned)
+        shapes.append(CityShape(unique_name("found_box", taken), mesh, material))
+    return shapes

@@ -1,0 +1,59 @@
+"""The twin of a loop: fitted to all its links, with its base, all causes and what maps have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import radiotwin
+from radiotwin.closeloop.predict.blending import make_blend, needs_rest
+from radiotwin.closeloop.run import Loop
+from radiotwin.effects.catalogue.position_errors import DevicePositionError
+from radiotwin.scene import Scene
+from radiotwin.twin.localize import RadiusCalibration, calibrate_radii, whole_area
+from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
+from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.twin import Twin
+
+
+def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
+    """Return the twin of a loop; it predicts by the loop's combination.
+
+    What belongs to a receiver (its offset, drift, antenna, …) is part of it, too; but a map is of
+    what arrives at a faultless receiver.
+
+    Args:
+        loop: what was found.
+        scene: that it was found in, if there was one.
+    """
+    model = loop.for_twin
+    shadowing = model.shadowing[0] if model.shadowing else None
+    if shadowing is None and needs_rest(loop.prediction):
+        shadowing = CorrelatedShadowing.fit(model.whole, model.fits[0], loop.seed)
+    fitted = replace(EffectModel.of(model.whole, model.fits[0]),
+                     **vars(_calibration(loop, scene)), shadowing=shadowing,
+                     blend=make_blend(model, loop.prediction, loop.seed))
+    provenance: dict[str, Any] = {"links": len(model.links),
+                                  "radiotwin_version": radiotwin.__version__}
+    if loop.origin is not None:
+        provenance |= {"origin": loop.origin.model_dump()}
+    if scene is not None:
+        provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}
+    # Devices whose position is too uncertain to be learnt from, too: a map with them is better.
+    return replace(model.twin, provenance=provenance, fitted=fitted)
+
+
+def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
+    """Return how far positions are to be believed that folds locate as the twin does."""
+    model, links = loop.for_twin, loop.links
+    if model.whole.channel.follows_paths:  # which locates nothing: `check_can_locate`
+        return RadiusCalibration()
+    models = [EffectModel.of(fold, fit).for_positions()
+              for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
+    # A device that the loop found elsewhere is not where it was declared.
+    moved = {device for each in model.whole.effects if isinstance(each.effect, DevicePositionError)
+             for device in model.links.device[each.acts].tolist()}
+    known = replace(links, anchors=links.anchors - moved)
+    held_out = [known.select(model.index == number) for number in range(len(models))]
+    area_m = scene.config.extent.bounds if scene is not None else whole_area(models[0], links)
+    return calibrate_radii(models, held_out, area_m, loop.seed)

@@ -1,0 +1,300 @@
+"""The result of the loop as `closeloop.json`: all that the page and the terminal show.
+
+Say which model predicts best, and whether a plain one would do.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from radiotwin import __version__
+from radiotwin.closeloop.crossfit import CrossValidatedModel, without_quality
+from radiotwin.closeloop.output.result_schema import ReportRecord
+from radiotwin.closeloop.predict.blending import held_out_coverage
+from radiotwin.closeloop.run import Loop
+from radiotwin.closeloop.search.posterior import Step
+from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.effects.params import Parameter
+from radiotwin.errors import BadInput
+from radiotwin.io.files import atomic_path
+from radiotwin.io.forms import read_record, validated
+from radiotwin.links import LinkData
+from radiotwin.links.sites import ReceiverDifference, receiver_differences
+from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
+
+AS_GOOD = 1.02  # ratio of errors up to which one model is as good as another
+# Of the models that are fitted; all others are published laws.
+_WORDS = {"log_distance": "the log-distance law", "segmented_log_distance": "the segmented law",
+          "regression_kriging": "kriging", "extra_trees": "a tree ensemble (ExtraTrees)",
+          "hist_gradient_boosting": "gradient boosting (HistGradientBoosting)"}
+SCHEMA, SCHEMA_1 = "radiotwin.closeloop/2", "radiotwin.closeloop/1"
+REMEDY = "run `radiotwin close-loop` again"
+MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
+# Parts that a report need not have, as version 0.1 had not.
+ABSENT: dict[str, Any] = {"posterior": [], "detectable": [], "combination": [], "prediction": None,
+                          "receivers_compared": []}
+# Of the interpolated rest, and of effects that version 0.1 wrote.
+NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, "probability": None}
+
+
+def compare_with_baselines(error: dict[str, Any],
+                           baselines: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
+    """Return how good the combination is beside the best other model; None without any error.
+
+    Args:
+        error: scores of `combined` and of `after`, each with `rmse_db` [dB].
+        baselines: scores of other models by name.
+
+    Returns:
+        `best_baseline`, `best_baseline_rmse_db`, `combined_rmse_db`, and `advice`, a sentence.
+    """
+    rmse_db = {name: each["rmse_db"] for name, each in baselines.items()
+               if each["n"] == error["combined"]["n"]}
+    combined_db = error["combined"]["rmse_db"]
+    if not rmse_db or not error["combined"]["n"]:
+        return None
+    best = min(rmse_db, key=lambda name: rmse_db[name])
+    words, best_db = _WORDS.get(best, best), rmse_db[best]
+    if best_db <= AS_GOOD * combined_db:
+        plain = "a plain regression" if best in _WORDS else "a published law"
+        advice = (f"For prediction alone {plain} would do: {words} {best_db:.2f} dB, "
+                  f"all that was learnt together {combined_db:.2f} dB.")
+    else:
+        gain = 100 * (1 - combined_db / best_db)
+        advice = (f"All that was learnt together predicts to {combined_db:.2f} dB, {gain:.0f} % "
+                  f"better than the best other model ({words} alone: {best_db:.2f} dB).")
+    after_db = error["after"]["rmse_db"]
+    if after_db is not None and after_db > AS_GOOD * best_db:
+        advice += f" The base with all that was found is behind {words}: {after_db:.2f} dB."
+    return {"best_baseline": best, "best_baseline_rmse_db": best_db,
+            "combined_rmse_db": combined_db, "advice": advice}
+
+
+def make_report(loop: Loop) -> dict[str, Any]:
+    """Return the content of `closeloop.json`; numbers that are not known are null."""
+    selection = loop.selection
+    kept = [score for score in selection.scores if score.kept]
+    named = [score for score in kept if score.name != SHADOWING]
+    effects = [{"name": each.effect.name, "variant": each.effect.variant, "rank": rank,
+                "uses": list(each.effect.uses), "is_declared": each.effect.is_declared,
+                "params": each.params.model_dump(mode="json"),
+                "parameters": {name: parameter.record() for name, parameter in parameters.items()},
+                "size_db": size.record(),
+                "confused_with": list(each.effect.confused_with), "indistinguishable_from": rivals,
+                "probability": score.probability,
+                "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value,
+                             "evidence_nats": score.evidence_nats}}
+               for rank, (score, each, parameters, size, rivals) in enumerate(
+                   zip(named, loop.after.whole.effects, loop.parameters, loop.sizes_db,
+                       selection.rivals, strict=True), start=1)]
+    if loop.after.shadowing:
+        effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
+    candidates = [{"name": score.name, "variant": score.variant, "step": score.step + 1,
+                   "heldout_rmse_db": score.rmse_db,
+                   "heldout_nll_gain": score.nll_gain, "p_value": score.p_value, "kept": score.kept,
+                   "reason": score.reason, "passed": score.passed,
+                   "evidence_nats": score.evidence_nats, "features": list(score.features),
+                   "probability": score.probability,
+                   "devices": list(score.devices), "receivers": list(score.receivers)}
+                  for score in selection.scores]
+    links = loop.after.links
+    error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),
+                             "noise_floor_db": loop.noise_floor_db}
+    if any("quality" in each.effect.uses for each in loop.after.whole.effects):
+        error["after_without_quality"] = scores(without_quality(loop.after))
+    for name, groups in _groups(links).items():
+        error[f"by_{name}"] = {label: {"before": scores(loop.before, rows),
+                                       "after": scores(loop.after, rows)}
+                               for label, rows in groups.items()}
+    predicted = loop.prediction
+    error["combined"] = errors(links.level_db, predicted.mean_db) | {
+        "in_90_percent_interval": held_out_coverage(loop.for_twin, predicted)}
+    baselines = {name: errors(links.level_db, mean_db)
+                 for name, mean_db in predicted.baselines.items()}
+    combination = [{"name": name, "weight_near": near, "weight_far": far} for name, near, far in
+                   zip(predicted.names, *predicted.weights, strict=True)]
+    return _for_json({
+        "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
+        "verdict": loop.verdict, "effects": effects, "candidates": candidates,
+        "posterior": [_step(each) for each in selection.steps],
+        "detectable": [vars(each) for each in loop.detectable],
+        "receivers_compared": [_difference(each, links) for each in receiver_differences(links)],
+        "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
+                    "n": int(np.isfinite(loop.after.held_out_nll).sum())},
+        "error": error, "baselines": baselines, "combination": combination,
+        "prediction": compare_with_baselines(error, baselines),
+        "dependences_before": [vars(each) for each in loop.dependences_before],
+        "remaining": {"structured": bool(loop.remaining),
+                      "drivers": [vars(each) for each in loop.remaining]},
+        "criteria": loop.criteria.to_json(), "notes": links.notes})
+
+
+def scores(model: CrossValidatedModel, rows: np.ndarray | None = None) -> dict[str, float]:
+    """Return held-out errors of the links of a mask (n,), or of all.
+
+    Returns:
+        as of `errors`, and `nll`, the mean negative log-likelihood of detected and
+        blank links [nats].
+    """
+    level_db, mean_db, nll = model.links.level_db, model.held_out_mean_db, model.held_out_nll
+    rows = np.ones(len(level_db), dtype=bool) if rows is None else rows
+    mean_nll = float(np.nanmean(nll[rows])) if np.isfinite(nll[rows]).any() else np.nan
+    return errors(level_db[rows], mean_db[rows]) | {"nll": mean_nll}
+
+
+def errors(level_db: np.ndarray, mean_db: np.ndarray) -> dict[str, float]:
+    """Return errors of detected links.
+
+    Args:
+        level_db: (n,) measured [dB]; NaN = not detected.
+        mean_db: (n,) predicted [dB]; NaN = none.
+
+    Returns:
+        number, bias (mean of predicted minus measured), standard deviation, RMSE, MAE [dB], and the
+        correlation of the two.
+    """
+    seen = np.isfinite(level_db) & np.isfinite(mean_db)
+    if not seen.any():
+        names = ("bias_db", "std_db", "correlation", "rmse_db", "mae_db")
+        return {"n": 0} | dict.fromkeys(names, np.nan)
+    level_db, mean_db = level_db[seen], mean_db[seen]
+    error = mean_db - level_db
+    constant = np.std(level_db) == 0 or np.std(mean_db) == 0
+    correlation = np.nan if constant else float(np.corrcoef(level_db, mean_db)[0, 1])
+    return {"n": int(seen.sum()), "bias_db": float(error.mean()), "std_db": float(error.std()),
+            "correlation": correlation, "rmse_db": float(np.sqrt((error**2).mean())),
+            "mae_db": float(np.abs(error).mean())}
+
+
+def write_report(report: dict[str, Any], path: Path) -> None:
+    """Write `closeloop.json`, whole or not at all."""
+    with atomic_path(path) as temporary:
+        text = json.dumps(report, indent=1, allow_nan=False)
+        temporary.write_text(text, encoding="utf-8")
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """Read a `closeloop.json` of this version or of version 0.1.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        its content as of this version; each field has the type of `ReportRecord`.
+
+    Raises:
+        BadInput: it cannot be read, it is of another version, or it is damaged.
+    """
+    return upgrade_report(read_record(path, "result of a close-loop (closeloop.json)"), path)
+
+
+def upgrade_report(report: dict[str, Any], source: object = "closeloop.json") -> dict[str, Any]:
+    """Return the content of a `closeloop.json` of this version or of version 0.1 as of this one.
+
+    Args:
+        report: content of the file.
+        source: where it is from; messages begin with it.
+
+    Raises:
+        BadInput: it is of neither, or damaged.
+    """
+    schema = report.get("schema")
+    if schema not in (SCHEMA, SCHEMA_1):
+        raise BadInput(f"{source}: schema is {repr(schema)[:60]}, this version reads {SCHEMA!r} "
+                       f"and {SCHEMA_1!r}; make the run again")
+    if schema == SCHEMA_1:
+        try:
+            report = _from_version_1(report)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise BadInput(f"{source} is damaged ({type(error).__name__}: {error}); {REMEDY}"
+                           ) from None
+    return check_report(report, source)
+
+
+def check_report(report: dict[str, Any], source: object = "closeloop.json") -> dict[str, Any]:
+    """Return the content of a `closeloop.json` of this version with nothing but checked fields.
+
+    Args:
+        report: content of the file.
+        source: where it is from; messages begin with it.
+
+    Raises:
+        BadInput: a field is missing or has another type.
+    """
+    return validated(ReportRecord, ABSENT | report, source, REMEDY)
+
+
+def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
+    new_names = {"remarks": "notes", "structure_before": "dependences_before"}
+    new = {new_names.get(name, name): value for name, value in report.items()}
+    new["effects"] = [{("params" if name == "setting" else name): value
+                       for name, value in effect.items()}
+                      | NOT_KNOWN
+                      for effect in report["effects"]]
+    new["error"] = _with_new_bias(report["error"]) | {"combined": None}
+    new["baselines"] = _with_new_bias(report["baselines"])
+    return new | {"schema": SCHEMA, "criteria": {}} | ABSENT
+
+
+def _with_new_bias(value: Any) -> Any:
+    """Turn the sign of every bias: version 1 had measured minus predicted."""
+    if not isinstance(value, dict):
+        return value
+    return {name: -each if name == "bias_db" and each is not None else _with_new_bias(each)
+            for name, each in value.items()}
+
+
+def _step(step: Step) -> dict[str, Any]:
+    """Return a step's probabilities, the likeliest first."""
+    ordered = sorted(step.probabilities.items(), key=lambda item: -item[1])
+    return {"step": step.number + 1, "unnamed_nats": step.unnamed_nats, "rest_db": step.rest_db,
+            "noise_db": step.noise_db,
+            "probabilities": [{"name": name, "probability": each} for name, each in ordered]}
+
+
+def _difference(found: ReceiverDifference, links: LinkData) -> dict[str, Any]:
+    value = Parameter(found.difference_db, found.low_db, found.high_db, "dB")
+    return {"first": links.receiver_names[found.first],
+            "second": links.receiver_names[found.second], "difference_db": value.record(),
+            "pairs": found.pairs, "places": found.places}
+
+
+def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> dict[str, Any]:
+    field, relatives = model.shadowing[0].field, model.shadowing[0].relatives
+    sd_db = model.shadowing[0].relative_sd * float(model.fits[0].scale_db.mean())
+    numbers = {"length_m": (field.length_m, "m"), "share": (field.share, "of the variance"),
+               "receiver_share": (field.kind_share, "of the variance"), "sigma_db": (sd_db, "dB")}
+    if relatives is not None:
+        share = float(np.mean(list(relatives.passed_on.values())))
+        numbers["relatives_share"] = share, "of their residual"
+    return {"name": score.name, "variant": "", "rank": rank, "params": {},
+            "parameters": {name: {"value": value, "low": np.nan, "high": np.nan, "unit": unit}
+                           for name, (value, unit) in numbers.items()},
+            "confused_with": [], "indistinguishable_from": [],
+            "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}} | NOT_KNOWN
+
+
+def _groups(links: LinkData) -> dict[str, dict[str, np.ndarray]]:
+    groups = {"los": {"los": links.los, "nlos": ~links.los}}
+    for name, index, labels in (("device", links.device, links.device_names),
+                                ("receiver", links.receiver, links.receiver_names),
+                                ("flight", links.flight, links.flight_names)):
+        members = np.unique(index)
+        if len(members) <= MAX_GROUPS:
+            groups[name] = {labels[member]: index == member for member in members}
+    return groups
+
+
+def _for_json(value: Any) -> Any:
+    """Return NaN as null and numpy's numbers as Python's."""
+    if isinstance(value, dict):
+        return {name: _for_json(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_for_json(each) for each in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

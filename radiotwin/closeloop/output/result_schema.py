@@ -1,0 +1,218 @@
+"""Schema of `closeloop.json`, by which it is read: it may come from somebody else."""
+
+from typing import Any, Literal, Self
+
+from pydantic import Field, model_validator
+
+from radiotwin.io.forms import Real, Record, Whole
+
+
+class ScoresRecord(Record):
+    """Errors of a model on a group of links; further ones are numbers, too."""
+
+    model_config = {"extra": "allow"}
+    __pydantic_extra__: dict[str, Real | None]
+
+    n: Whole
+    rmse_db: Real | None
+
+
+class BaselineRecord(ScoresRecord):
+    """Errors of another model on all links."""
+
+    n: Whole = 0
+
+
+class BothRecord(Record):
+    """Errors before and after the effects were added."""
+
+    before: ScoresRecord
+    after: ScoresRecord
+
+
+class ErrorRecord(BothRecord):
+    """Errors of all links and of groups of them, by the groups' names."""
+
+    combined: ScoresRecord | None = None
+    after_without_quality: ScoresRecord | None = None
+    noise_floor_db: Real | None
+    by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)
+    by_device: dict[str, BothRecord] = Field(default_factory=dict)
+    by_receiver: dict[str, BothRecord] = Field(default_factory=dict)
+    by_flight: dict[str, BothRecord] = Field(default_factory=dict)
+
+
+class ParameterRecord(Record):
+    """Estimate with its 90 % interval."""
+
+    value: Real | None
+    low: Real | None
+    high: Real | None
+    unit: str
+    determined: bool = True
+
+
+class KnownParameterRecord(ParameterRecord):
+    """Estimate that has all three numbers."""
+
+    value: Real
+    low: Real
+    high: Real
+
+
+class EvidenceRecord(Record):
+    """Evidence for an effect."""
+
+    heldout_nll_gain: Real | None
+    p_value: Real | None
+    evidence_nats: Real | None = None
+
+
+class EffectRecord(Record):
+    """An effect that was found."""
+
+    name: str
+    variant: str = ""
+    uses: list[str] = Field(default_factory=list)
+    is_declared: bool = False
+    rank: Whole
+    params: dict[str, Any] = Field(default_factory=dict)
+    parameters: dict[str, ParameterRecord]
+    size_db: ParameterRecord | None = None
+    confused_with: list[str] = Field(default_factory=list)
+    indistinguishable_from: list[str] = Field(default_factory=list)
+    probability: Real | None = None
+    evidence: EvidenceRecord
+
+
+class CandidateRecord(Record):
+    """An effect that was tried, or that the data do not allow to be looked for."""
+
+    name: str
+    variant: str = ""
+    step: Whole
+    heldout_rmse_db: Real | None
+    heldout_nll_gain: Real | None
+    p_value: Real | None
+    kept: bool
+    reason: str
+    evidence_nats: Real | None = None
+    passed: bool = False
+    features: list[Real | None] = Field(default_factory=list)
+    probability: Real | None = None
+    devices: list[str] = Field(default_factory=list)
+    receivers: list[str] = Field(default_factory=list)
+
+
+class WeightRecord(Record):
+    """Weights of a member of the combination, near measurements and far from them."""
+
+    name: str
+    weight_near: Real
+    weight_far: Real
+
+
+class PredictionRecord(Record):
+    """How good the combination is beside the best of the other models."""
+
+    best_baseline: str
+    best_baseline_rmse_db: Real
+    combined_rmse_db: Real
+    advice: str
+
+
+class DependenceRecord(Record):
+    """A variable that the residual depends on."""
+
+    variable: str
+    p_value: Real | None
+    effect_db: Real | None = None
+
+
+class RemainingRecord(Record):
+    """Variables that the residual depends on in the end."""
+
+    structured: bool
+    drivers: list[DependenceRecord]
+
+
+class ProbabilityRecord(Record):
+    """An effect that was scored, passed or not, `none` or `not in the catalogue`; they sum to 1."""
+
+    name: str
+    probability: Real | None
+
+
+class StepRecord(Record):
+    """Evidence in the residual at one step of the selection."""
+
+    step: Whole
+    probabilities: list[ProbabilityRecord]
+    unnamed_nats: dict[str, Real | None]
+    rest_db: Real | None
+    noise_db: Real | None
+
+
+class DetectableRecord(Record):
+    """How large an effect would have had to be, to be named; no size where none would do."""
+
+    name: str
+    size: Real | None
+    unit: str
+    pattern: str
+
+
+class ReceiverDifferenceRecord(Record):
+    """How much more one receiver reads than another where both have been."""
+
+    first: str
+    second: str
+    difference_db: KnownParameterRecord
+    pairs: Whole
+    places: Whole
+
+
+class FoldsRecord(Record):
+    """How links were held out."""
+
+    by: str
+    folds: Whole
+    n: Whole
+
+
+class InputsRecord(Record):
+    """Files that the loop was given."""
+
+    measurements: str | None = None
+    scene: str | None = None
+
+
+class ReportRecord(Record):
+    """Content of `closeloop.json`."""
+
+    schema_: Literal["radiotwin.closeloop/2"] = Field(alias="schema")
+    radiotwin_version: str = ""
+    base: str
+    verdict: Literal["effect", "none", "unexplained", "undecided"]
+    effects: list[EffectRecord]
+    candidates: list[CandidateRecord]
+    posterior: list[StepRecord] = Field(default_factory=list)
+    detectable: list[DetectableRecord] = Field(default_factory=list)
+    receivers_compared: list[ReceiverDifferenceRecord] = Field(default_factory=list)
+    heldout: FoldsRecord
+    error: ErrorRecord
+    baselines: dict[str, BaselineRecord]
+    combination: list[WeightRecord] = Field(default_factory=list)
+    prediction: PredictionRecord | None = None
+    dependences_before: list[DependenceRecord] = Field(default_factory=list)
+    remaining: RemainingRecord
+    criteria: dict[str, Real] = Field(default_factory=dict)
+    notes: list[str]
+    inputs: InputsRecord = Field(default_factory=InputsRecord)
+
+    @model_validator(mode="after")
+    def _effects_change_errors(self) -> Self:
+        rmse_db = self.error.before.rmse_db, self.error.after.rmse_db
+        if self.verdict == "effect" and None in rmse_db:
+            raise ValueError("the verdict is effect, and error has no rmse_db before or after it")
+        return self

@@ -1,0 +1,1 @@
+"""The final prediction of a loop and its baselines."""

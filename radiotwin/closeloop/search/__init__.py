@@ -1,0 +1,1 @@
+"""Search for effects: stages, candidates, evidence."""

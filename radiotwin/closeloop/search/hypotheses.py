@@ -1,0 +1,282 @@
+"""Competing explanations of a residual: nuisances of the base, unnamed and named causes.
+
+Nuisances are always there: a level and a slope of each class of line of sight, small errors of each
+device, receiver and flight, and a field over positions (`radiotwin.inference.correlated_evidence`).
+Causes without a name are curves over each variable, for all links, each receiver or each device:
+what one of them explains better than any named effect is not in the catalogue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from math import comb, log
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from radiotwin.effects.arrays import one_hot
+from radiotwin.effects.base import Effect
+from radiotwin.effects.catalogue.unexplained_trend import curve_columns
+from radiotwin.effects.params import NEAR_SHARE
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
+from radiotwin.links import LinkData
+from radiotwin.twin.model.correlated_shadowing import receivers_move
+from radiotwin.twin.model.fold_model import FoldModel
+
+MAX_Z = 3.0  # an outlier counts as this many scales from its neighbours
+NEIGHBOURS = 9
+LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # of a class of line of sight, at 100 m and per decade
+DEVICE_SD_DB, RECEIVER_SD_DB, FLIGHT_SD_DB = 1.0, 0.3, 0.3  # within tolerances: no effect
+MAX_ENDS = 40  # devices or receivers that have terms of their own
+CURVE_KNOTS, NUISANCE_SD_DB = 6, 2.0  # of the base's errors over its prediction and elevation
+KNOTS = 8  # of a curve over a variable
+TIME_KNOTS = 24  # of one over time
+CURVE_SD_DB = 4.0  # prior standard deviation of a curve
+MAX_COLUMNS = 250  # of one hypothesis
+MAX_FEW = 6  # ends of which each number is tried, before all of them
+STEP_SHARE = 0.3  # of a number's typical uncertainty, for what it changes
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """Evidence for causes, on the training links of one model.
+
+    Attributes:
+        evidence: of its residuals, with the field's length.
+        links: n training links.
+        scale_db: (n,) errors' scale, by which all residuals are divided.
+        nuisance: what is fitted beside any cause, over that scale.
+        base_z: (n,) residuals without any further cause.
+        mean_db: (n,) the model's mean.
+        coefficients: of its fit, levels first.
+        near: (n, `NEIGHBOURS`) links of the same series that are nearest to each.
+    """
+
+    evidence: CorrelatedEvidence
+    links: LinkData
+    scale_db: np.ndarray
+    nuisance: Columns
+    base_z: np.ndarray
+    mean_db: np.ndarray
+    coefficients: np.ndarray
+    near: np.ndarray
+
+    @classmethod
+    def of(cls, model: FoldModel, fit: FitResult, seed: int) -> Hypotheses:
+        """Return the hypotheses about what a model lacks.
+
+        Args:
+            model: with what was found so far.
+            fit: to its training links.
+            seed: of the draw of links, where there are many.
+        """
+        links, predicted = model.links.select(model.train), model.training.predict(fit)
+        nuisance = _nuisance(links, predicted.mean_db)
+        nuisance = Columns(nuisance.values / predicted.scale_db[:, None], nuisance.prior_sd)
+        residual_db = np.where(_says_something(model, fit), model.training.residual_db(fit), np.nan)
+        moving = receivers_move(links)
+        series = links.device if moving else links.receiver
+        position_m = links.receiver_m if moving else links.device_m[links.device]
+        near = _neighbours(series, position_m, np.isfinite(residual_db))
+        z = _tamed(residual_db / predicted.scale_db, near)
+        evidence = CorrelatedEvidence.fit(series, position_m, z, nuisance, seed)
+        return cls(evidence, links, predicted.scale_db, nuisance, z, predicted.mean_db,
+                   fit.coefficients, near)
+
+    @cached_property
+    def _rotated(self) -> tuple[np.ndarray, float, np.ndarray]:
+        """Nuisance columns, evidence and variances without any further cause."""
+        columns = self.evidence.rotated(self.nuisance.values)
+        found = self.evidence.of_rotated(self.evidence.rotated(self.base_z), columns,
+                                         self.nuisance.prior_sd)
+        return columns, *found
+
+    @property
+    def sizes_db(self) -> tuple[float, float]:
+        """Standard deviations of the rest that belongs to places, and of noise [dB]."""
+        _, _, theta = self._rotated
+        noise_db = np.exp(0.5 * theta[0]) * float(np.median(self.scale_db))
+        return noise_db * np.exp(0.5 * theta[1]), noise_db
+
+    def gain_nats(self, z: np.ndarray, columns: Columns) -> float:
+        """Return how much likelier residuals z (n,) with columns are than those of the model."""
+        nuisance, base, theta = self._rotated
+        both = np.hstack([nuisance, self.evidence.rotated(columns.values)])
+        sd = np.concatenate([self.nuisance.prior_sd, columns.prior_sd])
+        return self.evidence.of_rotated(self.evidence.rotated(z), both, sd, theta)[0] - base
+
+    def information(self, pattern_db: np.ndarray) -> float:
+        """Return how sharply the data would show a change (n,) of unit size [1/size²]."""
+        columns, _, theta = self._rotated
+        pattern = self.evidence.rotated(pattern_db / self.scale_db)
+        return self.evidence.information(pattern, columns, self.nuisance.prior_sd, theta)
+
+    def of_named(self, model: FoldModel, fit: FitResult) -> float:
+        """Return the evidence for the last effect of a model [nats].
+
+        Coefficients are integrated over their priors, and so are the numbers that were searched
+        for, of which what they change is taken as linear (Laplace's approximation; MacKay 2003,
+        'Information theory, inference, and learning algorithms', Ch. 28): what the data do not
+        determine costs nothing, and what fits best without the rest is fitted again beside it.
+
+        Args:
+            model: this one's with one more effect.
+            fit: of it.
+
+        Returns:
+            NaN for an effect that residuals do not show.
+        """
+        applied = model.effects[-1]
+        term, own = applied.term.select(model.train), model.coefficient_slices[-1]
+        if term.random_effect_sd_db is not None and applied.effect.within_flights:
+            return np.nan  # it makes errors larger, which levels alone do not show
+        z = _tamed(model.training.residual_db(fit) / self.scale_db, self.near)
+        # What its columns brought, and what levels gave way for it, is integrated over again.
+        shown_db = term.columns @ fit.coefficients[own]
+        levels = model.level_columns[model.train]
+        p = levels.shape[1]
+        shown_db += levels @ (fit.coefficients[:p] - self.coefficients[:p])
+        z += shown_db / self.scale_db
+        columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
+        if applied.effect.sparse:
+            return self._of_few(z, columns, fit.coefficients[own])
+        slopes = _slopes(model, fit)
+        return self.gain_nats(z, columns.beside(
+            Columns(slopes.values / self.scale_db[:, None], slopes.prior_sd)))
+
+    def _of_few(self, z: np.ndarray, columns: Columns, coefficients: np.ndarray) -> float:
+        """Return the evidence for the likeliest few of columns, largest coefficients (q,) first.
+
+        Any number of them is as probable as any other, and any set of that number (Scott and Berger
+        2010, 'Bayes and empirical-Bayes multiplicity adjustment in the variable-selection problem',
+        Ann. Stat. 38): one end that is off does not pay for all that are not.
+        """
+        order, q = np.argsort(-np.abs(coefficients - np.median(coefficients))), len(coefficients)
+        found = []
+        for count in sorted({*range(1, min(q, MAX_FEW) + 1), q}):
+            few = Columns(columns.values[:, order[:count]], columns.prior_sd[order[:count]])
+            found.append(self.gain_nats(z, few) - log(comb(q, count)) - log(q))
+        return max(found)
+
+    @cached_property
+    def unnamed_nats(self) -> dict[str, float]:
+        """Evidence for a cause without a name over each variable [nats]."""
+        found: dict[str, float] = {}
+        for name, values in self._curves():
+            scaled = values / self.scale_db[:, None]
+            columns = Columns(scaled, np.full(values.shape[1], CURVE_SD_DB))
+            found[name] = self.gain_nats(self.base_z, columns)
+        return found
+
+    def _curves(self) -> Iterator[tuple[str, np.ndarray]]:
+        links = self.links
+        ends = {"": None, "receiver": links.receiver, "device": links.device}
+        flights = len(np.unique(links.flight))
+        for name, label in ends.items():
+            if label is not None and 1 < flights * len(np.unique(label)) <= MAX_COLUMNS:
+                pairs = label * (links.flight.max() + 1) + links.flight
+                if len(np.unique(pairs)) > len(np.unique(label)):
+                    yield f"flight, {name}", one_hot(pairs, np.unique(pairs).tolist())
+        variables = {
+            "time": (links.time_s, TIME_KNOTS), "time in flight": (links.time_in_flight_s, KNOTS),
+            "azimuth": (links.azimuth_deg, KNOTS), "elevation": (links.elevation_deg, KNOTS),
+            "body azimuth": (links.body_azimuth_deg, KNOTS), "distance": (links.distance_m, KNOTS),
+            "predicted level": (self.mean_db, KNOTS), "altitude": (links.receiver_m[:, 2], KNOTS)}
+        for variable, (value, knots) in variables.items():
+            known = np.isfinite(value)
+            if known.mean() < 0.5 or len(np.unique(value[known])) < KNOTS:  # a label, then
+                continue
+            basis = curve_columns(value, knots, variable in ("azimuth", "body azimuth"))
+            for name, label in ends.items():
+                members = [None] if label is None else np.unique(label).tolist()
+                if label is not None and len(members) < 2:
+                    continue
+                if len(members) * basis.shape[1] > MAX_COLUMNS:
+                    continue
+                blocks = [basis if member is None else basis * (label == member)[:, None]
+                          for member in members]
+                yield variable + (f", {name}" if name else ""), np.hstack(blocks)
+
+
+def _slopes(model: FoldModel, fit: FitResult) -> Columns:
+    """Return what each number of the last effect changes (n, q) [dB], and how far it may (q,)."""
+    applied = model.effects[-1]
+    variation = applied.effect.variation(applied.params)
+    if variation is None:
+        return Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0))
+    here = variation.params(variation.values)
+    if here != applied.params:  # it varies with quicker levels than it has
+        model = model.with_effects([*model.effects[:-1], model.apply(applied.effect, here)])
+    mean_db, slopes_db = model.training.predict(fit).mean_db, []
+    # Of paths those that folds will ask for, too.
+    share = NEAR_SHARE if variation.follows_paths else STEP_SHARE
+    for number, step in enumerate(share * variation.steps):
+        values = variation.values.copy()
+        if values[number] + step > variation.high[number]:
+            step = -step
+        values[number] += step
+        other = model.apply(applied.effect, variation.params(values))
+        changed = model.with_effects([*model.effects[:-1], other]).training.predict(fit)
+        slopes_db.append((changed.mean_db - mean_db) / step)
+    width = variation.high - variation.low
+    return Columns(np.column_stack(slopes_db), width / np.sqrt(12.0))
+
+
+def _neighbours(series: np.ndarray, position_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return rows (n, `NEIGHBOURS`) that are known and nearest to each, of the same series."""
+    near = np.repeat(np.arange(len(series))[:, None], NEIGHBOURS, axis=1)
+    for label in np.unique(series):
+        mine = np.flatnonzero(series == label)
+        there = mine[known[mine]]
+        if len(there) >= NEIGHBOURS:
+            found = cKDTree(position_m[there]).query(position_m[mine], NEIGHBOURS)[1]
+            near[mine] = there[found]
+    return near
+
+
+def _tamed(z: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return residuals (n,) in which a link counts as so far from its neighbours at most.
+
+    Outliers are single links. What neighbours have in common is none, however large.
+    """
+    common = np.median(z[near], axis=1)
+    return common + np.clip(z - common, -MAX_Z, MAX_Z)
+
+
+def _says_something(model: FoldModel, fit: FitResult) -> np.ndarray:
+    """Return (m,) training links that were detected, or should have been."""
+    training = model.training
+    return np.isfinite(training.level_db) | (training.residual_db(fit) < 0)
+
+
+def _nuisance(links: LinkData, mean_db: np.ndarray) -> Columns:
+    """Return what every base may be wrong in, of n links [dB].
+
+    Args:
+        links: n links.
+        mean_db: (n,) the base's prediction: weak levels are those of ways that it does not follow.
+    """
+    slope = np.log10(links.distance_m / 100.0)
+    blocks, prior_sd_db = [], []
+    for members in (links.los, ~links.los):
+        if members.any():
+            blocks += [members[:, None].astype(float), (members * slope)[:, None]]
+            prior_sd_db += [LEVEL_SD_DB, SLOPE_SD_DB]
+    for label, sd_db in ((links.device, DEVICE_SD_DB), (links.receiver, RECEIVER_SD_DB),
+                         (links.track, FLIGHT_SD_DB)):
+        members = np.unique(label)
+        if 1 < len(members) <= MAX_ENDS:
+            blocks.append(one_hot(label, members.tolist()))
+            prior_sd_db += [sd_db] * len(members)
+    for values in (mean_db, links.elevation_deg):
+        blocks.append(curve_columns(values, CURVE_KNOTS, circular=False))
+        prior_sd_db += [NUISANCE_SD_DB] * blocks[-1].shape[1]
+    return Columns(np.hstack(blocks), np.array(prior_sd_db))
+
+
+def is_judged_by_levels(effect: Effect) -> bool:
+    """Return whether an effect changes levels, so that residuals can show it."""
+    return effect.stage not in ("limit", "detection")

@@ -1,0 +1,168 @@
+"""How probable it is that an effect is there, that nothing is, or something that has no name.
+
+Nats are worth what they turned out to be worth: a logistic regression, fitted on traced cases
+(`tests/undeclared`, of the foreign worlds the cities for calibration; `python -m studies foreign`
+judges it on the others), turns evidence beside a correlated rest, what held-out links gain, how
+much of the rest belongs to places (a map that is wrong, or none), and whether an effect of another
+kind is there already (two are rarer than one) into a probability (Platt 1999, 'Probabilistic
+outputs for support vector machines'). Its few numbers are in `calibration.json`, made by
+`python -m studies.calibration`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+from scipy.special import expit
+
+from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.search.hypotheses import Hypotheses
+from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+
+LEAST_RATIO = 0.2  # of what belongs to places to noise; less is none
+NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
+NONE, OTHER = "none", "not in the catalogue"
+
+
+@dataclass(frozen=True)
+class Step:
+    """Evidence in the residual at one step.
+
+    Attributes:
+        number: of effects that were there.
+        unnamed_nats: evidence for a curve without a name over each variable.
+        rest_db: standard deviation of what belongs to places and has no name [dB].
+        noise_db: and of what belongs to nothing.
+        probabilities: of each effect that was scored on held-out links, passed or not, of `NONE`
+            and of `OTHER`; they sum to 1.
+    """
+
+    number: int
+    unnamed_nats: dict[str, float]
+    rest_db: float
+    noise_db: float
+    probabilities: dict[str, float]
+
+    @property
+    def best_unnamed(self) -> float:
+        """Most evidence for a curve without a name, at least 0 [nats]."""
+        return max([0.0, *self.unnamed_nats.values()])
+
+
+def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypotheses: Hypotheses,
+          criteria: SelectionCriteria) -> tuple[list[CandidateScore], Step]:
+    """Return a step's scores with their probabilities, and what the step says.
+
+    Args:
+        scores: of every candidate of the step.
+        model: without any of them.
+        hypotheses: about what it lacks.
+        criteria: a candidate that passed is refused below `min_probability`.
+    """
+    rest_db, noise_db = hypotheses.sizes_db
+    step = Step(len(model.whole.effects), hypotheses.unnamed_nats, rest_db, noise_db, {})
+    there = model.whole.effect_names
+    judged = []
+    for score in scores:
+        if score.gain_by_fold.size:
+            held_out = score.held_out_nats
+            # What makes links blank has no rival among what changes levels, nor among curves.
+            by_levels = bool(np.isfinite(score.evidence_nats))
+            others = [each.held_out_nats for each in scores if each.name != score.name
+                      and each.gain_by_fold.size
+                      and (by_levels or not np.isfinite(each.evidence_nats))]
+            nats = score.nats, held_out, held_out - max([0.0, *others])
+            score = replace(score, features=features(
+                nats, score.rmse_fall, rest_db / noise_db, bool(there - {score.name})))
+            probability = probability_of(score.name, score.features)
+            low = probability < criteria.min_probability
+            why = (f"it is not probable enough ({probability:.2f}; "
+                   f"{criteria.min_probability:g} is needed)") if low else ""
+            score = replace(score, probability=probability,
+                            reason=why if score.passed else score.reason)
+        judged.append(score)
+    return judged, replace(step, probabilities=_probabilities(judged, step.best_unnamed, rest_db,
+                                                              noise_db))
+
+
+def features(nats: tuple[float, float, float], rmse_fall: float, rest_over_noise: float,
+             is_another_kind: bool) -> tuple[float, ...]:
+    """Return what a candidate's probability depends on, (6,).
+
+    Args:
+        nats: its evidence beside a correlated rest, its gain on held-out links, and its lead over
+            the best other effect there [nats].
+        rmse_fall: of held-out links, logarithm of the error without it over that with it.
+        rest_over_noise: standard deviations of what belongs to places and of noise.
+        is_another_kind: whether an effect of another name is there already.
+    """
+    return (*np.arcsinh(np.array(nats) / NATS).tolist(), 10 * rmse_fall,
+            float(np.log(max(rest_over_noise, LEAST_RATIO))), float(is_another_kind))
+
+
+def probability_of_all(scores: Sequence[CandidateScore], other: float, before: CrossValidatedModel,
+                       rest_over_noise: float) -> float:
+    """Return the probability that several effects are there, from what they explain together.
+
+    Args:
+        scores: each of a model with those before it.
+        other: most that any other effect gains on held-out links [nats].
+        before: the model without any of them.
+        rest_over_noise: standard deviations of what belongs to places and of noise, without them.
+    """
+    evidence, held_out = (sum(each.nats for each in scores),
+                          sum(each.held_out_nats for each in scores))
+    kinds = {each.name for each in scores} | before.whole.effect_names
+    values = features((evidence, held_out, held_out - other),
+                      sum(each.rmse_fall for each in scores),
+                      rest_over_noise, len(kinds) > 1)
+    return min(probability_of(each.name, values) for each in scores)
+
+
+def probability_of(name: str, values: tuple[float, ...]) -> float:
+    """Return the probability that an effect is there, from its `features`."""
+    weights = calibration()["effect"]
+    own = weights["names"].get(name, 0.0)
+    return float(expit(weights["intercept"] + own + np.dot(weights["weights"], values)))
+
+
+def _probabilities(scores: Sequence[CandidateScore], unnamed: float, rest_db: float,
+                   noise_db: float) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for score in scores:
+        if np.isfinite(score.probability):
+            found[score.name] = max(found.get(score.name, 0.0), score.probability)
+    total = sum(found.values())
+    missing = float(np.prod([1 - each for each in found.values()]))
+    best = max([0.0, *(score.nats for score in scores if np.isfinite(score.nats))])
+    none = missing * probability_of_nothing(best, unnamed, rest_db, noise_db)
+    # Two effects may both be there: shares of what is not "none" nor without a name.
+    named = {name: each * (1 - missing) / total for name, each in found.items()} if total else {}
+    return named | {NONE: none, OTHER: missing - none}
+
+
+def probability_of_nothing(best: float, unnamed: float, rest_db: float, noise_db: float) -> float:
+    """Return the probability that nothing is hidden where no effect of the catalogue is.
+
+    Args:
+        best: most evidence for an effect [nats].
+        unnamed: most evidence for a curve without a name [nats].
+        rest_db: standard deviation of what belongs to places [dB].
+        noise_db: and of what belongs to nothing [dB].
+    """
+    weights = calibration()["nothing"]
+    values = [*np.arcsinh(np.array([best, unnamed]) / NATS), np.log(max(rest_db, 0.1)),
+              np.log(max(noise_db, 0.1))]
+    return float(expit(weights["intercept"] + np.dot(weights["weights"], values)))
+
+
+@cache
+def calibration() -> Mapping[str, dict]:
+    """Return the numbers of both logistic regressions."""
+    return json.loads(files(__package__).joinpath("calibration.json").read_text(encoding="utf-8"))

@@ -1,0 +1,287 @@
+"""A candidate fitted to all links and to each fold's others, and what held-out links say of it.
+
+Which devices and receivers a fitted effect belongs to, to be named in the report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.search.hypotheses import Hypotheses, is_judged_by_levels
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.effects.base import Effect
+from radiotwin.effects.params import EffectParams
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.inference.held_out import cross_fit_p_value, sign_flip_p_value
+from radiotwin.links import LinkData
+from radiotwin.runtime.execution import Executor
+from radiotwin.twin.model.fitting import add_effect, along_paths, prepare_additions
+from radiotwin.twin.model.fold_model import FittedEffect, FoldModel
+
+# Of the fold where a candidate moves likelihoods most (and of all folds, for links with line of
+# sight), and of the fold where it gains or loses most.
+MIN_MOVED, MIN_SHARE = 0.05, 0.1
+
+
+def ends_of(fitted: FittedEffect, links: LinkData) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the devices and of the receivers that parameters belong to.
+
+    Where each end has a coefficient, and few are off, that is the one that is off most.
+
+    Args:
+        fitted: effect with its parameters.
+        links: that it was fitted to.
+
+    Returns:
+        names of devices, names of receivers; both empty for an effect of all links.
+    """
+    params, effect = fitted.params, fitted.effect
+    if effect.sparse and hasattr(params, "members"):
+        off = np.abs(fitted.coefficients - np.median(fitted.coefficients))
+        most = [params.members[int(off.argmax())]]
+        return (_names(most, links.device_names) if effect.of_device else (),
+                _names(most, links.receiver_names) if effect.of_receiver else ())
+    return (_names(_indices(params, "device"), links.device_names),
+            _names(_indices(params, "receiver"), links.receiver_names))
+
+
+def _indices(params: object, end: str) -> list[int]:
+    """Return the indices in `device` or `devices`, whatever an effect has."""
+    one, many = getattr(params, end, None), getattr(params, f"{end}s", ())
+    return [each for each in (one, *many) if isinstance(each, int)]
+
+
+def _names(indices: list[int], names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(str(names[each]) for each in indices if 0 <= each < len(names))
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateScore:
+    """A candidate of one step, and what held-out links say of it.
+
+    Attributes:
+        name: of the effect.
+        kept: whether it was added.
+        reason: why not; empty where it was.
+        nll_gain: held-out likelihood gained [nats]; NaN where it was not tried.
+        rmse_db: held-out RMSE with it [dB].
+        rmse_fall: logarithm of the held-out RMSE without it over that with it, on links of which
+            their fold could know.
+        p_value: of no gain, links that err alike counted as one, corrected for the candidates.
+        step: number of effects that were there before.
+        gain_by_fold: (folds,) `nll_gain` of each fold over the number of links that count as one;
+            empty where it was not tried.
+        evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
+            it was not looked at.
+        passed: whether held-out links support it, however probable it is.
+        features: (6,) what its probability depends on, see `radiotwin.closeloop.search.posterior`;
+        empty
+            where it was not tried.
+        probability: that it is there.
+        params: as fitted to all links; None where it was not tried.
+        variant: of the effect.
+        devices: names of those that `params` belong to, see `ends_of`.
+        receivers: the same of receivers.
+    """
+
+    name: str
+    kept: bool = False
+    reason: str = ""
+    nll_gain: float = np.nan
+    rmse_db: float = np.nan
+    rmse_fall: float = 0.0
+    p_value: float = np.nan
+    step: int = 0
+    gain_by_fold: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    evidence_nats: float = np.nan
+    passed: bool = False
+    features: tuple[float, ...] = ()
+    probability: float = np.nan
+    params: EffectParams | None = None
+    variant: str = ""
+    devices: tuple[str, ...] = ()
+    receivers: tuple[str, ...] = ()
+
+    @property
+    def held_out_nats(self) -> float:
+        """Gain on held-out links, those that err alike counted as one [nats]."""
+        return float(self.gain_by_fold.sum())
+
+    @property
+    def nats(self) -> float:
+        """Evidence beside a correlated rest; on held-out links where residuals do not show it."""
+        return self.evidence_nats if np.isfinite(self.evidence_nats) else self.held_out_nats
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An effect fitted to all links, and how much likelier they are with it [nats].
+
+    `gain` counts every link, `evidence` knows that the base may be wrong (NaN: not looked at).
+    """
+
+    effect: Effect
+    whole: FoldModel
+    fit: FitResult
+    gain: float
+    evidence: float = np.nan
+
+
+def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
+                  criteria: SelectionCriteria, hypotheses: Hypotheses | None = None,
+                  ) -> Candidate | CandidateScore:
+    """Fit a candidate to all links; return a score with the reason if that refuses it already.
+
+    Args:
+        model: without it.
+        effect: that is tried.
+        step: number of effects that are there.
+        criteria: that decide.
+        hypotheses: about what the model lacks; None: not to be looked at.
+    """
+    refused = CandidateScore(effect.name, step=step, variant=effect.variant)
+    whole = add_effect(model.whole, effect, model.fits[0])
+    if whole is None:
+        return replace(refused, reason="nothing in the residual looks like it")
+    links, city = model.whole.links.select(model.whole.usable), model.whole.corrected_map
+    if city is not links.city:  # what was found is part of what is known
+        links = links.with_city(city)
+    why = effect.contradicted(whole[0].effects[-1].params, links)
+    if why:
+        return replace(refused, reason=why)
+    whole = along_paths(*whole, model.fits[0])
+    coefficients = whole[1].coefficients[whole[0].coefficient_slices[-1]]
+    params = whole[0].effects[-1].params
+    why = effect.implausible(params, coefficients) or effect.contradicted(params, links)
+    if why:
+        return replace(refused, reason=why)
+    gain = model.fits[0].objective - whole[1].objective
+    if gain < criteria.min_training_gain_nats:
+        return replace(refused, reason=f"gains less than {criteria.min_training_gain_nats:.0f} "
+                       "nats even on the links that it is fitted to")
+    if hypotheses is None or not is_judged_by_levels(effect):
+        return Candidate(effect, *whole, gain)
+    return Candidate(effect, *whole, gain, hypotheses.of_named(*whole))
+
+
+def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.ndarray, tried: int,
+                    step: int, seed: int, criteria: SelectionCriteria, executor: Executor,
+                    ) -> tuple[CandidateScore, CrossValidatedModel | None]:
+    """Fit a candidate to each fold's training links, and score it on the others.
+
+    Args:
+        model: without it.
+        candidate: fitted to all links.
+        block: (n,) piece of evidence of each link.
+        tried: number of candidates, that the p-value is corrected for.
+        step: number of effects that are there.
+        seed: of permutations.
+        criteria: that decide.
+        executor: where folds are fitted.
+
+    Returns:
+        the score, and the model with it; None where it does not pass.
+    """
+    fitted = FittedEffect(candidate.effect, candidate.whole.effects[-1].params,
+                          candidate.fit.coefficients[candidate.whole.coefficient_slices[-1]])
+    devices, receivers = ends_of(fitted, model.links)
+    extended = with_candidate(model, candidate, executor)
+    score = CandidateScore(candidate.effect.name, step=step, evidence_nats=candidate.evidence,
+                           params=fitted.params, variant=candidate.effect.variant, devices=devices,
+                           receivers=receivers)
+    score = score_model(model, extended, score, block, tried, seed, criteria,
+                        nlos_only=candidate.effect.nlos_only)
+    return score, None if score.reason else extended
+
+
+def with_candidate(model: CrossValidatedModel, candidate: Candidate,
+                   executor: Executor) -> CrossValidatedModel:
+    """Return a model with a candidate; a fold has it as its own training links show it."""
+    effect, like = candidate.effect, candidate.whole.effects[-1].params
+    models, fits = [candidate.whole], [candidate.fit]
+    prepare_additions(model.folds, model.fits[1:], [effect], executor, like)
+    for each, fit in zip(model.folds, model.fits[1:], strict=True):
+        extended_fold, extended_fit = add_effect(each, effect, fit, like) or (each, fit)
+        models.append(extended_fold)
+        fits.append(extended_fit)
+    return model.extended(models, fits)
+
+
+def fit_and_score(model: CrossValidatedModel, effect: Effect, block: np.ndarray, tried: int,
+                  step: int, seed: int, criteria: SelectionCriteria, executor: Executor,
+                  hypotheses: Hypotheses | None = None,
+                  ) -> tuple[CandidateScore, CrossValidatedModel | None]:
+    """Return `score_candidate` of `fit_candidate`; of one that is refused, no model."""
+    candidate = fit_candidate(model, effect, step, criteria, hypotheses)
+    if isinstance(candidate, CandidateScore):
+        return candidate, None
+    return score_candidate(model, candidate, block, tried, step, seed, criteria, executor)
+
+
+def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score: CandidateScore,
+                block: np.ndarray | None, tried: int, seed: int, criteria: SelectionCriteria,
+                nlos_only: bool = False) -> CandidateScore:
+    """Return what held-out links say of an extended model; with the reason where it is refused.
+
+    Without pieces of evidence `block` (n,) the gain may hang on a few positions.
+    """
+    gain = model.held_out_nll - extended.held_out_nll
+    known, los = np.isfinite(gain), model.links.los
+    usable = known & ~model.unforeseen
+    if not usable.any():
+        return replace(score, reason="no held-out link can be judged with it")
+    design_effect = model.whole.view(model.fits[0]).design_effect
+
+    def by_fold(rows: np.ndarray) -> np.ndarray:
+        own = np.bincount(model.index[rows], weights=gain[rows], minlength=len(model.folds))
+        return own / design_effect
+
+    total, shares = float(gain[usable].sum()), by_fold(usable)
+    per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
+    p_value = min(tried * cross_fit_p_value(shares), 1.0)
+    before_db, after_db = model.rmse_db(usable), extended.rmse_db(usable)
+    # A receiver, or a device, is not in every fold.
+    moved = np.bincount(model.index[usable], np.abs(gain[usable]), len(model.folds))
+    touched = (moved >= MIN_MOVED * moved.max()) \
+        & (np.abs(shares) >= MIN_SHARE * np.abs(shares).max())
+    few_p = 0.0
+    if block is not None:
+        few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), seed)
+    los_p, moved_los = 0.0, np.abs(gain[usable & los]).sum()
+    # What is weak, as an emitter's power is, leaves links with line of sight as they are.
+    if not los.all() and not nlos_only and moved_los > MIN_MOVED * moved.sum():
+        los_p = cross_fit_p_value(by_fold(usable & los))
+    reason = ""
+    if total < criteria.min_gain_nats:
+        reason = (f"gains {total:.0f} nats on held-out links, {criteria.min_gain_nats:.0f} are "
+                  "needed")
+    elif total <= 0:
+        reason = "gains nothing on held-out links"
+    elif p_value > criteria.max_p_value:
+        reason = f"its gain may be chance (p = {p_value:.2g} after correction)"
+    elif few_p > criteria.max_sign_flip_p_value:
+        reason = f"its gain hangs on a few places (p = {few_p:.2g} if signs are flipped)"
+    elif (shares[touched] > 0).mean() < criteria.min_gaining_folds:
+        reason = (f"gains in {(shares[touched] > 0).sum()} of the {touched.sum()} folds only that "
+                  "it acts on")
+    elif per_link < criteria.min_gain_per_link_nats \
+            and after_db > criteria.max_rmse_ratio * before_db:
+        reason = (f"gains {per_link:.3f} nats a link only, {criteria.min_gain_per_link_nats} are "
+                  "needed")
+    elif after_db > criteria.max_rmse_rise * before_db:
+        reason = (f"the error of held-out links would rise to {after_db:.2f} dB, though they "
+                  "become likelier")
+    elif los_p > criteria.max_los_p_value:
+        reason = ("links with line of sight, where the base is surest, do not support it "
+                  f"(p = {los_p:.2g})")
+    return replace(score, reason=reason, passed=not reason, nll_gain=total,
+                   rmse_db=extended.rmse_db(known), rmse_fall=_fall(before_db, after_db),
+                   p_value=p_value, gain_by_fold=shares)
+
+
+def _fall(before_db: float, after_db: float) -> float:
+    return float(np.log(before_db / after_db)) if before_db > 0 and after_db > 0 else 0.0

@@ -1,0 +1,1 @@
+"""The verdict and every number that decides it."""

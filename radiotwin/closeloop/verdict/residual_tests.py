@@ -1,0 +1,84 @@
+"""Dependences of the residual: one permutation test for each variable."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from radiotwin.inference.dependence import Series, holm, levels_of, permutation_p_value
+from radiotwin.links import LinkData, residual_variables
+from radiotwin.runtime.pieces import kept
+
+MAX_LINKS = 20_000  # more are thinned to whole series
+MAX_Z = 4.0  # an outlier counts as this many scales
+
+
+@dataclass(frozen=True)
+class ResidualDependence:
+    """A variable and whether the residual depends on it.
+
+    Attributes:
+        variable: its name.
+        p_value: corrected for the number of variables (Holm 1979).
+        effect_db: standard deviation of the residual's mean over the variable [dB].
+    """
+
+    variable: str
+    p_value: float
+    effect_db: float
+
+
+def residual_dependences(links: LinkData, residual_db: np.ndarray, scale_db: np.ndarray,
+                         mean_db: np.ndarray, seed: int) -> list[ResidualDependence]:
+    """Test every variable that the data have.
+
+    Args:
+        links: n links.
+        residual_db: (n,) of held-out links [dB]; NaN where there is none.
+        scale_db: (n,) error scale of their prediction [dB].
+        mean_db: (n,) their prediction [dB].
+        seed: of the permutations.
+
+    Returns:
+        the strongest first.
+    """
+    inputs = links, residual_db, scale_db, mean_db, seed
+    return kept("dependences", inputs, lambda: _tested(*inputs),
+                lambda found: ({}, [asdict(each) for each in found]), _read)
+
+
+def _read(_: dict[str, np.ndarray], content: Any) -> list[ResidualDependence]:
+    return [ResidualDependence(str(each["variable"]), float(each["p_value"]),
+                               float(each["effect_db"])) for each in content]
+
+
+def _tested(links: LinkData, residual_db: np.ndarray, scale_db: np.ndarray, mean_db: np.ndarray,
+            seed: int) -> list[ResidualDependence]:
+    rng = np.random.default_rng(seed)
+    rows = np.flatnonzero(np.isfinite(residual_db))
+    if len(rows) > MAX_LINKS:
+        # Whole series, so that neighbours stay neighbours.
+        series = links.track[rows] * len(links.device_names) + links.device[rows]
+        names = rng.permutation(np.unique(series))
+        total = np.cumsum(np.bincount(series, minlength=names.max() + 1)[names])
+        kept = total <= MAX_LINKS
+        rows = rows[np.isin(series, names[kept])] if kept.any() else rows[:MAX_LINKS]
+    part = links.select(rows)
+    z = np.clip(residual_db[rows] / scale_db[rows], -MAX_Z, MAX_Z)
+    z = z - z.mean()
+    label = part.track * len(part.device_names) + part.device
+    series = Series.sort(np.unique(label, return_inverse=True)[1], np.nan_to_num(part.time_s))
+    found = []
+    for name, values in residual_variables(part, mean_db[rows]).items():
+        level = levels_of(values)
+        if level is None:
+            continue
+        count = np.bincount(level)
+        means = np.bincount(level, weights=residual_db[rows]) / np.maximum(count, 1)
+        squares = (means - residual_db[rows].mean()) ** 2
+        effect_db = float(np.sqrt(np.average(squares, weights=count)))
+        found.append((permutation_p_value(level, z, series, rng), name, effect_db))
+    found.sort(key=lambda each: (each[0], -each[2]))
+    corrected = holm(np.array([p_value for p_value, _, _ in found]))
+    return [ResidualDependence(name, float(p_value), effect_db)
+            for p_value, (_, name, effect_db) in zip(corrected, found, strict=True)]

@@ -1,0 +1,1 @@
+"""The catalogue: one file an effect, known by name to nobody else."""

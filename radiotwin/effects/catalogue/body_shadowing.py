@@ -1,0 +1,157 @@
+"""The receiver's body is in the way: loss depends on the direction of arrival in the body frame.
+
+The loss is greatest where the body is, nothing on the opposite side, and in between
+depth ((1 + cos angle) / 2)^k, with the angle between the arrival and the body, in azimuth and
+elevation together. Its width is where half of the depth is left: k = 1, the first harmonic, is 180°
+wide, and a large k is a normal curve. Airframe shadowing is described by Khawaja et al., 'A survey
+of air-to-ground propagation channel modeling for unmanned aerial vehicles', IEEE COMST 21(3), 2019.
+"""
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.antenna_params import allowed_of, vary_patterns
+from radiotwin.effects.arrays import frequent_labels, subsample
+from radiotwin.effects.base import GainEffect, ResidualView
+from radiotwin.effects.catalogue.tilted_dipole import TiltedDipole
+from radiotwin.effects.params import (
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+    quantities,
+    quantity,
+)
+from radiotwin.links import LinkData
+
+MIN_LINKS = 100  # of a receiver, detected and with a heading
+MIN_NATS = 4.0  # that a body must gain to be proposed
+DEPTH_SD_DB = 16.0  # prior of the depth, which steadies the proposal
+SEARCH_STEP_DEG, SEARCHED_WIDTHS_DEG = 15.0, (60.0, 120.0, 180.0)
+MAX_LINKS = 2000  # that the search looks at
+
+
+class Body(EffectParams):
+    """Where the body is, seen from one receiver's antenna, and what it takes."""
+
+    depth_db: float = quantity(0.0, unit="dB", low=0.0, high=40.0, step=2.0,
+                               description="Loss of what arrives through its middle.")
+    azimuth_deg: float = quantity(0.0, unit="deg", low=-720.0, high=1080.0, step=15.0,
+                                  description="Direction of its middle, clockwise from the nose.")
+    elevation_deg: float = quantity(0.0, unit="deg", low=-90.0, high=90.0, step=15.0,
+                                    description="Direction of its middle, up from the deck.")
+    width_deg: float = quantity(180.0, unit="deg", low=40.0, high=240.0, step=30.0,
+                                description="Angle across, within which half of it is lost.")
+
+    def loss_db(self, arrival: np.ndarray) -> np.ndarray:
+        """Return the loss (n,) [dB], of arrivals (n, 3) as unit vectors right, nose, top."""
+        middle = _directions(self.azimuth_deg, self.elevation_deg)
+        return self.depth_db * _share(arrival @ middle, self.width_deg)
+
+
+class BodyShadowing(GainEffect):
+    """Receivers that lose more on one side."""
+
+    name = "body_shadowing"
+    variant = "loss around the body"
+    figure = "pattern"
+    of_receiver = True
+    confused_with = ("antenna_pattern",)
+
+    class Params(EffectParams):
+        """Bodies that shadow."""
+
+        receivers: dict[ReceiverIndex, Body] = Field(
+            min_length=1, description="Body of each receiver, by index.")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        return TiltedDipole().unavailable(links)  # which needs headings, too
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found = view.links, {}
+        usable = np.isfinite(links.heading_deg) & np.isfinite(links.level_db)
+        for receiver in frequent_labels(links.receiver[usable], MIN_LINKS):
+            body = _best_body(view, np.flatnonzero((links.receiver == receiver) & usable))
+            if body is not None:
+                found[receiver] = body
+        return [self.Params(receivers=found)] if found else []
+
+    @override
+    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+        """Return also what all links proposed: every link bears on it, in each part alike."""
+        return [*self.propose(view), params]
+
+    @override
+    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+        gain_db = np.zeros(len(links))
+        for receiver, body in params.receivers.items():
+            rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
+            gain_db[rows] = -body.loss_db(_arrivals(links.select(rows)))
+        return gain_db
+
+    @override
+    def variation(self, params: Params) -> Variation:
+        return vary_patterns(params.receivers,
+                             lambda receivers: self.Params(receivers=receivers))
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        reported: dict[str, Parameter] = {}
+        bodies_sd = np.reshape(estimate.params_sd, (len(params.receivers), -1))
+        for (receiver, body), sd in zip(params.receivers.items(), bodies_sd, strict=True):
+            for (field, each), field_sd in zip(quantities(body).items(), sd, strict=True):
+                value = getattr(body, field)
+                value = value % 360 if field == "azimuth_deg" else value
+                reported[f"body_{field}[{links.receiver_names[receiver]}]"] = Parameter.normal(
+                    value, field_sd, each["unit"], allowed_of(field, each))
+        return reported
+
+
+def _arrivals(links: LinkData) -> np.ndarray:
+    """Return unit vectors (n, 3) towards the devices, along right, nose and top of the receiver."""
+    length_m = np.maximum(np.linalg.norm(links.offset_m, axis=1), 1e-9)
+    return np.einsum("nij,nj->ni", links.receiver_axes, -links.offset_m / length_m[:, None])
+
+
+def _directions(azimuth_deg: np.ndarray | float, elevation_deg: np.ndarray | float) -> np.ndarray:
+    """Return unit vectors (..., 3) along right, nose and top."""
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation),
+                     np.sin(elevation)], axis=-1)
+
+
+def _share(cosine: np.ndarray, width_deg: float) -> np.ndarray:
+    """Return the share of the depth that is lost, by the cosine of the angle to the middle."""
+    exponent = np.log(0.5) / (2 * np.log(np.cos(np.radians(width_deg / 4))))
+    return np.clip((1 + cosine) / 2, 0.0, 1.0) ** exponent
+
+
+def _best_body(view: ResidualView, rows: np.ndarray) -> Body | None:
+    """Return the body that fits links best, a level beside it; None if it gains little."""
+    few = subsample(rows, MAX_LINKS)
+    weight = view.weight[few] * (len(rows) / len(few))
+    residual_db, total = view.residual_db[few], weight.sum()
+    residual_db = residual_db - weight @ residual_db / total
+    azimuth_deg, elevation_deg = (each.ravel() for each in np.meshgrid(
+        np.arange(0.0, 360.0, SEARCH_STEP_DEG),
+        np.arange(-90.0 + SEARCH_STEP_DEG, 90.0, SEARCH_STEP_DEG)))
+    cosine = _arrivals(view.links.select(few)) @ _directions(azimuth_deg, elevation_deg).T
+    best, most_nats = None, MIN_NATS
+    for width_deg in SEARCHED_WIDTHS_DEG:
+        share = _share(cosine, width_deg)
+        share -= weight @ share / total
+        moment = np.maximum(-(weight * residual_db) @ share, 0.0)
+        precision = weight @ share**2 + DEPTH_SD_DB**-2
+        nats = 0.5 * moment**2 / precision
+        number = int(nats.argmax())
+        if nats[number] > most_nats:
+            most_nats = float(nats[number])
+            best = Body(depth_db=min(float(moment[number] / precision[number]), 40.0),
+                        azimuth_deg=float(azimuth_deg[number]),
+                        elevation_deg=float(elevation_deg[number]), width_deg=width_deg)
+    return best

@@ -1,0 +1,155 @@
+"""Receivers or devices inside buildings of the map: the loss of a wave that enters (ITU-R P.2109).
+
+The recommendation has the distribution of the loss over buildings and places in them. The median of
+one of its two classes of buildings is what a link loses at first; how much more or less it is here
+is fitted, with the spread of the distribution as the prior.
+
+Receivers' positions are off by metres, so each has a probability to be inside (`chance_inside`),
+and loses that share: the mean over both cases. One on the pavement loses some of it, too, unless it
+has line of sight. How much the loss scatters from place to place is fitted as well.
+"""
+
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+from scipy.special import ndtri
+from typing_extensions import override
+
+from radiotwin.effects.arrays import LinkCache, city_of
+from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, quantity
+from radiotwin.links import LinkData
+from radiotwin.links.checks import chance_inside
+
+MIN_LINKS = 30  # with one end inside
+MIN_HZ, MAX_HZ = 80e6, 100e9  # of the recommendation
+MIN_LOSS_DB = 1.0  # less is none: 1 % of traditional buildings cost below 1.6 dB, at 2.4 GHz
+START_SD_DB = 5.0  # of the search for the scatter
+MAX_PROBABILITY = 0.99  # of the loss: a greater one is something else
+
+
+class _Class(NamedTuple):
+    """Coefficients of a class of buildings (ITU-R P.2109-2, Table 1)."""
+
+    r: float
+    s: float
+    t: float
+    u: float
+    v: float
+    w: float
+    x: float
+    y: float
+    z: float
+
+
+Building = Literal["traditional", "thermally_efficient"]
+CLASSES: dict[Building, _Class] = {
+    "traditional": _Class(12.64, 3.72, 0.96, 9.6, 2.0, 9.1, -3.0, 4.5, -2.0),
+    "thermally_efficient": _Class(28.19, -3.00, 8.48, 13.5, 3.8, 27.8, -2.9, 9.4, -2.1)}
+
+
+def entry_loss_db(frequency_hz: float, elevation_deg: np.ndarray | float, building: Building,
+                  probability: float = 0.5) -> np.ndarray:
+    """Return the building entry loss (n,) [dB] (ITU-R P.2109-2, Eqs. 1 to 10).
+
+    Args:
+        frequency_hz: of the radio, 80 MHz to 100 GHz [Hz].
+        elevation_deg: (n,) elevation of the path at the facade [deg]; its sign does not matter.
+        building: class of the building.
+        probability: share of the buildings, and of the places in them, where the loss is less.
+    """
+    c, log_f = CLASSES[building], np.log10(frequency_hz / 1e9)
+    horizontal_db = c.r + c.s * log_f + c.t * log_f**2
+    first_db = horizontal_db + 0.212 * np.abs(elevation_deg)
+    quantile = ndtri(probability)
+    a_db = quantile * (c.u + c.v * log_f) + first_db
+    b_db = quantile * (c.y + c.z * log_f) + c.w + c.x * log_f
+    return 10 * np.log10(10 ** (a_db / 10) + 10 ** (b_db / 10) + 10**-0.3)
+
+
+class BuildingEntry(GainEffect):
+    """Links with one end inside a building lose on the way in."""
+
+    name = "building_entry"
+    needs_map = True
+    figure = "histogram"
+    nlos_only = True
+    confused_with = ("missing_obstacle", "receiver_gain_offset")
+
+    class Params(EffectParams):
+        """Class of the buildings."""
+
+        building: Building = Field(description="Class of ITU-R P.2109.")
+        frequency_hz: float = Field(ge=MIN_HZ, le=MAX_HZ, description="Of the radio [Hz].")
+        scatter_sd_db: float = quantity(
+            0.0, unit="dB", low=0.0, high=30.0, step=2.0,
+            description="Standard deviation of the loss, over buildings and places in them [dB].")
+
+    def __init__(self) -> None:
+        self._entering = LinkCache()
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if missing := super().unavailable(links):
+            return missing
+        if not MIN_HZ <= links.frequency_hz <= MAX_HZ:
+            return ("the frequency is not known, or outside the 80 MHz to 100 GHz of ITU-R P.2109; "
+                    "give frequency_hz")
+        count = int(self._chance(links).sum())
+        if count < MIN_LINKS:
+            return (f"{count} links probably have one end inside a building; {MIN_LINKS} are "
+                    "needed")
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        return [self.Params(building=building, frequency_hz=view.links.frequency_hz,
+                            scatter_sd_db=START_SD_DB) for building in CLASSES]
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        chance = self._chance(links)
+        median_db = entry_loss_db(params.frequency_hz, links.elevation_deg, params.building)
+        low_db, high_db = (entry_loss_db(params.frequency_hz, 0.0, params.building, probability)
+                           for probability in (0.1587, 0.8413))  # one standard deviation apart
+        return Term(-chance * median_db, -chance[:, None], np.array([(high_db - low_db) / 2]),
+                    random_effect_sd_db=np.sqrt(chance) * params.scatter_sd_db)
+
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        loss_db, most_db = self._loss_db(params, coefficients), entry_loss_db(
+            params.frequency_hz, 0.0, params.building, MAX_PROBABILITY)
+        if loss_db < 0:
+            return f"buildings would have to amplify, by {-loss_db:.1f} dB"
+        if loss_db < MIN_LOSS_DB:
+            return f"its links lose {loss_db:.1f} dB only: they scatter, and do not enter buildings"
+        if loss_db > most_db:
+            return (f"an entry loss of {loss_db:.0f} dB is above the {most_db:.0f} dB that 99 % of "
+                    "such buildings stay below (ITU-R P.2109)")
+        return None
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        scatter = Parameter.normal(params.scatter_sd_db, estimate.params_sd[0], "dB")
+        return {"entry_loss_db": Parameter.normal(self._loss_db(params, estimate.coefficients),
+                                                  estimate.coefficients_sd[0], "dB"),
+                "scatter_sd_db": replace(scatter, low=max(scatter.low, 0.0))}
+
+    @staticmethod
+    def _loss_db(params: Params, coefficients: np.ndarray) -> float:
+        """Return the fitted loss of a horizontal path [dB]."""
+        return float(entry_loss_db(params.frequency_hz, 0.0, params.building) + coefficients[0])
+
+    def _chance(self, links: LinkData) -> np.ndarray:
+        """Return the probability (n,) that one end is inside a building and the other outside."""
+        def derive() -> np.ndarray:
+            city = city_of(links, self.name)
+            device = city.inside(links.device_m)[links.device]
+            receiver = city.inside(links.receiver_m).astype(float)
+            measured = links.receiver >= 0  # others are points of a map, whose places are exact
+            receiver[measured] = chance_inside(city, links.receiver_m[measured])
+            return np.where(links.los, 0.0, np.where(device, 1 - receiver, receiver))
+        return self._entering.get(links, None, derive)

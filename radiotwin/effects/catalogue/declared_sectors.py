@@ -1,0 +1,318 @@
+"""Sector antennas of which only the direction is known: a planner's table has it, not the pattern.
+
+All declared devices have one pattern (3GPP TR 38.901 V17, Table 7.3-1, as in `sector_antenna`),
+each turned to its own azimuth and tilt, and levels that have much in common (`sector_levels`). All
+azimuths may be off by one small angle (a compass, another north), and all tilts (what is electrical
+is in few tables); by a large one the table is wrong. So it holds for a sector that nobody has
+measured, too, which a pattern learnt for each device by itself does not.
+
+Levels of sector antennas, which have the more in common the more of a site they share.
+
+Radios and cables of a mast come from one installation, and sectors of one direction are carriers
+that share an antenna. So levels are random effects, nested: of all, of a mast, of a direction
+there, of a device. What was heard of the others then says what to expect of a sector that nobody
+has measured, and how surely.
+"""
+
+from collections import Counter
+from itertools import product
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from typing_extensions import override
+
+from radiotwin.effects.antenna_params import allowed_of
+from radiotwin.effects.arrays import subsample
+from radiotwin.effects.base import LevelAt, ResidualView, Term
+from radiotwin.effects.catalogue.sector_antenna import (
+    BEAMWIDTHS_DEG,
+    FRONT_TO_BACK_DB,
+    LEVEL_SD_DB,
+    MAX_PROPOSE_LINKS,
+    MIN_LINKS,
+    MIN_NATS,
+    VERTICALS_DEG,
+    Rays,
+    SectorAntenna,
+    SectorPattern,
+)
+from radiotwin.effects.params import (
+    Decibels,
+    DeviceIndex,
+    Estimate,
+    Parameter,
+    Variation,
+    quantities,
+    quantity,
+)
+from radiotwin.links import LinkData
+from radiotwin.links.sites import antenna_of, site_of
+
+GROUP_SD_DB = 3.0  # between masts, and between directions of a mast
+DEVICE_SD_DB = 3.0  # between carriers of an antenna: powers and cables differ
+MIN_DEVICES = 2  # of declared azimuth; of one, the pattern is that of `SectorAntenna`
+TILT_SD_DEG = 4.0  # by which declared tilts are off: electrical ones are a few degrees
+MAX_TURN_DEG = 20.0  # by which compasses, maps and declination are off; more is a wrong table
+OFFSETS = ("azimuth_offset_deg", "tilt_offset_deg")  # numbers that all devices share
+TURNS_DEG = (0.0, -45.0, 45.0, -90.0, 90.0, -135.0, 135.0, 180.0)  # that are tried first
+
+
+def level_groups(links: LinkData, devices: list[int]) -> list[list[int]]:
+    """Return those of some devices that are on one mast, and those that look one way from it.
+
+    Groups are of at least two devices; one that is both, a mast of one direction, is in it twice.
+    """
+    found = [{tuple(other for other in group_of(links, device) if other in devices)
+              for device in devices} for group_of in (site_of, antenna_of)]
+    return [list(group) for kind in found for group in sorted(kind) if len(group) > 1]
+
+
+def own_sd_db(devices: list[int], groups: list[list[int]]) -> np.ndarray:
+    """Return the standard deviation of what no other device shares (k,) [dB].
+
+    That of a device, and of a mast or a direction that it has for itself.
+    """
+    alone = 2 - membership(devices, groups).sum(axis=1)
+    return np.sqrt(DEVICE_SD_DB**2 + GROUP_SD_DB**2 * alone)
+
+
+def membership(devices: list[int], groups: list[list[int]]) -> np.ndarray:
+    """Return which groups each device is in, (k, groups) of 0 and 1."""
+    return np.array([[float(device in group) for group in groups] for device in devices]
+                    ).reshape(len(devices), len(groups))
+
+
+def unheard_sd_db(devices: list[int], groups: list[list[int]], heard: set[int],
+                  common_sd_db: float) -> dict[int, float]:
+    """Return the standard deviation of the level of each device without a reading [dB].
+
+    That of a normal distribution, on condition of the levels of all others.
+
+    Args:
+        devices: all k.
+        groups: of them that have a level in common.
+        heard: those whose levels are known.
+        common_sd_db: between networks: of the level of all [dB].
+    """
+    member = membership(devices, groups)
+    covariance = common_sd_db**2 + GROUP_SD_DB**2 * member @ member.T
+    covariance += np.diag(own_sd_db(devices, groups) ** 2)
+    known = np.isin(devices, list(heard))
+    cross = covariance[np.ix_(~known, known)]
+    explained = np.einsum("ij,ji->i", cross, np.linalg.solve(covariance[np.ix_(known, known)],
+                                                             cross.T))
+    sd_db = np.sqrt(np.diag(covariance)[~known] - explained)
+    return {device: float(sd) for device, sd in zip(np.array(devices)[~known].tolist(), sd_db,
+                                                    strict=True)}
+
+
+class DeclaredSectors(SectorAntenna):
+    """One pattern for all devices of declared azimuth; links leave along the straight line.
+
+    Attributes:
+        straight: whether they do, or in the directions of the paths over the map. On the links that
+            both are fitted to, paths over a map that is half guessed may well win; held-out links
+            say which is right.
+    """
+
+    variant = "sector antennas of declared azimuth"
+    straight: ClassVar[bool] = True
+    is_declared = True
+    repeatable = False
+
+    class Params(SectorAntenna.Params):
+        """Antennas of devices, all of one pattern, at their declared azimuths and a common turn."""
+
+        azimuth_offset_deg: float = quantity(
+            0.0, unit="deg", low=-180.0, high=180.0, step=5.0, prior_sd=5.0,
+            description="By which all declared azimuths are off, clockwise.")
+        tilt_offset_deg: float = quantity(
+            0.0, unit="deg", low=-60.0, high=80.0, step=4.0,
+            description="By which all declared tilts are off, upwards; without any, the tilt.")
+        has_tilts: bool = Field(False, description="Whether tilts are declared.")
+        groups: list[list[DeviceIndex]] = Field(
+            [], description="Devices whose levels have more in common: of a mast, of a direction.")
+        unheard_sd_db: dict[DeviceIndex, Decibels] = Field(
+            {}, description="How uncertain the level of each device without a reading is.")
+
+        @model_validator(mode="after")
+        def _check_groups(self) -> Self:
+            counts = Counter(device for group in self.groups for device in group)
+            if any(len(set(group)) < max(len(group), 2) for group in self.groups) \
+                    or not set(counts) <= set(self.devices) or max(counts.values(), default=0) > 2:
+                raise ValueError("groups are not of two devices and more, each in two at most")
+            return self
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if missing := super().unavailable(links):
+            return missing
+        if len(_declared(links)) < MIN_DEVICES:
+            return f"azimuth_deg of {MIN_DEVICES} devices of known position is not declared"
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[SectorAntenna.Params]:
+        declared = _declared(view.links)
+        if np.isin(view.links.device, declared).sum() < MIN_LINKS:
+            return []
+        nats, shape, offset_deg = _best_shape(view, declared, self.straight)
+        if nats <= MIN_NATS:
+            return []
+        groups = level_groups(view.links, declared)
+        heard = view.links.device[np.isfinite(view.links.level_db)]
+        unheard = unheard_sd_db(declared, groups, set(heard.tolist()), LEVEL_SD_DB)
+        return [self.Params(devices=_turned(view.links, declared, shape, offset_deg),
+                            straight=self.straight, azimuth_offset_deg=offset_deg,
+                            tilt_offset_deg=shape.tilt_deg, groups=groups, unheard_sd_db=unheard,
+                            has_tilts=bool(np.isfinite(view.links.tilt_deg[declared]).any()))]
+
+    @override
+    def neg_log_prior(self, params: Any) -> float:
+        tilt = 0.5 * (params.tilt_offset_deg / TILT_SD_DEG) ** 2 if params.has_tilts else 0.0
+        return super().neg_log_prior(params) + tilt
+
+    @override
+    def implausible(self, params: Any, coefficients: np.ndarray) -> str | None:
+        if abs(params.azimuth_offset_deg) <= MAX_TURN_DEG:
+            return None
+        return (f"they fit azimuths that are all turned by {params.azimuth_offset_deg:+.0f}°; "
+                "azimuth_deg counts clockwise from north")
+
+    @override
+    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
+        own = super().term(links, params, level_at)
+        shared = _shared(params)
+        sd_db = np.zeros(len(links))
+        for device, level_sd_db in params.unheard_sd_db.items():
+            sd_db[links.device == device] = level_sd_db
+        return Term(own.offset_db, own.columns @ np.column_stack([shared, np.eye(len(shared))]),
+                    np.r_[LEVEL_SD_DB, np.full(len(params.groups), GROUP_SD_DB),
+                          own_sd_db(list(params.devices), params.groups)],
+                    unheard_sd_db=sd_db)
+
+    @override
+    def variation(self, params: Any) -> Variation:
+        fields = _numbers()
+        first = next(iter(params.devices.values()))
+        values = np.array([getattr(params if name in OFFSETS else first, name) for name in fields])
+        steps, low, high = (np.array([each[key] for each in fields.values()], dtype=float)
+                            for key in ("step", "low", "high"))
+        # Each antenna's own tilt stays within its bounds.
+        own_deg = [pattern.tilt_deg for pattern in params.devices.values()]
+        bounds, at = quantities(SectorPattern)["tilt_deg"], [*fields].index("tilt_offset_deg")
+        low[at] = values[at] + bounds["low"] - min(own_deg)
+        high[at] = values[at] + bounds["high"] - max(own_deg)
+
+        def changed(numbers: np.ndarray) -> DeclaredSectors.Params:
+            found = dict(zip(fields, numbers.tolist(), strict=True))
+            offsets = {name: found.pop(name) for name in OFFSETS}
+            turn_deg, up_deg = (each - getattr(params, name) for name, each in offsets.items())
+            devices = {device: pattern.model_copy(update=found | {
+                "azimuth_deg": pattern.azimuth_deg + turn_deg,
+                "tilt_deg": pattern.tilt_deg + up_deg})
+                for device, pattern in params.devices.items()}
+            return params.model_copy(update={"devices": devices} | offsets)
+
+        return Variation(values, steps, low, high, changed)
+
+    @override
+    def parameters(self, links: LinkData, params: Any,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        values = self.variation(params).values
+        reported = {name: Parameter.normal(value, sd, field["unit"], allowed_of(name, field))
+                    for (name, field), value, sd in zip(_numbers().items(), values,
+                                                        estimate.params_sd, strict=True)}
+        if not params.has_tilts:
+            reported["tilt_deg"] = reported.pop("tilt_offset_deg")
+        if links.city is None or params.straight:
+            reported.pop("scattered_db")
+        # The common one is the channel's.
+        shares = np.column_stack([_shared(params)[:, 1:], np.eye(len(params.devices))])
+        level_db = shares @ estimate.coefficients[1:]
+        sd_db = estimate.sd_of(np.column_stack([np.zeros(len(shares)), shares]))
+        for device, value_db, each_sd_db in zip(params.devices, level_db, sd_db, strict=True):
+            reported[f"gain_db[{links.device_names[device]}]"] = Parameter.normal(
+                float(value_db), float(each_sd_db), "dB")
+        return reported
+
+
+class DeclaredSectorsOnPaths(DeclaredSectors):
+    """The same, each path with the gain of the direction in which it leaves the device."""
+
+    variant = "sector antennas of declared azimuth, along paths"
+    straight = False
+    needs_map = True
+
+
+def _shared(params: Any) -> np.ndarray:
+    """Return which level each device shares with others, all or a group, (k, 1 + groups)."""
+    devices = list(params.devices)
+    return np.column_stack([np.ones(len(devices)), membership(devices, params.groups)])
+
+
+def _numbers() -> dict[str, dict]:
+    """Return what is searched for: name -> step, bounds and unit."""
+    common, shape = quantities(DeclaredSectors.Params), quantities(SectorPattern)
+    return {name: common[name] for name in OFFSETS} | {
+        name: field for name, field in shape.items() if name not in ("azimuth_deg", "tilt_deg")}
+
+
+def _declared(links: LinkData) -> list[int]:
+    """Return the devices of declared azimuth and position, also those without a reading."""
+    return [device for device in np.flatnonzero(np.isfinite(links.boresight_deg)).tolist()
+            if device in links.anchors]
+
+
+def _turned(links: LinkData, devices: list[int], shape: SectorPattern,
+            offset_deg: float) -> dict[int, SectorPattern]:
+    """Return device -> a pattern, turned to what is declared for it, and further.
+
+    A tilt that is not declared is the median of those that are, or else 0; that of `shape` is
+    added.
+    """
+    known = links.tilt_deg[devices]
+    usual = float(np.median(known[np.isfinite(known)])) if np.isfinite(known).any() else 0.0
+    bounds = quantities(SectorPattern)["tilt_deg"]
+    tilts_deg = np.clip(np.where(np.isfinite(known), known, usual) + shape.tilt_deg,
+                        bounds["low"], bounds["high"])
+    return {device: shape.model_copy(
+        update={"azimuth_deg": float(links.boresight_deg[device]) + offset_deg, "tilt_deg": tilt})
+        for device, tilt in zip(devices, tilts_deg.tolist(), strict=True)}
+
+
+def _best_shape(view: ResidualView, devices: list[int],
+                straight: bool) -> tuple[float, SectorPattern, float]:
+    """Return what the best pattern of a grid gains over a level [nats], the pattern, its turn."""
+    parts = []
+    for device in devices:
+        every = np.flatnonzero(view.links.device == device)
+        rows = subsample(every, MAX_PROPOSE_LINKS)
+        if len(rows):
+            parts.append((device, rows, np.full(len(rows), len(every) / len(rows)),
+                          Rays.of(view.links, rows, straight)))
+    rows, times = (np.concatenate([part[column] for part in parts]) for column in (1, 2))
+    residual_db = view.residual_db[rows]
+    weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
+
+    def nats(offset_db: np.ndarray) -> float:
+        level_db = weight @ (residual_db - offset_db) / max(weight.sum(), 1e-12)
+        return float(times @ view.gain_nats(rows, offset_db + level_db))
+
+    def tried(width: float, back_db: float, tilt: float, height: float,
+              offset_deg: float) -> tuple[float, SectorPattern, float]:
+        shape = SectorPattern(beamwidth_deg=width, front_to_back_db=back_db, tilt_deg=tilt,
+                              vertical_beamwidth_deg=height)
+        turned = _turned(view.links, devices, shape, offset_deg)
+        return nats(np.concatenate([rays.offset_db(turned[device])
+                                    for device, _, _, rays in parts])), shape, offset_deg
+
+    # A turn first, with the pattern flat: of azimuths in another convention no shape is right.
+    offset_deg = max((tried(*numbers, 0.0, 360.0, turn) for turn in TURNS_DEG
+                    for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
+                   key=lambda each: each[0])[2]
+    best, shape, _ = max((tried(*numbers, *vertical, offset_deg) for vertical in VERTICALS_DEG
+                          for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
+                         key=lambda each: each[0])
+    return best - nats(np.zeros(len(rows))), shape, offset_deg

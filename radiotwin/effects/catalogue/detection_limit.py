@@ -1,0 +1,69 @@
+"""A receiver less sensitive than the others: its links are blank below a limit of its own.
+
+A blank then means "below that limit" (Tobin 1958, 'Estimation of relationships for limited
+dependent variables', Econometrica 26) and not "below the usual one". Receivers whose limits hardly
+differ, and a declared limit that is wrong, are no effect: `radiotwin.links.limits` sees to them. A
+receiver with readings below a limit has another one: what is blank was lost for another reason,
+such as that no way leads there.
+"""
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.base import LimitEffect, ResidualView
+from radiotwin.effects.params import Decibels, EffectParams, Estimate, Parameter, ReceiverIndex
+from radiotwin.links import LinkData
+from radiotwin.links.limits import MIN_NATS, contradict_limit, receiver_limit
+
+MIN_RISE_DB = 2.0  # above the usual limit
+
+
+class DetectionLimit(LimitEffect):
+    """A limit for each receiver whose blanks become likelier by it."""
+
+    name = "noise_floor_censoring"
+    variant = "a receiver's own limit of detection"
+    confused_with = ("lock_loss", "missing_obstacle", "receiver_gain_offset")
+    nlos_only = True  # as good as: over a map, links with line of sight are far above a limit
+
+    class Params(EffectParams):
+        """Limits of receivers."""
+
+        receivers: dict[ReceiverIndex, Decibels] = Field(
+            description="Limit of detection of each receiver, by index [dB].")
+        sd_db: dict[ReceiverIndex, Decibels] = Field(
+            default_factory=dict, description="Standard deviation of each [dB].")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        return None if np.isnan(links.level_db).any() else "no link is blank"
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found, sd_db = view.links, {}, {}
+        seen = np.isfinite(links.level_db)
+        for receiver in np.unique(links.receiver):
+            mine = links.receiver == receiver
+            usual_db = float(np.median(links.limit_db[mine]))
+            limit = receiver_limit(links.level_db[mine], view.mean_db[mine], view.scale_db[mine],
+                                   view.design_effect, usual_db)
+            if (limit is not None and limit.is_sure and limit.limit_db > usual_db + MIN_RISE_DB
+                    and (np.isinf(usual_db) or limit.over_declared_nats > MIN_NATS)
+                    and not contradict_limit(links.level_db[mine & seen], limit.limit_db)):
+                found[int(receiver)], sd_db[int(receiver)] = limit.limit_db, limit.sd_db
+        return [self.Params(receivers=found, sd_db=sd_db)] if found else []
+
+    @override
+    def limits_db(self, links: LinkData, params: Params) -> np.ndarray:
+        by_receiver_db = np.full(len(links.receiver_names), -np.inf)
+        by_receiver_db[list(params.receivers)] = list(params.receivers.values())
+        return by_receiver_db[links.receiver]
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        unit = links.level_unit
+        return {f"limit[{links.receiver_names[receiver]}]": Parameter.normal(
+                    limit_db, params.sd_db.get(receiver, np.nan), unit)
+                for receiver, limit_db in params.receivers.items()}

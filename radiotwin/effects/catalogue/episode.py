@@ -1,0 +1,351 @@
+"""Something that takes from levels between two times: rain, a wet antenna, a plug that was loose.
+
+A loss [dB], or an attenuation along the path [dB/km] (ITU-R P.838, 'Specific attenuation model for
+rain'), of one receiver or of all. The times are the two change points between which the residual,
+compared with that of other flights at the same places, differs most from the rest (circular binary
+segmentation, Olshen et al. 2004, Biostatistics 5); no other window of that length may differ like
+that.
+"""
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+from scipy.stats import t
+from typing_extensions import override
+
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.comparison import (
+    by_precision,
+    compared_where_possible_db,
+    flight_mask,
+    mean_by_precision,
+    share_alike,
+)
+from radiotwin.effects.losses import max_gas_db_km, max_rain_db_km
+from radiotwin.effects.params import (
+    Allowed,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Seconds,
+)
+from radiotwin.links import LinkData, evidence_blocks
+from radiotwin.links.sites import site_of
+
+MIN_LINKS = 60  # with a time, of a receiver or a flight
+MIN_INSIDE = 20  # links between the two times, and outside
+MAX_INSIDE = 0.5  # share of the links between the two times: more are the usual state
+MIN_NATS = 10.0  # that an episode must gain to be proposed
+MIN_DB = 1.5  # mean change; a smaller one changes no decision
+INTERVAL_NATS = 2.0  # below the best: a change point's 90 % interval is wider than a mean's (1.35)
+BINS = 160  # of times, whose ends are tried
+FEW_WINDOWS = 6  # of the same length elsewhere: too few to say how much they differ
+APART = 2.5  # then it must explain so many times what any other window does
+MAX_P_VALUE = 0.01  # that one of the windows differs like that by chance
+MIN_DEVIATION_SD = 0.3  # between windows; independent links have 1
+MIN_MEMBER_LINKS = 5  # of a device or receiver in the episode, to be asked whether it agrees
+MIN_KNOWN, MIN_SITES = 0.5, 4  # share that is compared, or else sites of devices there must be
+LOW_M, MIN_PLACES = 10.0, 20  # height of receivers in streets, and places that they must have been
+MIN_MEMBERS = 0.7  # share of them that must agree: it acts on all
+MIN_OVERLAP = 0.3  # of what two windows span together, for them to be one episode
+SAME_SHARE = 0.9  # of a flight's links: an episode of one receiver that long is a faulty flight
+PRIOR_SD_DB, PRIOR_SD_DB_KM = 15.0, 30.0
+
+
+class _Window(NamedTuple):
+    """Links between two times: how much likelier, when (and between which times), in which form."""
+
+    nats: float
+    start_s: float
+    end_s: float
+    start_within_s: tuple[float, float]
+    end_within_s: tuple[float, float]
+    form: Literal["loss", "attenuation"]
+
+
+class Episode(GainEffect):
+    """A loss or an attenuation between two times; a step finds the strongest."""
+
+    name = "episode"
+    figure = "dependence"
+    of_receiver = True
+    repeatable = True
+    within_flights = True
+    confused_with = ("faulty_flight", "receiver_drift", "excess_attenuation")
+
+    class Params(EffectParams):
+        """Who is affected, when, and in which form."""
+
+        receiver: ReceiverIndex | None = Field(description="Index of the receiver; None: all.")
+        flight: str | None = Field(
+            None, max_length=10_000,
+            description="Name of the flight, where clocks restart in each; None: times tell.")
+        start_s: Seconds = Field(description="First time [s].")
+        end_s: Seconds = Field(description="Last time [s].")
+        start_within_s: tuple[Seconds, Seconds] = Field(
+            description="90 % interval of the time at which it began [s].")
+        end_within_s: tuple[Seconds, Seconds] = Field(
+            description="90 % interval of the time at which it ended [s].")
+        form: Literal["loss", "attenuation"] = Field(
+            description="A loss [dB], or one in proportion to the distance [dB/km].")
+        frequency_hz: float | None = Field(
+            None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, no bound.")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if np.isfinite(links.time_s).sum() < MIN_LINKS:
+            return "there is no time_s"
+        if len(np.unique(links.flight)) < 2:
+            return "there is one flight, and no other to compare with at the same places"
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found = view.links, []
+        rest_db, known = compared_where_possible_db(view)
+        value_db, weight = by_precision(view, rest_db)
+        receivers: list[int | None] = list(frequent_labels(links.receiver, MIN_LINKS))
+        flights = [str(links.flight_names[number]) for number in np.unique(links.flight)] \
+            if links.time_restarts else [None]
+        for receiver in receivers if len(receivers) < 2 else [None, *receivers]:
+            for flight in flights:
+                params = self._proposed(links, value_db, weight, known, receiver, flight)
+                if params is not None:
+                    found.append(params)
+        return [each for _, each in sorted(found, key=lambda each: -each[0])[:2]]
+
+    @override
+    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+        # The times are found anew: those of all links would be known from what is held out.
+        value_db, weight = by_precision(view, compared_where_possible_db(view)[0])
+        rows = _timed_rows(view.links, params.receiver, params.flight)
+        window = _strongest(view.links, value_db, weight, rows) \
+            if len(rows) >= MIN_LINKS else None
+        if window is None or not _is_same(window, params):
+            return []
+        return [params.model_copy(update={key: value for key, value in window._asdict().items()
+                                          if key not in ("nats", "form")})]
+
+    def _proposed(self, links: LinkData, value_db: np.ndarray, weight: np.ndarray,
+                  known: np.ndarray, receiver: int | None, flight: str | None,
+                  ) -> tuple[float, Params] | None:
+        rows = _timed_rows(links, receiver, flight)
+        window = _strongest(links, value_db, weight, rows) if len(rows) >= MIN_LINKS else None
+        if window is None or window.nats < MIN_NATS:
+            return None
+        known_hz = float(links.frequency_hz) if np.isfinite(links.frequency_hz) else None
+        params = self.Params(receiver=receiver, flight=flight, frequency_hz=known_hz,
+                             **{key: value for key, value in window._asdict().items()
+                                if key != "nats"})
+        inside = _inside(links, params)
+        stands_out = _agrees(links, value_db, weight, known, rows, inside) \
+            and not _is_another(links, params, inside) \
+            and _is_alone(links, value_db, weight, rows, inside, window.nats)
+        return (window.nats, params) if stands_out else None
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        loss = np.where(_inside(links, params), -1.0, 0.0)
+        if params.form == "attenuation":
+            return Term.of_columns((loss * links.distance_m / 1000)[:, None], PRIOR_SD_DB_KM)
+        return Term.of_columns(loss[:, None], PRIOR_SD_DB)
+
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        if coefficients[0] < 0:
+            unit = "dB" if params.form == "loss" else "dB/km"
+            return f"it would have to amplify, by {-coefficients[0]:.1f} {unit}"
+        if params.form == "attenuation" and params.frequency_hz is not None:
+            most_db_km = max_gas_db_km(params.frequency_hz) + max_rain_db_km(params.frequency_hz)
+            if coefficients[0] > most_db_km:
+                return (f"{coefficients[0]:.3g} dB/km are more than air and rain take at "
+                        f"{params.frequency_hz / 1e9:g} GHz: {most_db_km:.3g} dB/km (ITU-R P.676, "
+                        "P.838)")
+        return None
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        who = "all" if params.receiver is None else links.receiver_names[params.receiver]
+        member = f"[{who}]" if params.flight is None else f"[{who}, flight {params.flight}]"
+        time_s = links.time_s[_timed_rows(links, params.receiver, params.flight)]
+        flown = Allowed(float(time_s.min()), float(time_s.max())) if len(time_s) else Allowed()
+        name, unit = ("loss_db", "dB") if params.form == "loss" else \
+            ("specific_attenuation_db_km", "dB/km")
+        return {name + member: Parameter.normal(estimate.coefficients[0],
+                                                estimate.coefficients_sd[0], unit),
+                "start_s" + member: Parameter(params.start_s, *params.start_within_s, "s",
+                                              allowed=flown),
+                "end_s" + member: Parameter(params.end_s, *params.end_within_s, "s",
+                                            allowed=flown)}
+
+
+def _is_same(window: _Window, params: Any) -> bool:
+    """Return whether a window is mostly that of an episode: else it is of something else."""
+    both_s = min(window.end_s, params.end_s) - max(window.start_s, params.start_s)
+    either_s = max(window.end_s, params.end_s) - min(window.start_s, params.start_s)
+    return both_s >= 0 and both_s >= MIN_OVERLAP * either_s
+
+
+def _inside(links: LinkData, params: Any) -> np.ndarray:
+    """Return (n,) bool, links that an episode acts on."""
+    with np.errstate(invalid="ignore"):
+        between = (links.time_s >= params.start_s) & (links.time_s <= params.end_s)
+    return between & flight_mask(links, params.receiver, params.flight)
+
+
+def _timed_rows(links: LinkData, receiver: int | None, flight: str | None) -> np.ndarray:
+    """Return the rows of a receiver on a flight (None: of all) that have a time."""
+    return np.flatnonzero(flight_mask(links, receiver, flight) & np.isfinite(links.time_s))
+
+
+def _strongest(links: LinkData, every_db: np.ndarray, weights: np.ndarray,
+               rows: np.ndarray) -> _Window | None:
+    """Return the window in which a loss, or an attenuation, explains most.
+
+    Twice: over the whole time, then over finer ends around what was found.
+
+    Args:
+        links: n links.
+        every_db: (n,) compared residuals [dB].
+        weights: (n,) what each counts [1/dB²].
+        rows: (r,) links that it may be among.
+    """
+    time_s, rest_db, weight = links.time_s[rows], every_db[rows], weights[rows]
+    distance_km = links.distance_m[rows] / 1000
+    times_s = np.unique(time_s)
+    ends = times_s[np.unique(np.linspace(0, len(times_s) - 1, BINS).round().astype(int))]
+    best = _best_window(ends, time_s, rest_db, weight, distance_km)
+    if best is None or len(ends) == len(times_s):
+        return best
+    coarse = np.max(np.diff(np.searchsorted(times_s, ends)))
+    near = [np.abs(np.arange(len(times_s)) - np.searchsorted(times_s, each)) <= coarse
+            for each in (best.start_s, best.end_s)]
+    ends = times_s[near[0] | near[1]]
+    return _best_window(np.unique(np.r_[times_s[0], ends, times_s[-1]]), time_s, rest_db, weight,
+                        distance_km) or best
+
+
+def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, weight: np.ndarray,
+                 distance_km: np.ndarray) -> _Window | None:
+    """Return the best window from one of some times to just before another."""
+    cell = np.searchsorted(ends_s, time_s, side="right") - 1
+    count = _sums(cell, np.ones(len(cell)), len(ends_s))
+    inside = count[None, :] - count[:, None]
+    allowed = (inside >= MIN_INSIDE) & (inside <= MAX_INSIDE * len(time_s))
+    if not allowed.any():
+        return None
+    total = weight.sum()
+    if not total > 0:
+        return None
+    centred, best = rest_db - weight @ rest_db / total, None
+    shapes: dict[Literal["loss", "attenuation"], np.ndarray] = {
+        "loss": np.ones(len(cell)), "attenuation": distance_km}
+    for form, shape in shapes.items():
+        wx, wxx, wxd = (_sums(cell, weight * value, len(ends_s)) for value in
+                        (shape, shape**2, shape * centred))
+        x, xx, xd = (each[None, :] - each[:, None] for each in (wx, wxx, wxd))
+        prior = PRIOR_SD_DB if form == "loss" else PRIOR_SD_DB_KM
+        power = np.maximum(xx - x**2 / total, 0) + prior**-2
+        # The logarithm pays for the choice among the windows.
+        nats = np.where(allowed & (xx > 0), 0.5 * xd**2 / power, -np.inf) - np.log(allowed.sum())
+        nats = np.where(xd < 0, nats, -np.inf)  # what comes and goes takes away
+        start, end = np.unravel_index(int(nats.argmax()), nats.shape)
+        if nats[start, end] > (-np.inf if best is None else best.nats):
+            likely = nats > nats[start, end] - INTERVAL_NATS
+            starts, stops = np.flatnonzero(likely[:, end]), np.flatnonzero(likely[start])
+            last_s = np.r_[-np.inf, np.maximum.accumulate(_last_s(cell, time_s, len(ends_s)))]
+            # It began after the reading before its first one, and ended before the next one.
+            best = _Window(
+                float(nats[start, end]), float(ends_s[start]), float(last_s[end]),
+                (float(last_s[starts[0]] if starts[0] else ends_s[0]), float(ends_s[starts[-1]])),
+                (float(last_s[stops[0]]), float(ends_s[min(stops[-1], len(ends_s) - 1)])), form)
+    return best
+
+
+def _sums(cell: np.ndarray, value: np.ndarray, cells: int) -> np.ndarray:
+    """Return sums (cells + 1,) of the values (n,) in the cells before each."""
+    return np.r_[0.0, np.cumsum(np.bincount(cell, weights=value, minlength=cells))]
+
+
+def _last_s(cell: np.ndarray, time_s: np.ndarray, cells: int) -> np.ndarray:
+    """Return the last time (cells,) in each cell [s]; -inf in an empty one."""
+    last_s = np.full(cells, -np.inf)
+    np.maximum.at(last_s, cell, time_s)
+    return last_s
+
+
+def _agrees(links: LinkData, value_db: np.ndarray, weight: np.ndarray, known: np.ndarray,
+            rows: np.ndarray, inside: np.ndarray) -> bool:
+    """Return whether most devices, and most receivers, show the change.
+
+    Where no other flight was, there must be several sites: what a map lacks hides few at once, but
+    all sectors of a mast. From who is in a street it hides all, and so there must be many places.
+    """
+    mine, others = rows[inside[rows]], rows[~inside[rows]]
+    if known[mine].mean() < MIN_KNOWN:
+        devices = frequent_labels(links.device[mine], MIN_MEMBER_LINKS)
+        sites = {min(site_of(links, device)) for device in devices}
+        pieces = np.unique(np.column_stack([links.device, evidence_blocks(links)])[mine], axis=0)
+        places = np.median(np.unique(pieces[:, 0], return_counts=True)[1])
+        if len(sites) < MIN_SITES or (places < MIN_PLACES and _is_low(links, mine)):
+            return False
+    outside_db = mean_by_precision(value_db[others], weight[others])
+    change_db = mean_by_precision(value_db[mine], weight[mine]) - outside_db
+    if abs(change_db) < MIN_DB:
+        return False
+    return all(share_alike(label[mine], value_db[mine] - outside_db, weight[mine],
+                           MIN_MEMBER_LINKS, 0.3 * change_db) >= MIN_MEMBERS
+               for label in (links.device, links.receiver)
+               if np.bincount(label[mine]).max() >= MIN_MEMBER_LINKS)
+
+
+def _is_low(links: LinkData, rows: np.ndarray) -> bool:
+    """Return whether receivers are below most roofs."""
+    place_m = links.receiver_m[rows]
+    ground_m = 0.0 if links.city is None else links.city.ground_height_m(*place_m[:, :2].T)
+    return bool(np.median(place_m[:, 2] - ground_m) < LOW_M)
+
+
+def _is_another(links: LinkData, params: Any, inside: np.ndarray) -> bool:
+    """Return whether it is a step in time of one receiver, or all of one of its flights."""
+    if params.receiver is None:
+        return False
+    mine = links.receiver == params.receiver
+    if params.flight is None:
+        timed_s = links.time_s[mine & np.isfinite(links.time_s)]
+        if params.start_s <= timed_s.min() or params.end_s >= timed_s.max():
+            return True
+    covered = np.unique(links.flight[inside])
+    whole = [inside[mine & (links.flight == each)].mean() > SAME_SHARE for each in covered]
+    return len(covered) == 1 and whole[0]
+
+
+def _is_alone(links: LinkData, value_db: np.ndarray, weight: np.ndarray, rows: np.ndarray,
+              inside: np.ndarray, nats: float) -> bool:
+    """Return whether no other window differs as much.
+
+    None of the same length (Student's t); where it is so long that there are few of these, none
+    of any length, by far.
+    """
+    order = rows[np.lexsort((links.time_s[rows], links.flight[rows] * links.time_restarts))]
+    own = inside[order]
+    others = order[~own]
+    windows = int(len(others) // own.sum())
+    if windows < FEW_WINDOWS:
+        other = _strongest(links, value_db, weight, others)
+        return other is None or nats > APART * max(other.nats, MIN_NATS)
+    usual_db = mean_by_precision(value_db[others], weight[others])
+
+    def deviation(rows: np.ndarray) -> float:
+        """Over what it would be of independent links: windows see different devices."""
+        return float(weight[rows] @ (value_db[rows] - usual_db)
+                     / np.sqrt(max(weight[rows].sum(), 1e-9)))
+
+    usual = np.array([deviation(each) for each in np.array_split(others, windows)])
+    change = abs(deviation(order[own]) - float(usual.mean()))
+    sd = max(float(usual.std(ddof=1)), MIN_DEVIATION_SD) * np.sqrt(1 + 1 / windows)
+    return bool(2 * t.sf(change / sd, windows - 1) * (windows + 1) <= MAX_P_VALUE)

@@ -1,0 +1,267 @@
+"""A flight of one receiver whose readings disagree with all others: a loose plug, a wrong set-up.
+
+Its readings have an offset, follow the prediction with another slope (0: not at all), and scatter
+more (a random effect beside the error scale). So they no longer corrupt what is learnt of others.
+
+A flight stands out if its level, compared with other flights at the same places, is an outlier
+among the flights of its receiver, or its scatter or its roughness (the scatter from one reading of
+a device to its next) among all flights: Student's t with the pooled standard deviation of all
+others, corrected for the number of flights and of statistics (Grubbs 1969, 'Procedures for
+detecting outlying observations in samples', Technometrics 11). Maps that are wrong make the scatter
+of flights differ; roughness they hardly change.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+from scipy.stats import t
+from typing_extensions import override
+
+from radiotwin.effects.arrays import robust_sd
+from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.comparison import (
+    by_precision,
+    compared_db,
+    flight_mask,
+    mean_by_precision,
+    share_alike,
+)
+from radiotwin.effects.params import (
+    Decibels,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    quantity,
+)
+from radiotwin.links import LinkData
+
+MIN_LINKS = 30  # of a receiver on a flight, at places where other flights were
+MIN_FLIGHTS = 3  # of a receiver: of two whose levels differ, either may be the faulty one
+MIN_ALL_FLIGHTS = 4  # of all receivers, for one that scatters more to stand out
+MIN_DEVICE_LINKS = 5  # of a device, to be asked whether it agrees
+MIN_DEVICES = 0.7  # share of the devices that must agree: a fault of the receiver acts on all
+MIN_OFFSET_DB = 2.0  # a smaller one changes no decision
+FAR_SD, MIN_USUAL_SD_DB = 4.0, 0.5  # of flights' levels, robust: what is farther is no usual one
+MIN_SCATTER = 1.5  # times the others'
+MIN_SCATTER_DB = 1e-3
+# Of flights' levels, log scatters and log roughnesses, before any is seen, and the flights that it
+# counts for (Smyth 2004, 'Linear models and empirical Bayes methods', Stat. Appl. Genet. Mol. Biol.
+# 3): of three flights, two do not tell how much flights differ. In 30 campaigns over cities with
+# wrong maps, the levels of one receiver's flights had a standard deviation of 0.37 dB in the
+# median, of 0.78 in one of ten and more; this prior has 0.68 and 1.4, as other worlds are others.
+PRIOR_LEVEL_SD_DB, PRIOR_LOG_SD, PRIOR_FREEDOM = 0.6, (0.35, 0.25), 3
+STATISTICS = 4  # that are tested
+MAX_P_VALUE = 0.02  # corrected for the number of flights
+PRIOR_SD_DB = 15.0
+RELATION_SD = 0.5  # of the slope that is lost or gained
+
+
+@dataclass(frozen=True)
+class _Flight:
+    """A receiver's flight with its levels and scatters; NaN: not known.
+
+    Attributes:
+        receiver, flight: which.
+        rows: its detected links.
+        levels_db: of its residuals, compared with other flights at the same places and as they
+            are, over the median of the receiver's flights; NaN where its devices disagree.
+        log_scatters: of what comparison leaves, and from reading to reading.
+    """
+
+    receiver: int
+    flight: int
+    rows: np.ndarray
+    levels_db: tuple[float, float]
+    log_scatters: tuple[float, float]
+
+
+class FaultyFlight(GainEffect):
+    """One flight of one receiver that disagrees with all others; a step finds the worst."""
+
+    name = "faulty_flight"
+    figure = "links"
+    of_receiver = True
+    repeatable = True
+    within_flights = True
+    confused_with = ("receiver_drift", "episode", "lock_loss")
+
+    class Params(EffectParams):
+        """A receiver, one of its flights, and how much more that scatters."""
+
+        receiver: ReceiverIndex = Field(description="Index of the receiver.")
+        flight: str = Field(max_length=10_000, description="Name of the flight.")
+        centre_db: Decibels = Field(description="Predicted level at which the offset holds [dB].")
+        noise_sd_db: float = quantity(
+            1.0, unit="dB", low=0.0, high=60.0, step=1.0,
+            description="Standard deviation beside that of other flights [dB].")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        pairs = np.unique(np.column_stack([links.receiver, links.flight]), axis=0)
+        most = np.unique(pairs[:, 0], return_counts=True)[1].max()
+        if most < 2 or (most < MIN_FLIGHTS and len(pairs) < MIN_ALL_FLIGHTS):
+            return (f"no receiver is on {MIN_FLIGHTS} flights, and all are on fewer than "
+                    f"{MIN_ALL_FLIGHTS}, so that one could disagree")
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        known = list(zip(view.found_params(self.name, "receiver"),
+                         view.found_params(self.name, "flight"), strict=True))
+        flights = _flights(view)
+        found = []
+        for each in flights:
+            name = str(view.links.flight_names[each.flight])
+            if (each.receiver, name) in known:
+                continue
+            p_value, scatter_db = _disagreement(each, flights, view.links)
+            if p_value * len(flights) <= MAX_P_VALUE:
+                centre_db = float(np.median(view.mean_db[each.rows]))
+                found.append((p_value, self.Params(receiver=each.receiver, flight=name,
+                                                   centre_db=centre_db, noise_sd_db=scatter_db)))
+        return [params for _, params in sorted(found, key=lambda each: each[0])[:1]]
+
+    @override
+    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+        there = flight_mask(view.links, params.receiver, params.flight)
+        return [params] if there.sum() >= MIN_LINKS else []
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        rows = np.flatnonzero(flight_mask(links, params.receiver, params.flight))
+        columns, noise_db = np.zeros((len(links), 2)), np.zeros(len(links))
+        columns[rows, 0] = 1.0
+        if len(rows):
+            columns[rows, 1] = level_at(links.select(rows)) - params.centre_db
+        noise_db[rows] = params.noise_sd_db
+        return replace(Term.of_columns(columns, PRIOR_SD_DB),
+                       prior_sd_db=np.array([PRIOR_SD_DB, RELATION_SD]),
+                       random_effect_sd_db=noise_db)
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        member = f"[{links.receiver_names[params.receiver]}, flight {params.flight}]"
+        offset_db, slope = estimate.coefficients
+        offset_sd_db, slope_sd = estimate.coefficients_sd
+        noise = Parameter.normal(params.noise_sd_db, estimate.params_sd[0], "dB")
+        return {"offset_db" + member: Parameter.normal(offset_db, offset_sd_db, "dB"),
+                "added_noise_db" + member: replace(noise, low=max(noise.low, 0.0)),
+                "relation" + member: Parameter.normal(1 + slope, slope_sd, "of the prediction")}
+
+
+def _flights(view: ResidualView) -> list[_Flight]:
+    """Return every flight of every receiver with links enough."""
+    links = view.links
+    seen = np.isfinite(links.level_db)
+    pairs = np.unique(np.column_stack([links.receiver, links.flight])[seen], axis=0)
+    rows = [np.flatnonzero(seen & (links.receiver == receiver) & (links.flight == flight))
+            for receiver, flight in pairs]
+    residuals_db = [np.where(seen, each, np.nan) for each in (compared_db(view), view.residual_db)]
+    levels_db = np.column_stack([_levels_db(*by_precision(view, each), rows, pairs[:, 0], links)
+                                 for each in residuals_db])
+    found = []
+    for (receiver, flight), mine, level_db in zip(pairs.tolist(), rows, levels_db, strict=True):
+        if len(mine) >= MIN_LINKS:
+            scatters_db = (_robust_sd(residuals_db[0][mine]), _robust_sd(
+                _from_reading_to_reading_db(view.residual_db[mine], links.select(mine))))
+            logs = [float(np.log(max(each, MIN_SCATTER_DB))) for each in scatters_db]
+            found.append(_Flight(receiver, flight, mine, (level_db[0], level_db[1]),
+                                 (logs[0], logs[1])))
+    return found
+
+
+def _levels_db(value_db: np.ndarray, weight: np.ndarray, rows: list[np.ndarray],
+               receiver: np.ndarray, links: LinkData) -> np.ndarray:
+    """Return levels (f,) of flights over those of the same receiver; NaN if devices disagree."""
+    known = [mine[weight[mine] > 0] for mine in rows]
+    level_db = np.array([mean_by_precision(value_db[mine], weight[mine])
+                         if len(mine) >= MIN_LINKS else np.nan for mine in known])
+    for each in np.unique(receiver):  # what a receiver always has is no fault of one of its flights
+        same = (receiver == each) & np.isfinite(level_db)
+        level_db[same] -= np.median(level_db[same]) if same.any() else 0.0
+    for number, (mine, own_db) in enumerate(zip(known, level_db.tolist(), strict=True)):
+        if abs(own_db) >= MIN_OFFSET_DB and not _devices_agree(
+                value_db[mine], weight[mine], own_db, links.device[mine]):
+            level_db[number] = np.nan
+    return level_db
+
+
+def _devices_agree(value_db: np.ndarray, weight: np.ndarray, level_db: float,
+                   device: np.ndarray) -> bool:
+    """Return whether most devices show what the flight as a whole shows."""
+    if len(np.unique(device)) > len(device) / MIN_DEVICE_LINKS:  # positions of one that moves
+        return True
+    return share_alike(device, value_db, weight, MIN_DEVICE_LINKS, 0.4 * level_db) >= MIN_DEVICES
+
+
+def _robust_sd(values: np.ndarray) -> float:
+    """Return the standard deviation of normal values (n,); NaN where few are known."""
+    known = values[np.isfinite(values)]
+    return robust_sd(known) if len(known) >= MIN_LINKS else np.nan
+
+
+def _from_reading_to_reading_db(residual_db: np.ndarray, links: LinkData) -> np.ndarray:
+    """Return how far readings are from the one before of the same device, over sqrt(2) [dB]."""
+    order = np.lexsort((links.time_s, links.device))
+    same = np.diff(links.device[order]) == 0
+    return np.diff(residual_db[order])[same] / np.sqrt(2)
+
+
+def _disagreement(flight: _Flight, flights: list[_Flight], links: LinkData) -> tuple[float, float]:
+    """Return the p-value of a flight's disagreement, and the scatter that it adds [dB]."""
+    others = [each for each in flights if each is not flight]
+    noisy = [_excess(own, np.array([each.log_scatters[kind] for each in others]), prior_sd)
+             for kind, (own, prior_sd) in enumerate(zip(flight.log_scatters, PRIOR_LOG_SD,
+                                                        strict=True))]
+    p_value, added_db = min(noisy)
+    if not is_first_or_last(flight.receiver, flight.flight, links):
+        p_value = min(p_value, *(_offset_p_value(flight, others, kind, links)
+                                  for kind in range(2)))
+    return min(STATISTICS * p_value, 1.0), min(added_db, 50.0)
+
+
+def _excess(own: float, usual: np.ndarray, prior_sd: float) -> tuple[float, float]:
+    """Return the p-value of a log scatter against others (m,), and the scatter added [dB]."""
+    usual = usual[np.isfinite(usual)]
+    if np.isnan(own) or len(usual) < MIN_FLIGHTS - 1:
+        return 1.0, 0.0
+    excess = own - float(np.median(usual))
+    added_db = np.sqrt(max(np.exp(2 * own) - np.exp(2 * np.median(usual)), 0.0))
+    if excess <= np.log(MIN_SCATTER):
+        return 1.0, float(added_db)
+    freedom = len(usual) - 1
+    sum_of_squares = freedom * np.var(usual, ddof=1) + PRIOR_FREEDOM * prior_sd**2
+    sd = np.sqrt(sum_of_squares / (freedom + PRIOR_FREEDOM))
+    return float(t.sf(excess / sd, freedom + PRIOR_FREEDOM)), float(added_db)
+
+
+def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: LinkData) -> float:
+    """Return the p-value of a flight's level against others'; 1 if it is small or unknown."""
+    known = [each for each in others if np.isfinite(each.levels_db[kind])]
+    level_db = np.array([each.levels_db[kind] for each in known])
+    receiver = np.array([each.receiver for each in known])
+    same = receiver == flight.receiver
+    if same.sum() < MIN_FLIGHTS - 1:
+        return 1.0
+    own_db = flight.levels_db[kind] - float(np.median(level_db[same]))
+    if not abs(own_db) >= MIN_OFFSET_DB:
+        return 1.0
+    # A first or last flight that is far off is a step in time, and says nothing of how much the
+    # others differ: one of 20 dB would hide a fault of 15.
+    far = np.abs(level_db) > FAR_SD * max(robust_sd(level_db), MIN_USUAL_SD_DB)
+    usual = ~far | [not is_first_or_last(each.receiver, each.flight, links) for each in known]
+    freedom = max(int(usual.sum()) - len(np.unique(receiver[usual])), 0) + PRIOR_FREEDOM
+    sum_of_squares = (level_db[usual]**2).sum() + PRIOR_FREEDOM * PRIOR_LEVEL_SD_DB**2
+    return float(2 * t.sf(abs(own_db) / np.sqrt(sum_of_squares / freedom), freedom))
+
+
+def is_first_or_last(receiver: int, flight: int, links: LinkData) -> bool:
+    """Return whether a level that is off may as well be a step in time, before or after it."""
+    times = {number: time_s[0] for (each, number), (time_s, _) in links.tracks.items()
+             if each == receiver}
+    if links.time_restarts or flight not in times:
+        return False
+    return times[flight] in (min(times.values()), max(times.values()))

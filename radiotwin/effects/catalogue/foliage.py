@@ -1,0 +1,129 @@
+"""Vegetation that the map does not show.
+
+Loss of d metres through it: A_m (1 − exp(−γ d / A_m)), which saturates (ITU-R P.833-10, Eq. 1), at
+most at that recommendation's own A_m of the frequency. It is located by back-projection. A grove
+that only links of one device pass cannot be located along these links: the box then gives the
+direction in which it lies.
+"""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import ends_above, ends_above_ground
+from radiotwin.effects.base import GainEffect, ResidualView
+from radiotwin.effects.boxes import (
+    BESIDE_UNKNOWN,
+    CELL_M,
+    HEIGHTS_M,
+    Box,
+    back_project,
+    best_cells,
+    cross,
+    devices_through,
+    is_beside_unknown,
+    obstruction_nats,
+)
+from radiotwin.effects.losses import max_loss_db
+from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
+from radiotwin.links import LinkData
+
+MIN_NATS = 6.0  # that a cell must gain to be proposed
+MAX_CELLS = 3  # that are proposed, with each of `SIDES_M`
+SIDES_M = (25.0, 55.0)  # of a proposed box
+MIN_HEIGHT_M, MAX_PROPOSED_HEIGHT_M = 3.0, 26.0  # of tree tops
+LOSSES_DB = (3.0, 6.0, 9.0, 12.0, 16.0, 20.0)  # of a link through it, equally likely
+UNKNOWN_MAX_LOSS_DB = 25.0  # where the frequency is unknown: of ITU-R P.833 at 1 GHz
+
+
+class VegetationLoss(NamedTuple):
+    """Law of the loss over the metres inside.
+
+    Attributes:
+        specific_db_m: specific attenuation γ [dB/m].
+        max_db: greatest loss A_m [dB].
+    """
+
+    specific_db_m: Annotated[float, Field(gt=0, le=1000)] = 0.6
+    max_db: Annotated[float, Field(ge=1e-6, le=1000)] = 15.0
+
+
+class Foliage(GainEffect):
+    """A box of vegetation; one step finds one."""
+
+    name = "foliage"
+    figure = "links"
+    repeatable = True
+    confused_with = ("missing_obstacle", "excess_attenuation", "device_gain_offset",
+                     "antenna_pattern")
+
+    class Params(EffectParams):
+        """A grove."""
+
+        box: Box = Field(description="Up to the tree tops.")
+        law: VegetationLoss = Field(VegetationLoss(), description="Loss over the metres inside.")
+        ceiling_db: float = Field(UNKNOWN_MAX_LOSS_DB, gt=0, le=1000, description=(
+            "Greatest loss of vegetation at the frequency [dB]; what costs more is none."))
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        nats = obstruction_nats(view.residual_db, view.scale_db, LOSSES_DB) / view.design_effect
+        centres_m, total = back_project(*ends_above_ground(links), nats)
+        allowed = [i for i, height_m in enumerate(HEIGHTS_M)
+                   if MIN_HEIGHT_M <= height_m <= MAX_PROPOSED_HEIGHT_M]
+        ceiling_db = (max_loss_db(links.frequency_hz) if np.isfinite(links.frequency_hz)
+                      else UNKNOWN_MAX_LOSS_DB)
+        law = VegetationLoss(max_db=min(VegetationLoss().max_db, ceiling_db))
+        return [self.Params(box=Box(x_m, y_m, side_m, side_m, HEIGHTS_M[allowed[height]], 0.0),
+                            law=law, ceiling_db=ceiling_db)
+                for (x_m, y_m), height, gain in best_cells(centres_m, total[:, allowed], MAX_CELLS)
+                if gain > MIN_NATS for side_m in SIDES_M]
+
+    @override
+    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+        crossing = cross(params.box, *ends_above(links, params.box[:2]))
+        specific_db_m, max_db = params.law
+        return -max_db * (1 - np.exp(-crossing.inside_m * specific_db_m / max_db))
+
+    @override
+    def variation(self, params: Params) -> Variation:
+        x_m, y_m = params.box[:2]
+        low = [x_m - 80, y_m - 80, 5.0, 5.0, MIN_HEIGHT_M, -90.0, np.log(0.05),
+               np.log(min(3.0, params.ceiling_db))]
+        high = [x_m + 80, y_m + 80, 200.0, 200.0, 30.0, 90.0, np.log(5.0),
+                np.log(params.ceiling_db)]
+        return Variation(
+            np.array([*params.box, *np.log(params.law)]),
+            np.array([CELL_M, CELL_M, 12.0, 12.0, 3.0, 20.0, 0.4, 0.3]),
+            np.array(low), np.array(high),
+            lambda numbers: params.model_copy(update={
+                "box": Box(*numbers[:6].tolist()),
+                "law": VegetationLoss(*np.exp(numbers[6:]).tolist())}))
+
+    @override
+    def contradicted(self, params: Params, links: LinkData) -> str | None:
+        through = devices_through(params.box, links)
+        return BESIDE_UNKNOWN if is_beside_unknown(through, links) else None
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        variation = self.variation(params)
+        low, high = variation.low.tolist(), variation.high.tolist()
+        reported = {name: Parameter.normal(value, sd, "deg" if name == "turn_deg" else "m",
+                                           Allowed(least, most))
+                    for name, value, sd, least, most in zip(Box._fields, params.box,
+                                                            estimate.params_sd, low, high)}
+        names = {"specific_attenuation_db_m": "dB/m", "greatest_loss_db": "dB"}
+        return reported | {
+            name: Parameter.log_normal(value, sd, unit, Allowed(least, most, is_log=True))
+            for (name, unit), value, sd, least, most in zip(
+                names.items(), params.law, estimate.params_sd[6:], np.exp(low[6:]).tolist(),
+                np.exp(high[6:]).tolist(), strict=True)}
+
+    @override
+    def like(self, params: Params, other: Params) -> Params:
+        return params.model_copy(update={"box": params.box.like(other.box)})

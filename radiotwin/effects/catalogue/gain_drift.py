@@ -1,0 +1,301 @@
+"""A gain that changes with time: a receiver or a device warms up, ages, or changes at one moment.
+
+Warm-up as a first-order thermal lag, A exp(−t / τ) since switch-on (amplifier gain falls linearly
+with temperature, and temperature follows first-order cooling); ageing as a slope in time; a step at
+an unknown time (two means, Hinkley 1970, 'Inference about the change-point in a sequence of random
+variables', Biometrika 57).
+"""
+
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator, Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.params import (
+    Allowed,
+    DeviceIndex,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Seconds,
+    Variation,
+)
+from radiotwin.links import LinkData
+
+MIN_LINKS = 60  # of a receiver or device, with a time
+MIN_FLIGHTS = 3  # that a device was heard on: within a flight, time and position change together
+MAX_DEVICES = 200  # bounds the time of the search
+MIN_NATS = 5.0  # that a drift must gain to be proposed
+MIN_SIDE = 20  # links before and after a step
+MIN_GAP_SD = 3.0  # of a step's size, in standard deviations from flight to flight
+MAX_PROPOSALS = 2  # members: how much a drift explains shows once all else is fitted again
+PRIOR_SD_DB = 10.0
+MAX_LOG_S = 9.0  # natural logarithm of the longest time constant [s]
+TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
+MIN_CONSTANT_S = 1e-3  # of a warm-up that is read
+WARM_UPS = ("warm_up", "warm_up_each_flight")
+
+
+class Drift(NamedTuple):
+    """The form of a drift in time.
+
+    Attributes:
+        form: warm-up since the first measurement or since each take-off, ageing, or a step.
+        number: time constant of a warm-up, middle of the ageing, or time of the step [s].
+    """
+
+    form: Literal["warm_up", "warm_up_each_flight", "ageing", "step"]
+    number: Seconds
+
+
+def _possible(drifts: dict[int, Drift]) -> dict[int, Drift]:
+    if any(drift.form in WARM_UPS and drift.number < MIN_CONSTANT_S for drift in drifts.values()):
+        raise ValueError(f"a warm-up takes {MIN_CONSTANT_S:g} s or more")
+    return drifts
+
+
+class _DriftParams(EffectParams):
+    span_s: tuple[Seconds, Seconds] | None = Field(
+        None, description="First and last time that was learnt from [s]; ageing is relative to it.")
+
+
+class _GainDrift(GainEffect):
+    """A drift of one receiver or device, in the form that explains its links best.
+
+    Attributes:
+        forms: that it may have.
+        end: "receiver" or "device".
+    """
+
+    repeatable = True
+    forms: ClassVar[tuple[str, ...]]
+    end: ClassVar[str]
+
+    def __init__(self, between_flights: bool = False) -> None:
+        self._between_flights = between_flights
+
+    @property
+    def _forms(self) -> tuple[str, ...]:
+        # What each flight repeats is no difference between flights.
+        again = "warm_up_each_flight" if self._between_flights else None
+        return tuple(form for form in self.forms if form != again)
+
+    def index(self, links: LinkData) -> np.ndarray:
+        """Return the index (n,) of the receiver or device of each link."""
+        return getattr(links, self.end)
+
+    def drifts(self, params: _DriftParams) -> dict[int, Drift]:
+        """Return the drifts by index of the receiver or device."""
+        return getattr(params, f"{self.end}s")
+
+    def _members(self, links: LinkData) -> list[int]:
+        """Return the receivers or devices that may drift."""
+        return frequent_labels(self.index(links)[np.isfinite(links.time_s)], MIN_LINKS)
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if np.isfinite(links.time_s).sum() < MIN_LINKS:
+            return "there is no time_s"
+        if links.time_restarts and "warm_up_each_flight" not in self._forms:
+            return "time_s begins anew in each flight, so that flights have no order"
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Any]:
+        known = {member for drifts in view.found_params(self.name, f"{self.end}s")
+                 for member in drifts}
+        return self._best(view, sorted(set(self._members(view.links)) - known))
+
+    @override
+    def propose_like(self, view: ResidualView, params: _DriftParams) -> list[Any]:
+        # Whether this member drifts is the question, and not whether any does.
+        return self._best(view, list(self.drifts(params)))
+
+    def _best(self, view: ResidualView, members: list[int]) -> list[Any]:
+        links, found = view.links, []
+        for member in members:
+            rows = np.flatnonzero((self.index(links) == member) & np.isfinite(links.time_s))
+            if not len(rows):  # a fold may have none of its links
+                continue
+            nats, form, number = max(
+                each for each in _candidates(links.select(rows), view.residual_db[rows],
+                                             view.weight[rows], self._between_flights)
+                if each[1] in self._forms)
+            if nats > MIN_NATS:
+                # Other links must not change these times.
+                keep = form == "ageing" or not self.of_receiver
+                span_s = (links.first_s, links.last_s) if keep else None
+                found.append((nats, self.Params.model_validate(
+                    {f"{self.end}s": {member: (form, float(number))}, "span_s": span_s})))
+        return [params for _, params in sorted(found, key=lambda each: -each[0])[:MAX_PROPOSALS]]
+
+    @override
+    def term(self, links: LinkData, params: _DriftParams, level_at: LevelAt) -> Term:
+        columns, time_s = [], links.time_s
+        if not self.of_receiver and params.span_s:  # a map has no time: it is of the latest state
+            time_s = np.where(np.isnan(time_s), params.span_s[1], time_s)
+        for member, drift in self.drifts(params).items():
+            mine = (self.index(links) == member) & np.isfinite(time_s)
+            columns.append(np.where(mine, _shape(drift, links, time_s, params.span_s), 0.0))
+            # An offset of its own, or the drift would have to model a constant error, too.
+            columns.append(mine.astype(float))
+        return Term.of_columns(np.column_stack(columns), PRIOR_SD_DB)
+
+    @override
+    def variation(self, params: _DriftParams) -> Variation | None:
+        drifts = self.drifts(params)
+        warming = [member for member, drift in drifts.items() if drift.form in WARM_UPS]
+        if not warming:
+            return None
+        values, n = np.log([drifts[member].number for member in warming]), len(warming)
+
+        def changed(numbers: np.ndarray) -> _DriftParams:
+            new = {member: drifts[member]._replace(number=float(np.exp(number)))
+                   for member, number in zip(warming, numbers)}
+            return params.model_copy(update={f"{self.end}s": drifts | new})
+
+        return Variation(values, np.full(n, 0.3), np.full(n, 0.0), np.full(n, MAX_LOG_S),
+                         changed)
+
+    @override
+    def parameters(self, links: LinkData, params: _DriftParams,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        result, names = {}, getattr(links, f"{self.end}_names")
+        log_sd = iter(estimate.params_sd)
+        for number, (member, (form, value)) in enumerate(self.drifts(params).items()):
+            name = names[member]
+            result[f"{form}_db[{name}]"] = Parameter.normal(
+                estimate.coefficients[2 * number], estimate.coefficients_sd[2 * number], "dB")
+            if form in WARM_UPS:
+                result[f"time_constant_s[{name}]"] = Parameter.log_normal(
+                    value, next(log_sd), "s", Allowed(1.0, float(np.exp(MAX_LOG_S)), is_log=True))
+            elif form == "step":
+                result[f"step_time_s[{name}]"] = Parameter(
+                    value, *_gap_s(links, self.index(links) == member, value), "s")
+        return result
+
+
+class ReceiverDrift(_GainDrift):
+    """A receiver that warms up, once or on each flight, ages, or has changed."""
+
+    name = "receiver_drift"
+    of_receiver = True
+    confused_with = ("receiver_gain_offset", "interference")
+    forms = ("warm_up", "warm_up_each_flight", "ageing", "step")
+    end = "receiver"
+
+    class Params(_DriftParams):
+        """Drifts of receivers."""
+
+        receivers: Annotated[dict[ReceiverIndex, Drift], AfterValidator(_possible)] = Field(
+            min_length=1, description="Drift of each receiver, by index.")
+
+
+class DeviceDrift(_GainDrift):
+    """A device whose battery discharges or that has changed."""
+
+    name = "device_drift"
+    confused_with = ("device_gain_offset", "device_position_error")
+    forms = ("ageing", "step")
+    end = "device"
+
+    class Params(_DriftParams):
+        """Drifts of devices."""
+
+        devices: Annotated[dict[DeviceIndex, Drift], AfterValidator(_possible)] = Field(
+            min_length=1, description="Drift of each device, by index.")
+
+    @override
+    def _members(self, links: LinkData) -> list[int]:
+        flights = np.unique(np.column_stack([links.device, links.flight]), axis=0)[:, 0]
+        return sorted(set(super()._members(links)) & set(frequent_labels(flights, MIN_FLIGHTS)))
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        members = self._members(links)
+        if len(members) > MAX_DEVICES:
+            return f"{len(members)} devices are too many to examine each; at most {MAX_DEVICES}"
+        return super().unavailable(links) or (
+            None if members else f"no device has {MIN_LINKS} links on {MIN_FLIGHTS} flights")
+
+
+def _shape(drift: Drift, links: LinkData, time_s: np.ndarray,
+           span_s: tuple[float, float] | None) -> np.ndarray:
+    """Return the change (n,) at times (n,), with an amplitude of 1."""
+    form, number = drift
+    if form == "warm_up":
+        return np.exp(-(time_s - links.first_s) / number)
+    if form == "warm_up_each_flight":
+        return np.exp(-links.time_in_flight_s / number)
+    if form == "step":
+        return (time_s >= number).astype(float)
+    low, high = span_s or (np.nanmin(time_s), np.nanmax(time_s))  # twins of version 0.1 have none
+    return (time_s - number) / max(high - low, 1.0)
+
+
+def _gap_s(links: LinkData, mine: np.ndarray, when_s: float) -> tuple[float, float]:
+    """Return the times of the readings before and after a step: it was somewhere between."""
+    time_s = links.time_s[mine & np.isfinite(links.time_s) & np.isfinite(links.level_db)]
+    before, after = time_s[time_s < when_s], time_s[time_s >= when_s]
+    return (float(before.max()) if len(before) else when_s,
+            float(after.min()) if len(after) else when_s)
+
+
+def _candidates(links: LinkData, residual_db: np.ndarray, weight: np.ndarray,
+                between_flights: bool) -> Iterator[tuple[float, str, float]]:
+    """Yield (nats, form, number) of each form that the times of one member's links allow.
+
+    Steps, if so asked, between flights only: within one, places change with time.
+    """
+    time_s, comparable = links.time_s, not links.time_restarts
+    yield 0.0, "step", float(time_s.mean())
+
+    def nats(shape: np.ndarray) -> float:
+        centred = shape - weight @ shape / weight.sum()
+        power = weight @ centred**2
+        if power < 1e-9:
+            return 0.0
+        return 0.5 * (weight @ (centred * residual_db)) ** 2 / (power + 1 / PRIOR_SD_DB**2)
+
+    if np.ptp(time_s) > 0 and comparable:
+        yield nats((time_s - time_s.mean()) / np.ptp(time_s)), "ageing", float(time_s.mean())
+    for constant_s in TIME_CONSTANTS_S:
+        for form, since_s in zip(WARM_UPS, (time_s - links.first_s, links.time_in_flight_s)):
+            if constant_s < np.ptp(since_s) and (comparable or form == "warm_up_each_flight"):
+                yield nats(np.exp(-since_s / constant_s)), form, constant_s
+    order = np.argsort(time_s, kind="stable")
+    sums = np.cumsum(weight[order]), np.cumsum((weight * residual_db)[order])
+    gaps = np.flatnonzero(np.diff(time_s[order]) > 0)
+    gaps = gaps[(gaps >= MIN_SIDE) & (gaps < len(order) - MIN_SIDE)]
+    if between_flights:
+        flight = links.flight[order]
+        gaps = gaps[flight[gaps] != flight[gaps + 1]]
+    if len(gaps) and comparable:
+        total, moment = sums[0][-1], sums[1][-1]
+        before, moment_before = sums[0][gaps], sums[1][gaps]
+        step_db = moment_before / before - (moment - moment_before) / (total - before)
+        # The logarithm pays for the choice among the gaps.
+        value = 0.5 * step_db**2 * before * (total - before) / total - np.log(len(gaps))
+        best = int(value.argmax())
+        when_s = 0.5 * (time_s[order][gaps[best]] + time_s[order][gaps[best] + 1])
+        sd_db = _step_sd_db(time_s >= when_s, links.flight, residual_db, weight)
+        if abs(step_db[best]) > MIN_GAP_SD * sd_db:
+            yield float(value[best]), "step", float(when_s)
+
+
+def _step_sd_db(after: np.ndarray, flight: np.ndarray, residual_db: np.ndarray,
+                weight: np.ndarray) -> float:
+    """Return the standard deviation of a step [dB], from how flights on one side of it differ."""
+    cell = np.unique(np.column_stack([flight, after]), axis=0, return_inverse=True)[1].ravel()
+    mass = np.bincount(cell, weights=weight)
+    mean = np.bincount(cell, weights=weight * residual_db) / mass
+    later = np.bincount(cell, weights=weight * after) > 0.5 * mass
+    counts = [max((later == which).sum(), 1) for which in (False, True)]
+    rest = mean - np.where(later, mean[later].mean(), mean[~later].mean())
+    freedom = max(len(mean) - 2, 1)
+    return float(np.sqrt((rest**2).sum() / freedom * (1 / counts[0] + 1 / counts[1])))

@@ -1,0 +1,126 @@
+"""Constant gain errors: a device radiates, or a receiver reads, more or less than declared.
+
+Cable and connector loss, antenna efficiency, transmit power and calibration add constants to the
+link budget (ITU-R P.341, 'The concept of transmission loss for radio links').
+"""
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from pydantic import AliasChoices, Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import frequent_labels, one_hot
+from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.params import (
+    DeviceIndex,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Unique,
+)
+from radiotwin.links import LinkData
+
+PRIOR_SD_DB = 10.0  # wide: an error of a cable, a connector or a declared power
+MIN_LINKS = 30  # of a member; fewer do not outweigh shadowing
+MAX_MEMBERS = 200  # bounds the number of coefficients
+MIN_OFFSET_DB = 0.5  # accuracy of good power meters
+
+
+class _GainOffset(GainEffect):
+    """An offset for each member of a kind of end."""
+
+    figure = "intervals"
+    sparse = True
+    end: ClassVar[str]  # "device" or "receiver"
+
+    class Params(EffectParams):
+        """Who has an offset."""
+
+        members: Unique[int] = Field(description="Indices of those with an offset.")
+        offsets_sd_db: float = Field(validation_alias=AliasChoices("offsets_sd_db", "spread_db"),
+                                     ge=0, le=1000,
+                                     description="Standard deviation of the offsets [dB].")
+
+    def _names(self, links: LinkData) -> list[str]:
+        return getattr(links, f"{self.end}_names")
+
+    def _index(self, links: LinkData) -> np.ndarray:
+        return getattr(links, self.end)
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        members = frequent_labels(self._index(links), MIN_LINKS)
+        if len(members) < 2:
+            return f"needs two {self.end}s with {MIN_LINKS} links each, to compare them"
+        if len(members) > MAX_MEMBERS:
+            return (f"{len(members)} {self.end}s are too many to give each an offset; at most "
+                    f"{MAX_MEMBERS}")
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        index = self._index(view.links)
+        members = frequent_labels(index, MIN_LINKS)
+        if len(members) < 2:  # a fold may have fewer than all links
+            return []
+        offsets_db = [np.average(view.residual_db[index == member],
+                                 weights=view.weight[index == member]) for member in members]
+        return [self.Params(members=members, offsets_sd_db=float(np.std(offsets_db)))]
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        index = self._index(links)
+        unknown = ~np.isin(index, params.members)
+        return replace(Term.of_columns(one_hot(index, params.members), PRIOR_SD_DB),
+                       unheard_sd_db=np.where(unknown, params.offsets_sd_db, 0.0))
+
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        largest_db = np.abs(coefficients - np.median(coefficients)).max()
+        if largest_db < MIN_OFFSET_DB:
+            return (f"none of them is off by more than {largest_db:.1f} dB, which is within any "
+                    "instrument's tolerance")
+        return None
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        # Relative to the median member: a common offset is the channel's intercept.
+        order = np.argsort(estimate.coefficients)
+        median = order[len(order) // 2]
+        contrast = np.eye(len(order)) - np.eye(len(order))[median]
+        sd_db, names = estimate.sd_of(contrast), self._names(links)
+        return {f"offset_db[{names[member]}]": Parameter.normal(value_db, each_sd_db, "dB")
+                for member, value_db, each_sd_db in zip(
+                    params.members, contrast @ estimate.coefficients, sd_db)}
+
+
+class DeviceGainOffset(_GainOffset):
+    """Devices that radiate more or less than the others do."""
+
+    name = "device_gain_offset"
+    of_device = True
+    end = "device"
+    confused_with = ("antenna_pattern", "device_position_error")
+
+    class Params(_GainOffset.Params):
+        """Devices with an offset."""
+
+        members: Unique[DeviceIndex] = Field(description="Indices of those with an offset.")
+
+
+class ReceiverGainOffset(_GainOffset):
+    """Receivers that read more or less than the others do."""
+
+    name = "receiver_gain_offset"
+    end = "receiver"
+    of_receiver = True
+    confused_with = ("receiver_drift", "antenna_pattern")
+
+    class Params(_GainOffset.Params):
+        """Receivers with an offset."""
+
+        members: Unique[ReceiverIndex] = Field(description="Indices of those with an offset.")

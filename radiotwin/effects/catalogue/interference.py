@@ -1,0 +1,186 @@
+"""An unknown emitter adds its power to all readings: the more, the closer the receiver is.
+
+Powers of signal and interference add (ITU-R SM.1753). The emitter is assumed to be near the ground.
+Over a 3D map its power falls as that of a device at its place, by the channel, buildings in the way
+included; without one by the free-space law, 20 log10 d (ITU-R P.525), as a slope that was fitted to
+readings with interference in them is too small.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import NEPERS, add_power, subsample
+from radiotwin.effects.base import LevelAt, ReceiverEffect, ResidualView, Term
+from radiotwin.effects.params import (
+    Allowed,
+    Decibels,
+    EffectParams,
+    Estimate,
+    Metres,
+    Parameter,
+    Variation,
+)
+from radiotwin.links import LinkData
+
+HEIGHT_M = 1.5  # of the emitter
+REFERENCE_M = 100.0  # distance of its level
+MIN_POSITIONS, SAME_POSITION_M = 20, 10.0  # of receivers, and what counts as one
+AROUND_M = 100.0  # searched beyond the receivers; farther away it would be a noise floor
+EDGE_M = 10.0  # of the searched area, where an estimate means "outside"
+MAX_CELLS, MIN_CELL_M = 300, 20.0  # of the search
+QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8)  # of the readings over the emitter's, tried as its level
+MAX_LINKS = 2000  # that the search looks at
+MAX_PROPOSALS, APART_M = 2, 60.0  # and their distance from each other
+MIN_NATS = 4.0  # that an emitter must gain to be proposed
+
+
+class Interference(ReceiverEffect):
+    """One emitter that all receivers hear."""
+
+    name = "interference"
+    figure = "links"
+    confused_with = ("noise_floor_censoring", "receiver_drift")
+
+    class Params(EffectParams):
+        """Position and level of the emitter."""
+
+        place_m: tuple[Metres, Metres] = Field(description="x and y of the emitter [m].")
+        level_db: Decibels = Field(description=(
+            "Its level at a distance of 100 m in free space [dB]; through the channel, its power "
+            "over that of a device [dB]."))
+        within_m: tuple[Metres, Metres, Metres, Metres] = Field(
+            description="Least x and y, and greatest x and y, of the searched area [m].")
+        through_channel: bool = Field(False, description=(
+            "Whether its power falls by the channel, as it was found over a 3D map."))
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        positions = np.unique((links.receiver_m[:, :2] / SAME_POSITION_M).round(), axis=0)
+        if len(positions) < MIN_POSITIONS:
+            return (f"receivers were at {len(positions)} positions; {MIN_POSITIONS} are needed to "
+                    "locate an emitter")
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        low = links.receiver_m[:, :2].min(axis=0) - AROUND_M
+        high = links.receiver_m[:, :2].max(axis=0) + AROUND_M
+        step_m = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
+        axes = (np.arange(a, b, step_m) for a, b in zip(low, high))
+        positions_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        if links.city is not None:
+            height_m = HEIGHT_M + links.city.ground_height_m(*positions_m.T)
+            positions_m = positions_m[~links.city.inside(np.column_stack([positions_m, height_m]))]
+        rows = subsample(np.arange(len(links)), MAX_LINKS)
+        nats, levels_db = _gains(view, rows, positions_m)
+        nats = nats * len(links) / len(rows)
+        found: list[Interference.Params] = []
+        for number in np.argsort(-nats.max(axis=1)):
+            best = nats[number].argmax()
+            if nats[number, best] < MIN_NATS or len(found) == MAX_PROPOSALS:
+                break
+            position_m = positions_m[number]
+            if all(np.hypot(*(position_m - other.place_m)) > APART_M for other in found):
+                found.append(self.Params(place_m=tuple(position_m.tolist()),
+                                         level_db=float(levels_db[number, best]),
+                                         within_m=(*low.tolist(), *high.tolist()),
+                                         through_channel=links.city is not None))
+        return found
+
+    @override
+    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+        """Return also what all links proposed: every link bears on it, in each part alike."""
+        return [*self.propose(view), params]
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        fall_db = _fall_db(links, params.place_m, level_at if params.through_channel else None)
+        return Term.of_inputs(np.exp((params.level_db + fall_db) * NEPERS))
+
+    @override
+    def response(self, level_db: np.ndarray, params: Params,
+                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return add_power(level_db, inputs)
+
+    @override
+    def variation(self, params: Params) -> Variation:
+        level_db = params.level_db
+        low, high = np.reshape(params.within_m, (2, 2)).tolist()
+
+        def changed(numbers: np.ndarray) -> Interference.Params:
+            x_m, y_m, level_db = numbers.tolist()
+            return params.model_copy(update={"place_m": (x_m, y_m), "level_db": level_db})
+
+        return Variation(np.array([*params.place_m, level_db]), np.array([20.0, 20.0, 3.0]),
+                         np.array([*low, level_db - 40]), np.array([*high, level_db + 40]), changed)
+
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        low, high = np.reshape(params.within_m, (2, 2))
+        if (np.minimum(params.place_m - low, high - params.place_m) < EDGE_M).any():
+            return ("the emitter would be at the edge of the searched area or beyond: its position "
+                    "is unknown")
+        return None
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        level = ("over_a_device_db", "dB") if params.through_channel else (
+            f"level_at_{REFERENCE_M:.0f}_m", links.level_unit)
+        names, units = ("x_m", "y_m", level[0]), ("m", "m", level[1])
+        of = self.variation(params)
+        return {name: Parameter.normal(value, sd, unit, Allowed(float(low), float(high)))
+                for name, value, sd, unit, low, high in zip(
+                    names, of.values.tolist(), estimate.params_sd, units, of.low, of.high)}
+
+
+def _fall_db(links: LinkData, position_m: Sequence[float] | np.ndarray,
+             level_at: LevelAt | None) -> np.ndarray:
+    """Return the level (n,) of an emitter of 0 dB: by the channel, or else by free space.
+
+    In free space it is 0 dB at `REFERENCE_M`.
+    """
+    ground_m = 0.0 if links.city is None else float(links.city.ground_height_m(*position_m))
+    emitter_m = np.array([*position_m, ground_m + HEIGHT_M])
+    if level_at is not None:
+        return level_at(links.with_devices(np.tile(emitter_m, (len(links.device_m), 1))))
+    distance_m = np.linalg.norm(links.receiver_m - emitter_m, axis=1)
+    return -20 * np.log10(np.maximum(distance_m, 1.0) / REFERENCE_M)
+
+
+def _gains(view: ResidualView, rows: np.ndarray,
+           positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return half of the drop of the weighted squares of some links by an emitter [nats].
+
+    A level and a slope for each class of line of sight are fitted beside it, because the channel's
+    have taken up part of the interference.
+
+    Args:
+        view: residuals.
+        rows: (r,) links.
+        positions_m: (p, 2) x and y of emitters [m].
+
+    Returns:
+        (p, q) nats, and the levels (p, q) of `Interference.Params` [dB].
+    """
+    part = view.links.select(rows)
+    root = np.sqrt(view.weight[rows])
+    decades = np.log10(part.distance_m)
+    columns = np.column_stack([part.los, part.los * decades, ~part.los, ~part.los * decades])
+    basis, size, _ = np.linalg.svd(columns * root[:, None], full_matrices=False)
+    basis = basis[:, size > 1e-9 * size[0]]
+    target = root * view.residual_db[rows]
+    target = target - basis @ (basis.T @ target)
+    nats, levels_db = np.empty((2, len(positions_m), len(QUANTILES)))
+    for number, position_m in enumerate(positions_m):
+        fall_db = _fall_db(part, position_m, None if part.city is None else view.level_at)
+        levels_db[number] = np.nanquantile(part.level_db - fall_db, QUANTILES)
+        power_db = fall_db + levels_db[number][:, None]
+        rise_db = root * 10 * np.log10(1 + 10 ** ((power_db - view.mean_db[rows]) / 10))
+        rise_db = rise_db - (rise_db @ basis) @ basis.T
+        nats[number] = rise_db @ target - 0.5 * (rise_db**2).sum(axis=1)
+    return nats, levels_db

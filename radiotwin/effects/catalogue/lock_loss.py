@@ -1,0 +1,297 @@
+"""A receiver that loses lock now and then: links are blank, or weaker, whatever their level.
+
+A blank is either too weak or lost, P(blank) = p + (1 - p) F (the p-tobit of Deaton and Irish 1984,
+'Statistical models for zero expenditures in household budgets', Journal of Public Economics 23),
+with a p for each receiver. Of a receiver that goes on reading without lock the level is lower by
+some decibels with a probability p. Losses in sequences have the same p as losses at random; that
+neighbouring links are lost together widens the interval.
+
+Readings of a receiver that are now and then lower by the same amount, whatever the place.
+
+All links of an instant share the receiver's state: lock kept or lost. So the likelihood is a
+mixture over instants, fitted by EM (Dempster, Laird and Rubin 1977, JRSS B 39) from several first
+drops, and held against one Student t whose tails are as heavy as the levels want them. A drop that
+comes once is an episode or a faulty flight, and one that comes at certain places is the map's.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from scipy.special import expit, logit, stdtr
+from typing_extensions import override
+
+from radiotwin.effects.arrays import frequent_labels, robust_sd
+from radiotwin.effects.base import DetectionEffect, ResidualView
+from radiotwin.effects.comparison import compared_where_possible_db
+from radiotwin.effects.params import (
+    QUANTILE_90,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+)
+from radiotwin.inference.student import Losses, log_density
+from radiotwin.links import LinkData
+
+DOF = 4.0  # of the errors within a state
+TAILS = (1.2, 1.6, 2.2, 3.0, 4.0, 8.0)  # degrees of freedom of the single t, tried
+FIRST_DROPS_DB = (10.0, 15.0, 22.0, 32.0, 42.0)
+STEPS = 40  # of EM
+MIN_DROP_DB = 8.0  # a smaller one cannot be told from shadowing
+MAX_SHARE = 0.5  # of two states the rarer one is the fault
+MIN_RUNS = 4  # stretches of time in which levels are low
+MAX_RUN = 0.5  # share of the low instants in the longest of them
+MAX_OTHERS = 0.3  # share of low readings of other receivers, over this one's
+MIN_APART = 3.0  # error scales between the states
+MIN_LINKS = 60  # of a receiver, with line of sight
+MIN_NATS = 5.0  # that losses must gain to be proposed for a receiver
+STRONGEST = 0.25  # share of the links, which must gain, too
+MIN_DEVICE_LINKS = 20  # of a device, to be asked whether it gains
+MIN_DEVICES = 0.6  # share of those devices that must gain
+PROBABILITIES = np.geomspace(0.002, 0.9, 60)  # tried
+MIN_PROBABILITY = 1e-9  # of a level below the limit; bounds the weight of one link
+MAX_VARIED = 8  # receivers whose probabilities are refined; more take too long
+STEP, MAX_CHANGE = 0.3, 1.0  # of the log-odds
+STEP_DB, MAX_CHANGE_DB = 1.0, 6.0  # of a drop
+MAX_DROP_DB = 80.0  # the range of a good receiver
+
+
+@dataclass(frozen=True, eq=False)
+class Drops:
+    """Drops of a receiver's level.
+
+    Attributes:
+        share: of its instants.
+        drop_db: how much lower they are.
+        nats: (n,) gain in log-likelihood of each of its readings.
+    """
+
+    share: float
+    drop_db: float
+    nats: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _States:
+    """Two states of instants: (i,) probability of the low one, and log-likelihood (i,) [nats]."""
+
+    share: float
+    level_db: float
+    drop_db: float
+    scale_db: float
+    low: np.ndarray
+    nats: np.ndarray
+
+
+def find_drops(view: ResidualView, receiver: int, rows: np.ndarray, design_effect: float,
+               min_nats: float) -> Drops | None:
+    """Return how the readings of a receiver drop now and then; None where they do not.
+
+    Args:
+        view: the training links.
+        receiver: its index.
+        rows: (n,) its detected links, with line of sight where there are any.
+        design_effect: how many links count as one.
+        min_nats: least gain.
+    """
+    every_db, _ = compared_where_possible_db(view)
+    rest_db, instant = every_db[rows], _instants(view.links, rows)
+    states = max((_two_states(rest_db, instant, drop_db) for drop_db in FIRST_DROPS_DB),
+                 key=lambda each: each.nats.sum())
+    single = _single_state(rest_db)
+    nats = (states.nats / np.bincount(instant))[instant] - single
+    if (nats.sum() < min_nats * design_effect or states.drop_db < MIN_DROP_DB
+            or states.drop_db < MIN_APART * states.scale_db or not 0 < states.share < MAX_SHARE):
+        return None
+    if not _comes_and_goes(view.links, rows, instant, states.low > 0.5):
+        return None
+    others = np.flatnonzero((view.links.receiver != receiver) & np.isfinite(view.links.level_db)
+                            & (view.links.los == view.links.los[rows[0]]))
+    low_db = states.level_db - 0.5 * states.drop_db
+    if len(others) and (every_db[others] < low_db).mean() > MAX_OTHERS * (rest_db < low_db).mean():
+        return None
+    return Drops(states.share, states.drop_db, nats)
+
+
+def _instants(links: LinkData, rows: np.ndarray) -> np.ndarray:
+    """Return the number (n,) of the instant of each link, in the order of time."""
+    time_s = links.time_s[rows]
+    key = np.where(np.isfinite(time_s), time_s, rows)
+    _, instant = np.unique(np.column_stack([links.flight[rows], key]), axis=0, return_inverse=True)
+    return instant.ravel()
+
+
+def _two_states(rest_db: np.ndarray, instant: np.ndarray, drop_db: float) -> _States:
+    """Return the likeliest two states of instants, from a first drop on."""
+    share, level_db = 0.2, float(np.quantile(rest_db, 0.6))
+    scale_db = max(robust_sd(rest_db), 0.5) / 2
+    low, total = np.zeros(instant.max() + 1), np.zeros(instant.max() + 1)
+    for _ in range(STEPS):
+        z = (rest_db[None] - level_db + np.array([[0.0], [drop_db]])) / scale_db
+        of_links = log_density(z, DOF) - np.log(scale_db)
+        of_instants = np.array([np.bincount(instant, weights=each) for each in of_links])
+        of_instants += np.log([[1 - share], [share]])
+        total = np.logaddexp(*of_instants)
+        low = np.exp(of_instants[1] - total)
+        mine = np.array([1 - low, low])[:, instant]
+        weight = mine * (DOF + 1) / (DOF + z * z)
+        kept, dropped = weight.sum(axis=1)
+        if min(kept, dropped) < 1.0:
+            break
+        centres = (weight * rest_db).sum(axis=1) / (kept, dropped)
+        level_db, drop_db = float(centres[0]), float(centres[0] - centres[1])
+        share = float(np.clip(low.mean(), 1e-4, 1 - 1e-4))
+        square = (weight * (rest_db - centres[:, None]) ** 2).sum() / len(rest_db)
+        scale_db = max(float(np.sqrt(square)), 0.3)
+    return _States(share, level_db, drop_db, scale_db, low, total)
+
+
+def _single_state(rest_db: np.ndarray) -> np.ndarray:
+    """Return the log-likelihood of each residual (n,) by the likeliest single t [nats]."""
+    best = np.full(len(rest_db), -np.inf)
+    for dof in TAILS:
+        level_db = float(np.median(rest_db))
+        scale_db = robust_sd(rest_db) + 0.3
+        for _ in range(STEPS):
+            z = (rest_db - level_db) / scale_db
+            weight = (dof + 1) / (dof + z * z)
+            level_db = float(weight @ rest_db / weight.sum())
+            scale_db = max(float(np.sqrt((weight * (rest_db - level_db) ** 2).mean())), 0.3)
+        nats = log_density((rest_db - level_db) / scale_db, dof) - np.log(scale_db)
+        best = max(best, nats, key=np.sum)
+    return best
+
+
+def _comes_and_goes(links: LinkData, rows: np.ndarray, instant: np.ndarray,
+                    low: np.ndarray) -> bool:
+    """Return whether the low instants (i,) are several stretches of time, none of them most."""
+    flight = np.zeros(len(low), dtype=int)
+    flight[instant] = links.flight[rows]
+    begins = low & ~np.r_[False, low[:-1] & (flight[1:] == flight[:-1])]
+    lengths = np.bincount(np.cumsum(begins)[low])[1:]
+    return len(lengths) >= MIN_RUNS and lengths.max() <= MAX_RUN * lengths.sum()
+
+
+class LockLoss(DetectionEffect):
+    """A probability of loss for each receiver whose links become likelier by it."""
+
+    name = "lock_loss"
+    confused_with = ("missing_obstacle", "noise_floor_censoring", "episode", "faulty_flight")
+
+    class Params(EffectParams):
+        """Receivers that lose lock."""
+
+        receivers: dict[ReceiverIndex, Annotated[float, Field(ge=0, lt=1)]] = Field(
+            description="Probability of a loss, of each receiver by index.")
+        drops_db: dict[ReceiverIndex, Annotated[float, Field(gt=0, le=MAX_DROP_DB)]] = Field(
+            default_factory=dict, description="By how much the level is lower without lock, of "
+            "those receivers that are not blank then [dB].")
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, blank, shares, drops_db = view.links, {}, {}, {}
+        # Behind buildings, links are blank, or weak, for want of a path, too.
+        clear = links.los if links.los.any() else np.ones(len(links), dtype=bool)
+        for receiver in frequent_labels(links.receiver[clear], MIN_LINKS):
+            rows = np.flatnonzero(clear & (links.receiver == receiver))
+            probability = _blank_share(view, rows)
+            if probability is not None:
+                blank[receiver] = probability
+            heard = rows[np.isfinite(links.level_db[rows])]
+            found = find_drops(view, receiver, heard, view.design_effect, MIN_NATS) \
+                if len(heard) >= MIN_LINKS else None
+            if found is not None and _most_devices_gain(links.device[heard], found.nats):
+                shares[receiver], drops_db[receiver] = found.share, found.drop_db
+        proposed = [self.Params(receivers=blank)] if blank else []
+        if shares:
+            proposed.append(self.Params(receivers=shares, drops_db=drops_db))
+        return proposed
+
+    @override
+    def losses(self, links: LinkData, params: Params) -> Losses:
+        blank, drop, drop_db = np.zeros((3, len(links.receiver_names)))
+        for receiver, probability in params.receivers.items():
+            (drop if receiver in params.drops_db else blank)[receiver] = probability
+        drop_db[list(params.drops_db)] = list(params.drops_db.values())
+        return Losses(*(each[links.receiver] for each in (blank, drop, drop_db)))
+
+    @override
+    def variation(self, params: Params) -> Variation | None:
+        if len(params.receivers) > MAX_VARIED:
+            return None
+        log_odds = logit(np.array(list(params.receivers.values())))
+        drops_db = np.array(list(params.drops_db.values()))
+        start, change = np.r_[log_odds, drops_db], np.r_[
+            np.full(len(log_odds), MAX_CHANGE), np.full(len(drops_db), MAX_CHANGE_DB)]
+        least = np.r_[np.full(len(log_odds), -np.inf), np.full(len(drops_db), MIN_DROP_DB / 2)]
+        most = np.r_[np.full(len(log_odds), np.inf), np.full(len(drops_db), MAX_DROP_DB)]
+
+        def changed(numbers: np.ndarray) -> LockLoss.Params:
+            shares, own_db = np.split(numbers, [len(log_odds)])
+            return self.Params(receivers=dict(zip(params.receivers, expit(shares).tolist())),
+                               drops_db=dict(zip(params.drops_db, own_db.tolist())))
+
+        return Variation(
+            start, np.r_[np.full(len(log_odds), STEP), np.full(len(drops_db), STEP_DB)],
+            np.maximum(start - change, least), np.minimum(start + change, most), changed)
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        sd = estimate.params_sd
+        if not len(sd):  # too many to be varied
+            sd = np.full(len(params.receivers) + len(params.drops_db), np.nan)
+        shares_sd, drops_sd_db = np.split(sd, [len(params.receivers)])
+        result = {}
+        for (receiver, probability), own_sd in zip(params.receivers.items(), shares_sd):
+            low, high = expit(logit(probability) + QUANTILE_90 * own_sd * np.array([-1, 1]))
+            result[f"lost_share[{links.receiver_names[receiver]}]"] = Parameter(
+                probability, float(low), float(high), "of its links")
+        for (receiver, drop_db), sd_db in zip(params.drops_db.items(), drops_sd_db):
+            result[f"drop_db[{links.receiver_names[receiver]}]"] = Parameter.normal(
+                drop_db, sd_db, "dB")
+        return result
+
+
+def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
+    """Return the likeliest share of the links (n,) of a receiver that are lost; None: no gain."""
+    links = view.links
+    blank = np.isnan(links.level_db[rows])
+    if not blank.any() or not np.isfinite(links.limit_db[rows]).all():
+        return None
+    margin = (links.limit_db[rows] - view.mean_db[rows]) / view.scale_db[rows]
+    probability, nats = _likeliest(stdtr(DOF, margin), blank)
+    # A receiver less sensitive than declared misses no strong links, and an obstacle affects some
+    # devices only.
+    strong = margin <= np.quantile(margin, STRONGEST)
+    gains = (nats.sum() > MIN_NATS * view.design_effect and nats[strong].sum() > 0
+             and _most_devices_gain(links.device[rows], nats))
+    return probability if gains else None
+
+
+def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the likeliest dropout probability, and the gain of each link by it (n,) [nats].
+
+    Args:
+        below: (n,) probability of a level below the limit.
+        blank: (n,) bool.
+    """
+    below = np.maximum(below, MIN_PROBABILITY)
+
+    def nats(probability: float | np.ndarray, below: np.ndarray) -> np.ndarray:
+        return np.log((probability + (1 - probability) * below) / below)
+
+    total = (nats(PROBABILITIES[:, None], below[blank]).sum(axis=1)
+             + (~blank).sum() * np.log1p(-PROBABILITIES))
+    best = float(PROBABILITIES[total.argmax()])
+    return best, np.where(blank, nats(best, below), np.log1p(-best))
+
+
+def _most_devices_gain(device: np.ndarray, nats: np.ndarray) -> bool:
+    """Return whether most devices with enough links gain."""
+    counts, sums = np.bincount(device), np.bincount(device, weights=nats)
+    enough = counts >= MIN_DEVICE_LINKS
+    return not enough.any() or float((sums[enough] > 0).mean()) > MIN_DEVICES

@@ -1,0 +1,101 @@
+"""Vegetation that the map shows: woods, parks and rows of trees, with a loss that is fitted.
+
+Loss of d metres through it: A_m (1 − exp(−γ d / A_m)) (ITU-R P.833-10, Eq. 1), with the A_m of the
+frequency; γ, the specific attenuation, is fitted, one for each kind. The ray tracer and the paths
+over the map know nothing of vegetation.
+"""
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import LinkCache, city_of
+from radiotwin.effects.base import GainEffect, ResidualView
+from radiotwin.effects.catalogue.foliage import UNKNOWN_MAX_LOSS_DB
+from radiotwin.effects.losses import max_loss_db
+from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
+from radiotwin.links import LinkData
+from radiotwin.scene.vegetation import KINDS
+
+MIN_THROUGH_M, MIN_LINKS = 3.0, 60  # way in vegetation that counts, and links that have one
+SPECIFIC_DB_M = (0.05, 0.15, 0.4, 1.0)  # that are tried first
+MIN_SPECIFIC_DB_M = 0.005  # less costs nothing: 0.5 dB over 100 m
+
+
+class MappedVegetation(GainEffect):
+    """Loss in the declared vegetation of one kind; one step finds one kind's."""
+
+    name = "mapped_vegetation"
+    repeatable = True
+    needs_map = True
+    confused_with = ("foliage", "excess_attenuation")
+
+    class Params(EffectParams):
+        """Loss over the metres inside."""
+
+        specific_attenuation_db_m: float = quantity(
+            0.15, unit="dB/m", low=0.001, high=5.0, step=0.1,
+            description="Of the first metres of vegetation.")
+        kind: Literal["wood", "park", "tree_row"] = Field("wood", description="Of vegetation.")
+        greatest_loss_db: float = Field(UNKNOWN_MAX_LOSS_DB, gt=0, le=1000, description=(
+            "Of a link through it, at the frequency [dB]."))
+
+    def __init__(self) -> None:
+        self._through = LinkCache()
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if missing := super().unavailable(links):
+            return missing
+        if not len(city_of(links, self.name).vegetation):
+            return "the map shows no vegetation"
+        if not self._kinds(links):
+            return (f"fewer than {MIN_LINKS} links pass {MIN_THROUGH_M:g} m or more of vegetation "
+                    "of one kind")
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        known = view.found_params(self.name, "kind")
+        frequency_hz = view.links.frequency_hz
+        most_db = max_loss_db(frequency_hz) if np.isfinite(frequency_hz) else UNKNOWN_MAX_LOSS_DB
+        return [self.Params(kind=kind, specific_attenuation_db_m=specific, greatest_loss_db=most_db)
+                for kind in self._kinds(view.links) if kind not in known
+                for specific in SPECIFIC_DB_M]
+
+    @override
+    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+        most_db = params.greatest_loss_db
+        through_m = self._through_m(links, params.kind)
+        return most_db * np.expm1(-through_m * params.specific_attenuation_db_m / most_db)
+
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        if params.specific_attenuation_db_m < MIN_SPECIFIC_DB_M:
+            return f"the {params.kind.replace('_', ' ')} would have to cost nothing"
+        return None
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        return {f"specific_attenuation_db_m[{params.kind}]": Parameter.normal(
+            params.specific_attenuation_db_m, estimate.params_sd[0], "dB/m",
+            Allowed(low=0.0, high=5.0))}
+
+    def _kinds(self, links: LinkData) -> list[str]:
+        """Return the kinds that enough links pass."""
+        return [kind for kind in KINDS
+                if (self._through_m(links, kind) >= MIN_THROUGH_M).sum() >= MIN_LINKS]
+
+    def _through_m(self, links: LinkData, kind: str) -> np.ndarray:
+        def measure() -> np.ndarray:
+            city = city_of(links, self.name)
+            vegetation = city.vegetation.of_kind(kind)
+            if not len(vegetation):
+                return np.zeros(len(links))
+            return vegetation.metres_through(links.device_m[links.device], links.receiver_m,
+                                             city.ground_height_m if city.terrain is not None
+                                             else None)
+        return self._through.get(links, kind, measure)

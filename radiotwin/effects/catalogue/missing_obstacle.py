@@ -1,0 +1,356 @@
+"""A building that the map does not show.
+
+It is located by back-projecting the loss along the links; then a box is fitted. Behind the box
+these powers add: what passes over the two edges of its roof and around both sides (knife edges of
+ITU-R P.526), and what reaches any shadow by reflections: what is left on the other paths of the
+link or, where that explains more, the class's level without line of sight (a small box hides the
+straight line only, a large one most paths), plus a fitted offset. Exactly: the channel's level over
+the map with the box in it.
+"""
+
+from collections.abc import Iterable
+from functools import lru_cache
+from itertools import product
+from typing import TypeVar
+
+import numpy as np
+from pydantic import Field
+from scipy.constants import speed_of_light
+from typing_extensions import override
+
+from radiotwin.effects.arrays import LinkCache, city_of, ends_above, ends_above_ground, subsample
+from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.boxes import (
+    BESIDE_UNKNOWN,
+    HEIGHTS_M,
+    Box,
+    Crossing,
+    back_project,
+    best_cells,
+    cross,
+    devices_through,
+    grid_around,
+    is_beside_unknown,
+    is_seen_from_one_place,
+    knife_edge_db,
+    near_box,
+    obstruction_nats,
+    stands_on,
+    two_edges_db,
+)
+from radiotwin.effects.params import (
+    QUANTILE_90,
+    Allowed,
+    Decibels,
+    EffectParams,
+    Estimate,
+    Parameter,
+    Variation,
+)
+from radiotwin.links import LinkData
+from radiotwin.scene.citymap import CONCRETE, CityMap
+
+MIN_NATS = 6.0  # that a cell must gain to be proposed
+MAX_PROPOSALS = 4
+SHIFTS_M = (-8.0, 0.0, 8.0)  # from a cell's centre, to the east and to the north
+SQUARES_M, RECTANGLES_M = (6.0, 12.0, 24.0), ((20.0, 8.0), (36.0, 12.0), (40.0, 24.0))  # tried
+SHAPES = (*product(((side_m, side_m) for side_m in SQUARES_M), (0.0, 45.0)),
+          *product(RECTANGLES_M, (-45.0, 0.0, 45.0, 90.0)))  # sides [m] and turn [deg]
+SCATTERED_DB = (0.0, -10.0)  # relative power in the shadow that shapes are tried with
+MAX_BUILT = 0.15  # of its ground and so far around it that is built in the map
+AROUND_M = 3.0  # outlines are off by metres: a box along a wall is a wall that is off
+GRID, MIN_BUILT_M = 9, 2.0  # points along each side that are looked at, and what is built there
+REACH_M, MAX_LINKS = 30.0, 3000  # links so near to a centre, and how many, that shapes are tried on
+NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
+MARGIN_M = 10.0  # and those within so much more are followed at once: boxes are tried side by side
+TURNS_DEG = (-20.0, 20.0)  # from where quick levels end: of a nearly square box they tell little
+LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # of an obstructed link, equally likely
+MAX_LOSS_DB = 50.0  # that a box causes
+HEIGHT_SCALE_M = 20.0  # of Rayleigh distributed heights: dense urban, ITU-R P.1410-6, Table 1
+
+T = TypeVar("T")
+
+
+class MissingObstacle(GainEffect):
+    """A box that obstructs links; one step finds one."""
+
+    name = "missing_obstacle"
+    figure = "links"
+    repeatable = True
+    always_exact = True
+    confused_with = ("foliage", "antenna_pattern", "device_position_error")
+
+    class Params(EffectParams):
+        """A box, and what reaches its shadow."""
+
+        box: Box = Field(description="In place of the building.")
+        scattered_db: Decibels = Field(
+            0.0, description="Power in the shadow, relative to the channel without line of sight.")
+        exact: bool = Field(False, description="Whether paths are followed over a map with it.")
+        known_paths: bool = Field(False, description=(
+            "Whether of the paths over the map without it those count that it does not block."))
+        by_class: bool = Field(False, description=(
+            "Whether the shadow has the level of the class without line of sight, not what is "
+            "left on the other paths."))
+
+    def __init__(self) -> None:
+        self._shadows, self._known = LinkCache(), LinkCache()
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if not np.isfinite(links.frequency_hz):
+            return "the frequency is not known; give frequency_hz in devices.csv"
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        rows = np.flatnonzero(links.los)
+        if not len(rows):
+            return []
+        nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows],
+                                LOSSES_DB) / view.design_effect
+        centres_m, total = back_project(*ends_above_ground(links, rows), nats)
+        found = [self._best_shape(view, rows, centre_m, height, by_class)
+                 for centre_m, height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
+                 if gain > MIN_NATS for by_class in _ways(links, (False, True))]
+        return [each for each in found if each is not None]
+
+    @override
+    def kind(self, params: Params) -> bool:
+        return params.by_class
+
+    def _best_shape(self, view: ResidualView, los: np.ndarray, centre_m: np.ndarray,
+                    height: int, by_class: bool) -> Params | None:
+        """Return the box near a cell's centre with which links (r,) with line of sight gain most.
+
+        Of shapes, turns and places that the cell does not tell: a box that is too large hides links
+        that are not obstructed, and a search that starts there ends where it started. None where
+        all stand in buildings of the map.
+        """
+        links, (x_m, y_m) = view.links, centre_m.tolist()
+        found = view.found_params(self.name, "box")
+        around = Box(x_m, y_m, 2 * REACH_M, 2 * REACH_M, max(HEIGHTS_M), 0.0)
+        near = near_box(around, *ends_above_ground(links, los), 0.0)
+        rows = subsample(los[near], MAX_LINKS)
+        mine = links.select(rows)
+
+        gains: dict[tuple[Box, float], float] = {}
+        scattered_db = _ways(links, SCATTERED_DB)
+
+        def params(box: Box, scattered_db: float) -> MissingObstacle.Params:
+            return self.Params(box=box, scattered_db=scattered_db, by_class=by_class)
+
+        def best(boxes: Iterable[Box]) -> Box:
+            for box in boxes:
+                changes_db = self._offsets_db(mine, box, scattered_db, by_class, view.level_at)
+                for each_db, changed_db in zip(scattered_db, changes_db, strict=True):
+                    gains[box, each_db] = float(view.gain_nats(rows, changed_db).sum())
+            return max(gains, key=gains.__getitem__)[0]
+
+        tops_m = HEIGHTS_M[max(height - 1, 0):height + 2]
+        box = best(Box(x_m, y_m, *sides_m, top_m, turn_deg)
+                   for (sides_m, turn_deg), top_m in product(SHAPES, tops_m))
+        box = best(box._replace(x_m=x_m + east_m, y_m=y_m + north_m, height_m=top_m)
+                   for east_m, north_m, top_m in product(SHIFTS_M, SHIFTS_M, tops_m))
+        best(Box(box.x_m, box.y_m, *sides_m, box.height_m, turn_deg)
+             for sides_m, turn_deg in SHAPES)
+        return next((params(*tried) for tried in sorted(gains, key=gains.__getitem__, reverse=True)
+                     if built_share(links, tried[0], found) <= MAX_BUILT), None)
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        offset_db = np.zeros(len(links))
+        if params.exact:
+            city = city_of(links, self.name)
+            rows = np.flatnonzero(self._near(links, params.box))
+            mine = links.select(rows)
+            with_box = mine.with_city(_with_box(city, params.box))
+            offset_db[rows] = level_at(with_box, True) - level_at(mine, True)
+            return Term.of_offset(offset_db)
+        if params.known_paths:
+            return Term.of_offset(self._past_db(links, params.box, level_at))
+        return Term.of_offset(self._offsets_db(links, params.box, (params.scattered_db,),
+                                               params.by_class, level_at)[0])
+
+    def _offsets_db(self, links: LinkData, box: Box, scattered_db: tuple[float, ...],
+                    by_class: bool, level_at: LevelAt) -> np.ndarray:
+        """Return what a box adds to links (n,), by each of k powers in its shadow (k, n) [dB]."""
+        offset_db, rows = np.zeros((len(scattered_db), len(links))), np.flatnonzero(links.los)
+        crossing = cross(box, *ends_above(links, box[:2], rows))
+        crosses = np.isfinite(crossing.left_m)
+        if crosses.any():
+            rows = rows[crosses]
+            scattered: np.ndarray | float = 0.0
+            if links.city is not None:
+                shadow_db = self._shadow_db(links, level_at, by_class)[rows]
+                scattered = 10 ** (np.minimum(shadow_db + np.array(scattered_db)[:, None], 0) / 10)
+            offset_db[:, rows] = _gain_db(Crossing(*(value[crosses] for value in crossing)),
+                                          scattered, speed_of_light / links.frequency_hz)
+        return offset_db
+
+    def _past_db(self, links: LinkData, box: Box, level_at: LevelAt) -> np.ndarray:
+        """Return what a box adds to links (n,) past which their known paths go [dB]."""
+        from radiotwin.propagation.laws.followed_paths import KnownPaths, UprightBox
+
+        city, rows = city_of(links, self.name), np.flatnonzero(self._near(links, box))
+        known = self._known.get(links, "paths", lambda: KnownPaths(links.geometry, city))
+        level_db = self._known.get(links, (level_at, "levels"),
+                                   lambda: np.full(len(links), np.nan))
+        if np.isnan(level_db[rows]).any():
+            around = self._near(links, box, NEAR_M + MARGIN_M) & np.isnan(level_db)
+            level_db[around] = level_at(links.select(around), True)
+            known.follow(np.flatnonzero(around))
+        top_m = float(city.ground_height_m(*box[:2])) + box.height_m
+        power = known.past(UprightBox(box[:2], (box.length_m / 2, box.width_m / 2),
+                                      float(np.radians(box.turn_deg)), top_m), rows)
+        before = power.direct + power.others
+        # Diffuse power, and what a channel adds to that of paths, passes any box.
+        rest = np.maximum(10 ** (level_db[rows] / 10) - before, 0.0)
+        crossing = cross(box, *ends_above(links, box[:2], rows))
+        crosses = np.isfinite(crossing.left_m)
+        direct = power.direct.copy()
+        direct[crosses] *= 10 ** (_gain_db(Crossing(*(value[crosses] for value in crossing)), 0.0,
+                                           speed_of_light / links.frequency_hz) / 10)
+        offset_db = np.zeros(len(links))
+        share = (direct + power.others_past + rest) / np.maximum(before + rest, 1e-300)
+        offset_db[rows] = 10 * np.log10(np.clip(share, 10 ** (-MAX_LOSS_DB / 10), 1.0))
+        return offset_db
+
+    def _near(self, links: LinkData, box: Box, within_m: float = NEAR_M) -> np.ndarray:
+        """Return whether (n,) links may have other levels along paths because of a box."""
+        return near_box(box, links.device_m[links.device], links.receiver_m, within_m)
+
+    @override
+    def reach(self, links: LinkData, params: Params) -> np.ndarray | None:
+        along_paths = params.exact or params.known_paths
+        return self._near(links, params.box) if along_paths else None
+
+    def _shadow_db(self, links: LinkData, level_at: LevelAt, by_class: bool) -> np.ndarray:
+        """Return what links (n,) lose if something hides the other end [dB]; see `Params`."""
+        def derive() -> np.ndarray:
+            hidden = links.with_los(np.zeros(len(links), bool))
+            return level_at(hidden, not by_class) - level_at(links, not by_class)
+        return self._shadows.get(links, (level_at, by_class), derive)
+
+    @override
+    def exact(self, params: Params) -> Params:
+        # The search goes on from here: a turn must not begin at its bounds.
+        return params.model_copy(update={"box": params.box.straightened(), "exact": True,
+                                         "known_paths": False, "by_class": False})
+
+    @override
+    def variation(self, params: Params) -> Variation:
+        x_m, y_m = params.box[:2]
+        # To follow paths for each value takes minutes, and known ones tell nearly the same; what
+        # reaches the shadow is on them.
+        along_paths = params.exact or params.known_paths
+        count = len(params.box) + (not along_paths)
+
+        def changed(numbers: np.ndarray) -> MissingObstacle.Params:
+            values = [*numbers.tolist(), params.scattered_db][:len(params.box) + 1]
+            return params.model_copy(update={
+                "box": Box(*values[:-1]), "scattered_db": values[-1], "exact": False,
+                "known_paths": along_paths})
+
+        values = np.array([*params.box, params.scattered_db])[:count]
+        turned = [np.array([*box, params.scattered_db])[:count]
+                  for box in (params.box.turned_by(turn_deg) for turn_deg in TURNS_DEG)]
+        return Variation(
+            values, np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0])[:count],
+            np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0])[:count],
+            np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0])[:count], changed,
+            is_rough=along_paths, starts=turned if along_paths else ())
+
+    @override
+    def neg_log_prior(self, params: Params) -> float:
+        # Links that all pass below the roof only bound its height from below.
+        return 0.5 * (params.box.height_m / HEIGHT_SCALE_M) ** 2
+
+    @override
+    def contradicted(self, params: Params, links: LinkData) -> str | None:
+        through = devices_through(params.box, links)
+        if is_beside_unknown(through, links):
+            return BESIDE_UNKNOWN
+        if is_seen_from_one_place(through, links):
+            return ("it is seen from one place only: how far away it is, and how large, nothing "
+                    "tells")
+        share = built_share(links, params.box)
+        if share <= MAX_BUILT:
+            return None
+        return (f"{share:.0%} of it and of what is around it would be buildings of the map, or "
+                "found before: their walls or roofs are off, then, and no other is missing")
+
+    @override
+    def corrected_map(self, city: CityMap, params: Params) -> CityMap:
+        return _with_box(city, params.box)
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        variation = self.variation(params)
+        reach = variation.values + QUANTILE_90 * estimate.sides_sd * np.array([[-1.0], [1.0]])
+        units = {"turn_deg": "deg", "scattered_db": "dB"}
+        return {name: Parameter(float(value), float(low), float(high), units.get(name, "m"),
+                                allowed=Allowed(float(least), float(most)))
+                for name, value, low, high, least, most in zip(
+                    (*Box._fields, "scattered_db")[:len(variation.values)], variation.values,
+                    *reach, variation.low, variation.high, strict=True)}
+
+    @override
+    def like(self, params: Params, other: Params) -> Params:
+        return params.model_copy(update={"box": params.box.like(other.box)})
+
+
+def _ways(links: LinkData, ways: tuple[T, ...]) -> tuple[T, ...]:
+    """Return the ways in which power reaches a shadow; without a map there is one, past the box."""
+    return ways if links.city is not None else ways[:1]
+
+
+def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
+             wavelength_m: float) -> np.ndarray:
+    """Return what a box adds to links that cross it, (n,) or (k, n) as `scattered` power is."""
+    over_db = two_edges_db(crossing.enter_over_m, crossing.leave_over_m, crossing.before_m,
+                           crossing.between_m, crossing.behind_m, wavelength_m)
+    first_m = crossing.before_m + crossing.between_m / 2
+    second_m = crossing.behind_m + crossing.between_m / 2
+    power = scattered
+    for side_m in (crossing.left_m, crossing.right_m):
+        power = power + 10 ** (-knife_edge_db(side_m, first_m, second_m, wavelength_m) / 10)
+    # A link above the roof has its own level: what comes around the sides does not add to it.
+    below_roof = np.maximum(crossing.enter_over_m, crossing.leave_over_m) > 0
+    power = np.where(below_roof, power, 0.0) + 10 ** (-over_db / 10)
+    return np.maximum(10 * np.log10(np.minimum(power, 1.0)), -MAX_LOSS_DB)
+
+
+def built_share(links: LinkData, box: Box, found: Iterable[Box] = ()) -> float:
+    """Return the share of the ground of a box, and just around it, that is built.
+
+    In the map of links, if they have one, or because boxes were found there.
+    """
+    x_m, y_m = grid_around(box, AROUND_M, GRID)
+    built = np.zeros(x_m.shape, dtype=bool)
+    if links.city is not None:
+        built = links.city.height_at(x_m, y_m) - links.city.ground_height_m(x_m, y_m) > MIN_BUILT_M
+    for other in found:
+        built |= stands_on(other, x_m, y_m)
+    return float(built.mean())
+
+
+@lru_cache(maxsize=32)
+def _with_box(city: CityMap, box: Box) -> CityMap:
+    """Return a map with a box on its ground."""
+    import trimesh  # slow to load, and needed for exact levels only
+
+    pose = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
+    base_m = float(city.ground_height_m(box.x_m, box.y_m))
+    depth_m = 0.0 if city.terrain is None else max(box.length_m, box.width_m)  # into a slope
+    pose[:3, 3] = box.x_m, box.y_m, base_m + 0.5 * (box.height_m - depth_m)
+    mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m + depth_m), pose)
+    count = len(mesh.faces)
+    material = np.concatenate([city.material, np.full(count, len(city.materials))])
+    terrain, height_sd_m = (None if each is None else np.concatenate([each, np.full(count, own)])
+                            for each, own in ((city.terrain, False), (city.height_sd_m, np.nan)))
+    return CityMap(np.vstack([city.vertices, mesh.vertices]),
+                   np.vstack([city.faces, mesh.faces + len(city.vertices)]),
+                   (*city.materials, CONCRETE), material, city.vegetation, terrain, height_sd_m)

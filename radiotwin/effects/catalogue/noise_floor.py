@@ -1,0 +1,138 @@
+"""Readings that contain the receiver's own noise: near the floor they stop falling with distance.
+
+Powers of signal and noise add: reading = 10 log10(10^(signal / 10) + 10^(floor / 10)). Readings
+such as RSSI contain both; those of a known reference signal do not (ITU-R SM.1753, 'Methods for
+measurements of radio noise').
+
+So nearly no reading is far below a floor, however weak the signal: of 30 receivers whose noise was
+measured alone (`powder_frs`) no reading is by 6 dB. Where many are, weak links fade less than the
+base says, for another reason: scattering, ways that it does not follow.
+"""
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import NEPERS, add_power, frequent_labels
+from radiotwin.effects.base import ReceiverEffect, ResidualView
+from radiotwin.effects.params import (
+    Decibels,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+)
+from radiotwin.links import LinkData
+
+MIN_LINKS = 40  # of a receiver, to estimate its floor
+MIN_RECEIVERS = 3  # with a floor, so that their median is the usual one
+MIN_NATS = 2.0  # that a floor must gain to be proposed for a receiver alone
+QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)  # of a receiver's readings, tried as its floor
+COMMON_QUANTILES = (0.03, 0.15)  # the same for all receivers
+MAX_BELOW, BELOW_DB = 0.01, 6.0  # share of a receiver's readings that may be as far below its floor
+AT_BOUND_DB = 0.1
+
+
+class NoiseFloor(ReceiverEffect):
+    """A floor for each receiver."""
+
+    name = "noise_floor_censoring"
+    confused_with = ("interference", "excess_attenuation")
+    nlos_only = True  # as good as: over a map, links with line of sight are far above a floor
+
+    class Params(EffectParams):
+        """Floors of receivers."""
+
+        receivers: dict[ReceiverIndex, Decibels] = Field(
+            description="Floor of each receiver, by index [dB].")
+        highest: dict[ReceiverIndex, Decibels] = Field({}, description=(
+            "Highest floor that a receiver's own readings allow, by index [dB]; empty: any."))
+        alone: bool = Field(False, description=(
+            "Whether no other receiver has a floor; else those without an estimate have the "
+            "median, where three or more have one."))
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found, own, highest = view.links, {}, {}, {}
+        seen = np.isfinite(links.level_db)
+        for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
+            rows = seen & (links.receiver == receiver)
+            mean_db, weight = view.mean_db[rows], view.weight[rows]
+            residual_db = view.residual_db[rows]
+            highest[receiver] = float(np.quantile(links.level_db[rows], MAX_BELOW)) + BELOW_DB
+            floors_db = np.minimum(np.quantile(links.level_db[rows], QUANTILES), highest[receiver])
+            found[receiver] = max(
+                (-float(weight @ (residual_db + mean_db - floored(mean_db, floor_db)[0]) ** 2),
+                 float(floor_db)) for floor_db in floors_db)[1]
+            every = np.flatnonzero(links.receiver == receiver)
+            nats, floor_db = max(
+                (self._gain_nats(view, every, floor_db), float(floor_db))
+                for floor_db in floors_db)
+            if nats > MIN_NATS:
+                own[receiver] = floor_db
+        if not found:
+            return []
+        # A law that was fitted without a floor is too flat and hides it, so usual ones are tried.
+        tried = [{receiver: min(highest[receiver], float(np.nanquantile(
+            links.level_db[links.receiver == receiver], share))) for receiver in found}
+            for share in COMMON_QUANTILES]
+        # Where links are blank below a limit, a floor above it is wrong for most receivers: then
+        # one may have a floor alone.
+        alone = own and own.keys() != found.keys()
+        return [*([self.Params(receivers=own, highest=highest, alone=True)] if alone else []),
+                *(self.Params(receivers=floors_db, highest=highest)
+                  for floors_db in (found, *tried))]
+
+    @staticmethod
+    def _gain_nats(view: ResidualView, rows: np.ndarray, floor_db: float) -> float:
+        """Return how much likelier links (r,), blanks as well, become by a floor [nats]."""
+        change_db = floored(view.mean_db[rows], floor_db)[0] - view.mean_db[rows]
+        return float(view.gain_nats(rows, change_db).sum())
+
+    @override
+    def inputs(self, links: LinkData, params: Params) -> np.ndarray:
+        floors_db = list(params.receivers.values())
+        # A receiver without an estimate has the usual floor, unless some have one alone.
+        usual = len(floors_db) >= MIN_RECEIVERS and not params.alone
+        usual_db = np.median(floors_db) if usual else -np.inf
+        by_receiver_db = np.full(len(links.receiver_names), usual_db)
+        by_receiver_db[list(params.receivers)] = floors_db
+        return np.exp(by_receiver_db * NEPERS)[links.receiver]
+
+    @override
+    def response(self, level_db: np.ndarray, params: Params,
+                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return add_power(level_db, inputs)
+
+    @override
+    def variation(self, params: Params) -> Variation:
+        n = len(params.receivers)
+        return Variation(
+            np.array(list(params.receivers.values())), np.full(n, 2.0), np.full(n, -250.0),
+            np.array([params.highest.get(receiver, 50.0) for receiver in params.receivers]),
+            lambda numbers: params.model_copy(update={
+                "receivers": dict(zip(params.receivers, numbers.tolist()))}),
+            list(np.arange(n)[:, None]))
+
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        at_bound = [floor_db > params.highest.get(receiver, np.inf) - AT_BOUND_DB
+                    for receiver, floor_db in params.receivers.items()]
+        if 2 * sum(at_bound) <= len(at_bound):
+            return None
+        return (f"the levels would have it higher, but more than {MAX_BELOW:.0%} of the readings "
+                f"would be {BELOW_DB:.0f} dB below it then: it is no floor")
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        unit = links.level_unit
+        return {f"floor[{links.receiver_names[receiver]}]": Parameter.normal(floor_db, sd_db, unit)
+                for (receiver, floor_db), sd_db in zip(params.receivers.items(),
+                                                       estimate.params_sd)}
+
+
+def floored(level_db: np.ndarray, floor_db: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reading (n,) of levels (n,) with a noise floor [dB], and its slope (n,)."""
+    return add_power(level_db, np.exp(floor_db * NEPERS))

@@ -1,0 +1,131 @@
+"""A receiver that compresses strong signals.
+
+Rapp's model of a solid-state amplifier (Rapp 1991, 'Effects of HPA-nonlinearity on a 4-DPSK/OFDM
+signal'): output = input / (1 + (input / saturation)^(2p))^(1 / 2p), in amplitudes; here in
+decibels.
+"""
+
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import ReceiverEffect, ResidualView
+from radiotwin.effects.params import (
+    Decibels,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+)
+from radiotwin.links import LinkData
+
+MIN_STRONG = 20  # links above the saturation level
+MIN_LINKS = 5 * MIN_STRONG  # of a receiver
+MIN_NATS = 3.0  # that compression must gain to be proposed for a receiver
+SMOOTHNESS = (1.0, 3.0)  # tried
+QUANTILES = (0.6, 0.7, 0.8, 0.88, 0.94, 0.98)  # of the predicted levels, tried as saturation level
+
+
+class Compression(NamedTuple):
+    """Rapp's model.
+
+    Attributes:
+        level_db: saturation level [dB].
+        smoothness: p; the higher, the sharper the knee.
+    """
+
+    level_db: Decibels
+    smoothness: Annotated[float, Field(ge=1e-3, le=1000)]
+
+
+class ReceiverSaturation(ReceiverEffect):
+    """Receivers that read less than they receive where it is strong."""
+
+    name = "receiver_saturation"
+    confused_with = ("antenna_pattern", "excess_attenuation")
+
+    class Params(EffectParams):
+        """Compression of receivers."""
+
+        receivers: dict[ReceiverIndex, Compression] = Field(
+            description="Of each receiver, by index.")
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found = view.links, {}
+        seen = np.isfinite(links.level_db)
+        for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
+            rows = seen & (links.receiver == receiver)
+            mean_db, weight = view.mean_db[rows], view.weight[rows]
+            residual_db = view.residual_db[rows]
+            best_nats, best = 0.0, None
+            for quantile in QUANTILES:
+                level_db = float(np.quantile(mean_db, quantile))
+                if (mean_db > level_db).sum() < MIN_STRONG:
+                    continue
+                for smoothness in SMOOTHNESS:
+                    rest_db = residual_db - (_compress(mean_db, level_db, smoothness)[0] - mean_db)
+                    nats = 0.5 * (_squares(residual_db, weight) - _squares(rest_db, weight))
+                    if nats > best_nats:
+                        best_nats, best = nats, Compression(level_db, smoothness)
+            if best and best_nats > MIN_NATS:
+                found[receiver] = best
+        return [self.Params(receivers=found)] if found else []
+
+    @override
+    def inputs(self, links: LinkData, params: Params) -> np.ndarray:
+        by_receiver = np.full((len(links.receiver_names), 2), np.inf)
+        for receiver, compression in params.receivers.items():
+            by_receiver[receiver] = compression
+        return by_receiver[links.receiver]
+
+    @override
+    def response(self, level_db: np.ndarray, params: Params,
+                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        reading_db, slope = level_db.copy(), np.ones_like(level_db)
+        mine = np.isfinite(inputs[:, 0])
+        reading_db[mine], slope[mine] = _compress(level_db[mine], *inputs[mine].T)
+        return reading_db, slope
+
+    @override
+    def variation(self, params: Params) -> Variation:
+        n = len(params.receivers)
+        values = np.concatenate([[level_db, np.log(smoothness)]
+                                 for level_db, smoothness in params.receivers.values()])
+
+        def changed(numbers: np.ndarray) -> ReceiverSaturation.Params:
+            return self.Params(receivers={
+                receiver: Compression(float(level_db), float(np.exp(log_smoothness)))
+                for receiver, (level_db, log_smoothness) in zip(params.receivers,
+                                                                numbers.reshape(-1, 2))})
+
+        return Variation(values, np.tile([3.0, 0.4], n), np.tile([-250.0, np.log(0.4)], n),
+                         np.tile([50.0, np.log(8.0)], n), changed,
+                         list(np.arange(2 * n).reshape(n, 2)))
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        unit = links.level_unit
+        return {f"saturation_level[{links.receiver_names[receiver]}]":
+                Parameter.normal(compression.level_db, sd_db, unit)
+                for (receiver, compression), sd_db in zip(params.receivers.items(),
+                                                          estimate.params_sd[::2])}
+
+
+def _squares(residual_db: np.ndarray, weight: np.ndarray) -> float:
+    """Return the weighted squares about the weighted mean."""
+    return weight @ (residual_db - weight @ residual_db / weight.sum()) ** 2
+
+
+def _compress(level_db: np.ndarray, saturation_db: float | np.ndarray,
+              smoothness: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reading (n,) and its slope (n,)."""
+    over = (level_db - saturation_db) * smoothness * np.log(10) / 10
+    reading_db = level_db - np.logaddexp(0, over) / smoothness * 10 / np.log(10)
+    # A slope of e^-60 is none, but can be divided by.
+    return reading_db, 1 / (1 + np.exp(np.minimum(over, 60)))

@@ -1,0 +1,179 @@
+"""A building of the map that does not exist any more.
+
+No law of its own: links near it have the channel's level over the map without it. (Not exactly, as
+in some twins' files: links that only this building blocks have the channel's level with nothing in
+their way.)
+
+The buildings that most links behind them have lost less to than the model says are tried. Maps give
+many a roof too high, and links that pass just below its edge gain from that building's removal as
+well: it has to explain them much better than a lower building does.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import city_of
+from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.boxes import (
+    Box,
+    building_height_sds_m,
+    buildings,
+    near_box,
+    obstruction_nats,
+)
+from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter
+from radiotwin.errors import BadInput
+from radiotwin.links import LinkData
+from radiotwin.scene.citymap import CityMap
+
+MAX_PROPOSALS = 4  # of buildings whose removal is tried exactly
+MIN_LINKS = 8  # that a building hides
+RISES_DB = (-4.0, -8.0, -12.0, -16.0, -20.0)  # losses that a link behind it would not have
+LOWER = (5 / 6, 5 / 3)  # standard deviations of its mapped height, by which a building may be lower
+FLAT_M = 0.5  # least height of a building that is lower
+# Very strong evidence (Kass and Raftery 1995, 'Bayes factors', J. Am. Stat. Assoc. 90, Sec. 3.2).
+MIN_LEAD_NATS = 5.0
+SAME_M = 1.0  # a building whose centre is as near is the same one
+NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
+
+
+class RemovedObstacle(GainEffect):
+    """One building of the map; one step finds one."""
+
+    name = "removed_obstacle"
+    figure = "links"
+    nlos_only = True
+    repeatable = True
+    needs_map = True
+    always_exact = True
+    confused_with = ("device_position_error",)
+
+    class Params(EffectParams):
+        """A building of the map."""
+
+        building: int = Field(ge=0, description="Index, as `buildings` numbers them.")
+        centre_m: tuple[Metres, Metres, Metres] = Field(description="Centre x, y, and height [m].")
+        exact: bool = Field(False, description="Whether paths are followed over a map without it.")
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        assert links.city is not None
+        rows = np.flatnonzero(~links.los)
+        a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
+        nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows], RISES_DB)
+        label, centres_m = buildings(links.city)
+        total = np.full(len(centres_m), -np.inf)
+        for building in np.unique(label[~links.city.on_ground]).tolist():
+            behind = ~links.city.without(label != building).line_of_sight(a_m, b_m)
+            if behind.sum() >= MIN_LINKS:
+                total[building] = nats[behind].sum()
+        # A building behind which links are no stronger than they should be is there.
+        likely = [int(building) for building in np.argsort(-total)[:MAX_PROPOSALS]
+                  if total[building] > 0]
+        gains = {building: _gain_nats(view, building, _without(links.city, building)[0])
+                 for building in likely}
+        for building in sorted(gains, key=gains.__getitem__, reverse=True):
+            least = gains[building] - MIN_LEAD_NATS
+            lower_m = building_height_sds_m(links.city)[building] * np.array(LOWER)
+            if least > 0 and all(_gain_nats(view, building, _lower(links.city, building, by_m))
+                                 < least for by_m in lower_m.tolist()):
+                return [self.Params(building=building, centre_m=tuple(centres_m[building].tolist()),
+                                    exact=True)]
+        return []
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        offset_db, with_it = np.zeros(len(links)), city_of(links, self.name)
+        if params.exact:
+            city, box = _without(with_it, params.building)
+            rows = _near(links, box)
+            mine = links.select(rows)
+            offset_db[rows] = level_at(mine.with_city(city), True) - level_at(mine, True)
+            return Term.of_offset(offset_db)
+        rows = np.flatnonzero(only_blocker(links) == params.building)
+        if len(rows):
+            offset_db[rows] = _rise_db(links.select(rows), level_at)
+        return Term.of_offset(offset_db)
+
+    @override
+    def exact(self, params: Params) -> Params:
+        return params.model_copy(update={"exact": True})
+
+    @override
+    def corrected_map(self, city: CityMap, params: Params) -> CityMap:
+        # By its place: other effects' buildings that are gone, or there, have changed the numbers.
+        apart_m = np.linalg.norm(buildings(city)[1] - np.array(params.centre_m), axis=1)
+        nearest = int(apart_m.argmin())
+        return _without(city, nearest)[0] if apart_m[nearest] < SAME_M else city
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        return {name: Parameter(value, value, value, "m")
+                for name, value in zip(("x_m", "y_m", "height_m"), params.centre_m, strict=True)}
+
+
+def _gain_nats(view: ResidualView, building: int, other: CityMap) -> float:
+    """Return how much likelier links are over another map, which differs in one building."""
+    assert view.links.city is not None
+    rows = _near(view.links, _without(view.links.city, building)[1])
+    mine = view.links.select(rows)
+    change_db = view.level_at(mine.with_city(other), True) - view.level_at(mine, True)
+    return float(view.gain_nats(rows, change_db).sum())
+
+
+def _near(links: LinkData, box: Box) -> np.ndarray:
+    """Return the rows of links that pass near a box."""
+    return np.flatnonzero(near_box(box, links.device_m[links.device], links.receiver_m, NEAR_M))
+
+
+def _rise_db(links: LinkData, level_at: LevelAt) -> np.ndarray:
+    """Return what links (n,) gain if nothing were in their straight line [dB]."""
+    return level_at(links.with_los(np.ones(len(links), bool)), True) - level_at(links, True)
+
+
+def only_blocker(links: LinkData) -> np.ndarray:
+    """Return (n,) the building that alone blocks each link; -1 where none or more than one does.
+
+    Terrain is no building.
+    """
+    assert links.city is not None
+    label = buildings(links.city)[0]
+    alone = np.full(len(links), -1)
+    rows = np.flatnonzero(~links.los)
+    a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
+    near, far = links.city.first_face(a_m, b_m), links.city.first_face(b_m, a_m)
+    same = (near >= 0) & (far >= 0) & (label[near] == label[far])
+    if links.city.terrain is not None:
+        same &= ~links.city.terrain[near]
+    alone[rows[same]] = label[near[same]]
+    return alone
+
+
+@lru_cache(maxsize=32)
+def _lower(city: CityMap, building: int, by_m: float) -> CityMap:
+    """Return a map in which a building is lower, or nearly as flat as the ground."""
+    mine = np.unique(city.faces[buildings(city)[0] == building])
+    vertices = city.vertices.copy()
+    height_m = vertices[mine, 2]
+    vertices[mine, 2] = np.maximum(height_m - by_m, np.minimum(height_m, height_m.min() + FLAT_M))
+    return city.with_vertices(vertices)
+
+
+@lru_cache(maxsize=32)
+def _without(city: CityMap, building: int) -> tuple[CityMap, Box]:
+    """Return a map without a building, and the box around that building."""
+    label, centres_m = buildings(city)
+    if building >= len(centres_m):
+        raise BadInput(f"the effect removed_obstacle removes building {building}, but the map has "
+                       f"{len(centres_m)}; give the scene that the twin was made with")
+    mine = label == building
+    corners_m = city.vertices[city.faces[mine]].reshape(-1, 3)
+    low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
+    (x_m, y_m, _), (length_m, width_m, _) = (low_m + high_m) / 2, high_m - low_m
+    return (city.without(mine),
+            Box(x_m, y_m, length_m, width_m, high_m[2], 0.0))

@@ -1,0 +1,196 @@
+"""A receiver with an undeclared half-wave dipole, upright or tilted, fixed to its body.
+
+Far field of a half-wave dipole, cos(π/2 cos θ) / sin θ along its own polar direction (Balanis,
+Antenna Theory, Sec. 4.6), directivity 1.64, times the share of it that has the polarisation of an
+upright transmitting antenna's wave. With a 3D map each path has the gain of the direction from
+which it comes. Power on paths that are not followed, which is fitted too, has the mean of the
+pattern.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.antenna_params import AntennaParams, report_pattern, vary_patterns
+from radiotwin.effects.arrays import LinkCache, frequent_labels
+from radiotwin.effects.base import GainEffect, ResidualView
+from radiotwin.effects.params import (
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+    quantity,
+)
+from radiotwin.links import LinkData
+from radiotwin.propagation.laws.followed_paths import free_space, rays_of, through_antenna_db
+
+MIN_LINKS = 100  # of a receiver with line of sight, to propose its dipole
+MIN_NATS = 4.0  # that a dipole must gain to be proposed
+DIRECTIVITY = 1.64  # of a half-wave dipole (Balanis, Sec. 4.6)
+MIN_GAIN = 10**-2.5  # below the maximum, linear: no real antenna has deeper nulls
+MEAN_GAIN = 0.5  # over all directions and both polarisations
+MIN_HEADING_SD = 0.05  # of its sine and cosine together; below it, the heading counts as constant
+TILTS_DEG = np.arange(0.0, 60.1, 5.0)  # that are tried
+AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0)
+
+
+class DipoleParams(AntennaParams):
+    """Attitude of one receiver's dipole in the body frame."""
+
+    tilt_deg: float = quantity(0.0, unit="deg", low=0.0, high=85.0, step=4.0,
+                               description="Angle between the dipole and the body's top.")
+    lean_azimuth_deg: float = quantity(0.0, unit="deg", low=-720.0, high=1080.0, step=10.0,
+                                       description="Side it leans to, clockwise from the nose.")
+    scattered_db: float = quantity(-35.0, unit="dB", low=-80.0, high=0.0, step=6.0,
+                                   description="Power on paths that are not followed.")
+
+
+def dipole_gain(ray: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Return the gain of a half-wave dipole for vertically polarised waves, linear.
+
+    Args:
+        ray: (…, 3) unit vectors towards the source of the wave; up is z.
+        axis: (…, 3) unit vectors along the dipole.
+
+    Returns:
+        (…,) relative to an isotropic antenna.
+    """
+    cosine = (ray * axis).sum(axis=-1)
+    # The wave's electric field lies in the vertical plane through the ray.
+    flat = np.sqrt(np.maximum(1 - ray[..., 2] ** 2, 1e-9))
+    along = (axis[..., 2] - ray[..., 2] * cosine) / flat
+    field = np.cos(np.pi / 2 * cosine) / np.maximum(1 - cosine**2, 1e-6) * along
+    return DIRECTIVITY * np.maximum(field**2, MIN_GAIN)
+
+
+class TiltedDipole(GainEffect):
+    """A dipole for each receiver that fits better with one."""
+
+    name = "antenna_pattern"
+    variant = "tilted dipole of a receiver"
+    figure = "pattern"
+    of_receiver = True
+    confused_with = ("body_shadowing", "receiver_gain_offset")
+
+    class Params(EffectParams):
+        """Dipoles of receivers."""
+
+        receivers: dict[ReceiverIndex, DipoleParams] = Field(
+            description="Dipole of each receiver, by index.")
+
+    def __init__(self) -> None:
+        self._arrivals = LinkCache()
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if np.isnan(links.heading_deg).all():
+            return "there is no heading_deg, so directions in the receiver's body frame are unknown"
+        heading = np.radians(links.heading_deg)
+        if np.nanstd(np.cos(heading)) + np.nanstd(np.sin(heading)) < MIN_HEADING_SD:
+            return "the heading never changes, so body and world frame cannot be distinguished"
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found = view.links, {}
+        usable = links.los & np.isfinite(links.heading_deg)
+        for receiver in frequent_labels(links.receiver, MIN_LINKS):
+            rows = np.flatnonzero((links.receiver == receiver) & usable)
+            dipole = _best_dipole(view, rows) if len(rows) >= MIN_LINKS else None
+            if dipole is not None:
+                found[receiver] = dipole
+        return [self.Params(receivers=found)] if found else []
+
+    @override
+    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+        offset_db = np.zeros(len(links))
+        for receiver, dipole in params.receivers.items():
+            rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
+            arrivals = self._arrivals.get(links, receiver,
+                                          partial(_Arrivals.of, links, rows))
+            offset_db[rows] = arrivals.offset_db(dipole)
+        return offset_db
+
+    @override
+    def variation(self, params: Params) -> Variation:
+        return vary_patterns(params.receivers,
+                             lambda receivers: self.Params(receivers=receivers))
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        reported: dict[str, Parameter] = {}
+        dipoles_sd = np.reshape(estimate.params_sd, (len(params.receivers), -1))
+        for (receiver, dipole), sd in zip(params.receivers.items(), dipoles_sd, strict=True):
+            reported |= report_pattern(dipole, sd, links.receiver_names[receiver],
+                                       links.city is not None)
+        return reported
+
+
+def _best_dipole(view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
+    """Return the dipole of a grid that fits best along straight lines; None if none gains much."""
+    links = view.links.select(rows)
+    ray, residual_db, weight = -_unit(links.offset_m), view.residual_db[rows], view.weight[rows]
+
+    def squares(rest_db: np.ndarray) -> float:
+        return weight @ (rest_db - weight @ rest_db / weight.sum()) ** 2
+
+    def after(tilt: float, azimuth: float) -> float:
+        gain = dipole_gain(ray, _axis(links.receiver_axes, tilt, azimuth))
+        return squares(residual_db - 10 * np.log10(gain))
+
+    best, tilt, azimuth = min((after(tilt, azimuth), tilt, azimuth)
+                              for tilt in TILTS_DEG for azimuth in AZIMUTHS_DEG)
+    if 0.5 * (squares(residual_db) - best) > MIN_NATS:
+        return DipoleParams(tilt_deg=tilt, lean_azimuth_deg=azimuth)
+    return None
+
+
+class _Arrivals(NamedTuple):
+    """Directions from which links arrive at their receiver.
+
+    Attributes:
+        ray: (n, sectors, 3) unit vectors towards where they come from, in the world.
+        power: (n, sectors) power gain.
+        axes: (n, 3, 3) of the receiver, see `LinkData.receiver_axes`.
+        free: (n,) power gain in free space; 0 without a map, where the straight line is all.
+    """
+
+    ray: np.ndarray
+    power: np.ndarray
+    axes: np.ndarray
+    free: np.ndarray
+
+    @classmethod
+    def of(cls, links: LinkData, rows: np.ndarray) -> "_Arrivals":
+        """Return those of some links, which are followed over the map."""
+        links = links.select(rows)
+        if links.city is None:
+            return cls(-_unit(links.offset_m)[:, None], np.ones((len(links), 1)),
+                       links.receiver_axes, free_space(links.geometry))
+        ray = rays_of(links, "arrivals")
+        power = np.linalg.norm(ray, axis=2)
+        return cls(ray / np.maximum(power, 1e-30)[..., None], power, links.receiver_axes,
+                   free_space(links.geometry))
+
+    def offset_db(self, dipole: DipoleParams) -> np.ndarray:
+        """Return (n,) what the dipole adds to each link [dB]."""
+        axis = _axis(self.axes, dipole.tilt_deg, dipole.lean_azimuth_deg)
+        gain = dipole_gain(self.ray, axis[:, None])
+        scattered = self.free * 10 ** (dipole.scattered_db / 10)
+        return through_antenna_db(self.power, gain, scattered, MEAN_GAIN)
+
+
+def _axis(axes: np.ndarray, tilt_deg: float, azimuth_deg: float) -> np.ndarray:
+    """Return (n, 3) the direction in the world of a dipole on receivers with axes (n, 3, 3)."""
+    tilt, lean = np.radians(tilt_deg), np.radians(azimuth_deg)
+    in_body = np.array([np.sin(tilt) * np.sin(lean), np.sin(tilt) * np.cos(lean), np.cos(tilt)])
+    return np.einsum("i,nij->nj", in_body, axes)
+
+
+def _unit(offset_m: np.ndarray) -> np.ndarray:
+    return offset_m / np.maximum(np.linalg.norm(offset_m, axis=1, keepdims=True), 1e-9)

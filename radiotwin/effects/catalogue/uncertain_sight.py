@@ -1,0 +1,89 @@
+"""Walls and roofs of a map that are off by metres: near them, the line of sight is not certain.
+
+In how many of some maps as this one might be (`perturbed_map`) a link has line of sight is its
+chance of it. Where that is neither 0 nor 1, the map's class says less than elsewhere: the level
+lies between those of both classes, and errors are larger. How much of either is fitted. Without
+this, a box or a grove that hides a few links beside a wall explains what the wall's error did.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from typing_extensions import override
+
+from radiotwin.effects.arrays import LinkCache, city_of
+from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
+from radiotwin.links import LinkData
+from radiotwin.scene.perturbation import perturbed_map
+
+# Between the accuracies of buildings as blocks with roofs (2 m) and of surveyed ones (0.5 m): LoD2
+# and LoD3 of CityGML 2.0 (OGC 12-019, Table 1); heights are often counted from storeys.
+WALL_SD_M, HEIGHT_SD_M = 1.0, 2.0
+MAPS = 8  # beside the one that is given
+PRIOR_SD_DB = 20.0  # of what a link near a wall loses or gains: the difference of the classes
+CONTRASTS_DB = (6.0, 12.0, 20.0)  # that are tried first
+MIN_LINKS = 60  # of which it is not certain
+
+
+class UncertainSight(GainEffect):
+    """Levels between those of both classes near walls and roofs, and larger errors."""
+
+    name = "uncertain_sight"
+    variant = "walls and roofs that are off by metres"
+    figure = "histogram"
+    is_declared = True
+    needs_map = True
+    is_cause = False
+
+    class Params(EffectParams):
+        """How much lines of sight are worth where walls decide."""
+
+        contrast_db: float = quantity(
+            12.0, unit="dB", low=0.5, high=60.0, step=3.0, description=(
+                "Difference of level between both classes that errors near walls are of [dB]."))
+
+    def __init__(self) -> None:
+        self._chances = LinkCache()
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if missing := super().unavailable(links):
+            return missing
+        chance = self._chance(links)
+        count = int(((chance > 0) & (chance < 1)).sum())
+        if count < MIN_LINKS:
+            return (f"walls that are {WALL_SD_M:g} m off decide over {count} links; {MIN_LINKS} "
+                    "are needed")
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        return [self.Params(contrast_db=contrast_db) for contrast_db in CONTRASTS_DB]
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        chance, los = self._chance(links), links.los
+        columns = np.column_stack([np.where(los, chance - 1.0, 0.0), np.where(los, 0.0, chance)])
+        return replace(Term.of_columns(columns, PRIOR_SD_DB),
+                       random_effect_sd_db=params.contrast_db * np.sqrt(chance * (1.0 - chance)))
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        contrast = Parameter.normal(params.contrast_db, estimate.params_sd[0], "dB",
+                                    Allowed(low=0.0))
+        names = "loss_without_sight_db", "gain_with_sight_db"
+        return {"contrast_db": contrast} | {
+            name: Parameter.normal(value_db, sd_db, "dB") for name, value_db, sd_db in
+            zip(names, estimate.coefficients, estimate.coefficients_sd, strict=True)}
+
+    def _chance(self, links: LinkData) -> np.ndarray:
+        """Return how probable the line of sight of each link (n,) is."""
+        def derive() -> np.ndarray:
+            city = city_of(links, self.name)
+            seen = links.los.astype(float)
+            for seed in range(MAPS):
+                seen += links.with_city(perturbed_map(city, WALL_SD_M, HEIGHT_SD_M, seed)).los
+            return seen / (MAPS + 1)
+        return self._chances.get(links, None, derive)

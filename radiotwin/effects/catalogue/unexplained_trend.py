@@ -1,0 +1,141 @@
+"""`unexplained_trend`, a last resort: the residual as a smooth curve over one variable.
+
+It describes on which variable the residual still depends, and how; it explains nothing. It is no
+candidate among the effects, because it would fit part of whatever they model. A twin and its maps
+have a curve that is the same for all receivers and over a variable of places; a map has no heading
+and no time.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import LinkCache
+from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, Unique
+from radiotwin.links import LinkData, residual_variable
+
+KNOTS = 8
+PRIOR_SD_DB = 5.0  # of the value at a knot
+MAX_CURVES = 10  # receivers that may have a curve each
+MIN_KNOWN = 0.5  # share of the links with a value
+CIRCULAR = ("azimuth_deg", "body_azimuth_deg", "heading_deg")
+ON_MAPS = ("distance_m", "elevation_deg", "azimuth_deg", "altitude_m", "predicted_level_db",
+           "metres_inside_m", "diffraction_parameter")
+OVER = "over "
+MAX_KNOT = 1e15  # of times since 1970, too
+
+
+def _ascending(values: list[float]) -> list[float]:
+    if any(after <= before for before, after in zip(values, values[1:], strict=False)):
+        raise ValueError("knots must ascend")
+    return values
+
+
+class UnexplainedTrend(GainEffect):
+    """A curve over one variable, the same for all receivers or one for each."""
+
+    name = "unexplained_trend"
+    nlos_only = True  # may be: its cause is unknown
+    of_receiver = True
+    is_cause = False
+
+    class Params(EffectParams):
+        """Knots and receivers of the curves."""
+
+        knots: Annotated[list[Annotated[float, Field(ge=-MAX_KNOT, le=MAX_KNOT)]],
+                         AfterValidator(_ascending)] = Field(
+            min_length=1, max_length=KNOTS, description="Values of the variable, ascending.")
+        receivers: Unique[ReceiverIndex | None] = Field(
+            description="Indices of the receivers with a curve each; [None] is one for all.")
+
+    def __init__(self, variable: str) -> None:
+        """Make the effect for a variable of `residual_variables`."""
+        self.variable = variable
+        self.variant = f"{OVER}{variable}"  # type: ignore[misc]  # one class for every variable
+        self.uses = ("quality",) if variable == "quality" else ()  # type: ignore[misc]
+        self._values = LinkCache()
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        value = self._value(view.links, view.level_at)
+        known = np.isfinite(value)
+        if known.mean() < MIN_KNOWN or np.ptp(value[known]) < 1e-9:
+            return []
+        receivers = np.unique(view.links.receiver).tolist()
+        choices = [[None], *([receivers] if 1 < len(receivers) <= MAX_CURVES else [])]
+        knots = _knots(value[known], KNOTS, self.variable in CIRCULAR)
+
+        def rating(params: UnexplainedTrend.Params) -> float:
+            term = self.term(view.links, params, view.level_at)
+            return view.score(term) - term.columns.shape[1]  # (Akaike 1974)
+
+        return [max((self.Params(knots=knots, receivers=members) for members in choices),
+                    key=rating)]
+
+    @override
+    def is_on_maps(self, params: Params) -> bool:
+        return self.variable in ON_MAPS and params.receivers == [None]
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        basis = _hats(self._value(links, level_at), np.array(params.knots),
+                      self.variable in CIRCULAR)
+        columns = [basis if member is None else basis * (links.receiver == member)[:, None]
+                   for member in params.receivers]
+        return Term.of_columns(np.hstack(columns), PRIOR_SD_DB)
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        curves = np.reshape(estimate.coefficients, (len(params.receivers), -1))
+        result = {}
+        for member, curve in zip(params.receivers, curves):
+            label = self.variable
+            if member is not None:
+                label += f", {links.receiver_names[member]}"
+            result[f"rise_and_fall_db[{label}]"] = Parameter(float(np.ptp(curve)), np.nan, np.nan,
+                                                             "dB")
+        return result
+
+    def _value(self, links: LinkData, level_at: LevelAt) -> np.ndarray:
+        """Return the variable (n,)."""
+        return self._values.get(
+            links, (level_at,), lambda: residual_variable(self.variable, links, level_at(links)))
+
+
+def curve_columns(value: np.ndarray, knots: int, circular: bool) -> np.ndarray:
+    """Return columns (n, ≤ knots) of a curve over values (n,), 0 where they are unknown."""
+    places = _knots(value[np.isfinite(value)], knots, circular)
+    return _hats(value, np.array(places), circular)
+
+
+def _knots(value: np.ndarray, count: int, circular: bool) -> list[float]:
+    """Return knots round the circle, or at evenly spaced quantiles of the values."""
+    if circular:
+        return (np.arange(count) * 360.0 / count).tolist()
+    return np.unique(np.quantile(value, (np.arange(count) + 0.5) / count)).tolist()
+
+
+def _hats(value: np.ndarray, knots: np.ndarray, circular: bool) -> np.ndarray:
+    """Return the piecewise linear basis (n, knots) of values (n,).
+
+    It is constant beyond the outer knots, and zero where the value is unknown.
+    """
+    known = np.isfinite(value)
+    filled = np.where(known, value, knots[0])
+    if circular:
+        position = filled % 360 / 360 * len(knots)
+        left = np.floor(position).astype(int) % len(knots)
+        right, share = (left + 1) % len(knots), position % 1
+    else:
+        position = np.interp(filled, knots, np.arange(len(knots)))
+        left = np.minimum(np.floor(position).astype(int), len(knots) - 1)
+        right, share = np.minimum(left + 1, len(knots) - 1), position - left
+    hats = np.zeros((len(value), len(knots)))
+    rows = np.arange(len(value))
+    np.add.at(hats, (rows, left), 1 - share)
+    np.add.at(hats, (rows, right), share)
+    return hats * known[:, None]

@@ -1,0 +1,1 @@
+"""Frames, reference systems, and conversion between them."""

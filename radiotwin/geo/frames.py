@@ -1,0 +1,170 @@
+"""The frame of tables of positions: `frame.toml` beside them says where on the earth it lies."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+import tomli_w
+from pydantic import ConfigDict, Field, ValidationError, model_validator
+
+from radiotwin.errors import BadInput
+from radiotwin.geo.geodesy import local_crs, to_geographic, to_local
+from radiotwin.io.forms import Origin, Table
+from radiotwin.io.inputs import is_within, read_toml
+
+GroundHeight = Callable[[np.ndarray, np.ndarray], np.ndarray]
+FRAME_FILE = "frame.toml"
+SAME_DEG, SAME_ALTITUDE_M = 1e-9, 1e-3  # of one place, after rounding: 0.1 mm on the ground
+
+
+class FrameRecord(Table):
+    """Content of `frame.toml`: all tables in its folder are in this local frame."""
+
+    schema_: Literal["radiotwin.frame/1"] = Field("radiotwin.frame/1", alias="schema")
+    crs: str | None = Field(None, description="PROJ string of the frame, for other programs")
+    origin: Origin
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False,
+                              populate_by_name=True)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "FrameRecord":
+        if self.crs not in (None, local_crs(self.origin)):
+            raise ValueError("crs is not that of the local frame about [origin]; remove it, or "
+                             f'write crs = "{local_crs(self.origin)}"')
+        return self
+
+
+def read_frame(folder: Path) -> Origin | None:
+    """Return the origin of the frame of a folder's tables; None where `frame.toml` is absent.
+
+    Args:
+        folder: of the tables.
+
+    Raises:
+        BadInput: it cannot be read, it leads out of its folder, or a value is not allowed.
+    """
+    path = folder / FRAME_FILE
+    if not os.path.lexists(path):
+        return None
+    if not is_within(path, folder):
+        raise BadInput(f"{path} is a link out of its folder; copy it there")
+    try:
+        return FrameRecord.model_validate(read_toml(path)).origin
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        reason = first["msg"].removeprefix("Value error, ")
+        raise BadInput(f"{path}: {key + ': ' if key else ''}{reason}; import the measurements "
+                       "again, or correct it") from None
+
+
+def write_frame(origin: Origin, path: Path) -> None:
+    """Write `frame.toml`.
+
+    Args:
+        origin: of the frame.
+        path: of the file.
+    """
+    record = FrameRecord(origin=origin, crs=local_crs(origin))
+    with path.open("wb") as file:
+        tomli_w.dump(record.model_dump(by_alias=True), file)
+
+
+def place(origin: Origin) -> str:
+    """Return an origin as a message names it.
+
+    Args:
+        origin: of a frame.
+
+    >>> place(Origin(latitude_deg=36.0001, longitude_deg=-78.93575))
+    '36.0001, -78.93575'
+    """
+    return f"{origin.latitude_deg:.10g}, {origin.longitude_deg:.10g}"
+
+
+def is_same_frame(one: Origin, other: Origin) -> bool:
+    """Return whether coordinates of one frame are those of the other.
+
+    Args:
+        one: origin of a frame.
+        other: origin of another.
+    """
+    turn_deg = abs(one.longitude_deg - other.longitude_deg) % 360
+    return (abs(one.latitude_deg - other.latitude_deg) <= SAME_DEG
+            and min(turn_deg, 360 - turn_deg) <= SAME_DEG
+            and abs(_rise_m(one, other)) <= SAME_ALTITUDE_M)
+
+
+def between_frames(position_m: np.ndarray, one: Origin, other: Origin) -> np.ndarray:
+    """Convert positions exactly, by way of latitude and longitude.
+
+    Heights count from the ground of a frame. They change only where both frames declare their
+    ground's altitude: one of 0 m, which maps have that know no terrain, declares none.
+
+    Args:
+        position_m: (n, 3) in the frame about `one` [m]; NaN where unknown.
+        one: origin of their frame.
+        other: origin of the frame to convert to.
+
+    Returns:
+        (n, 3) in the frame about `other` [m].
+    """
+    moved_m = np.array(position_m, dtype=float)
+    known = np.isfinite(moved_m[:, :2]).all(axis=1)
+    moved_m[known, :2] = np.column_stack(to_local(other, *to_geographic(
+        one, *moved_m[known, :2].T)))
+    moved_m[:, 2] += _rise_m(one, other)
+    return moved_m
+
+
+def _rise_m(one: Origin, other: Origin) -> float:
+    """Return what to add to heights of one frame for those of the other [m]."""
+    if not (one.altitude_m and other.altitude_m):
+        return 0.0
+    return one.altitude_m - other.altitude_m
+
+
+def above_datum(table: pd.DataFrame, what: str, position: list[str],
+                ground_height_m: GroundHeight | None) -> pd.DataFrame:
+    """Return a table with the heights that it gives above the ground above the datum.
+
+    Args:
+        table: with columns of positions, and one named as that of the height, `above_ground_m` for
+            `z_m`; a row has one of both heights, or none.
+        what: it holds, for messages.
+        position: its columns of x, y and z.
+        ground_height_m: returns the heights (n,) of the ground at x and y (n,) [m]; None: it is at
+            z = 0.
+
+    Raises:
+        BadInput: a row has both heights, or one above the ground of an unknown position.
+    """
+    column = position[2].replace("z_m", "above_ground_m")
+    if column not in table:
+        return table
+    (x_m, y_m, z_m), above_m = table[position].to_numpy(dtype=float).T, table[column].to_numpy()
+    given = np.isfinite(above_m)
+    twice = np.flatnonzero(given & np.isfinite(z_m))
+    if len(twice):
+        raise BadInput(f"{what}, row {twice[0] + 2}: {position[2]} (above the datum) and {column} "
+                       "are both given; leave one of them empty")
+    nowhere = np.flatnonzero(given & ~np.isfinite(x_m + y_m))
+    if len(nowhere) and ground_height_m is not None:
+        raise BadInput(f"{what}, row {nowhere[0] + 2}: {column} needs a known position; a device "
+                       f"to be found is searched at one height above the datum: give {position[2]}")
+    ground_m = np.zeros(len(table))
+    if ground_height_m is not None:
+        ground_m[given] = ground_height_m(x_m[given], y_m[given])
+    return table.drop(columns=column).assign(**{position[2]: np.where(given, ground_m + above_m,
+                                                                      z_m)})
+
+
+def moved_positions(table: pd.DataFrame, columns: list[str],
+                    position_m: Callable[[np.ndarray], np.ndarray]) -> pd.DataFrame:
+    """Return a table with its columns of positions converted by a function of (n, 3) [m]."""
+    moved_m = position_m(table[columns].to_numpy(dtype=float))
+    return table.assign(**dict(zip(columns, moved_m.T)))

@@ -1,0 +1,332 @@
+"""Formats that are recognised by their columns.
+
+A known format: which columns hold what, in which unit, and where that is described.
+
+Text exports of drive test tools, whose columns a user chooses.
+
+LoRa: gateways that receive the packets of a node.
+
+Programs of telephones that log cells, Wi-Fi and Bluetooth beacons.
+
+Spectrum scanners.
+
+All known formats.
+
+Formats that are recognised by their columns.
+"""
+
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from radiotwin.errors import BadInput
+from radiotwin.importing.read_source import Expected, WithoutHeader
+from radiotwin.importing.rtl_power import read_rtl_power
+from radiotwin.importing.source import columns_of
+
+MADE_UP = "made-up"
+"""Tried on a file that was made up after the description only."""
+SEMTECH = "Semtech, SX1276/77/78/79 data sheet, rev. 4, 5.5.5"
+_LEVEL = "power of the packet, dBm: RSSI, plus SNR where that is below 0"
+_CAUTION = ("the RSSI of a packet below the noise is mostly noise, so level = RSSI + SNR where SNR "
+            f"is below 0 ({SEMTECH}; at SNR = 0 the packet alone has 3 dB less). Packets that a "
+            "gateway did not hear are not in the file")
+_MAPPER = (_CAUTION + ". Devices are the gateways, the receiver is the node that moves: the gain "
+           "is that of both directions, and the level is that of the node's transmitter")
+_STACK = "https://www.thethingsindustries.com/docs/the-things-stack/concepts/data-formats/"
+_CHIRPSTACK = "https://docs.rs/crate/chirpstack_api (integration.proto, gw.proto; JSON of proto3)"
+_UNITS = {"level_unit": "dBm", "length_unit": "m", "time_format": "ISO 8601"}
+_UNKNOWN = 2147483647  # of Android's telephony, CellInfo.UNAVAILABLE
+_MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ by more than "
+          "10 dB and are no one quantity; keep one with --only {}=LTE")
+
+
+@dataclass(frozen=True)
+class Format:
+    """The mapping of a known format.
+
+    Attributes:
+        name: as of `--format`.
+        title: of the program that writes it.
+        columns: quantity of `Columns` -> entry of a mapping, or several, of which the first counts
+            whose columns the file has; names in any case.
+        signature: columns by which a file is recognised.
+        level: what the level is, with its unit.
+        source: of the description.
+        settings: others than `columns`.
+        tried_on: `MADE_UP`, or which original.
+        caution: of the units, which is printed at every import.
+        without_header: how a file without a header is recognised and read, or None.
+    """
+
+    name: str
+    title: str
+    columns: Mapping[str, str | tuple[str, ...]]
+    signature: tuple[str, ...]
+    level: str
+    source: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    tried_on: str = MADE_UP
+    caution: str = ""
+    without_header: WithoutHeader | None = None
+
+    def fits(self, header: Iterable[str]) -> bool:
+        """Return whether a header has the signature."""
+        return set(map(_plain, self.signature)) <= set(map(_plain, header))
+
+    def mapping(self, header: Iterable[str]) -> dict[str, str]:
+        """Return the entries of `columns` for a header, without what it does not have.
+
+        Args:
+            header: names of the file's columns.
+        """
+        actual = {_plain(name): name for name in reversed(list(header))}  # the first one counts
+        result = {}
+        for quantity, entries in self.columns.items():
+            for entry in (entries,) if isinstance(entries, str) else entries:
+                names = columns_of(entry, ())
+                if all(_plain(name) in actual for name in names):
+                    for name in names:
+                        entry = entry.replace(name, actual[_plain(name)])
+                    result[quantity] = entry
+                    break
+        return result
+
+
+def _plain(name: str) -> str:
+    """Return a name in lower case without what programs put after it: an index, `(Text)`."""
+    return re.sub(r"(\s*(\(text\)|\[\d+\]))+$", "", name.strip().lower())
+
+
+DRIVE_TEST = (
+    Format(
+        "tems", "TEMS, text export",
+        {"level": ("Serving Cell RSRP (dBm)", "LTE Serving Cell RSRP (dBm)",
+                   "All-Serving Cell RSRP (dBm)"),
+         "device": ("{Serving Cell DL EARFCN} {Serving Cell PCI}",
+                    "{Serving Cell DL EARFCN} {Serving Physical Cell ID}", "Serving Cell PCI",
+                    "Serving Physical Cell ID", "Serving Cell Identity"),
+         "time": "Time", "latitude": "All-Latitude Decimal Degree",
+         "longitude": "All-Longitude Decimal Degree"},
+        ("Time", "All-Latitude Decimal Degree", "All-Longitude Decimal Degree"),
+        "RSRP of the serving LTE cell, dBm",
+        "columns as in public readers of its exports; its manual is not public",
+        {"level_unit": "dBm", "not_measured": ["empty"]},
+        caution="the columns of an export are chosen by its user: declare --time-format, "
+                "--time-zone, and the columns that are named otherwise"),
+    Format(
+        "qualipoc", "QualiPoc, CSV export",
+        {"level": "RSRP", "device": ("{DL EARFCN} {PCI}", "Cell Id"), "time": "Time",
+         "latitude": "Latitude", "longitude": "Longitude", "altitude": "Altitude"},
+        ("Time", "Data technology", "DL EARFCN", "PCI", "RSRP"),
+        "RSRP of the serving cell, dBm",
+        "columns as in public readers of its exports; its manual is not public",
+        {"level_unit": "dBm", "length_unit": "m", "time_format": "ISO 8601",
+         "not_measured": ["empty"]},
+        caution="several columns have one name (RSRP, PCI, …): the first is read; give "
+                "--time-zone"),
+)
+
+
+def _things_stack(prefix: str) -> tuple[Format, Format]:
+    """Return the formats of uplink messages, for nodes with and without a position."""
+    message, gateway = f"{prefix}uplink_message.", f"{prefix}uplink_message.rx_metadata."
+    node = f"{prefix}end_device_ids.device_id"
+    decoded = message + "decoded_payload."
+    common: dict[str, str | tuple[str, ...]] = {
+        "level": gateway + "rssi", "snr": gateway + "snr",
+        "time": (message + "received_at", prefix + "received_at")}
+    name = "things-stack" + "-storage" * bool(prefix)
+    title = "The Things Stack, uplink messages" + ", storage integration" * bool(prefix)
+    return (
+        Format(
+            f"{name}-mapper", f"{title}, of a node that sends its position (JSON lines)",
+            {**common, "device": gateway + "gateway_ids.gateway_id", "receiver": node,
+             "latitude": decoded + "latitude", "longitude": decoded + "longitude",
+             "altitude": decoded + "altitude",
+             "device_latitude": gateway + "location.latitude",
+             "device_longitude": gateway + "location.longitude",
+             "device_altitude": gateway + "location.altitude"},
+            (gateway + "rssi", gateway + "gateway_ids.gateway_id", node, decoded + "latitude",
+             decoded + "longitude"),
+            _LEVEL, _STACK, _UNITS, caution=_MAPPER),
+        Format(
+            name, f"{title} (JSON lines)",
+            {**common, "device": node, "receiver": gateway + "gateway_ids.gateway_id",
+             "latitude": gateway + "location.latitude",
+             "longitude": gateway + "location.longitude",
+             "altitude": gateway + "location.altitude"},
+            (gateway + "rssi", gateway + "gateway_ids.gateway_id", node),
+            _LEVEL, _STACK, _UNITS, caution=_CAUTION))
+
+
+LORA = (
+    Format(
+        "ttn-mapper", "TTN Mapper, CSV export",
+        {"level": "rssi", "snr": "snr", "device": ("gwaddr", "gtw_id", "gateway_id"),
+         "receiver": ("nodeaddr", "dev_id", "device_id"), "time": "time", "latitude": "lat",
+         "longitude": "lon", "altitude": "alt"},
+        ("time", "snr", "rssi", "freq", "lat", "lon", "alt", "hdop", "sats", "provider"),
+        _LEVEL,
+        "https://ttnmapper.org, export of a user; header and two rows quoted in a public README",
+        {**_UNITS, "time_zone": "UTC"},
+        caution=_MAPPER + ". Times are taken for UTC. alt may be 0 where the node has no height"),
+    *_things_stack(""),
+    *_things_stack("result."),
+    Format(
+        "chirpstack-mapper", "ChirpStack 4, uplink events of a node that sends its position "
+                             "(JSON lines)",
+        {"level": "rxInfo.rssi", "snr": "rxInfo.snr", "time": "time",
+         "device": "rxInfo.gatewayId", "receiver": "deviceInfo.devEui",
+         "latitude": "object.latitude", "longitude": "object.longitude",
+         "altitude": "object.altitude", "device_latitude": "rxInfo.location.latitude",
+         "device_longitude": "rxInfo.location.longitude",
+         "device_altitude": "rxInfo.location.altitude"},
+        ("rxInfo.rssi", "rxInfo.gatewayId", "deviceInfo.devEui", "object.latitude",
+         "object.longitude"),
+        _LEVEL, _CHIRPSTACK, _UNITS, caution=_MAPPER),
+    Format(
+        "chirpstack", "ChirpStack 4, uplink events (JSON lines)",
+        {"level": "rxInfo.rssi", "snr": "rxInfo.snr", "time": "time",
+         "device": "deviceInfo.devEui", "receiver": "rxInfo.gatewayId",
+         "latitude": "rxInfo.location.latitude", "longitude": "rxInfo.location.longitude",
+         "altitude": "rxInfo.location.altitude"},
+        ("rxInfo.rssi", "rxInfo.gatewayId", "deviceInfo.devEui"),
+        _LEVEL, _CHIRPSTACK, _UNITS, caution=_CAUTION),
+    Format(
+        "semtech-udp", "Semtech UDP packet forwarder, rxpk (JSON lines)",
+        {"level": "rxpk.rssi", "snr": "rxpk.lsnr", "time": "rxpk.time"},
+        ("rxpk.rssi", "rxpk.freq", "rxpk.datr", "rxpk.tmst"),
+        _LEVEL, "https://github.com/Lora-net/packet_forwarder/blob/master/PROTOCOL.TXT", _UNITS,
+        caution=_CAUTION + ". The node's address is within the packet: name it by "
+                           "--columns 'device=always NAME', and the gateway's place by "
+                           "--receivers"),
+)
+
+
+PHONE = (
+    Format(
+        "wigle", "WiGLE WiFi Wardriving, CSV 1.4 and 1.6",
+        {"level": "RSSI", "device": "MAC", "time": "FirstSeen", "latitude": "CurrentLatitude",
+         "longitude": "CurrentLongitude", "altitude": "AltitudeMeters"},
+        ("MAC", "FirstSeen", "RSSI", "CurrentLatitude", "CurrentLongitude", "Type"),
+        "RSSI of the beacon, dBm", "https://api.wigle.net/csvFormat.html",
+        {"level_unit": "dBm", "length_unit": "m", "time_format": "%Y-%m-%d %H:%M:%S",
+         "time_zone": "UTC"},
+        caution="times are read as UTC, which the format's description leaves open; a shift does "
+                "no harm within one telephone. Wi-Fi, Bluetooth and cells are in one file: keep "
+                "one with --only Type=WIFI"),
+    Format(
+        "tower-collector", "Tower Collector, CSV export",
+        {"level": "dbm", "device": "{net_type} {mcc}-{mnc}-{lac}-{cell_id}", "time": "measured_at",
+         "latitude": "lat", "longitude": "lon", "altitude": "altitude", "receiver": "device"},
+        ("mcc", "mnc", "lac", "cell_id", "dbm", "lat", "lon", "measured_at", "net_type"),
+        "dbm of Android: RSRP, RSCP or RSSI by net_type, dBm",
+        "https://github.com/zamojski/TowerCollector (CsvExportFormatter)",
+        {"level_unit": "dBm", "length_unit": "m", "time_format": "ISO 8601",
+         "not_measured": ["empty", _UNKNOWN]},
+        caution=_MIXED.format("net_type")),
+    Format(
+        "cellmapper", "CellMapper, CSV output of the app",
+        {"level": "signal", "device": "{type} {MCC}-{MNC}-{LAC}-{CID}", "latitude": "latitude",
+         "longitude": "longitude", "altitude": "altitude"},
+        ("latitude", "longitude", "altitude", "MCC", "MNC", "LAC", "CID", "signal", "type",
+         "subtype", "ARFCN"),
+        "RSSI, or RSRP of LTE, dBm", "https://docs.cellmapper.net/mw/CellMapper_CSV",
+        {"level_unit": "dBm", "length_unit": "m", "not_measured": ["empty", _UNKNOWN]},
+        caution="it has no times. " + _MIXED.format("type"),
+        without_header=WithoutHeader(
+            r"-?\d+\.\d+,-?\d+\.\d+,-?[\d.]*,\d{3},\d{1,3},-?\d+,-?\d+,-?\d+,"
+            r"(GSM|UMTS|CDMA|LTE|NR),[^,]*,-?\d*,-?\d*",
+            ("latitude", "longitude", "altitude", "MCC", "MNC", "LAC", "CID", "signal", "type",
+             "subtype", "ARFCN", "PSC"))),
+    Format(
+        "g-nettrack", "G-NetTrack, text log",
+        {"level": "Level", "device": ("{NetworkTech} {CGI}", "{NetworkTech} {Node} {CellID}"),
+         "time": "Timestamp", "latitude": "Latitude", "longitude": "Longitude",
+         "altitude": "Altitude"},
+        ("Timestamp", "Latitude", "Longitude", "NetworkTech", "Level", "Qual", "CGI"),
+        "Level: RSRP of 4G and 5G, RSCP of 3G, RXLEV of 2G, dBm",
+        "https://gyokovsolutions.com/g-nettrack/; columns as in public readers of its logs",
+        {"level_unit": "dBm", "length_unit": "m", "time_format": "%Y.%m.%d_%H.%M.%S",
+         "not_measured": ["empty", _UNKNOWN]},
+        caution="times are those of the telephone: give its --time-zone. "
+                + _MIXED.format("NetworkTech").replace("=LTE", "=4G")),
+    Format(
+        "netmonitor", "NetMonitor (Cell Signal Logging), CSV session",
+        {"level": "rssi", "device": "{tech} {mcc}-{mnc}-{lac_tac}-{node_id}-{cid}",
+         "time": "sys_time", "latitude": "lat", "longitude": "long"},
+        ("sys_time", "net_type", "tech", "mcc", "mnc", "lac_tac", "cid", "rssi", "lat", "long"),
+        "rssi: RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM, dBm",
+        "header as in public readers of its files; no description by its author was found",
+        {"level_unit": "dBm", "time_format": "%Y%m%d%H%M%S",
+         "not_measured": ["empty", "null", 0, _UNKNOWN]},
+        caution="times are those of the telephone: give its --time-zone. "
+                "gps = 0 is a row without a fix: --only gps=1. " + _MIXED.format("tech")),
+    Format(
+        "g-mon", "G-MoN, text log of Wi-Fi networks",
+        {"level": "RXL", "device": "BSSID", "time": "{Date} {Time}", "latitude": "LAT",
+         "longitude": "LON"},
+        ("BSSID", "LAT", "LON", "SSID", "Crypt", "Beacon Interval", "Connection Mode", "Channel",
+         "RXL", "Date", "Time"),
+        "RXL of the network, dBm",
+        "header and rows as in public readers of its files; no description by its author was found",
+        {"level_unit": "dBm", "time_format": "%Y/%m/%d %H:%M:%S",
+         "not_measured": ["empty", "?"]},
+        caution="times are those of the telephone: give its --time-zone. The files that are known "
+                "have few rows of a network, over months: a fit needs many. Its log of cells is "
+                "not known, and needs --columns"),
+)
+
+
+SCANNER = (
+    Format(
+        "rtl-power", "rtl_power",
+        {"level": "power_db", "device": "band", "time": "{date} {time}"},
+        ("date", "time", "band", "power_db", "bins"),
+        "power in the band (`--band-hz`, or all of a sweep), the sum of its bins; relative dB",
+        "http://kmkeen.com/rtl-power/ and csv_dbm() of rtl_power.c (osmocom rtl-sdr)",
+        {"level_unit": "dBm", "time_format": "%Y-%m-%d %H:%M:%S", "not_measured": ["empty"]},
+        caution="levels are relative to the receiver's full scale, not dBm: calibrate with "
+                "--level-offset-db, and never compare files with different gains or bins. Times "
+                "are those of the computer: give its --time-zone. Positions come from a --track",
+        without_header=WithoutHeader(
+            r"\d{4}-\d\d-\d\d, \d\d:\d\d:\d\d, \d+, \d+, [\d.]+, \d+, .*", read=read_rtl_power)),
+)
+
+
+FORMATS: tuple[Format, ...] = (*PHONE, *DRIVE_TEST, *LORA, *SCANNER)
+
+
+def expected(formats: Iterable[Format], columns: Collection[str] = ()) -> Expected:
+    """Return what a file may have.
+
+    Args:
+        formats: that it may be of.
+        columns: of a declared mapping, in lower case.
+    """
+    formats = list(formats)
+    signatures = [frozenset(name.lower() for name in each.signature) for each in formats]
+    return Expected((frozenset(columns), *signatures),
+                    tuple(each.without_header for each in formats if each.without_header))
+
+
+def find_format(header: Iterable[str]) -> Format | None:
+    """Return the format with the longest signature in a header, or None."""
+    names = list(header)
+    return max((each for each in FORMATS if each.fits(names)),
+               key=lambda each: len(each.signature), default=None)
+
+
+def format_named(name: str) -> Format:
+    """Return a format by its name.
+
+    Raises:
+        BadInput: unknown.
+    """
+    for each in FORMATS:
+        if each.name == name:
+            return each
+    raise BadInput(f"format {name!r} is unknown; allowed are "
+                   f"{', '.join(each.name for each in FORMATS)}")

@@ -1,0 +1,221 @@
+"""Readings at one place: repeated rows, stays of a receiver, and local means over fast fading.
+
+Local means over fast fading.
+
+The phases of the paths, and with them the level, change within half a wavelength; shadowing
+changes over tens of metres. A mean over 20 to 40 wavelengths removes the first and keeps the
+second, and 36 to 50 readings bring it within 1 dB (W. C. Y. Lee, "Estimate of local average power
+of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1), 1985).
+
+One reading of a stay: a receiver that hovers reads one and the same error many times.
+
+Rows of a file that repeat an earlier one.
+"""
+
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from scipy.constants import speed_of_light
+
+from radiotwin.importing.source import Source
+from radiotwin.importing.tracks.fixes import ANGLES
+
+WAVELENGTHS = (20, 40)  # Lee 1985
+HASHED_AT_ONCE = 500_000  # rows; bounds the memory of that
+
+
+def average(links: pd.DataFrame, length_m: float,
+            method: Literal["power", "median"]) -> pd.DataFrame:
+    """Average links over bins along the track of each (receiver, device, flight).
+
+    A track is followed in the order of time, or of the file where it has no times. A reading that
+    was not detected counts as zero power in the mean and as the smallest value in the median; a bin
+    of which more than half were not detected is not detected. With at most half of them below the
+    limit of detection, the mean is off by at most 3 dB.
+
+    Args:
+        links: as of `build_links`, with receiver positions.
+        length_m: length of the bins [m].
+        method: `power`, the mean of the linear power, or `median`.
+
+    Returns:
+        one row per bin: levels by `method`, means of positions and times, circular means of
+        headings, pitches and rolls (-180 to 180 degrees), and the number of readings in `quality`.
+    """
+    links = links.reset_index(drop=True)
+    track = links.groupby(["receiver", "device", "flight"], sort=False).ngroup().to_numpy()
+    links, track = in_track_order(links, track)
+    bin_index, first = _bins(links, track, length_m)
+    count = np.bincount(bin_index)
+    means = {name: _mean(links[name].to_numpy(dtype=float), bin_index, len(count))
+             for name in links
+             if links[name].dtype.kind == "f" and name not in ("level_db", *ANGLES)}
+    for name in (name for name in ANGLES if name in links):
+        angle_rad = np.radians(links[name].to_numpy(dtype=float))
+        sine, cosine = (_mean(part, bin_index, len(count))
+                        for part in (np.sin(angle_rad), np.cos(angle_rad)))
+        means[name] = np.degrees(np.arctan2(sine, cosine))
+    if "heading_deg" in means:
+        means["heading_deg"] %= 360
+    means["level_db"] = _level(links["level_db"].to_numpy(), bin_index, count, method)
+    bins = links.iloc[first].reset_index(drop=True)
+    return bins.assign(**means, quality=count.astype(float))
+
+
+def in_wavelengths(length_m: float, frequency_hz: float) -> float:
+    """Convert a length [m] to wavelengths.
+
+    Args:
+        length_m: [m].
+        frequency_hz: [Hz].
+    """
+    return length_m * frequency_hz / speed_of_light
+
+
+def in_track_order(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
+    """Sort links by track, and within a track by time where all of its times are known.
+
+    Args:
+        links: n rows.
+        track: number of each link's track, (n,).
+
+    Returns:
+        links with a new index, and their tracks.
+    """
+    time_s = np.zeros(len(links))
+    if "time_s" in links:
+        time_s = links["time_s"].to_numpy(dtype=float)
+        incomplete = np.bincount(track, weights=np.isnan(time_s)) > 0
+        time_s = np.where(incomplete[track], 0.0, time_s)
+    order = np.lexsort((np.arange(len(links)), time_s, track))
+    return links.iloc[order].reset_index(drop=True), track[order]
+
+
+def positions_m(links: pd.DataFrame) -> np.ndarray:
+    """Return where receivers are, (n, 3) [m]: above the datum, else above the ground, else at 0."""
+    position_m = links[["receiver_x_m", "receiver_y_m", "receiver_z_m"]].to_numpy(copy=True)
+    if "receiver_above_ground_m" in links:
+        low = np.isnan(position_m[:, 2])
+        position_m[low, 2] = links["receiver_above_ground_m"].to_numpy()[low]
+    return np.nan_to_num(position_m)
+
+
+def _bins(links: pd.DataFrame, track: np.ndarray,
+          length_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bin of each row, (n,) ascending, and the first row of each bin."""
+    position_m = positions_m(links)
+    step_m = np.linalg.norm(np.diff(position_m, axis=0, prepend=position_m[:1]), axis=1)
+    starts = np.diff(track, prepend=-1) != 0
+    step_m[starts] = 0.0
+    along_m = np.cumsum(step_m)
+    along_m -= along_m[starts][np.cumsum(starts) - 1]
+    cell = np.floor(along_m / length_m)
+    new = starts | (np.diff(cell, prepend=-1) != 0)
+    return np.cumsum(new) - 1, np.flatnonzero(new)
+
+
+def _mean(values: np.ndarray, bin_index: np.ndarray, bins: int) -> np.ndarray:
+    """Return the means of the known values, (bins,); NaN where none is known."""
+    known = ~np.isnan(values)
+    if not known.any():
+        return np.full(bins, np.nan)
+    offset = values[known][0]  # a sum of epoch seconds would have no decimals left
+    total = np.bincount(bin_index[known], weights=values[known] - offset, minlength=bins)
+    count = np.bincount(bin_index[known], minlength=bins)
+    return np.where(count > 0, total / np.maximum(count, 1) + offset, np.nan)
+
+
+def _level(level_db: np.ndarray, bin_index: np.ndarray, count: np.ndarray,
+           method: str) -> np.ndarray:
+    """Return the level of each bin [dB], (bins,); NaN = not detected."""
+    missed = np.isnan(level_db)
+    if method == "power":
+        power = np.where(missed, 0.0, 10 ** (np.nan_to_num(level_db) / 10))
+        with np.errstate(divide="ignore"):
+            result = 10 * np.log10(np.bincount(bin_index, weights=power) / count)
+    else:
+        finite = pd.Series(np.where(missed, -np.inf, level_db))
+        result = finite.groupby(bin_index).median().to_numpy()
+    mostly_missed = np.bincount(bin_index, weights=missed) > count / 2
+    return np.where(mostly_missed | ~np.isfinite(result), np.nan, result)
+
+
+def stay_representatives(links: pd.DataFrame, distance_m: float) -> np.ndarray:
+    """Choose one reading of each stay: the one with the (lower) median level.
+
+    A stay is a run of readings of one receiver, device and flight, in the order of time, that are
+    within a distance of the first of them. A reading that was not detected is below all others.
+
+    Args:
+        links: n rows with receiver positions.
+        distance_m: [m].
+
+    Returns:
+        (n,) bool, the readings that represent a stay.
+    """
+    track = links.groupby(["receiver", "device", "flight"], sort=False).ngroup().to_numpy()
+    rows = pd.DataFrame({"row": np.arange(len(links)), "level_db": links["level_db"].to_numpy()})
+    if "time_s" in links:
+        rows["time_s"] = links["time_s"].to_numpy()
+    ordered, track = in_track_order(rows, track)
+    stay = _stays(positions_m(links)[ordered["row"].to_numpy()], track, distance_m)
+    level_db = np.nan_to_num(ordered["level_db"].to_numpy(), nan=-np.inf)
+    by_level = np.lexsort((np.arange(len(stay)), level_db, stay))
+    count = np.bincount(stay)
+    middle = np.cumsum(count) - count + (count - 1) // 2
+    chosen = np.zeros(len(links), dtype=bool)
+    chosen[ordered["row"].to_numpy()[by_level[middle]]] = True
+    return chosen
+
+
+def _stays(position_m: np.ndarray, track: np.ndarray, distance_m: float) -> np.ndarray:
+    """Return the number of the stay of each reading, (n,) ascending."""
+    stay = np.empty(len(track), dtype=np.int64)
+    number, current, limit = -1, None, distance_m**2
+    x0 = y0 = z0 = 0.0
+    for i, (own, (x, y, z)) in enumerate(zip(track.tolist(), position_m.tolist())):
+        if own != current or (x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2 > limit:
+            number, current, x0, y0, z0 = number + 1, own, x, y, z
+        stay[i] = number
+    return stay
+
+
+def without_repetition(source: Source) -> tuple[Source, list[int]]:
+    """Remove the rows that equal an earlier one in every column.
+
+    Args:
+        source: the file.
+
+    Returns:
+        the file without them, and their indices.
+    """
+    table = source.table
+    rows = np.arange(len(table))  # that repeat, or are repeated, in the columns so far
+    key = np.zeros(len(table), dtype=np.uint64)
+    for name in table:
+        key = key * np.uint64(0x9E3779B97F4A7C15) + _hashes(table[name], rows)
+        again = pd.Series(key).duplicated(keep=False).to_numpy()
+        rows, key = rows[again], key[again]
+    if not len(rows):
+        return source, []
+    comparable = table.iloc[rows]  # equal hashes may be of different rows
+    if table.dtypes.eq(object).any():
+        comparable = comparable.astype(str)
+    repeats = np.zeros(len(table), dtype=bool)
+    repeats[rows] = comparable.duplicated()
+    unique = Source(source.path, table[~repeats], source.where, source.notes)
+    return unique, list(table.index[repeats])
+
+
+def _hashes(cells: pd.Series, rows: np.ndarray) -> np.ndarray:
+    """Return hashes (n,) of the cells of some rows; equal cells have equal ones."""
+    parts = [np.empty(0, dtype=np.uint64)]
+    for start in range(0, len(rows), HASHED_AT_ONCE):
+        part = cells.iloc[rows[start:start + HASHED_AT_ONCE]]
+        if part.dtype.kind == "O":
+            part = part.astype(str)
+        elif part.dtype.kind == "f":
+            part = part + 0.0  # of two zeros that are equal, one is negative
+        parts.append(pd.util.hash_pandas_object(part, index=False).to_numpy())
+    return np.concatenate(parts)

@@ -1,0 +1,366 @@
+"""Tables in files: the cells of .csv, .csv.gz and .parquet, and the layout of a CSV file.
+
+The layout of a CSV file: its header, and as many fields in every row, counted in blocks.
+
+The cells of a table in a file: text from .csv and .csv.gz, typed columns from .parquet.
+"""
+
+import csv
+import gzip
+import re
+from collections.abc import Collection, Iterable, Iterator
+from itertools import chain
+from pathlib import Path, PurePath
+from typing import IO, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from radiotwin.errors import BadInput
+from radiotwin.io.budgets import CELLS, COLUMNS, FILE_BYTES, ROW_BYTES, ROWS
+from radiotwin.io.inputs import open_gzip, open_input
+from radiotwin.io.texts import unquoted, with_quotes, without_quotes
+
+_BLOCK_BYTES = 2**20  # that are checked at a time
+_WHAT = "table (.csv, .csv.gz, .parquet)"
+_CHUNK_CELLS = 2_000_000  # that are parsed at a time
+_NUMBERS_AT_ONCE = 1_000_000  # pandas makes an object of each
+_MAX_DIGITS = 1000  # of a number
+_PARQUET_ROWS, _NESTED_ROWS = 2**17, 2**10  # that are decoded at a time
+_SHOWN_CHARACTERS, _SHOWN_COLUMNS = 80, 50  # of a cell, and of a table, in a message
+
+
+class CsvLayout:
+    """Checks that every row of a CSV file has as many fields as its header.
+
+    Args:
+        path: of the file, for messages.
+
+    Attributes:
+        header: names of the columns.
+        rows: with the header, without blank lines.
+        has_apostrophes: whether there is any.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.header: list[str] = []
+        self.rows = 0
+        self.has_apostrophes = False
+
+    def check(self, file: IO[bytes]) -> None:
+        """Check all rows; counts separators as long as there are no quotation marks.
+
+        Args:
+            file: decompressed.
+
+        Raises:
+            BadInput: names the row.
+        """
+        blocks = self._blocks(file)
+        for block in blocks:
+            if b'"' in block or block.count(b"\r") != block.count(b"\r\n"):
+                self._check_fields(chain([block], blocks))
+                break
+            self._count_separators(block)
+        if not self.header:
+            raise BadInput(f"{self._path} is empty; it needs a first row with the names of the "
+                           "columns")
+
+    def _blocks(self, file: IO[bytes]) -> Iterator[bytes]:
+        """Yield whole lines, checked to be text."""
+        rest = file.read(3).removeprefix(b"\xef\xbb\xbf")
+        while data := file.read(_BLOCK_BYTES):
+            whole, newline, rest_of_data = data.rpartition(b"\n")
+            if not newline:
+                rest += data
+                if len(rest) > ROW_BYTES.limit:
+                    ROW_BYTES.refuse(f"{self._path}: after row {self.rows}",
+                                     f"a row of more than {ROW_BYTES.limit:,} bytes")
+                continue
+            yield self._checked(rest + whole + newline)
+            rest = rest_of_data
+        if rest:
+            yield self._checked(rest)
+
+    def _checked(self, block: bytes) -> bytes:
+        block.decode()
+        if b"\0" in block:
+            raise BadInput(f"{self._path} is not text in UTF-8 (it has null characters); allowed "
+                           "is comma-separated, UTF-8")
+        self.has_apostrophes = self.has_apostrophes or b"'" in block
+        return block
+
+    def _count_separators(self, block: bytes) -> None:
+        if not self.header:
+            line, _, block = block.lstrip(b"\r\n").partition(b"\n")
+            COLUMNS.check(line.count(b",") + 1, f"{self._path}: row 1")
+            if not line:
+                return
+            self._begin(next(csv.reader([line.decode()], skipinitialspace=True)))
+        if not block:
+            return
+        if not block.endswith(b"\n"):
+            block += b"\n"
+        codes = np.frombuffer(block, dtype=np.uint8)
+        ends = np.flatnonzero(codes == ord("\n"))
+        fields = np.diff(np.searchsorted(np.flatnonzero(codes == ord(",")), ends), prepend=0) + 1
+        length = np.diff(ends, prepend=-1) - 1
+        blank = (length == 0) | ((length == 1) & (codes[ends - 1] == ord("\r")))
+        fields = fields[~blank]
+        wrong = fields != len(self.header)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            self._refuse(self.rows + row + 1, int(fields[row]))
+        self._add(len(fields))
+
+    def _check_fields(self, blocks: Iterable[bytes]) -> None:
+        """Check rows that may have fields in quotation marks, or lines that end in any way."""
+        lines = (line for block in blocks
+                 for line in re.findall(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+$", block.decode()))
+        try:
+            for fields in filter(None, csv.reader(lines, skipinitialspace=True)):
+                if not self.header:
+                    COLUMNS.check(len(fields), f"{self._path}: row 1")
+                    self._begin(fields)
+                    continue
+                if len(fields) != len(self.header):
+                    self._refuse(self.rows + 1, len(fields))
+                self._add(1)
+        except csv.Error as error:
+            raise BadInput(f"{self._path}: row {self.rows + 1}: {error}; is a quotation mark not "
+                           "closed?") from None
+
+    def _begin(self, header: list[str]) -> None:
+        self.header, self.rows = [unquoted(name.strip()) for name in header], 1
+        if len(header) == 1 and not self.header[0].isidentifier():
+            raise BadInput(f"{self._path}: its header {self.header[0][:60]!r} is one single "
+                           "column; allowed is comma-separated, UTF-8")
+
+    def _add(self, rows: int) -> None:
+        self.rows += rows
+        ROWS.check(self.rows - 1, self._path)
+        CELLS.check((self.rows - 1) * len(self.header), self._path)
+
+    def _refuse(self, row: int, fields: int) -> None:
+        raise BadInput(f"{self._path}: row {row} has {fields} fields, the header has "
+                       f"{len(self.header)}; every row needs as many commas as the header")
+
+
+def read_cells(path: Path, required: Collection[str] = (),
+               optional: Collection[str] | None = None) -> pd.DataFrame:
+    """Read the cells of a table as they are.
+
+    Args:
+        path: `.csv`, `.csv.gz` or `.parquet`, in any case.
+        required: columns that it must have.
+        optional: other columns that are read; None for all.
+
+    Returns:
+        columns of texts (`""` where empty) from CSV, typed columns from Parquet; rows are numbered
+        from 0 in the order of the file.
+
+    Raises:
+        BadInput: no such file, unreadable, too large, no header, a missing or repeated column, or a
+            row with too few or too many fields.
+    """
+    check_suffix(path)
+    try:
+        read = _read_parquet if path.suffix.lower() == ".parquet" else _read_csv
+        return read(path, required, optional)
+    except BadInput:
+        raise
+    except UnicodeDecodeError:
+        raise BadInput(f"{path} is not text in UTF-8; allowed is comma-separated, UTF-8") from None
+    except Exception as error:  # pandas, gzip and pyarrow each have their own
+        raise BadInput(f"{path} cannot be read as {''.join(path.suffixes[-2:])}: "
+                       f"{str(error)[:500]}") from None
+
+
+def write_csv(table: pd.DataFrame, target: Path | IO[bytes], float_format: str | None = None,
+              header: bool = True) -> None:
+    """Write a table, without its index, as CSV in which a spreadsheet finds no formula.
+
+    A text that begins as a formula does, and is not a number, gets an apostrophe in front, which
+    `read_cells` takes off again, as it does where a text has apostrophes and then such a beginning.
+
+    Args:
+        table: any columns.
+        target: temporary path from `radiotwin.io.files`, compressed if it ends in `.gz`; or a file.
+        float_format: such as `%.4f`; all digits by default.
+        header: whether to write the names of the columns.
+    """
+    table = with_quotes(table)
+    if not isinstance(target, Path) or target.suffix.lower() != ".gz":
+        table.to_csv(target, index=False, float_format=float_format, header=header)
+        return
+    # Neither a name nor a time in the header: the same table gives the same bytes.
+    with open(target, "wb") as file, gzip.GzipFile("", "wb", 9, file, mtime=0) as packed:
+        table.to_csv(packed, index=False, float_format=float_format, header=header)
+
+
+def check_suffix(path: Path) -> None:
+    """Check that a table has one of the formats that are read and written.
+
+    Args:
+        path: of the table; its suffix counts in any case.
+
+    Raises:
+        BadInput: another suffix.
+    """
+    name = PurePath(path.name.lower())  # some loggers write A.CSV
+    if name.suffix not in (".csv", ".parquet") and name.suffixes[-2:] != [".csv", ".gz"]:
+        raise BadInput(f"{path}: unknown format; allowed are .csv, .csv.gz and .parquet")
+
+
+def require_pyarrow(path: Path) -> None:
+    """Check that pyarrow is installed.
+
+    Args:
+        path: of the Parquet file, for the message.
+
+    Raises:
+        BadInput: it is not.
+    """
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        raise BadInput(f"{path}: Parquet needs the package pyarrow; `pip install "
+                       "radiotwin[parquet]`, or use .csv.gz") from None
+
+
+def refuse(path: Path, name: str, column: pd.Series, bad: ArrayLike, reason: str) -> None:
+    """Raise BadInput about the first bad cell of a column, if there is one.
+
+    Args:
+        path: of the table.
+        name: of the column.
+        column: its cells, (n,).
+        bad: (n,) bool.
+        reason: end of the message, after the cell's text.
+
+    Raises:
+        BadInput: names file, row (1 is the header) and column.
+    """
+    rows = np.flatnonzero(np.asarray(bad, dtype=bool))
+    if len(rows):
+        more = f" ({len(rows)} such rows)" if len(rows) > 1 else ""
+        raise BadInput(f"{path}: row {rows[0] + 2}, column {name}: "
+                       f"{shown(column.iloc[rows[0]])} {reason}{more}")
+
+
+def as_numbers(text: pd.Series) -> np.ndarray:
+    """Convert texts to numbers, (n,); NaN where one is not a number, or empty.
+
+    Args:
+        text: (n,) without spaces around.
+    """
+    numbers = np.empty(len(text))
+    for start in range(0, len(text), _NUMBERS_AT_ONCE):
+        rows = slice(start, start + _NUMBERS_AT_ONCE)
+        try:
+            numbers[rows] = pd.to_numeric(text.iloc[rows], errors="coerce")
+        except ValueError:  # an integer of more digits than Python converts
+            short = text.iloc[rows].mask(text.iloc[rows].str.len() > _MAX_DIGITS, "")
+            numbers[rows] = pd.to_numeric(short, errors="coerce")
+    return numbers
+
+
+def shown(cell: object) -> str:
+    """Return the text of a cell in quotation marks for a message, cut where it is long."""
+    text = str(cell)
+    return repr(text) if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]!r}…"
+
+
+def listed(names: Iterable[object]) -> str:
+    """Return the names of columns for a message, the first ones where there are many."""
+    texts = [str(name)[:_SHOWN_CHARACTERS] for name in names]
+    more = f", … ({len(texts):,} columns)" if len(texts) > _SHOWN_COLUMNS else ""
+    return ", ".join(texts[:_SHOWN_COLUMNS]) + more
+
+
+def _selected(path: Path, names: list[str], required: Collection[str],
+              optional: Collection[str] | None) -> list[str]:
+    """Check the names of all columns; return those that are to be read, in their order."""
+    repeated = pd.Index(names, dtype=object).duplicated()
+    if repeated.any():
+        name = names[int(np.argmax(repeated))]
+        raise BadInput(f"{path}: row 1: column {shown(name)} occurs twice; every name must be "
+                       "unique")
+    missing = [name for name in required if name not in names]
+    if missing:
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs "
+                       f"{', '.join(required)}, it has {listed(names)}")
+    return [name for name in names if optional is None or name in required or name in optional]
+
+
+def _read_parquet(path: Path, required: Collection[str],
+                  optional: Collection[str] | None) -> pd.DataFrame:
+    """Read Parquet without the index that pandas may have saved.
+
+    A table that was filtered or sorted before it was saved would keep its old row labels; messages
+    count rows. It is decoded in batches, whose texts count before they are written out: a
+    dictionary can stand for far more than it takes in the file.
+    """
+    require_pyarrow(path)
+    import pyarrow
+    from pyarrow.parquet import ParquetFile
+
+    with open_input(path, _WHAT) as file:
+        schema, metadata = ParquetFile(file).schema_arrow, ParquetFile(file).metadata
+        COLUMNS.check(metadata.num_columns, path)
+        ROWS.check(metadata.num_rows, path)
+        names = _selected(path, schema.names, required, optional)
+        CELLS.check(metadata.num_rows * len(names), path)
+        nested = any(pyarrow.types.is_nested(schema.field(name).type) for name in names)
+        texts = [name for name in names if pyarrow.types.is_string(schema.field(name).type)
+                 or pyarrow.types.is_large_string(schema.field(name).type)]
+        table = ParquetFile(file, read_dictionary=texts)
+        batches, rows, size = [], 0, 0
+        for batch in table.iter_batches(_NESTED_ROWS if nested else _PARQUET_ROWS, columns=names):
+            rows, size = rows + len(batch), size + sum(map(_decoded_bytes, batch.columns))
+            ROWS.check(rows, path)
+            FILE_BYTES.check(size, path)
+            batches.append(pyarrow.record_batch(
+                [column.dictionary_decode() if name in texts else column
+                 for name, column in zip(names, batch.columns)], names=names))
+    if not batches:
+        return schema.empty_table().select(names).to_pandas(ignore_metadata=True)
+    whole = pyarrow.Table.from_batches(batches)
+    del batches, batch
+    return whole.to_pandas(ignore_metadata=True, split_blocks=True, self_destruct=True)
+
+
+def _decoded_bytes(column: Any) -> int:
+    """Return the size of an Arrow array that the number of rows does not bound: of its texts."""
+    import pyarrow
+    from pyarrow import compute
+
+    if pyarrow.types.is_nested(column.type):
+        return column.nbytes
+    is_dictionary = pyarrow.types.is_dictionary(column.type)
+    try:
+        lengths = compute.binary_length(column.dictionary if is_dictionary else column)
+    except pyarrow.ArrowNotImplementedError:  # numbers
+        return 0
+    return compute.sum(lengths.take(column.indices) if is_dictionary else lengths).as_py() or 0
+
+
+def _read_csv(path: Path, required: Collection[str],
+              optional: Collection[str] | None) -> pd.DataFrame:
+    """Read cells of a CSV file as text.
+
+    The fields are counted first: pandas fills short rows with blanks, and a blank level means "not
+    detected".
+    """
+    with open_gzip(path, _WHAT) as file:
+        layout = CsvLayout(path)
+        layout.check(file)
+    names = _selected(path, layout.header, required, optional)
+    with open_gzip(path, _WHAT) as file, \
+            pd.read_csv(file, dtype=str, keep_default_na=False, skipinitialspace=True, header=0,
+                        names=layout.header, usecols=names, index_col=False, encoding="utf-8",
+                        chunksize=max(_CHUNK_CELLS // len(layout.header), 1)) as reader:
+        chunks = [without_quotes(chunk) if layout.has_apostrophes else chunk for chunk in reader]
+    return pd.concat(chunks, ignore_index=True)

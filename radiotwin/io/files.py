@@ -1,0 +1,373 @@
+"""Atomic output: files and folders are written under a temporary name, flushed, then renamed.
+
+A temporary name is a folder `.radiotwin-????????` beside the output. A killed run leaves it; the
+next one that writes there removes it. It is locked while its process lives, so that none in use is
+taken away. (Files are not locked: HDF5 locks those that it writes itself.)
+"""
+
+import errno
+import io
+import os
+import re
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import IO, Any
+
+from radiotwin.errors import BadInput, RunFailed
+from radiotwin.io.signals import deferred
+
+try:
+    import fcntl
+except ImportError:  # Windows: nothing is locked, and nothing is swept
+    fcntl = None  # type: ignore[assignment]
+
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+_FLUSHED_AT_ONCE = 16
+_TEMPORARY = re.compile(r"\.radiotwin-[a-z0-9_]{8}(?P<aside>-aside)?")
+
+
+def is_temporary(path: Path) -> bool:
+    """Return whether a path has the name of a temporary, which a killed process may have left."""
+    return _TEMPORARY.fullmatch(path.name) is not None
+
+
+def require_writable(path: Path | str) -> None:
+    """Check that a file can be written; call it before long work.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        BadInput: the folder cannot be made or written, or `path` is not an ordinary file.
+        RunFailed: the disk is full.
+    """
+    path = Path(path)
+    _refuse_folder(path)
+    with (_parent_of(path, only_tried=True), _reported(path),
+          _temporary_folder(path) as folder):
+        (folder / path.name).touch()
+
+
+def require_suffix(path: Path | str, *allowed: str) -> None:
+    """Raise BadInput unless a file's name ends in one of the allowed suffixes."""
+    if not str(path).lower().endswith(allowed):
+        raise BadInput(f"{path}: unknown format; allowed {'are' if len(allowed) > 1 else 'is'} "
+                       f"{' and '.join(allowed)}")
+
+
+@contextmanager
+def atomic_path(path: Path | str, flush: bool = True) -> Iterator[Path]:
+    """Write a file atomically, by code that raises OSError where a write or a close fails.
+
+    Args:
+        path: of the file; missing folders are made.
+        flush: wait for the disk; without, a power failure may leave a damaged file.
+
+    Yields:
+        a temporary path with the same name in a folder beside `path`; it is flushed to the disk
+        and renamed to `path` on success and removed on failure.
+
+    Raises:
+        BadInput: the folder cannot be made or written, or `path` is not an ordinary file.
+        RunFailed: the disk is full or failed; an older file at `path` is unchanged.
+    """
+    path = Path(path)
+    _refuse_folder(path)
+    with _parent_of(path), _reported(path, only_disk=True), _temporary_folder(path) as folder:
+        temporary = folder / path.name
+        with _reported(path):
+            temporary.touch()
+        yield temporary
+        with _reported(path):
+            if flush:
+                _flush(temporary)
+            os.replace(temporary, path)
+
+
+@contextmanager
+def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[bytes]]:
+    """Write a file atomically, by code that takes an open file.
+
+    Args:
+        path: of the file; missing folders are made.
+        hide_errors: keep the first error of a write until the end, for libraries that crash or
+            swallow it (HDF5); all that is written after it is kept in memory, and lost.
+
+    Yields:
+        binary file, open for reading and writing.
+
+    Raises:
+        BadInput: as `atomic_path`.
+        RunFailed: as `atomic_path`.
+    """
+    with atomic_path(path) as temporary:
+        if not hide_errors:
+            with open(temporary, "w+b") as file:
+                yield file
+            return
+        kept = _ErrorsKept(open(temporary, "w+b", buffering=0))
+        try:
+            with kept:
+                yield kept  # type: ignore[misc]  # a raw file
+        finally:  # what the library made of the lost bytes matters less than why they were lost
+            if kept.error is not None:
+                raise kept.error
+
+
+@contextmanager
+def atomic_folder(path: Path | str) -> Iterator[Path]:
+    """Write a folder atomically.
+
+    Args:
+        path: of the folder; missing parents are made.
+
+    Yields:
+        an empty temporary folder beside `path`, which replaces `path` on success and is removed on
+        failure.
+
+    Raises:
+        BadInput: the parent cannot be written, or `path` is a file.
+        RunFailed: the disk is full or failed; an older folder at `path` is unchanged.
+    """
+    path = Path(path)
+    with _reported(path):
+        if path.exists() and not path.is_dir():
+            raise BadInput(f"{path} is a file; give the name of a folder")
+    with (_parent_of(path), _reported(path, only_disk=True),
+          _temporary_folder(path) as temporary):
+        yield temporary
+        with _reported(path):
+            _flush_all([inside for inside in temporary.rglob("*") if inside.is_file()])
+            temporary.chmod(0o755)
+            _swap(temporary, path)
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Make a folder for files that are needed for a while; the next run removes a killed one's."""
+    with _temporary_folder(Path(tempfile.gettempdir()) / "scratch") as folder:
+        yield folder
+
+
+class _ErrorsKept(io.RawIOBase):
+    """A file whose writes always succeed: from the first that did not they are kept in memory.
+
+    A library reads again what it wrote, and crashes where that is lost.
+
+    Attributes:
+        error: of the first write that did not succeed.
+    """
+
+    def __init__(self, file: io.FileIO) -> None:
+        self._file = file
+        self._position = self._end = 0
+        self._lost: list[tuple[int, bytes]] = []  # position and data
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        data = memoryview(data).cast("B")
+        if self.error is None:
+            try:
+                self._file.seek(self._position)
+                rest = data
+                while rest:
+                    rest = rest[self._file.write(rest):]
+            except OSError as error:
+                self.error = error
+        if self.error is not None:
+            self._lost.append((self._position, bytes(data)))
+        self._position += len(data)
+        self._end = max(self._end, self._position)
+        return len(data)
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        start = self._position
+        stop = max(start, min(start + len(view), self._end))
+        view[:stop - start] = bytes(stop - start)
+        self._file.seek(start)
+        rest = view[:stop - start]
+        while rest and (count := self._file.readinto(rest)):
+            rest = rest[count:]
+        for first, data in self._lost:
+            low, high = max(first, start), min(first + len(data), stop)
+            if low < high:
+                view[low - start:high - start] = data[low - first:high - first]
+        self._position = stop
+        return stop - start
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position,
+                                   os.SEEK_END: self._end}[whence]
+        return self._position
+
+    def tell(self) -> int:
+        return self._position
+
+    def truncate(self, size: int | None = None) -> int:
+        self._end = self._position if size is None else size
+        if self.error is None:
+            try:
+                self._file.truncate(self._end)
+            except OSError as error:
+                self.error = error
+        return self._end
+
+    def readable(self) -> bool:
+        return True
+
+    def writable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        if not self._file.closed:
+            try:
+                self._file.close()
+            except OSError as error:
+                self.error = self.error or error
+        super().close()
+
+
+@contextmanager
+def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
+    """Make and lock an empty folder beside `path`; remove it in the end."""
+    _sweep(path.parent)
+    name: str | None = None
+    handle: int | None = None
+    try:
+        with _reported(path), deferred():
+            while True:
+                name = tempfile.mkdtemp(prefix=".radiotwin-", suffix=suffix, dir=path.parent)
+                handle = None if fcntl is None else os.open(name, os.O_RDONLY)
+                if handle is None or _locked(handle, name):
+                    break
+        yield Path(name)
+    finally:
+        with deferred():
+            if name is not None:
+                shutil.rmtree(name, ignore_errors=True)
+            if handle is not None:
+                os.close(handle)
+
+
+def _locked(handle: int, name: str) -> bool:
+    """Lock a new folder; False if another process has swept it before."""
+    with suppress(OSError):  # a file system without locks
+        fcntl.flock(handle, fcntl.LOCK_EX)
+    try:
+        if os.path.samestat(os.fstat(handle), os.stat(name)):
+            return True
+    except FileNotFoundError:
+        pass
+    os.close(handle)
+    return False
+
+
+@cache  # once a folder and process: a store of batches writes thousands of files to one
+def _sweep(folder: Path) -> None:
+    """Remove the temporaries of processes that were killed."""
+    if fcntl is None:
+        return
+    with suppress(OSError):
+        for entry in os.scandir(folder):
+            match = _TEMPORARY.fullmatch(entry.name)
+            if match and entry.is_dir(follow_symlinks=False):
+                with suppress(OSError):
+                    _remove_stale(Path(entry.path), aside=bool(match["aside"]))
+
+
+def _remove_stale(path: Path, aside: bool) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if its process lives
+        for old in path.iterdir() if aside else ():  # killed in `_swap`
+            if not (path.parent / old.name).exists():
+                os.replace(old, path.parent / old.name)
+        shutil.rmtree(path)
+    finally:
+        os.close(handle)
+
+
+def _swap(new: Path, path: Path) -> None:
+    """Replace the folder `path` by `new`; restore the old one if that fails."""
+    if not path.exists():
+        os.replace(new, path)
+        return
+    with _temporary_folder(path, "-aside") as aside, deferred():
+        old = aside / path.name
+        os.replace(path, old)
+        try:
+            os.replace(new, path)
+        except OSError:
+            os.replace(old, path)
+            raise
+
+
+@contextmanager
+def _parent_of(path: Path, only_tried: bool = False) -> Iterator[None]:
+    """Make the folders above `path`; remove the new ones where nothing was written."""
+    written = False
+    with _reported(path):
+        new = [folder for folder in path.parents if not folder.exists()]
+    try:
+        with _reported(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+        written = not only_tried
+    finally:
+        # Not where it was written: another process may need the folder, empty or not.
+        for folder in () if written else new:
+            with suppress(OSError):  # not empty, or never made
+                folder.rmdir()
+
+
+@contextmanager
+def _reported(path: Path, only_disk: bool = False) -> Iterator[None]:
+    """Turn an OSError, or only those of a full or failed disk, into a message about `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _DISK_ERRORS:
+            raise RunFailed(f"cannot write {path}: {error.strerror}; what was there before is "
+                            "unchanged: make room, or choose another output path") from error
+        if only_disk:
+            raise
+        raise BadInput(f"cannot write {path}: {error.strerror or error}; choose another output "
+                       "path") from error
+
+
+def _flush(path: Path) -> None:
+    """Have the system write a file to the disk, which may fail only now."""
+    handle = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _flush_all(paths: list[Path]) -> None:
+    """Flush files side by side: thousands one after the other wait for the disk each."""
+    with ThreadPoolExecutor(min(_FLUSHED_AT_ONCE, max(len(paths), 1))) as pool:
+        for _ in pool.map(_flush, paths):
+            pass
+
+
+def _refuse_folder(path: Path) -> None:
+    with _reported(path):
+        try:
+            mode = path.stat().st_mode  # once: another process may write or remove it meanwhile
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        if stat.S_ISDIR(mode):
+            raise BadInput(f"{path} is a folder; give the name of a file")
+        if not stat.S_ISREG(mode):
+            raise BadInput(f"{path} is not an ordinary file; give the name of a file")

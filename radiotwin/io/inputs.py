@@ -1,0 +1,316 @@
+"""The one way in: every file that is read is opened here, or checked here before a library does.
+
+A file may come from a stranger. It is a regular file (a pipe or a device would wait for ever), it
+lies in the folder that names it, and it has a size budget that is checked before memory is taken.
+"""
+
+import gzip
+import io
+import json
+import os
+import re
+import stat
+import tomllib
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from radiotwin.errors import BadInput
+from radiotwin.io.budgets import DOCUMENT_BYTES, FILE_BYTES, NESTING, SETTINGS_BYTES, Budget
+
+_KEY_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_KEY_DOT = r"[ \t]*+\.[ \t]*+"
+_BLOCK_BYTES = 2**20
+
+
+def is_within(path: Path, *folders: Path) -> bool:
+    """Return whether a path lies in one of the folders once links are followed."""
+    try:
+        return any(path.resolve().is_relative_to(folder.resolve()) for folder in folders)
+    except (OSError, RuntimeError, ValueError):  # circular links, a name that no file can have
+        return False
+
+
+def require_within(folder: Path, path: Path, source: str) -> Path:
+    """Return the path if it lies in the folder once links are followed.
+
+    Args:
+        folder: that the reader may read.
+        path: file that something in the folder names.
+        source: file, and line if known, that names it, for the message.
+
+    Raises:
+        BadInput: the path leaves the folder by `..`, by its root, or by a symbolic link.
+    """
+    if not is_within(path, folder):
+        raise BadInput(f"{source}: {path} leads out of {folder}; only files in that folder may be "
+                       "named: copy the file there")
+    return path
+
+
+def keep_inputs(out: Path, *read: Path | None) -> None:
+    """Check that an output replaces nothing that the command reads; call it before long work.
+
+    Args:
+        out: file or folder that will be replaced.
+        read: files and folders; None where an option is not given.
+
+    Raises:
+        BadInput: one of them is `out`, or lies in it, once links are followed.
+    """
+    for path in read:
+        if path is not None and is_within(path, out):
+            raise BadInput(f"cannot write {out}: the command reads {path}, which would be lost; "
+                           "choose another output path")
+
+
+def require_plain(folder: Path) -> None:
+    """Check that a folder holds nothing but regular files and folders, before it is written to.
+
+    Raises:
+        BadInput: a link, a pipe or a device is in it, or in a folder within.
+    """
+    for entry in os.scandir(folder):
+        if entry.is_dir(follow_symlinks=False):
+            require_plain(Path(entry.path))
+        elif not entry.is_file(follow_symlinks=False):
+            kind = "a symbolic link" if entry.is_symlink() else "a pipe or a device"
+            raise BadInput(f"{entry.path} is {kind}; only regular files and folders may be in "
+                           f"{folder}: remove it")
+
+
+def check_input(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES) -> int:
+    """Check that a library may open a file: it exists, is regular, and is not too large.
+
+    Args:
+        path: of the file.
+        what: it should be, for the message, such as `radio map (.nc)`.
+        budget: of its bytes.
+
+    Returns:
+        its size [bytes].
+
+    Raises:
+        BadInput: it cannot be read.
+    """
+    with open_input(path, what, budget) as file:
+        return os.fstat(file.fileno()).st_size
+
+
+@contextmanager
+def open_input(path: Path | str, what: str = "file",
+               budget: Budget = FILE_BYTES) -> Iterator[IO[bytes]]:
+    """Open a regular file for reading.
+
+    Args:
+        path: of the file.
+        what: it should be, for the message.
+        budget: of its bytes, checked before the first is read.
+
+    Yields:
+        binary file.
+
+    Raises:
+        BadInput: no such file, a folder, a pipe, a device, no permission, or too large.
+    """
+    try:
+        # Without O_NONBLOCK the opening of a pipe would wait for a writer.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)
+                         | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0))
+    except FileNotFoundError:
+        raise BadInput(f"{path} does not exist; give the path of a {what}") from None
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        reason = getattr(error, "strerror", None) or error
+        raise BadInput(f"{path} cannot be read ({reason}); give the path of a {what}") from None
+    status = os.fstat(handle)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(handle)
+        kind = ("a folder" if stat.S_ISDIR(status.st_mode)
+                else "not a regular file (a pipe or a device)")
+        raise BadInput(f"{path} is {kind}; give the path of a {what}")
+    with open(handle, "rb") as file:
+        budget.check(status.st_size, path)
+        yield file
+
+
+def read_bytes(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES) -> bytes:
+    """Read a file.
+
+    Args:
+        path: of the file.
+        what: it should be, for the message.
+        budget: of its bytes.
+
+    Raises:
+        BadInput: as `open_input`.
+    """
+    with open_input(path, what, budget) as file:
+        # Memory for as much as is asked for is taken at once, so no more than the file has.
+        data = _read(file, path, os.fstat(file.fileno()).st_size + 1)
+        while more := _read(file, path, _BLOCK_BYTES):  # it grows, or lies as those of /proc do
+            data += more
+            budget.check(len(data), path)
+    return data
+
+
+def read_text(path: Path | str, what: str = "text file",
+              budget: Budget = DOCUMENT_BYTES) -> str:
+    """Read a text in UTF-8, with or without a byte-order mark.
+
+    Args:
+        path: of the file.
+        what: it should be, for the message.
+        budget: of its bytes.
+
+    Raises:
+        BadInput: as `open_input`, or it is not UTF-8.
+    """
+    return decode_text(read_bytes(path, what, budget), path)
+
+
+def decode_text(data: bytes, path: Path | str) -> str:
+    """Decode a text in UTF-8, with or without a byte-order mark.
+
+    Args:
+        data: of the file.
+        path: of the file, for the message.
+
+    Raises:
+        BadInput: it is not UTF-8.
+    """
+    try:
+        return data.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        raise BadInput(f"{path} is not text in UTF-8 (byte {error.start + 1}); save it as "
+                       "UTF-8") from None
+
+
+def read_json(path: Path | str, what: str = "JSON file") -> Any:
+    """Read a JSON document by the standard: NaN and infinity are refused.
+
+    Args:
+        path: of the file.
+        what: it should be, for the message.
+
+    Raises:
+        BadInput: as `read_text`, not JSON, nested too deep, or a number of too many digits.
+    """
+    return parse_json(read_text(path, what), path)
+
+
+def parse_json(text: str, source: object, allow_nan: bool = False) -> Any:
+    """Parse a JSON document by the standard: NaN and infinity are refused.
+
+    Args:
+        text: of the document.
+        source: it is from; the message begins with it.
+        allow_nan: read them, as some programs write them; the caller checks every number.
+
+    Raises:
+        BadInput: as `read_json`.
+    """
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is no JSON number")
+
+    try:
+        return json.loads(text, parse_constant=None if allow_nan else refuse)
+    except RecursionError:
+        NESTING.refuse(source, f"more than {NESTING.limit} levels of nesting")
+    except ValueError as error:
+        raise BadInput(f"{source} is not readable JSON ({error}); make or export it "
+                       "again") from None
+
+
+def read_toml(path: Path | str, what: str = "TOML file") -> dict[str, Any]:
+    """Read a TOML document.
+
+    Args:
+        path: of the file.
+        what: it should be, for the message.
+
+    Raises:
+        BadInput: as `read_text`, not TOML, nested too deep, or a number of too many digits.
+    """
+    text = read_text(path, what, SETTINGS_BYTES)
+    # tomllib takes memory by the square of the parts of a key.
+    if re.search(rf"(?:^|[\[{{,])[ \t]*+{_KEY_PART}(?:{_KEY_DOT}{_KEY_PART}){{{NESTING.limit}}}",
+                 text, re.MULTILINE):
+        NESTING.refuse(path, f"a key of more than {NESTING.limit} parts")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        NESTING.refuse(path, f"more than {NESTING.limit} levels of nesting")
+    except ValueError as error:  # TOMLDecodeError, or too many digits
+        raise BadInput(f"{path} is not readable TOML ({error}); correct that line") from None
+
+
+@contextmanager
+def open_gzip(path: Path | str, what: str = "file",
+              budget: Budget = FILE_BYTES) -> Iterator[IO[bytes]]:
+    """Open a file for reading; decompress it while it is read if its name ends in `.gz`, or `.GZ`.
+
+    Args:
+        path: of the file.
+        what: it should be, for the message.
+        budget: of its bytes, before and after decompression.
+
+    Yields:
+        buffered binary file; reading beyond the budget, or a damaged file, raises BadInput.
+
+    Raises:
+        BadInput: as `open_input`.
+    """
+    with open_input(path, what, budget) as file:
+        if Path(path).suffix.lower() != ".gz":
+            yield file
+            return
+        with bounded(file, path, True, budget) as content:
+            yield content
+
+
+@contextmanager
+def bounded(file: IO[bytes], source: object, is_gzip: bool,
+            budget: Budget = FILE_BYTES) -> Iterator[IO[bytes]]:
+    """Read from packed bytes up to a budget.
+
+    Args:
+        file: open, such as a file in a zip file.
+        source: of it, for messages.
+        is_gzip: whether it is compressed by gzip, too.
+        budget: of its bytes after decompression.
+
+    Yields:
+        buffered binary file; reading beyond the budget, or a damaged file, raises BadInput.
+    """
+    content = gzip.GzipFile(fileobj=file) if is_gzip else file
+    with io.BufferedReader(_Bounded(content, source, budget), _BLOCK_BYTES) as buffered:
+        yield buffered
+
+
+class _Bounded(io.RawIOBase):
+    """Decompressed bytes up to a budget."""
+
+    def __init__(self, content: Any, path: object, budget: Budget) -> None:
+        self._content, self._path, self._budget, self._left = content, path, budget, budget.limit
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = _read(self._content, self._path, len(buffer))
+        self._left -= len(data)
+        if self._left < 0:
+            self._budget.refuse(self._path,
+                                f"more than {self._budget.limit:,} bytes when decompressed")
+        buffer[:len(data)] = data
+        return len(data)
+
+
+def _read(file: Any, path: object, size: int) -> bytes:
+    try:
+        return file.read(size)
+    except (OSError, EOFError, zlib.error) as error:
+        raise BadInput(f"{path} cannot be read ({error}); it is damaged or cut off: make or fetch "
+                       "it again") from None

@@ -1,0 +1,248 @@
+"""Check that a Zarr folder holds plain arrays in the folder itself, of bounded size.
+
+A Zarr folder can lead elsewhere by links, name codecs that are loaded as plug-ins, and stand for
+far more values than it has bytes. All of that is refused by its description, before zarr opens it.
+The format is Zarr 3, https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html.
+"""
+
+import math
+import os
+import stat
+import zlib
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from radiotwin.errors import BadInput
+from radiotwin.io.budgets import (
+    FILE_BYTES,
+    MAP_ATTRIBUTES,
+    MAP_CHUNKS,
+    MAP_PIECE_BYTES,
+    MAP_VALUES,
+    SETTINGS_BYTES,
+    Budget,
+)
+from radiotwin.io.inputs import parse_json, read_text
+
+METADATA = "zarr.json"
+_PIECES = "c"  # folder of an array's pieces, by the default chunk key encoding
+_FORMAT_2 = (".zgroup", ".zarray", ".zattrs", ".zmetadata")
+_ITEM_BYTES = {"bool": 1, "int8": 1, "int16": 2, "int32": 4, "int64": 8, "uint8": 1, "uint16": 2,
+               "uint32": 4, "uint64": 8, "float16": 2, "float32": 4, "float64": 8}
+_TEXT = "fixed_length_utf32"
+_COMPRESSORS = ("zstd", "gzip")
+_CRC_BYTES = 4
+_MAX_DIMS = 4
+_MAX_DIGITS = 9  # of the number of a piece
+_HEAD_BYTES = 18  # the longest head of a Zstandard frame
+_ADVICE = ("write it again with radiotwin, or with xarray's to_zarr(…, zarr_format=3) and its "
+           "standard codecs")
+
+
+@dataclass(frozen=True)
+class _Array:
+    """Pieces of an array, by its description."""
+
+    grid: tuple[int, ...]
+    piece_bytes: int
+    compressor: str | None
+    has_crc: bool
+    missing_is_nothing: bool  # whether a piece that is not there stands for "not detected"
+
+
+def check_zarr(folder: Path, known: Collection[str], streamed: Budget) -> dict[str, int]:
+    """Check that opening a Zarr folder and reading it piece by piece is safe.
+
+    Args:
+        folder: to check.
+        known: names of the arrays that may be in it.
+        streamed: limit of the values of an array of four dims, which is read in parts.
+
+    Returns:
+        Number of pieces that are not there, by array: they stand for the fill value.
+
+    Raises:
+        BadInput: it is no Zarr folder of format 3; it has links, arrays, codecs or types that radio
+            maps do not have; or it is too large.
+    """
+    entries = _listed(folder, [METADATA, *known])
+    if METADATA not in entries:
+        raise BadInput(f"{folder} has no {METADATA}, so it is no radio map in Zarr; `radiotwin map "
+                       "… --out NAME.zarr` makes one")
+    group = _metadata(folder, "group")
+    MAP_ATTRIBUTES.check(len(group.get("attributes", {})), f"{folder}: its attributes")
+    missing = {}
+    for name in sorted(entries - {METADATA}):
+        missing[name] = _check_array(folder / name, streamed)
+    return missing
+
+
+def _listed(folder: Path, allowed: Collection[str]) -> set[str]:
+    """Return the names in a folder, which must be among the allowed ones, and no links."""
+    names = set()
+    for entry in os.scandir(folder):
+        if entry.name in _FORMAT_2:
+            raise BadInput(f"{folder} is of Zarr format 2; {_ADVICE}")
+        if entry.name not in allowed:
+            raise BadInput(f"{folder} holds {entry.name[:60]!r}, which is no part of a radio map "
+                           "in Zarr: remove it")
+        if not (entry.is_dir(follow_symlinks=False) or entry.is_file(follow_symlinks=False)):
+            _refuse_kind(entry.path)
+        names.add(entry.name)
+    return names
+
+
+def _refuse_kind(path: Path | str) -> None:
+    raise BadInput(f"{path} is a link, a pipe or a device; a radio map in Zarr is one folder with "
+                   "regular files: copy what it stands for")
+
+
+def _metadata(folder: Path, kind: str) -> dict[str, Any]:
+    """Return the description of a group or an array."""
+    path = folder / METADATA
+    found = parse_json(read_text(path, "description of a Zarr map", SETTINGS_BYTES), path,
+                       allow_nan=True)
+    if not isinstance(found, dict) or found.get("zarr_format") != 3 \
+            or found.get("node_type") != kind \
+            or not isinstance(found.get("attributes", {}), dict):
+        raise BadInput(f"{path} does not describe a Zarr {kind} of format 3; {_ADVICE}")
+    return found
+
+
+def _check_array(folder: Path, streamed: Budget) -> int:
+    """Check an array; return how many of its pieces are missing."""
+    names = _listed(folder, (METADATA, _PIECES))
+    described = _metadata(folder, "array")
+    try:
+        array = _described(folder, described, streamed)
+    except (LookupError, TypeError, AttributeError, ValueError) as error:
+        raise BadInput(f"{folder / METADATA} is damaged ({type(error).__name__}: "
+                       f"{str(error)[:200]}); {_ADVICE}") from None
+    found = _check_pieces(folder / _PIECES, array.grid, array) if _PIECES in names else 0
+    missing = math.prod(array.grid) - found
+    if missing and not array.missing_is_nothing:
+        raise BadInput(f"{folder} lacks {missing:,} of {math.prod(array.grid):,} pieces, which "
+                       "would stand for a number; copy the folder again, as a whole")
+    return missing
+
+
+def _described(folder: Path, described: dict[str, Any], streamed: Budget) -> _Array:
+    MAP_ATTRIBUTES.check(len(described.get("attributes", {})), f"{folder}: its attributes")
+    shape = _sizes(described["shape"], 0)
+    if described["chunk_grid"]["name"] != "regular" or described.get("storage_transformers"):
+        raise BadInput(f"{folder} is not cut into equal pieces; {_ADVICE}")
+    keys = described["chunk_key_encoding"]
+    if keys["name"] != "default" or keys.get("configuration", {}).get("separator", "/") != "/":
+        raise BadInput(f"{folder} names its pieces otherwise than c/0/0; {_ADVICE}")
+    chunk = _sizes(described["chunk_grid"]["configuration"]["chunk_shape"], 1)
+    if len(chunk) != len(shape) or len(shape) > _MAX_DIMS:
+        raise ValueError(f"{len(shape)} dims, in pieces of {len(chunk)}")
+    kind, item_bytes = _kind(folder, described["data_type"])
+    values = math.prod(shape)
+    (streamed if len(shape) == _MAX_DIMS else MAP_VALUES).check(values, folder)
+    if len(shape) < _MAX_DIMS:
+        FILE_BYTES.check(values * item_bytes, folder)
+    piece_bytes = math.prod(chunk) * item_bytes
+    MAP_PIECE_BYTES.check(piece_bytes, f"{folder}: each piece")
+    grid = tuple(-(-size // part) for size, part in zip(shape, chunk))
+    MAP_CHUNKS.check(math.prod(grid), folder)
+    compressor, has_crc = _codecs(folder, described["codecs"])
+    is_nothing = described["fill_value"] == "NaN" if kind.startswith("float") else kind == "bool"
+    is_read = len(shape) > 0  # of the grid mapping only attributes are
+    return _Array(grid, piece_bytes, compressor, has_crc, is_nothing or not is_read)
+
+
+def _sizes(values: Any, least: int) -> tuple[int, ...]:
+    if not all(type(value) is int and value >= least for value in list(values)):
+        raise ValueError(f"sizes {str(values)[:60]} are not whole numbers from {least} on")
+    return tuple(values)
+
+
+def _kind(folder: Path, data_type: Any) -> tuple[str, int]:
+    """Return the type of the values, and the bytes of each."""
+    if isinstance(data_type, str) and data_type in _ITEM_BYTES:
+        return data_type, _ITEM_BYTES[data_type]
+    if isinstance(data_type, dict) and data_type.get("name") == _TEXT:
+        (item_bytes,) = _sizes([data_type["configuration"]["length_bytes"]], 4)
+        return _TEXT, item_bytes
+    raise BadInput(f"{folder} holds values of the type {str(data_type)[:60]!r}; allowed are "
+                   f"numbers, bool and {_TEXT}: {_ADVICE}")
+
+
+def _codecs(folder: Path, codecs: Any) -> tuple[str | None, bool]:
+    """Return the compressor, if any, and whether a checksum follows."""
+    names = [codec["name"] for codec in codecs]
+    rest = names[1:]
+    compressor = rest.pop(0) if rest and rest[0] in _COMPRESSORS else None
+    if names[:1] != ["bytes"] or rest not in ([], ["crc32c"]):
+        raise BadInput(f"{folder} is stored by the codecs {str(names)[:100]}; allowed are bytes, "
+                       f"then zstd or gzip or neither, then crc32c or not: {_ADVICE}")
+    return compressor, bool(rest)
+
+
+def _check_pieces(path: Path, grid: tuple[int, ...], array: _Array) -> int:
+    """Check the pieces below a path; return their number."""
+    if not grid:
+        _check_piece(path, array)
+        return 1
+    count = 0
+    for entry in os.scandir(path):
+        name = entry.name
+        if not (name.isascii() and name.isdigit() and len(name) <= _MAX_DIGITS
+                and str(int(name)) == name and int(name) < grid[0]):
+            raise BadInput(f"{path} holds {name[:60]!r}, which is no piece of the array: remove it")
+        if not (entry.is_dir(follow_symlinks=False) if grid[1:]
+                else entry.is_file(follow_symlinks=False)):
+            _refuse_kind(entry.path)
+        count += _check_pieces(Path(entry.path), grid[1:], array)
+    return count
+
+
+def _check_piece(path: Path, array: _Array) -> None:
+    """Check that a piece becomes exactly as large as it must be."""
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    with open(handle, "rb") as file:
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode):
+            _refuse_kind(path)
+        size = status.st_size - _CRC_BYTES * array.has_crc
+        if array.compressor is None:
+            becomes: int | None = size
+        elif size > 2 * array.piece_bytes + 1024:
+            becomes = None
+        elif array.compressor == "zstd":
+            becomes = _zstd_bytes(file.read(_HEAD_BYTES))
+        else:
+            becomes = _gzip_bytes(file.read(max(size, 0)), array.piece_bytes)
+    if becomes != array.piece_bytes:
+        raise BadInput(f"{path} is damaged, or another size than its array needs "
+                       f"({array.piece_bytes:,} bytes when decompressed); copy the folder again, "
+                       "as a whole")
+
+
+def _zstd_bytes(head: bytes) -> int | None:
+    """Return the size that a Zstandard frame declares, RFC 8878, section 3.1.1.1; None: none.
+
+    The decompressor takes memory for that, and writes no more.
+    """
+    if len(head) < 6 or head[:4] != b"\x28\xb5\x2f\xfd":
+        return None
+    flags = head[4]
+    is_single = flags >> 5 & 1
+    size = {0: is_single, 1: 2, 2: 4, 3: 8}[flags >> 6]
+    start = 5 + (1 - is_single) + (0, 1, 2, 4)[flags & 3]
+    if not size or len(head) < start + size:
+        return None
+    return int.from_bytes(head[start:start + size], "little") + (256 if size == 2 else 0)
+
+
+def _gzip_bytes(data: bytes, expected: int) -> int | None:
+    """Return the decompressed size of gzip data; None where it is damaged, or above `expected`."""
+    inflater = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    try:
+        size = len(inflater.decompress(data, expected + 1))
+    except zlib.error:
+        return None
+    return size if inflater.eof and not inflater.unused_data else None

@@ -1,0 +1,511 @@
+"""Measured levels of links, and their devices: two tables, checked when they are read.
+
+Columns of measurements and of devices: what their cells may hold.
+"""
+
+import os
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from radiotwin.display import PlotFrame, Summary, new_axes
+from radiotwin.display.axes import GAIN_COLOURS, level_range_db, plain
+from radiotwin.display.summary import Summarised, count, some, span
+from radiotwin.errors import BadInput
+from radiotwin.geo.frames import (
+    FRAME_FILE,
+    GroundHeight,
+    above_datum,
+    between_frames,
+    is_same_frame,
+    moved_positions,
+    place,
+    read_frame,
+    write_frame,
+)
+from radiotwin.io.budgets import DEVICES
+from radiotwin.io.cells import (
+    as_numbers,
+    check_suffix,
+    read_cells,
+    refuse,
+    require_pyarrow,
+    shown,
+    write_csv,
+)
+from radiotwin.io.files import atomic_path
+from radiotwin.io.forms import MAX_POSITION_M, Origin, name_fault
+from radiotwin.io.inputs import is_within
+from radiotwin.links.view import links_dataset, links_table, of_device, plot_links
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+    from matplotlib.axes import Axes
+
+    from radiotwin.scene import Scene
+
+LEVELS = ["gain_db", "rssi_dbm"]
+_TEXT = {"flight", "receiver", "device", "role"}
+# Limits that no measurement exceeds: what lies beyond them is another unit or a placeholder.
+MAX_LEVEL_DB = 300.0
+FREQUENCIES_HZ = (1e6, 450e9)  # as of a scene; materials of ITU-R P.2040 end at 450 GHz
+MAX_TIME_S = 1e11  # the year 5138; milliseconds since 1970 lie beyond
+MAX_SPAN_S = 3.2e9  # a century, the longest campaign
+MAX_TILT_DEG = 90.0
+MAX_ANGLE_DEG = 1e6  # thousands of turns in one direction, which some compasses count
+MAX_POWER_DBM = 300.0  # as of a level
+MAX_QUALITY = 1e15  # whole numbers are exact up to there
+# Columns of the two files, as in docs/conventions.md.
+REQUIRED = ["flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device"]
+OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality", "receiver_above_ground_m"]
+DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
+DEVICE_OPTIONAL = ["frequency_hz", "tx_power_dbm", "azimuth_deg", "tilt_deg", "above_ground_m"]
+ROLES = ("anchor", "unknown")
+_RECEIVER_POSITION = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
+_DEVICE_POSITION = ["x_m", "y_m", "z_m"]
+MAX_APART_M = 1e6  # between an anchor and the receivers' middle: no radio link is so long
+_MAY_BE_EMPTY = {"receiver_z_m", *LEVELS, *OPTIONAL}
+_DEVICE_MAY_BE_EMPTY = {"x_m", "y_m", "z_m", *DEVICE_OPTIONAL}
+
+
+def read_columns(path: Path, required: list[str], optional: list[str],
+                 may_be_empty: set[str]) -> pd.DataFrame:
+    """Read the columns of a table, names as texts and all others as numbers.
+
+    Args:
+        path: `.csv`, `.csv.gz` or `.parquet`.
+        required: columns that it must have.
+        optional: columns that it may have.
+        may_be_empty: columns whose cells may be empty: NaN.
+
+    Raises:
+        BadInput: names file, row and column of the first value that cannot be used.
+    """
+    table = read_cells(path, required, optional)
+    for name in table.columns:
+        if name in _TEXT:
+            table[name] = _names(path, name, table[name])
+        else:
+            cells = table[name]
+            table[name] = _numbers(path, name, cells, name in may_be_empty)
+            refuse_limits(partial(refuse, path, name, cells), name, table[name].to_numpy())
+    return table
+
+
+def _names(path: Path, name: str, column: pd.Series) -> pd.Series:
+    """Return the names in a column without spaces around them."""
+    names = column.astype(str).str.strip()
+    faults = {text: fault for text in names.unique() if (fault := name_fault(text))}
+    for text, fault in faults.items():
+        refuse(path, name, names, names == text, fault)
+    return names
+
+
+def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd.Series:
+    """Convert the cells of a column, NaN where empty."""
+    needed = "every row needs one: fill it in, or leave the row out"
+    if column.dtype.kind in "fiu":
+        numbers, empty = column.astype(float), column.isna()
+    else:
+        text = column.fillna("").astype(str).str.strip()
+        empty = text == ""
+        numbers = pd.Series(as_numbers(text), index=column.index)
+        named_nan = numbers.isna() & ~empty
+        named_nan[named_nan] = text[named_nan].str.lower().isin(["nan", "na", "none"])
+        refuse(path, name, column, numbers.isna() & ~empty & ~named_nan, "is not a number")
+        remedy = "leave the cell empty where there is no value" if may_be_empty else needed
+        refuse(path, name, column, named_nan, f"is not a number; {remedy}")
+    remedy = "; leave the cell empty where nothing was detected" if name in LEVELS else ""
+    refuse(path, name, column, np.isinf(numbers), f"is not finite{remedy}")
+    if not may_be_empty:
+        refuse(path, name, column, empty, f"is empty; {needed}")
+    return numbers
+
+
+def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
+                  numbers: np.ndarray) -> None:
+    """Refuse numbers of a column that can only be mistakes, such as a wrong unit.
+
+    Args:
+        refuse: called with (n,) bool and the reason; raises where one is true.
+        name: of the column, as in `measurements.csv` or `devices.csv`.
+        numbers: (n,) in its unit; NaN where empty.
+    """
+    if name in LEVELS:
+        refuse(np.abs(numbers) > MAX_LEVEL_DB,
+               f"is no level; allowed are -{MAX_LEVEL_DB:g} to {MAX_LEVEL_DB:g}")
+    if name == "gain_db":
+        refuse(numbers > 0,
+               "is above 0 dB, which no channel gain is; received power [dBm] goes into a column "
+               "rssi_dbm, and a path loss needs a minus sign")
+    if name == "frequency_hz":
+        low, high = FREQUENCIES_HZ
+        refuse((numbers < low) | (numbers > high),
+               f"is no frequency; allowed are {low:g} to {high:g} Hz; the unit is Hz")
+    if name.endswith("_m"):
+        refuse(np.abs(numbers) > MAX_POSITION_M,
+               f"is too far away; allowed are -{MAX_POSITION_M:g} to {MAX_POSITION_M:g} m in "
+               "the scene's frame")
+    if name == "time_s":
+        refuse(np.abs(numbers) > MAX_TIME_S,
+               f"is no time; allowed are -{MAX_TIME_S:g} to {MAX_TIME_S:g} s; the unit is s, not "
+               "ms")
+        if np.isfinite(numbers).any():
+            refuse(numbers - np.nanmin(numbers) > MAX_SPAN_S,
+                   f"is more than a century ({MAX_SPAN_S:g} s) after the first time, "
+                   f"{np.nanmin(numbers):g} s; is one of them wrong, or in another unit?")
+    if name == "tilt_deg":
+        refuse(np.abs(numbers) > MAX_TILT_DEG,
+               f"is no tilt; allowed are -{MAX_TILT_DEG:g} (down) to {MAX_TILT_DEG:g} (up)")
+    for ending, limit in (("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM),
+                          ("quality", MAX_QUALITY)):
+        if name.endswith(ending):
+            refuse(np.abs(numbers) > limit,
+                   f"is out of range; allowed are -{limit:g} to {limit:g}")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurements(Summarised):
+    """Levels of links between devices and receivers.
+
+    Attributes:
+        table: one row per link, columns as in `measurements.csv`; NaN level = not detected.
+        devices: one row per device, columns as in `devices.csv`; NaN x, y where unknown.
+        origin: of the local frame of both; None where it is not known.
+    """
+
+    table: pd.DataFrame
+    devices: pd.DataFrame
+    origin: Origin | None = None
+
+    @property
+    def level_column(self) -> str:
+        """`gain_db`, or `rssi_dbm` where the transmit power is unknown."""
+        return next(name for name in LEVELS if name in self.table)
+
+    @property
+    def level_db(self) -> np.ndarray:
+        """Measured levels [dB or dBm], (n,); NaN = not detected."""
+        return self.table[self.level_column].to_numpy(dtype=float)
+
+    @property
+    def receiver_m(self) -> np.ndarray:
+        """Receiver positions [m], (n, 3)."""
+        return self.table[_RECEIVER_POSITION].to_numpy(dtype=float)
+
+    @cached_property
+    def device_index(self) -> np.ndarray:
+        """Row of each link's device in `devices`, (n,)."""
+        return pd.Index(self.devices["device"]).get_indexer(self.table["device"])
+
+    @property
+    def device_m(self) -> np.ndarray:
+        """Declared device positions [m], (k, 3); NaN where unknown."""
+        return self.devices[_DEVICE_POSITION].to_numpy(dtype=float)
+
+    @property
+    def is_anchor(self) -> np.ndarray:
+        """Whether the position of each device is known, (k,) bool."""
+        return (self.devices["role"] == "anchor").to_numpy()
+
+    @property
+    def flights(self) -> list[str]:
+        """Names of the flights, in the order of their first rows."""
+        return list(dict.fromkeys(self.table["flight"]))
+
+    def select(self, mask: np.ndarray) -> "Measurements":
+        """Return a selection of the links, with all devices.
+
+        Args:
+            mask: (n,) bool.
+        """
+        return Measurements(self.table[np.asarray(mask)].reset_index(drop=True), self.devices,
+                            self.origin)
+
+    def moved(self, position_m: Callable[[np.ndarray], np.ndarray],
+              origin: Origin | None) -> "Measurements":
+        """Return the same links in another frame.
+
+        Args:
+            position_m: converts (n, 3) positions [m] to that frame; NaN where unknown.
+            origin: of that frame.
+        """
+        return Measurements(moved_positions(self.table, _RECEIVER_POSITION, position_m),
+                            moved_positions(self.devices, _DEVICE_POSITION, position_m), origin)
+
+    def on_ground(self, ground_height_m: GroundHeight | None) -> "Measurements":
+        """Return the same links with all heights above the datum; see `above_datum`."""
+        if "receiver_above_ground_m" not in self.table and "above_ground_m" not in self.devices:
+            return self
+        return Measurements(
+            above_datum(self.table, "measurements", _RECEIVER_POSITION, ground_height_m),
+            above_datum(self.devices, "devices", _DEVICE_POSITION, ground_height_m), self.origin)
+
+    def in_frame(self, origin: Origin) -> "Measurements":
+        """Return the same links in the frame about another origin, converted exactly.
+
+        Args:
+            origin: of that frame.
+
+        Raises:
+            BadInput: the origin of the links' own frame is not known.
+        """
+        here = self.origin
+        if here is None:
+            raise BadInput("the origin of the measurements' frame is not known; give it to "
+                           "Measurements, or move them")
+        return self.moved(lambda position_m: between_frames(position_m, here, origin), origin)
+
+    @classmethod
+    def load(cls, path: Path | str, devices_path: Path | str | None = None) -> "Measurements":
+        """Read links and devices, see `read_measurements`.
+
+        Args:
+            path: `.csv`, `.csv.gz` or `.parquet`.
+            devices_path: table of the devices; None: `devices.csv` in the same folder.
+        """
+        return read_measurements(path, devices_path)
+
+    def save(self, path: Path | str) -> None:
+        """Write the links, and the devices to `devices.csv` in the same folder.
+
+        A known origin goes to `frame.toml` there.
+
+        Args:
+            path: `.csv`, `.csv.gz` or `.parquet`.
+
+        Raises:
+            BadInput: `path` cannot be written, or the folder has a `devices.csv` of other devices,
+                or a `frame.toml` of another frame.
+        """
+        path = Path(path)
+        check_suffix(path)
+        if path.name == "devices.csv":
+            raise BadInput(f"{path}: this name is for the devices' table, which is written beside "
+                           "the links; give the links another name, such as measurements.csv")
+        self._check_replaceable(path.parent / "devices.csv")
+        self._check_frame(path.parent)
+        with ExitStack() as together:
+            if self.origin is not None:
+                frame = together.enter_context(atomic_path(path.parent / FRAME_FILE))
+                write_frame(self.origin, frame)
+            devices = together.enter_context(atomic_path(path.parent / "devices.csv"))
+            links = together.enter_context(atomic_path(path))
+            write_csv(self.devices, devices)
+            if path.suffix.lower() == ".parquet":
+                require_pyarrow(path)
+                self.table.to_parquet(links, index=False)
+            else:
+                write_csv(self.table, links)
+
+    write = save  # the name of version 0.1
+
+    def plot(self, device: str | None = None, ax: "Axes | None" = None, *,
+             scene: "Scene | None" = None, geographic: bool | None = None) -> "Axes":
+        """Draw the levels of a device's links at the end that moves.
+
+        Args:
+            device: name; None: the one with the most detected links.
+            ax: axes of matplotlib to draw into; None: a new figure.
+            scene: whose buildings are outlined; None: none are.
+            geographic: whether axes are longitude and latitude; None: where the origin is known.
+
+        Returns:
+            The axes.
+
+        Raises:
+            BadInput: no such device, no link at all, or longitude and latitude without an origin.
+        """
+        if self.table.empty:
+            raise BadInput("there are no links to draw")
+        if device is None:
+            heard = self.table["device"][np.isfinite(self.level_db)]
+            device = str((heard if len(heard) else self.table["device"]).mode()[0])
+        origin = self.origin or (scene.config.origin if scene is not None else None)
+        frame = PlotFrame.choose(origin, geographic)
+        links = of_device(self._links_with_devices(), device)
+        level = links[self.level_column].to_numpy(dtype=float)
+        ax, (low, high) = new_axes(ax), level_range_db(level)
+        label = "channel gain [dB]" if self.level_column == "gain_db" else "received power [dBm]"
+        plot_links(links, level, ax, frame, scene, label, True, cmap=GAIN_COLOURS, vmin=low,
+                   vmax=high)
+        ax.set_title(f"device {plain(device)}: {count(len(links), 'link')}, "
+                     f"{np.isfinite(level).sum():,} detected")
+        return ax
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return links with the positions of both ends as variables over the dimension `link`."""
+        return links_dataset(self._links_with_devices(), self.origin)
+
+    def to_geodataframe(self) -> "GeoDataFrame":
+        """Return the links with a point at the end that moves, in metres of the local frame.
+
+        Raises:
+            BadInput: GeoPandas is not installed.
+        """
+        return links_table(self._links_with_devices(), self.origin)
+
+    def _links_with_devices(self) -> pd.DataFrame:
+        device = self.devices.iloc[self.device_index].reset_index(drop=True)
+        columns = {f"device_{name}": device[name] for name in _DEVICE_POSITION}
+        return self.table.reset_index(drop=True).assign(role=device["role"], **columns)
+
+    def __len__(self) -> int:
+        """Return the number of links."""
+        return len(self.table)
+
+    def __bool__(self) -> bool:
+        return True
+
+    @property
+    def _summary(self) -> Summary:
+        seen = np.isfinite(self.level_db)
+        known = self.level_db[seen]
+        unit = "dB" if self.level_column == "gain_db" else "dBm"
+        levels = span(float(known.min()), float(known.max()), unit) if len(known) else "–"
+        anchors, receivers = int(self.is_anchor.sum()), self.table["receiver"].unique()
+        missed = f"{1 - seen.mean():.1%}" if len(seen) else "–"
+        return Summary(
+            "Measurements", f"{count(len(self), 'link')}, {count(len(receivers), 'receiver')}, "
+            f"{count(len(self.devices), 'device')}, {count(len(self.flights), 'flight')}, "
+            f"{self.level_column} {levels}, {missed} not detected", (
+                ("links", f"{len(self):,}"), ("flights", some(self.flights)),
+                ("receivers", some(receivers)), ("devices", some(self.devices["device"])),
+                ("of these", count(anchors, "anchor")), (self.level_column, levels),
+                ("not detected", missed),
+                ("origin", "not known" if self.origin is None else place(self.origin))))
+
+    def _check_frame(self, folder: Path) -> None:
+        """Refuse a folder whose tables are in another frame."""
+        there = read_frame(folder)
+        if there is not None and (self.origin is None or not is_same_frame(there, self.origin)):
+            raise BadInput(f"{folder / FRAME_FILE} says that tables of this folder are in the "
+                           f"frame about {place(there)}, and these are "
+                           + (f"about {place(self.origin)}" if self.origin else
+                              "in one of unknown origin") + "; choose another output folder")
+
+    def _check_replaceable(self, path: Path) -> None:
+        """Allow replacing a table of the same devices only; another one may be the only copy."""
+        if not os.path.exists(path):  # False, not an error, of a name that no file can have
+            return
+        try:
+            same = sorted(read_devices(path)["device"]) == sorted(self.devices["device"])
+        except BadInput:
+            same = False
+        if not same:
+            raise BadInput(f"{path} exists and is not a table of this survey's devices "
+                           f"({_enumerate(self.devices['device'])}); it is not overwritten: choose "
+                           "another output folder, or move it away")
+
+
+def read_measurements(path: Path | str, devices_path: Path | str | None = None) -> Measurements:
+    """Read links and devices.
+
+    Args:
+        path: `.csv`, `.csv.gz` or `.parquet` with the columns of `REQUIRED` and one of `LEVELS`.
+        devices_path: table of the devices; by default `devices.csv` in the same folder.
+
+    Returns:
+        links and devices in the frame that the `frame.toml` beside the links declares; devices of
+        another folder are converted from theirs.
+
+    Raises:
+        BadInput: names file, row and column of the first value that cannot be used.
+    """
+    path = Path(path)
+    table = read_columns(path, REQUIRED, OPTIONAL + LEVELS, _MAY_BE_EMPTY)
+    levels = [name for name in LEVELS if name in table]
+    if len(levels) != 1:
+        raise BadInput(f"{path}: needs exactly one of the columns {' and '.join(LEVELS)}, it "
+                       f"has {'both' if levels else 'neither'}")
+    named = devices_path is not None
+    devices_path = Path(devices_path) if devices_path else path.parent / "devices.csv"
+    if not os.path.exists(devices_path):
+        raise BadInput(f"{devices_path} does not exist; the table of devices needs the columns "
+                       f"{', '.join(DEVICE_REQUIRED)} (role: {' or '.join(ROLES)}); --devices "
+                       "names another file")
+    if not named and not is_within(devices_path, path.parent):
+        raise BadInput(f"{devices_path} is a link out of its folder; name the table that it leads "
+                       "to with --devices")
+    devices = read_devices(devices_path)
+    if table.empty:
+        raise BadInput(f"{path}: has no rows; it needs at least one measured link")
+    undeclared = ~table["device"].isin(devices["device"])
+    if undeclared.any():
+        row = int(np.flatnonzero(undeclared)[0])
+        raise BadInput(f"{path}: row {row + 2}, column device: {table['device'][row]!r} is not in "
+                       f"{devices_path} (it has {_enumerate(devices['device'])}); add it there or "
+                       "correct the name")
+    origin, of_devices = read_frame(path.parent), read_frame(devices_path.parent)
+    if origin is not None and of_devices is not None and not is_same_frame(origin, of_devices):
+        devices = moved_positions(devices, _DEVICE_POSITION,
+                                  lambda position_m: between_frames(position_m, of_devices, origin))
+    _check_spread(path, table, devices_path, devices)
+    return Measurements(table, devices, origin)
+
+
+def read_devices(path: Path | str) -> pd.DataFrame:
+    """Read a table of devices.
+
+    Args:
+        path: `.csv`, `.csv.gz` or `.parquet` with the columns of `DEVICE_REQUIRED`.
+
+    Returns:
+        one row per device, columns as in `devices.csv`.
+
+    Raises:
+        BadInput: names file, row and column of the first value that cannot be used.
+    """
+    path = Path(path)
+    devices = read_columns(path, DEVICE_REQUIRED, DEVICE_OPTIONAL, _DEVICE_MAY_BE_EMPTY)
+    if devices.empty:
+        raise BadInput(f"{path}: has no rows; it needs one for each device")
+    DEVICES.check(len(devices), path)
+    repeated = devices["device"].duplicated()
+    if repeated.any():
+        row = int(np.flatnonzero(repeated)[0])
+        raise BadInput(f"{path}: row {row + 2}, column device: {devices['device'][row]!r} occurs "
+                       "twice; every device needs one row, and a name of its own")
+    wrong = ~devices["role"].isin(ROLES)
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        raise BadInput(f"{path}: row {row + 2}, column role: {shown(devices['role'][row])}; "
+                       f"allowed are {' and '.join(ROLES)}")
+    unplaced = (devices["role"] == "anchor") & devices[["x_m", "y_m"]].isna().any(axis=1)
+    if unplaced.any():
+        row = int(np.flatnonzero(unplaced)[0])
+        raise BadInput(f"{path}: row {row + 2}: anchor {devices['device'][row]!r} has no x_m, y_m; "
+                       "fill them in or give it the role unknown")
+    return devices
+
+
+def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,
+                  devices: pd.DataFrame) -> None:
+    """Refuse an anchor that is too far away for any link.
+
+    Where all are, receivers and devices have different frames, which is found where it matters.
+    """
+    middle_m = table[["receiver_x_m", "receiver_y_m"]].median().to_numpy()
+    anchor = (devices["role"] == "anchor").to_numpy()
+    far = anchor & (np.abs(devices[["x_m", "y_m"]].to_numpy() - middle_m).max(axis=1) > MAX_APART_M)
+    if far.any() and far.sum() < anchor.sum():
+        row = int(np.argmax(far))
+        x_m, y_m = devices.loc[row, ["x_m", "y_m"]]
+        raise BadInput(f"{devices_path}: row {row + 2}: anchor {devices['device'][row]!r} at "
+                       f"({x_m:g}, {y_m:g}) m is more than {MAX_APART_M / 1000:g} km from the "
+                       f"middle of the receivers of {path.name}, ({middle_m[0]:g}, "
+                       f"{middle_m[1]:g}) m; both need one frame, in metres")
+
+
+def _enumerate(names: Iterable[str]) -> str:
+    """Join the first six names, and count the others."""
+    names = list(names)
+    more = f", … {len(names)} in all" if len(names) > 6 else ""
+    return ", ".join(map(str, names[:6])) + more

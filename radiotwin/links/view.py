@@ -1,0 +1,106 @@
+"""Draw values of links over the end that moves, and give links to GIS programs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from radiotwin.display import PlotFrame, geo_data_frame
+from radiotwin.display.axes import add_colour_bar, add_legend, draw_points
+from radiotwin.display.summary import some
+from radiotwin.errors import BadInput
+from radiotwin.io.forms import Origin
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+    from matplotlib.axes import Axes
+
+    from radiotwin.scene import Scene
+
+ENDS = ("receiver", "device")
+_UNITS = {"_m": "m", "_db": "dB", "_dbm": "dBm", "_s": "s", "_deg": "degree", "_hz": "Hz"}
+
+
+def moving_end(table: pd.DataFrame) -> str:
+    """Return `receiver`, or `device` where devices are at more positions than receivers."""
+    receivers, devices = (len(table[[f"{end}_x_m", f"{end}_y_m"]].dropna().drop_duplicates())
+                          for end in ENDS)
+    return ENDS[int(devices > receivers)]
+
+
+def of_device(table: pd.DataFrame, device: str | None) -> pd.DataFrame:
+    """Return the links of a device; of all where it is None.
+
+    Raises:
+        BadInput: no link is to such a device.
+    """
+    if device is None:
+        return table
+    part = table[table["device"] == device]
+    if part.empty:
+        raise BadInput(f"no link is to device {device!r}; there are links to "
+                       f"{some(table['device'].unique())}")
+    return part
+
+
+def plot_links(table: pd.DataFrame, values: np.ndarray, ax: Axes, frame: PlotFrame,
+               scene: Scene | None, label: str, strongest_last: bool, **look: Any) -> None:
+    """Draw a value of each link at its moving end, and the ends that do not move.
+
+    Args:
+        table: n links, with positions of both ends.
+        values: (n,) of them; NaN is drawn as not detected.
+        ax: to draw into.
+        frame: of the axes.
+        scene: whose buildings are outlined; None: none are.
+        label: of the colour bar.
+        strongest_last: draw large values over small ones; else large magnitudes over small ones.
+        look: of `Axes.scatter`.
+    """
+    end = moving_end(table)
+    other = ENDS[1 - ENDS.index(end)]
+    x_m, y_m = (table[f"{end}_{axis}_m"].to_numpy(dtype=float) for axis in "xy")
+    if scene is not None:
+        scene.draw_outlines(ax, frame)
+    seen = np.isfinite(values)
+    if not seen.all():
+        draw_points(ax, frame, x_m[~seen], y_m[~seen], s=7, color="0.75", linewidths=0,
+                    label="not detected", zorder=2)
+    rows = np.flatnonzero(seen)
+    rows = rows[np.argsort(values[rows] if strongest_last else np.abs(values[rows]))]
+    drawn = draw_points(ax, frame, x_m[rows], y_m[rows], c=values[rows], s=14, linewidths=0,
+                        zorder=3, **look)
+    add_colour_bar(ax, drawn, label, "both")
+    fixed = table[[f"{other}_x_m", f"{other}_y_m"]].dropna().drop_duplicates().to_numpy(float)
+    if len(fixed):
+        draw_points(ax, frame, *fixed.T, marker="^" if other == "device" else "s", s=70,
+                    color="white", edgecolors="black", label=other, zorder=4)
+    frame.prepare(ax)
+    add_legend(ax)
+
+
+def links_dataset(table: pd.DataFrame, origin: Origin | None) -> xr.Dataset:
+    """Return the columns of a table as variables over the dimension `link`, with units."""
+    attributes = {} if origin is None else {
+        f"origin_{name}": value for name, value in origin.model_dump().items()}
+    variables = {}
+    for name in table:
+        unit = next((unit for ending, unit in _UNITS.items() if str(name).endswith(ending)), None)
+        values = table[name].to_numpy()
+        variables[name] = ("link", values.astype(object) if values.dtype.kind not in "biuf"
+                           else values, {} if unit is None else {"units": unit})
+    return xr.Dataset(variables, {"link": np.arange(len(table))}, attributes)
+
+
+def links_table(table: pd.DataFrame, origin: Origin | None) -> GeoDataFrame:
+    """Return the links with a point at the end that moves.
+
+    Raises:
+        BadInput: GeoPandas is not installed.
+    """
+    end = moving_end(table)
+    position_m = table[[f"{end}_x_m", f"{end}_y_m"]].to_numpy(dtype=float)
+    return geo_data_frame(table.reset_index(drop=True), origin, position_m=position_m)

@@ -1,0 +1,1 @@
+"""Radio maps: the object, its files, flights through it, and export."""

@@ -1,0 +1,115 @@
+"""Radio maps as numbers: NetCDF, Zarr, CSV and NumPy.
+
+Whether a radio map is of a scene's place.
+"""
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.io.cells import write_csv as write_table
+from radiotwin.io.files import atomic_file
+from radiotwin.maps.file import write_parts
+from radiotwin.maps.form import MapBlock, MapStream
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.scene.lattice import Lattice
+
+MAX_ORIGIN_DIFFERENCE = 1e-6  # [degrees, or metres of altitude] of one place, after rounding
+
+
+def write_dataset(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
+    """Write NetCDF-4 or Zarr after the CF conventions, for xarray and `RadioMap.load`.
+
+    Args:
+        radio_map: map to write.
+        scene: whose origin places the map on the globe.
+        path: of the .nc file, or the .zarr folder.
+    """
+    placed = radio_map.placed(scene.config.origin)
+    if isinstance(placed, RadioMap):
+        placed.write(path)
+        return
+    dtypes = {name: np.dtype(bool if name == "los" else np.float32) for name in placed.variables}
+    write_parts(placed.header, dtypes, placed.blocks(), path)
+
+
+def write_csv(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
+    """Write CSV with one row a link.
+
+    Columns: device, x_m, y_m, z_m, gain_db (empty: not detected), los, and sigma_db of a learned
+    map. Nine digits restore single precision to the bit.
+
+    Args:
+        radio_map: map to write.
+        scene: not used.
+        path: of the .csv file.
+    """
+    devices, lattice, is_first = radio_map.devices, radio_map.lattice, True
+    with atomic_file(path) as file:
+        for block in radio_map.blocks():
+            table = _rows(block, devices, lattice)
+            write_table(table, file, "%.9g", header=is_first)
+            is_first = False
+
+
+def _rows(block: MapBlock, devices: list[str], lattice: Lattice) -> pd.DataFrame:
+    """Return the links of a block, one a row."""
+    row, z, y, x = block.where
+    z_m, y_m, x_m = np.meshgrid(lattice.z_m[z], lattice.y_m[y], lattice.x_m[x], indexing="ij")
+    names = np.repeat(np.array(devices[row], dtype=object), z_m.size)
+    columns = {"device": names, "x_m": x_m.ravel(), "y_m": y_m.ravel(), "z_m": z_m.ravel()}
+    if lattice.ground_m is not None:
+        columns |= {"z_m": (z_m + lattice.ground_m[y, x]).ravel(), "above_ground_m": z_m.ravel()}
+    return pd.DataFrame(columns | {name: values.astype(bool if name == "los" else np.float32,
+                                                       copy=False).ravel()
+                                   for name, values in block.values.items()})
+
+
+def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
+    """Write NumPy arrays, which `numpy.load` reads without pickling.
+
+    Arrays: gain_db, los and sigma_db (device, z, y, x), device, z_m, y_m, x_m; and ground_m (y, x)
+    where z_m is above the ground.
+
+    Args:
+        radio_map: map to write.
+        scene: not used.
+        path: of the .npz file.
+    """
+    lattice, dataset = radio_map.lattice, radio_map.dataset
+    arrays = {"device": np.array(radio_map.devices), "z_m": lattice.z_m, "y_m": lattice.y_m,
+              "x_m": lattice.x_m}
+    if lattice.ground_m is not None:
+        arrays |= {"ground_m": lattice.ground_m}
+    arrays |= {name: dataset[name].values for name in radio_map.variables}
+    with atomic_file(path) as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle
+
+
+def check_map_place(name: str, attributes: dict[str, Any], scene: Scene) -> None:
+    """Refuse a map of another city, which would get the outlines and the origin of this one.
+
+    Args:
+        name: of the map in messages.
+        attributes: of the map.
+        scene: that is given with it.
+
+    Raises:
+        BadInput: their origins differ.
+    """
+    origin = scene.config.origin
+    for key, value in ({} if origin is None else origin.model_dump()).items():
+        of_map = attributes.get(f"origin_{key}", value)
+        if abs(of_map - value) > MAX_ORIGIN_DIFFERENCE:
+            raise BadInput(f"{name} is a map of another place: its origin's {key} is {of_map:g}, "
+                           f"that of {scene.folder} is {value:g}; give the scene that it was made "
+                           "for, or trace again")
+    if attributes.get("scene_hash") not in (None, scene.content_hash()):
+        warnings.warn(f"{name} was made for another scene than {scene.folder}, or that has changed "
+                      "since: outlines, devices and the origin are those of the scene",
+                      stacklevel=3)

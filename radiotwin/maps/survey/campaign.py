@@ -1,0 +1,287 @@
+"""A measurement campaign: every UAV flies every flight, and measures all devices in every slot.
+
+Flight patterns: functions that draw the cells of one flight, from the start to the terminal.
+
+Each takes the grid of its altitude, the start (row, column), the battery [units] and a source of
+random numbers, and returns one cell (row, column) per slot. The terminal is reached in time.
+"""
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.io.budgets import ROWS
+from radiotwin.links.measurements import Measurements
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey.grid import HOVER_COST, MOVE_COST, UNREACHABLE, Cell, FlightGrid
+from radiotwin.maps.survey.truth import read_truth, require_possible
+from radiotwin.runtime.console import progress
+from radiotwin.scene import Scene
+from radiotwin.scene.config import UavConfig
+
+_MAX_FLIGHTS = 100_000  # far beyond any campaign: a typing error
+_MAX_NOISE_DB = 50.0  # as is this: receivers are off by some decibels
+
+
+def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
+                    ) -> list[Cell]:
+    """Fly straight to random cells, as long as there is battery for one and home again.
+
+    Args:
+        grid: Cells of the altitude.
+        start: First cell.
+        battery: Battery units.
+        rng: Source of the waypoints.
+    """
+    cells = [start]
+    while True:
+        left = battery - MOVE_COST * (len(cells) - 1)
+        steps = grid.steps_to(cells[-1]) + grid.steps_to(grid.terminal)
+        reachable = steps <= left / MOVE_COST
+        reachable[cells[-1]] = False
+        if not reachable.any():
+            return cells + grid.path(cells[-1], grid.terminal, rng)
+        row, column = rng.choice(np.argwhere(reachable))
+        cells += grid.path(cells[-1], (int(row), int(column)), rng)
+
+
+def lawnmower(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
+              ) -> list[Cell]:
+    """Fly parallel lanes, as narrow as the battery allows, in a random direction and order.
+
+    Args:
+        grid: Cells of the altitude.
+        start: First cell.
+        battery: Battery units.
+        rng: Source of direction, offset and order.
+    """
+    cells = [start]
+    for corner in _lane_ends(grid.allowed.shape, battery, rng):
+        if grid.steps_home(corner) == UNREACHABLE:
+            continue
+        for cell in grid.path(cells[-1], corner, rng):
+            if MOVE_COST * (len(cells) + grid.steps_home(cell)) > battery:
+                return cells + grid.path(cells[-1], grid.terminal, rng)
+            cells.append(cell)
+    return cells + grid.path(cells[-1], grid.terminal, rng)
+
+
+def _lane_ends(shape: tuple[int, ...], battery: float, rng: np.random.Generator) -> list[Cell]:
+    """Return the ends of the lanes in the order in which they are flown."""
+    along = int(rng.integers(2))  # axis that lanes run along
+    lane_length, width = shape[along], shape[1 - along]
+    lanes_affordable = max(int(battery / MOVE_COST // lane_length), 2)
+    spacing = max(int(np.ceil(width / lanes_affordable)), 1)
+    lanes = np.arange(rng.integers(spacing), width, spacing)
+    if rng.integers(2):
+        lanes = lanes[::-1]
+    ends = []
+    for number, lane in enumerate(lanes):
+        far, near = (lane_length - 1, 0) if number % 2 else (0, lane_length - 1)
+        ends += [(far, lane), (near, lane)]
+    return [(int(a), int(b)) if along == 0 else (int(b), int(a)) for a, b in ends]
+
+
+def random_walk(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
+                ) -> list[Cell]:
+    """Move or hover with equal chances in every slot, as long as the terminal stays in reach.
+
+    Args:
+        grid: Cells of the altitude.
+        start: First cell.
+        battery: Battery units.
+        rng: Source of the moves.
+    """
+    cells, left = [start], battery
+    while True:
+        options = [(cell, MOVE_COST) for cell in grid.neighbours(cells[-1])]
+        options.append((cells[-1], HOVER_COST))
+        safe = [(cell, cost) for cell, cost in options
+                if grid.steps_home(cell) * MOVE_COST <= left - cost]
+        if not safe:
+            return cells
+        cell, cost = safe[rng.integers(len(safe))]
+        cells.append(cell)
+        left -= cost
+
+
+PATTERNS = {"random-waypoint": random_waypoint, "lawnmower": lawnmower, "random-walk": random_walk}
+
+
+def fly_survey(scene: Scene, truth: RadioMap | str = "traced", *, flights: int = 5,
+               pattern: str = "random-waypoint", seed: int = 0, noise_db: float | None = None
+               ) -> Measurements:
+    """Fly and measure.
+
+    Args:
+        scene: UAVs, devices and sensitivity.
+        truth: Map over the scene's lattice, or what `read_truth` takes for one; where it has
+            `sigma_db`, shadowing is drawn anew for every link.
+        flights: Number of flights; in each, every UAV of the scene flies once.
+        pattern: Key of `PATTERNS`.
+        seed: Seed of paths and noise; the n-th flight does not depend on the number of flights.
+        noise_db: Standard deviation of the receiver's measurement error [dB]; None: 1, and 0 with a
+            truth that has shadowing of its own (`sigma_db`).
+
+    Returns:
+        The measurements; unknown devices are without x and y.
+
+    Raises:
+        BadInput: An unknown pattern, no flight, no UAV, more rows than a table may have, a map of
+            another scene, or one with gains that physics does not allow.
+    """
+    if isinstance(truth, str):
+        truth = read_truth(scene, truth)
+    if noise_db is None:
+        noise_db = 0.0 if "sigma_db" in truth.dataset else 1.0
+    _check(scene, truth, flights, pattern, noise_db)
+    limit_db = scene.config.gain_limit_db
+    row_of = {name: row for row, name in enumerate(truth.devices)}
+    rows = [row_of[device.device] for device in scene.config.devices]
+    gain_db = truth.gain_db[rows].reshape(len(rows), -1).astype(float)
+    shadowing_sd_db = None
+    if "sigma_db" in truth.dataset:
+        shadowing_sd_db = truth.dataset["sigma_db"].values[rows].reshape(gain_db.shape)
+    slot_s, start_s, tables = scene.config.mission.slot_s, 0.0, []
+    with progress("flying", total=flights) as advance:
+        for flight in range(flights):
+            longest = 0
+            for number, uav in enumerate(scene.config.uavs):
+                rng = np.random.default_rng([seed, flight, number])
+                cells = fly(scene, uav, pattern, rng)
+                index = _lattice_index(scene, uav, cells)
+                # NumPy refuses -0.0 for a standard deviation.
+                error_db = rng.normal(0, abs(noise_db), (len(gain_db), len(index)))
+                level_db = gain_db[:, index] + error_db
+                if shadowing_sd_db is not None:
+                    level_db += rng.normal(0, 1, level_db.shape) * shadowing_sd_db[:, index]
+                level_db[level_db < limit_db] = np.nan
+                time_s = start_s + slot_s * np.arange(len(index))
+                tables.append(link_table(scene, f"f{flight}", uav.uav, index, level_db, time_s,
+                                         heading_deg(cells)))
+                longest = max(longest, len(index))
+            start_s += slot_s * longest
+            advance(1)
+    return Measurements(pd.concat(tables, ignore_index=True), declared_devices(scene),
+                        scene.config.origin)
+
+
+def declared_devices(scene: Scene) -> pd.DataFrame:
+    """Return the devices as a survey knows them: unknown ones with their height only.
+
+    Args:
+        scene: Scene that declares them.
+
+    Returns:
+        Rows of `devices.csv`: device, x_m, y_m, z_m, role.
+    """
+    rows = [(device.device,
+             *((device.x_m, device.y_m) if device.role == "anchor" else (np.nan, np.nan)),
+             device.z_m, device.role)
+            for device in scene.config.devices]
+    return pd.DataFrame(rows, columns=["device", "x_m", "y_m", "z_m", "role"])
+
+
+def fly(scene: Scene, uav: UavConfig, pattern: str, rng: np.random.Generator) -> np.ndarray:
+    """Fly one UAV once.
+
+    Args:
+        scene: City and lattice.
+        uav: Its altitude, start, terminal and battery.
+        pattern: Key of `PATTERNS`.
+        rng: Source of the path.
+
+    Returns:
+        (slots, 2) cells (row, column) from its start to its terminal.
+
+    Raises:
+        BadInput: The battery does not reach from the start to the terminal.
+    """
+    lattice = scene.lattice
+    start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m),
+                        round((x_m - lattice.x_m[0]) / lattice.step_m))
+                       for x_m, y_m in ((uav.start_x_m, uav.start_y_m),
+                                        (uav.terminal_x_m, uav.terminal_y_m)))
+    grid = FlightGrid(~scene.blocked[_level(scene, uav)], terminal)
+    needed = grid.steps_home(start) * MOVE_COST
+    if needed > uav.battery:
+        raise BadInput(f"uav {uav.uav!r}: battery = {uav.battery:g} does not reach from its start "
+                       f"to its terminal ({needed:g} moves are needed); raise it in "
+                       f"{scene.folder / 'scene.toml'}")
+    return np.array(PATTERNS[pattern](grid, start, uav.battery, rng))
+
+
+def _level(scene: Scene, uav: UavConfig) -> int:
+    """Return the index of a UAV's altitude."""
+    return int(np.abs(scene.lattice.z_m - uav.altitude_m).argmin())
+
+
+def _lattice_index(scene: Scene, uav: UavConfig, cells: np.ndarray) -> np.ndarray:
+    level = np.full(len(cells), _level(scene, uav))
+    return np.ravel_multi_index((level, cells[:, 0], cells[:, 1]), scene.lattice.shape)
+
+
+def heading_deg(cells: np.ndarray) -> np.ndarray:
+    """Return the heading along a flight, clockwise from north.
+
+    It is that of the last move; the first slot has that of the next move.
+
+    Args:
+        cells: (slots, 2) cells (row, column).
+
+    Returns:
+        (slots,) headings [degrees]; 0 where the UAV never moves.
+    """
+    moves = np.diff(cells, axis=0)
+    heading = pd.Series(np.full(len(cells), np.nan))
+    moved = np.flatnonzero(moves.any(axis=1))
+    heading[moved + 1] = np.degrees(np.arctan2(moves[moved, 1], moves[moved, 0])) % 360
+    return heading.ffill().bfill().fillna(0.0).to_numpy()
+
+
+def link_table(scene: Scene, flight: str, receiver: str, index: np.ndarray, level_db: np.ndarray,
+               time_s: np.ndarray, heading_deg: np.ndarray) -> pd.DataFrame:
+    """Return the measurements of one receiver on one flight as rows of `Measurements.table`.
+
+    Args:
+        scene: Names and order of the devices.
+        flight: Name of the flight.
+        receiver: Name of the receiver.
+        index: (slots,) flat lattice index of the positions.
+        level_db: (devices, slots) gain [dB], NaN where not detected.
+        time_s: (slots,) times [s].
+        heading_deg: (slots,) headings [degrees].
+    """
+    devices, slots = len(level_db), len(index)
+    position_m = scene.lattice.positions_m[index]
+    return pd.DataFrame({
+        "time_s": np.repeat(time_s, devices), "flight": flight, "receiver": receiver,
+        **{f"receiver_{axis}_m": np.repeat(position_m[:, i], devices)
+           for i, axis in enumerate("xyz")},
+        "device": np.tile([device.device for device in scene.config.devices], slots),
+        "gain_db": level_db.T.ravel().round(3), "heading_deg": np.repeat(heading_deg, devices),
+    })
+
+
+def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: float) -> None:
+    path = scene.folder / "scene.toml"
+    if pattern not in PATTERNS:
+        raise BadInput(f"pattern {pattern!r} is unknown; allowed are {', '.join(PATTERNS)}")
+    if not 1 <= flights <= _MAX_FLIGHTS:
+        raise BadInput(f"flights = {flights}: allowed is 1 to {_MAX_FLIGHTS}")
+    if not 0 <= noise_db <= _MAX_NOISE_DB:
+        raise BadInput(f"noise_db = {noise_db}: allowed is 0 to {_MAX_NOISE_DB:g} dB, the standard "
+                       "deviation of a receiver's error")
+    if not scene.config.uavs:
+        raise BadInput(f"{path}: declares no UAV; add at least one [[uavs]] table, or build the "
+                       "scene with --uavs N")
+    if not scene.config.devices:
+        raise BadInput(f"{path}: declares no device; add some, each as a table\n\n"
+                       "[[devices]]\ndevice = 'd0'\nx_m = 10.0\ny_m = 20.0\nz_m = 1.5\n"
+                       "role = 'anchor'\n\nor build the scene with --devices N")
+    slot_cost = HOVER_COST if pattern == "random-walk" else MOVE_COST  # only that pattern hovers
+    slots = flights * sum(uav.battery // slot_cost + 1 for uav in scene.config.uavs)
+    ROWS.check(slots * len(scene.config.devices), f"{path}: {flights} flights, as far as the "
+               "batteries of its UAVs go")
+    scene.check_map(truth)
+    require_possible(scene, truth)

@@ -1,0 +1,1 @@
+"""Propagation: paths over a 3D map, and channel models."""

@@ -1,0 +1,362 @@
+"""Powers and directions of the paths of links over the 3D map, each followed once.
+
+What a box in a known map would block: paths that are followed once, and held against each box.
+
+Nothing is followed anew: what a box itself reflects is missing, and paths that bend at its edges
+are there for the straight line only, as those of knife edges, which the caller adds.
+"""
+
+import time
+from collections import OrderedDict
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy.constants import speed_of_light
+
+from radiotwin.errors import BadInput
+from radiotwin.links import LinkData, LinkGeometry
+from radiotwin.propagation.paths.powers import paths_with_points
+from radiotwin.runtime.console import progress
+from radiotwin.runtime.pieces import KeptParts, Piece
+from radiotwin.runtime.processes import in_threads
+from radiotwin.scene.citymap import CityMap
+
+GRID_M = 0.5  # estimated positions of devices are rounded to it, and share their paths
+MAX_REMEMBERED = 300_000  # links: 200 MB
+MIN_REMEMBERED = 2  # devices, however many links they have
+BATCH_LINKS = 50_000  # of devices that are followed side by side: 30 MB
+LINK_CHUNK = 1000  # whose paths are held before the weakest go: tens of megabytes
+WEAKEST = 1e-3  # of a link's strongest path: most are weaker, and together they carry little
+MIN_STEP_M = 1e-9  # a shorter leg along an axis is none along it
+
+
+def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> np.ndarray:
+    """Return the power gain (n,) of some kinds of paths between isotropic antennas.
+
+    Args:
+        geometry: n links over a map.
+        kinds: names of `radiotwin.propagation.paths.PathPowers`' components; None: all.
+    """
+    from radiotwin.propagation.paths.powers import (
+        COMPONENTS,  # late, as everywhere here: numba is large
+    )
+
+    columns = [COMPONENTS.index(kind) for kind in (COMPONENTS if kinds is None else kinds)]
+    power = np.zeros(len(geometry))
+    for rows, followed, index in _by_device(geometry):
+        power[rows] = followed.powers[index][:, columns].sum(axis=1)
+    return power
+
+
+def interaction_gains(geometry: LinkGeometry) -> np.ndarray:
+    """Return the power gain (n, 3) of the direct, the reflected and the diffracted paths.
+
+    A path with an edge is diffracted, whatever else it has.
+
+    Args:
+        geometry: n links over a map.
+    """
+    from radiotwin.propagation.paths.powers import COMPONENTS
+
+    diffracted = np.array(["diffracted" in kind for kind in COMPONENTS])
+    direct = np.array([kind == "direct" for kind in COMPONENTS])
+    power = np.zeros((len(geometry), 3))
+    for rows, followed, index in _by_device(geometry):
+        by_kind = followed.powers[index]
+        power[rows] = np.column_stack([by_kind[:, which].sum(axis=1) for which in
+                                       (direct, ~direct & ~diffracted, diffracted)])
+    return power
+
+
+def paths_of(links: LinkData, kinds: tuple[str, ...]) -> np.ndarray:
+    """Return `path_gains` (n,) of measured links."""
+    return path_gains(links.geometry, kinds)
+
+
+def rays_of(links: LinkData, end: str) -> np.ndarray:
+    """Return power times direction of the paths at one end of links.
+
+    Args:
+        links: n links over a map.
+        end: `departures` or `arrivals`, see `radiotwin.propagation.paths.PathPowers`.
+
+    Returns:
+        (n, sectors, 3)
+    """
+    from radiotwin.propagation.paths.powers import SECTORS
+
+    rays = np.zeros((len(links), SECTORS, 3), dtype=np.float32)
+    for rows, followed, index in _by_device(links.geometry):
+        rays[rows] = getattr(followed, end)[index]
+    return rays
+
+
+def free_space(geometry: LinkGeometry) -> np.ndarray:
+    """Return the power gain (n,) along the straight line if nothing were in the way (ITU-R P.525).
+
+    0 without a map, where the straight line is all that is known.
+    """
+    if geometry.city is None:
+        return np.zeros(len(geometry))
+    return (speed_of_light / geometry.frequency_hz / (4 * np.pi * geometry.distance_m)) ** 2
+
+
+def through_antenna_db(power: np.ndarray, gain: np.ndarray, scattered: np.ndarray,
+                       mean_gain: float) -> np.ndarray:
+    """Return what an antenna adds to links (n,) [dB].
+
+    Args:
+        power: (n, sectors) of the rays.
+        gain: (n, sectors) of the antenna in their directions, linear.
+        scattered: (n,) power from everywhere.
+        mean_gain: of the antenna over all directions, linear.
+    """
+    received = (power * gain).sum(axis=1) + scattered * mean_gain
+    return 10 * np.log10(received / (power.sum(axis=1) + scattered))
+
+
+class _Followed(NamedTuple):
+    """Paths from one position to ends.
+
+    Attributes:
+        ends: (n,) keys of the ends, sorted.
+        powers: (n, kinds)
+        departures, arrivals: (n, sectors, 3)
+    """
+
+    ends: np.ndarray
+    powers: np.ndarray
+    departures: np.ndarray
+    arrivals: np.ndarray
+
+
+_Position = tuple[float, float, float]  # [m]
+_NewPaths = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+_remembered: OrderedDict[tuple[CityMap, _Position, float], _Followed] = OrderedDict()
+
+
+def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
+    """Yield of each device: its links, what was followed, and each link's row of that."""
+    city = geometry.city
+    if city is None:
+        raise BadInput("the channel image_paths follows paths over a 3D map, and none is given; "
+                       "give it with --scene")
+    devices, first, count = np.unique(geometry.device, return_index=True, return_counts=True)
+    batch = np.cumsum(count) // BATCH_LINKS
+    for number in np.unique(batch):
+        rows = [np.flatnonzero(geometry.device == device) for device in devices[batch == number]]
+        wanted = [(followed_from_m(geometry, row), geometry.receiver_m[mine])
+                  for row, mine in zip(first[batch == number], rows, strict=True)]
+        yield from ((mine, *found) for mine, found in zip(
+            rows, _follow(city, wanted, geometry.frequency_hz), strict=True))
+
+
+def followed_from_m(geometry: LinkGeometry, row: int) -> _Position:
+    """Return where paths of the device of a link are followed from [m]."""
+    assert geometry.city is not None
+    position_m = geometry.device_m[row]
+    if geometry.estimated is not None and geometry.estimated[row]:
+        rounded_m = np.append(np.round(position_m[:2] / GRID_M) * GRID_M, position_m[2])
+        position_m = position_m if geometry.city.inside(rounded_m[None])[0] else rounded_m
+    x_m, y_m, z_m = map(float, position_m)
+    return x_m, y_m, z_m
+
+
+def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
+            frequency_hz: float) -> list[tuple[_Followed, np.ndarray]]:
+    """Return the paths from positions to ends (n, 3) of each, and the row of each end."""
+    from radiotwin.propagation.paths.powers import COMPONENTS, SECTORS
+
+    no_rays = np.zeros((0, SECTORS, 3), dtype=np.float32)
+    nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))), no_rays,
+                        no_rays)
+    keys = [_keys(ends_m) for _, ends_m in wanted]
+    # Sectors of one mast are at one place: what one has followed serves the others.
+    at: dict[_Position, list[int]] = {}
+    for number, (position_m, _) in enumerate(wanted):
+        at.setdefault(position_m, []).append(number)
+    known = {position_m: _remembered.pop((city, position_m, frequency_hz), nothing)
+             for position_m in at}
+    missing = {}
+    for position_m, numbers in at.items():
+        ends, old = np.concatenate([keys[number] for number in numbers]), known[position_m]
+        unknown = np.append(old.ends, -1)[np.searchsorted(old.ends, ends)] != ends
+        if unknown.any():
+            new, first = np.unique(ends[unknown], return_index=True)
+            ends_m = np.concatenate([wanted[number][1] for number in numbers])
+            missing[position_m] = new, (position_m, ends_m[unknown][first])
+    followed = _new_paths(city, [asked for _, asked in missing.values()], frequency_hz)
+    for (position_m, (new, _)), found in zip(missing.items(), followed, strict=True):
+        old = known[position_m]
+        order = np.argsort(np.concatenate([old.ends, new]))
+        known[position_m] = _Followed(*(np.concatenate([each, more])[order]
+                                        for each, more in zip(old, (new, *found), strict=True)))
+    for position_m, each in known.items():
+        _remembered[city, position_m, frequency_hz] = each
+    while len(_remembered) > MIN_REMEMBERED \
+            and sum(len(each.ends) for each in _remembered.values()) > MAX_REMEMBERED:
+        _remembered.popitem(last=False)
+    return [(known[position_m], np.searchsorted(known[position_m].ends, ends))
+            for (position_m, _), ends in zip(wanted, keys, strict=True)]
+
+
+def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
+               frequency_hz: float) -> list[_NewPaths]:
+    """Return powers, departures and arrivals as of `_Followed` from positions to ends (n, 3)."""
+    if not asked:  # as most often: no bar, and no numba, for what is remembered
+        return []
+    from radiotwin.propagation.paths.powers import COMPONENTS, SECTORS, path_powers
+
+    def follow(number: int) -> _NewPaths:
+        position_m, ends_m = asked[number]
+        found = path_powers(city, np.array([position_m]), ends_m, np.zeros(len(ends_m), int),
+                            frequency_hz, "vertical")
+        powers = np.column_stack([getattr(found, name) for name in COMPONENTS])
+        return powers, found.departures.astype(np.float32), found.arrivals.astype(np.float32)
+
+    def write(found: _NewPaths) -> Piece:
+        return dict(zip(("powers", "departures", "arrivals"), found, strict=True)), None
+
+    def read(arrays: dict[str, np.ndarray], _: Any) -> _NewPaths:
+        values = arrays["powers"], arrays["departures"], arrays["arrivals"]
+        ends = len(values[0])
+        if [each.shape for each in values] != [(ends, len(COMPONENTS)), *[(ends, SECTORS, 3)] * 2]:
+            raise ValueError("other shapes")
+        return values
+
+    parts: KeptParts[int, _NewPaths] = KeptParts(
+        "paths", lambda number: (city, *asked[number], frequency_hz), write, read)
+    names = [parts.name(number) for number in range(len(asked))]
+    found = {}
+    for number, (name, (_, ends_m)) in enumerate(zip(names, asked, strict=True)):
+        earlier = parts.find(name) if name else None
+        if earlier is not None and len(earlier[0][0]) == len(ends_m):
+            found[number] = earlier[0]
+    new = [number for number in range(len(asked)) if number not in found]
+    with progress("following paths", total=len(new)) as advance:
+        def timed(number: int) -> tuple[_NewPaths, float]:
+            started = time.perf_counter()
+            value = follow(number)
+            advance()
+            return value, time.perf_counter() - started
+
+        # Threads follow, and one keeps: what is kept notes warnings, of which there is one place.
+        for number, (value, seconds) in zip(new, in_threads(timed, new), strict=True):
+            if names[number]:
+                parts.keep(names[number], value, [], seconds)
+            found[number] = value
+    return [found[number] for number in range(len(asked))]
+
+
+def _keys(positions_m: np.ndarray) -> np.ndarray:
+    """Return (n,) positions (n, 3) to the centimetre as one integer; equal ones are 20 km apart."""
+    x, y, z = (np.round(positions_m * 100).astype(np.int64) & 0x1FFFFF).T
+    return x << 42 | y << 21 | z
+
+
+class UprightBox(NamedTuple):
+    """Where a box stands.
+
+    Attributes:
+        centre_m: x and y [m].
+        half_m: half of its length and of its width [m].
+        turn_rad: of the length, counter-clockwise from east [rad].
+        top_m: z of its roof [m]; below it reaches any depth.
+    """
+
+    centre_m: tuple[float, float]
+    half_m: tuple[float, float]
+    turn_rad: float
+    top_m: float
+
+
+class Power(NamedTuple):
+    """Power gains (n,) of links, linear: of the direct path, of all others, of these past a box."""
+
+    direct: np.ndarray
+    others: np.ndarray
+    others_past: np.ndarray
+
+
+class KnownPaths:
+    """The stronger paths of n links over a map, each link's followed when it is first asked for."""
+
+    def __init__(self, geometry: LinkGeometry, city: CityMap) -> None:
+        self._geometry, self._city = geometry, city
+        self._is_followed = np.zeros(len(geometry), dtype=bool)
+        self._direct = np.zeros(len(geometry))
+        self._paths: tuple[np.ndarray, ...] = ()  # link, power, points and their number, (p, ...)
+
+    def past(self, box: UprightBox, rows: np.ndarray) -> Power:
+        """Return the power of some links (r,), without a box and past one."""
+        self.follow(rows)
+        if not self._paths:
+            nothing = np.zeros(len(rows))
+            return Power(self._direct[rows], nothing, nothing)
+        link, power, points_m, count = self._paths
+        power_past, n = power * ~_blocked(points_m, count, *box), len(self._geometry)
+        return Power(self._direct[rows], np.bincount(link, power, n)[rows],
+                     np.bincount(link, power_past, n)[rows])
+
+    def follow(self, rows: np.ndarray) -> None:
+        """Follow the paths of links (r,), of which some may be known."""
+        geometry, parts = self._geometry, [self._paths] if self._paths else []
+        rows = rows[~self._is_followed[rows]]
+        if not len(rows):
+            return
+        for device in np.unique(geometry.device[rows]):
+            of_device = rows[geometry.device[rows] == device]
+            position_m = np.array(followed_from_m(geometry, int(of_device[0])))
+            for first in range(0, len(of_device), LINK_CHUNK):
+                mine = of_device[first:first + LINK_CHUNK]
+                found = paths_with_points(self._city, position_m, geometry.receiver_m[mine],
+                                          geometry.frequency_hz)
+                strongest = np.zeros(len(mine))
+                np.maximum.at(strongest, found.receiver, found.power)
+                kept = found.power > WEAKEST * strongest[found.receiver]
+                parts.append((mine[found.receiver[kept]], found.power[kept],
+                              found.points_m[kept], found.points[kept]))
+        self._paths = tuple(np.concatenate(each) for each in zip(*parts, strict=True))
+        followed = geometry.select(rows)
+        self._direct[rows] = np.where(followed.los, free_space(followed), 0.0)
+        self._is_followed[rows] = True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blocked(points_m: np.ndarray, count: np.ndarray, centre_m: tuple[float, float],
+             half_m: tuple[float, float], turn_rad: float, top_m: float) -> np.ndarray:
+    """Return whether a leg of each path (p,) goes through a box."""
+    out = np.zeros(len(count), dtype=np.bool_)
+    cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
+    reach_m = np.hypot(half_m[0], half_m[1])
+    for path in range(len(count)):
+        for leg in range(count[path] - 1):
+            x, y = points_m[path, leg, 0] - centre_m[0], points_m[path, leg, 1] - centre_m[1]
+            to_x = points_m[path, leg + 1, 0] - centre_m[0]
+            to_y = points_m[path, leg + 1, 1] - centre_m[1]
+            if min(x, to_x) > reach_m or max(x, to_x) < -reach_m or min(y, to_y) > reach_m \
+                    or max(y, to_y) < -reach_m:  # as nearly all
+                continue
+            z, dx, dy = points_m[path, leg, 2], to_x - x, to_y - y
+            enter, leave = _within(cosine * x + sine * y, cosine * dx + sine * dy, -half_m[0],
+                                   half_m[0], 0.0, 1.0)
+            enter, leave = _within(cosine * y - sine * x, cosine * dy - sine * dx, -half_m[1],
+                                   half_m[1], enter, leave)
+            enter, leave = _within(z, points_m[path, leg + 1, 2] - z, -np.inf, top_m, enter, leave)
+            if enter < leave:
+                out[path] = True
+                break
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _within(start_m: float, step_m: float, low_m: float, high_m: float, enter: float,
+            leave: float) -> tuple[float, float]:
+    """Return the part of a leg from `enter` to `leave` in which it is between two planes."""
+    if abs(step_m) < MIN_STEP_M:
+        return (enter, leave) if low_m <= start_m <= high_m else (1.0, 0.0)
+    first, second = (low_m - start_m) / step_m, (high_m - start_m) / step_m
+    return max(enter, min(first, second)), min(leave, max(first, second))

@@ -1,0 +1,269 @@
+"""The channel that follows reflected and diffracted paths over the 3D map.
+
+Levels of paths over a map whose frame, materials or shapes may be other than declared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+from scipy.optimize import minimize
+from typing_extensions import override
+
+from radiotwin.inference.gaussian import Limit, limits_of
+from radiotwin.links import LinkGeometry
+from radiotwin.propagation.laws.base import (
+    ANY_LEVEL_SD_DB,
+    ChannelModel,
+    require_names,
+    require_number,
+)
+from radiotwin.propagation.laws.class_fit import LinkFit, links_as_one
+from radiotwin.propagation.laws.followed_paths import free_space, interaction_gains, path_gains
+from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
+from radiotwin.propagation.laws.published import free_space_db
+
+MIN_NLOS = 30  # links without line of sight that the diffuse power is fitted to
+DIFFUSE_DEFAULT = (-150.0, 3.0)  # nearly nothing; the exponent then does not matter
+DIFFUSE_BOUNDS = np.array([[-150.0, 2.0], [-60.0, 6.0]])
+NEAR_QUANTILE = 0.05  # of links that are nearer than where diffuse power is bounded
+MIN_LOSS_DB = 6.0  # of diffuse power beside free space: one reflection at concrete loses as much
+DIFFUSE_STARTS_DB = (-100.0, -110.0, -120.0, -130.0)
+LOS_SLOPE_SD_DB, NLOS_SLOPE_SD_DB = 1.0, 5.0  # prior: how wrong the fall may be [dB per decade]
+ERROR_SCALE_DB = 4.0  # of the Cauchy loss of the fit of the diffuse power
+OFFSET_SD_DB = 6.0  # prior of what reflections and diffractions lie above those of the map
+MAX_OFFSET_DB = 20.0
+Offsets = tuple[float, float]
+"""Levels of reflected and of diffracted paths above those of the map [dB]."""
+
+
+class ImagePaths(ChannelModel):
+    """Power of the paths over the map (`radiotwin.propagation.paths`) plus diffuse power.
+
+    The diffuse power stands for what reaches any position on ways that are not followed: more
+    bounces and edges, rough walls. It falls with distance by a law of its own. Levels and slopes,
+    one for each class of line of sight, are fitted with the effects.
+
+    Attributes:
+        law: fitted to the same links; predicts what small changes do, quickly, and the
+            size of the errors.
+        diffuse: gain of the diffuse power at 100 m [dB], and the exponent of its fall.
+    """
+
+    name = "image_paths"
+    uses_map = True
+    follows_paths = True
+
+    def __init__(self, law: ChannelModel | None = None,
+                 diffuse: tuple[float, float] = DIFFUSE_DEFAULT) -> None:
+        self.law: ChannelModel = SegmentedLogDistance() if law is None else law
+        self.diffuse = diffuse
+
+    @override
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+            seed: int = 0) -> Self:
+        self.law.fit(links, level_db, limit_db, seed)
+        return self.fit_diffuse(links, level_db, limit_db)
+
+    def fit_diffuse(self, links: LinkGeometry, level_db: np.ndarray,
+                    limit_db: Limit) -> Self:
+        """Fit the diffuse power to links without line of sight, beside a level of their own.
+
+        Args:
+            links: n links over a map.
+            level_db: (n,) [dB]; NaN = not detected.
+            limit_db: below which levels are not detected [dB], one for all or (n,); None or -inf:
+                unknown.
+        """
+        nlos = links.select(~links.los)
+        level_db = level_db[~links.los]
+        blank = np.isnan(level_db)
+        limits_db = limits_of(limit_db, len(links))[~links.los]
+        level_db = np.where(blank, limits_db, level_db)
+        known = np.isfinite(level_db)
+        # Blanks alone say no more than that it is weak, and the least is.
+        if known.sum() < MIN_NLOS or blank[known].all():
+            self.diffuse = DIFFUSE_DEFAULT
+            return self
+        power = path_gains(nlos)
+        near_m = min(float(np.quantile(links.distance_m, NEAR_QUANTILE)), 100.0)
+
+        def loss(numbers: np.ndarray) -> float:
+            inside = _within_bounds(numbers, near_m, links.frequency_hz)
+            error_db = level_db - with_diffuse_db(power, nlos.distance_m, *inside)
+            error_db = error_db - np.median(error_db[known & ~blank])
+            error_db = np.where(blank, np.minimum(error_db, 0.0), error_db)[known]
+            misfit = np.log1p((error_db / ERROR_SCALE_DB) ** 2).sum()
+            return float(misfit + np.abs(numbers - inside).sum())
+
+        starts = [np.array([start_db, DIFFUSE_DEFAULT[1]]) for start_db in DIFFUSE_STARTS_DB]
+        found = minimize(loss, min(starts, key=loss), method="Nelder-Mead",
+                         options={"xatol": 0.1, "fatol": 0.5}).x
+        gain_db, exponent = _within_bounds(found, near_m, links.frequency_hz)
+        self.diffuse = float(gain_db), float(exponent)
+        return self
+
+    @override
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        return self.level_db(_seen_gains(links), links), self.law.predict(links)[1]
+
+    def level_db(self, power: np.ndarray, links: LinkGeometry) -> np.ndarray:
+        """Return the mean level (n,) [dB] of links whose paths carry these powers (n,)."""
+        return with_diffuse_db(power, links.distance_m, *self.diffuse)
+
+    @property
+    @override
+    def quick(self) -> ChannelModel:
+        return self.law
+
+    @property
+    @override
+    def trend(self) -> ChannelModel:
+        return self
+
+    @override
+    def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        # Slopes: what the map's materials and walls lack adds up on the way.
+        los, slope = links.los, np.log10(links.distance_m / 100.0)
+        columns = np.column_stack([los, ~los, los * slope, ~los * slope])
+        return columns.astype(float), np.array([ANY_LEVEL_SD_DB] * 2 + [LOS_SLOPE_SD_DB,
+                                                                         NLOS_SLOPE_SD_DB])
+
+    @override
+    def error_group(self, links: LinkGeometry) -> np.ndarray:
+        return links.los.astype(int)
+
+    @override
+    def error_groups(self, links: LinkGeometry) -> int:
+        return 2
+
+    @override
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        arrays, settings = self.law.state()
+        return arrays, {"law": self.law.name, "law_settings": settings,
+                        "diffuse": list(self.diffuse)}
+
+    @classmethod
+    @override
+    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        require_names("settings", settings, ["law", "law_settings", "diffuse"])
+        if settings["law"] != SegmentedLogDistance.name:
+            raise ValueError(f"law is not {SegmentedLogDistance.name!r}")
+        return cls(SegmentedLogDistance.from_state(arrays, settings["law_settings"]),
+                   stored_diffuse(settings["diffuse"]))
+
+
+def _seen_gains(links: LinkGeometry) -> np.ndarray:
+    """Return the power (n,) of the paths over a map, with lines of sight as the links have them.
+
+    They may have others than the map: something is in the way, or gone; or paths are those from
+    beside an estimated position. The direct path is lost, then, or is there as in free space, and
+    all other paths stay.
+    """
+    gains = interaction_gains(links)
+    other = (gains[:, 0] > 0) != links.los
+    gains[other, 0] = np.where(links.los[other], free_space(links)[other], 0.0)
+    return gains.sum(axis=1)
+
+
+def stored_diffuse(value: Any) -> tuple[float, float]:
+    """Return the diffuse power that a file has: gain at 100 m [dB], and exponent.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError("the diffuse power is not a gain and an exponent")
+    named = dict(zip(("gain", "exponent"), value, strict=True))
+    return require_number(named, "gain", -300.0, 100.0), require_number(named, "exponent", 0, 20)
+
+
+def _within_bounds(numbers: np.ndarray, near_m: float, frequency_hz: float) -> np.ndarray:
+    """Return the diffuse power (2,) that is nearest and weaker than a way in free space.
+
+    A level of links without line of sight is fitted beside it. Where paths bring nothing that
+    readings show, diffuse power above that of free space would take their place, and then that of
+    the links with line of sight.
+
+    Args:
+        numbers: (2,) gain at 100 m [dB] and exponent.
+        near_m: distance from which on it is to be weaker [m], 100 m or less.
+        frequency_hz: of the radio [Hz].
+    """
+    gain_db, exponent = np.clip(numbers, *DIFFUSE_BOUNDS)
+    most_db = -free_space_db(np.array(100.0), frequency_hz) - MIN_LOSS_DB \
+        + 10 * (exponent - 2.0) * np.log10(near_m / 100.0)
+    return np.array([np.clip(gain_db, None, most_db), exponent])
+
+
+def with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,
+                    exponent: float) -> np.ndarray:
+    """Return the level (n,) [dB] of followed and diffuse power together.
+
+    Args:
+        power: (n,) of the followed paths, linear.
+        distance_m: (n,) [m].
+        gain_db: of the diffuse power at 100 m [dB].
+        exponent: of its fall with distance.
+    """
+    return 10 * np.log10(power + 10 ** (gain_db / 10) * (distance_m / 100.0) ** -exponent)
+
+
+def paths_db(links: LinkGeometry, diffuse: tuple[float, float], offsets_db: Offsets = (0.0, 0.0)
+             ) -> np.ndarray:
+    """Return the level (n,) [dB] of followed paths and diffuse power.
+
+    Args:
+        links: n links over a map.
+        diffuse: power beside the paths, see `ImagePaths`.
+        offsets_db: see `Offsets`.
+    """
+    return _level_db(interaction_gains(links), links.distance_m, diffuse, offsets_db)
+
+
+def moved(links: LinkGeometry, east_m: float, north_m: float) -> LinkGeometry:
+    """Return links with both ends moved over their map; their line of sight is its."""
+    step_m = np.array([east_m, north_m, 0.0])
+    device_m, receiver_m = links.device_m + step_m, links.receiver_m + step_m
+    los = links.los if links.city is None else links.city.line_of_sight(device_m, receiver_m)
+    return replace(links, device_m=device_m, receiver_m=receiver_m, los=los)
+
+
+def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+                diffuse: tuple[float, float]) -> Offsets:
+    """Return what reflections and diffractions carry beside those over the map [dB].
+
+    The most likely ones under a normal prior of `OFFSET_SD_DB`, which keeps them at 0 where levels
+    do not tell the two apart: each class of line of sight has a level of its own.
+
+    Args:
+        links: n links over a map.
+        level_db: (n,) [dB]; NaN: not detected.
+        limit_db: below which levels are not detected [dB], one for all or (n,); None: unknown.
+        diffuse: power beside the paths, see `ImagePaths`.
+    """
+    fit, gains = LinkFit(level_db, limit_db), interaction_gains(links)
+    distance_m = links.distance_m
+    undisturbed_db = _level_db(gains, distance_m, diffuse, np.zeros(2))
+    as_one = links_as_one(links, fit.fit(links.los, undisturbed_db)[1])
+
+    def loss(offsets_db: np.ndarray) -> float:
+        inside = np.clip(offsets_db, -MAX_OFFSET_DB, MAX_OFFSET_DB)
+        prior = 0.5 * (offsets_db**2).sum() / OFFSET_SD_DB**2
+        level_db = _level_db(gains, distance_m, diffuse, inside)
+        return fit.fit(links.los, level_db)[0].sum() / as_one + float(prior)
+
+    simplex = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])
+    found = minimize(loss, np.zeros(2), method="Nelder-Mead",
+                     options={"xatol": 0.1, "fatol": 0.02, "initial_simplex": simplex})
+    reflected_db, diffracted_db = np.clip(found.x, -MAX_OFFSET_DB, MAX_OFFSET_DB).tolist()
+    return reflected_db, diffracted_db
+
+
+def _level_db(gains: np.ndarray, distance_m: np.ndarray, diffuse: tuple[float, float],
+              offsets_db: Offsets | np.ndarray) -> np.ndarray:
+    """Return the level (n,) [dB] of `interaction_gains` (n, 3) and diffuse power."""
+    factor = 10 ** (np.array([0.0, *offsets_db]) / 10)
+    return with_diffuse_db(gains @ factor, distance_m, *diffuse)

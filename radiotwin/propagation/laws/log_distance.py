@@ -1,0 +1,140 @@
+"""The log-distance law: one line for all links, or one with and one without line of sight.
+
+The log-distance law with one exponent for all links, the baseline that needs no map.
+
+The log-distance law with one line for links with line of sight and one for those without.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+from typing_extensions import override
+
+from radiotwin.inference.censored_line import LogDistanceLine, fit_line, shift_line
+from radiotwin.inference.gaussian import Limit
+from radiotwin.links import LinkGeometry
+from radiotwin.propagation.laws.base import (
+    MAX_DB,
+    MIN_DETECTED,
+    ChannelModel,
+    drop_uninformative,
+    require_array,
+    require_lines,
+    require_names,
+)
+
+# Prior of the gap between the lines: in 3GPP TR 38.901 UMi, at 100 m and 2.4 GHz, LoS lies 19 dB
+# above NLoS.
+NLOS_LOSS_DB, NLOS_LOSS_SD_DB = 20.0, 10.0
+BORROWED_SD_DB = 8.0  # least sd of a borrowed line: UMi NLoS has 7.8 dB (TR 38.901 table 7.4.1-1)
+
+
+class LogDistance(ChannelModel):
+    """gain = intercept + 10 * exponent * log10(d / 1 m) + N(0, sd^2), with or without LoS."""
+
+    name = "log_distance"
+    uses_map = False
+
+    def __init__(self, line: LogDistanceLine | None = None) -> None:
+        self.line: LogDistanceLine = line  # type: ignore[assignment]  # None only until it is fitted
+
+    @override
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+            seed: int = 0) -> Self:
+        links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
+        self.line = fit_line(links.log_distance, level_db, limit_db)
+        return self
+
+    @override
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        return self.line.mean_db(links.log_distance), np.full(len(links), self.line.sd_db)
+
+    @override
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        line = self.line
+        return {"line": np.array([line.intercept_db, line.exponent, line.sd_db])}, {}
+
+    @classmethod
+    @override
+    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        require_names("settings", settings, [])
+        require_names("arrays", arrays, ["line"])
+        line = require_lines(require_array(arrays, "line", (3,), -MAX_DB, MAX_DB))
+        return cls(LogDistanceLine(*map(float, line)))
+
+
+class SegmentedLogDistance(ChannelModel):
+    """gain = intercept_s + 10 * exponent_s * log10(d / 1 m) + N(0, sd_s^2), s = LoS or NLoS.
+
+    The segmented law of Chen et al., 'Model-aided federated reinforcement learning for multi-UAV
+    trajectory planning in IoT networks' (GLOBECOM Workshops 2023). A class with fewer than
+    MIN_DETECTED detected links borrows the other's line, with a warning: moved by NLOS_LOSS_DB, a
+    prior that its few links correct, and with a standard deviation of at least BORROWED_SD_DB.
+
+    Attributes:
+        los, nlos: the lines.
+        borrowed: class with the borrowed line, "los" or "nlos"; None: both have lines of their own.
+    """
+
+    name = "segmented_log_distance"
+    uses_map = True
+
+    def __init__(self, los: LogDistanceLine | None = None, nlos: LogDistanceLine | None = None,
+                 borrowed: str | None = None) -> None:
+        self.los: LogDistanceLine = los  # type: ignore[assignment]  # None only until it is fitted
+        self.nlos: LogDistanceLine = nlos  # type: ignore[assignment]
+        self.borrowed = borrowed
+
+    @override
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+            seed: int = 0) -> Self:
+        links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
+        data = {
+            name: (links.log_distance[rows], level_db[rows], limit_db[rows])
+            for name, rows in (("los", links.los), ("nlos", ~links.los))
+        }
+        detected = {name: int(np.isfinite(level).sum()) for name, (_, level, _) in data.items()}
+        poor, rich = sorted(detected, key=lambda name: detected[name])
+        lines = {rich: fit_line(*data[rich])}
+        self.borrowed = poor if detected[poor] < MIN_DETECTED else None
+        if self.borrowed is None:
+            lines[poor] = fit_line(*data[poor])
+        else:
+            wide = replace(lines[rich], sd_db=max(lines[rich].sd_db, BORROWED_SD_DB))
+            prior_db = NLOS_LOSS_DB if poor == "los" else -NLOS_LOSS_DB
+            lines[poor] = shift_line(wide, *data[poor], prior_db, NLOS_LOSS_SD_DB)
+            shift_db = lines[poor].intercept_db - lines[rich].intercept_db
+            labels = {"los": "LoS", "nlos": "NLoS"}
+            warnings.warn(
+                f"only {detected[poor]} detected {labels[poor]} links (wanted: {MIN_DETECTED}), so "
+                f"the {labels[poor]} channel is the {labels[rich]} one moved by {shift_db:+.1f} "
+                f"dB, mostly a guess: measure more {labels[poor]} links before relying on it",
+                stacklevel=2)
+        self.los, self.nlos = lines["los"], lines["nlos"]
+        return self
+
+    @override
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        intercept_db, exponent, sd_db = self.state()[0]["lines"][links.los.astype(np.intp)].T
+        return intercept_db + 10.0 * exponent * links.log_distance, sd_db
+
+    @override
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return `lines`: (2, 3) intercept [dB], exponent, sd [dB] of NLoS, then of LoS."""
+        lines = [[line.intercept_db, line.exponent, line.sd_db] for line in (self.nlos, self.los)]
+        return {"lines": np.array(lines)}, {"borrowed": self.borrowed}
+
+    @classmethod
+    @override
+    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        require_names("settings", settings, ["borrowed"])
+        require_names("arrays", arrays, ["lines"])
+        lines = require_lines(require_array(arrays, "lines", (2, 3), -MAX_DB, MAX_DB))
+        if settings["borrowed"] not in (None, "los", "nlos"):
+            raise ValueError("borrowed is none of null, los, nlos")
+        nlos, los = (LogDistanceLine(*map(float, row)) for row in lines)
+        return cls(los, nlos, settings["borrowed"])

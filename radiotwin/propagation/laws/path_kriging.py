@@ -1,0 +1,234 @@
+"""Paths over a map that may be wrong, and what was measured near by, each as far as it helps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+from typing_extensions import override
+
+from radiotwin.inference.gaussian import Limit, standardised
+from radiotwin.links import LinkGeometry
+from radiotwin.propagation.laws.base import (
+    MAX_DB,
+    MAX_SD_DB,
+    ChannelModel,
+    drop_uninformative,
+    require_array,
+    require_names,
+    require_number,
+)
+from radiotwin.propagation.laws.class_fit import DOF, fit_class, scale_db
+from radiotwin.propagation.laws.image_paths import DIFFUSE_DEFAULT, paths_db, stored_diffuse
+from radiotwin.propagation.laws.kriging import RegressionKriging, ResidualField
+from radiotwin.propagation.laws.map_error import Found, MapError, estimate_map_error
+from radiotwin.scene.perturbation import perturbed_map
+
+MEMBERS = 6  # maps with errors, beside the one that is given
+FOLDS = 4  # of the links that the weight is found with
+BLOCK_M = 60.0  # side of the squares of ground that are left out together
+SPREAD_FACTOR = np.sqrt(DOF / (DOF - 2))  # standard deviation over scale of the errors
+
+
+class PathKriging(ChannelModel):
+    """A mean over two predictions, weighted by how well each predicts links that it has not seen.
+
+    One follows paths over the map (`ImagePaths`), and over maps with errors as large as the given
+    one seems to have (`MapError`): its mean is theirs, and where they disagree it is unsure. What
+    it leaves of the measured links is interpolated for each device. The other is
+    `RegressionKriging`, which knows only which links have line of sight.
+
+    A device is its index in `LinkGeometry.device`: use the same indices to fit and to predict.
+
+    Attributes:
+        diffuse: power beside the paths, see `ImagePaths`.
+        map_error: of the map, as far as the links show it.
+        lost: devices whose positions are too uncertain to follow paths from; kriging alone predicts
+            their links.
+        classes: (2, 2) level and own error scale [dB] of links without and with line of sight.
+        field: interpolation of what paths leave.
+        kriging: the other prediction.
+        weight: (2,) of the paths' prediction, without and with line of sight.
+        seed: of the maps' errors.
+    """
+
+    name = "path_kriging"
+    uses_map = True
+    follows_paths = True
+
+    def __init__(self, found: Found | None = None, lost: tuple[int, ...] = ()) -> None:
+        """Make a model to be fitted.
+
+        Args:
+            found: the map's error and the diffuse power where they are known already, as of
+                `estimate_map_error`.
+            lost: see the class.
+        """
+        self._found, self.lost = found, np.array(lost, dtype=np.int64)
+        self.map_error, self.diffuse = found or (MapError(), DIFFUSE_DEFAULT)
+        self.classes = np.array([[0.0, 5.0], [0.0, 5.0]])
+        self.field = ResidualField()
+        self.kriging = RegressionKriging()
+        self.weight = np.ones(2)
+        self.seed = 0
+
+    @override
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+            seed: int = 0) -> Self:
+        links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
+        self.seed = seed
+        sure = ~np.isin(links.device, self.lost)
+        self.map_error, self.diffuse = self._found or estimate_map_error(
+            links.select(sure), level_db[sure], limit_db[sure], seed)
+        links = self.map_error.on_map(links)
+        self.kriging.fit(links, level_db, limit_db, seed)
+        links, level_db, limit_db = links.select(sure), level_db[sure], limit_db[sure]
+        paths = self._over_maps(links)
+        self._fit_classes(links, level_db, limit_db, *paths)
+        self._fit_field(links, level_db, limit_db, *paths)
+        self.weight = self._held_out_weight(links, level_db, limit_db, *paths)
+        return self
+
+    @override
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        links = self.map_error.on_map(links)
+        mean_db, sd_db = self.kriging.predict(links)
+        sure = np.flatnonzero(~np.isin(links.device, self.lost))
+        followed = links.select(sure)
+        by_paths = self._with_field(self.field, followed, *self._over_maps(followed))
+        share = self.weight[followed.los.astype(int)]
+        mean_db[sure], sd_db[sure] = _mixture(share, by_paths, (mean_db[sure], sd_db[sure]))
+        return mean_db, sd_db
+
+    @property
+    @override
+    def quick(self) -> ChannelModel:
+        return self.kriging.law
+
+    @property
+    @override
+    def trend(self) -> ChannelModel:
+        return self.kriging.law
+
+    def _over_maps(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean level (n,) [dB] and its mean square change (n,) [dB²] over possible maps."""
+        power = self.diffuse, self.map_error.offsets_db
+        levels_db = [paths_db(links, *power)]
+        if self.map_error.is_seen and links.city is not None:
+            for member in range(MEMBERS):
+                wrong = perturbed_map(links.city, self.map_error.wall_m[0],
+                                      self.map_error.height_m[0], self.seed + member)
+                # Line of sight stays that of the given map, whose class the links belong to.
+                levels_db.append(paths_db(replace(links, city=wrong), *power))
+        unbiased = len(levels_db) / max(len(levels_db) - 1, 1)
+        return np.mean(levels_db, axis=0), unbiased * np.var(levels_db, axis=0)
+
+    def _fit_classes(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
+                     mean_db: np.ndarray, square_db: np.ndarray) -> None:
+        heard = [int(np.isfinite(level_db[links.los == los]).sum()) for los in (False, True)]
+        for los in (False, True):
+            mine = links.los == los
+            if heard[los]:
+                fit = fit_class(level_db[mine], limit_db[mine], mean_db[mine], square_db[mine])
+                self.classes[int(los)] = fit.level_db, np.exp(fit.numbers[1])
+        for los in (False, True):
+            if not heard[los]:  # nothing is known of it but what the other shows
+                self.classes[int(los)] = self.classes[1 - int(los)]
+
+    def _at_paths(self, links: LinkGeometry, mean_db: np.ndarray, square_db: np.ndarray
+                  ) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and standard deviation (n,) [dB] without what is interpolated."""
+        level_db, own_db = self.classes[links.los.astype(int)].T
+        return mean_db + level_db, SPREAD_FACTOR * scale_db(own_db, square_db)
+
+    def _fit_field(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
+                   mean_db: np.ndarray, square_db: np.ndarray) -> None:
+        mean_db, sd_db = self._at_paths(links, mean_db, square_db)
+        residual = standardised(level_db, mean_db, sd_db, limit_db)
+        self.field.fit(links.device, links.receiver_m, residual, self.seed)
+
+    def _with_field(self, field: ResidualField, links: LinkGeometry, mean_db: np.ndarray,
+                    square_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        mean_db, sd_db = self._at_paths(links, mean_db, square_db)
+        mean, sd = field.predict(links.device, links.receiver_m)
+        return mean_db + sd_db * mean, sd_db * sd
+
+    def _held_out_weight(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
+                         mean_db: np.ndarray, square_db: np.ndarray) -> np.ndarray:
+        """Return the weights (2,) that predict links in squares of ground left out best.
+
+        Least squares over the detected links, within 0 and 1. The correlations are those of all
+        links.
+        """
+        square = np.floor(links.receiver_m[:, :2] / BLOCK_M)
+        label = np.unique(square, axis=0, return_inverse=True)[1].reshape(-1)
+        rng = np.random.default_rng(self.seed)
+        fold = rng.permutation(np.arange(label.max() + 1) % FOLDS)[label]
+        errors_db = np.full((2, len(links)), np.nan)
+        own = *self._at_paths(links, mean_db, square_db), self.field
+        law = *self.kriging.law.predict(links), self.kriging.field
+        for row, (there_db, sd_db, field) in enumerate((own, law)):
+            residual = standardised(level_db, there_db, sd_db, limit_db)
+            for number in range(FOLDS):
+                rest, held = fold != number, fold == number
+                if not held.any() or not rest.any():
+                    continue
+                refitted = field.with_points(links.device[rest], links.receiver_m[rest],
+                                             residual[rest])
+                mean, _ = refitted.predict(links.device[held], links.receiver_m[held])
+                errors_db[row, held] = level_db[held] - there_db[held] - sd_db[held] * mean
+        weight = np.ones(2)
+        for los in (False, True):
+            mine = (links.los == los) & np.isfinite(errors_db).all(axis=0)
+            by_paths, by_law = errors_db[:, mine]
+            apart = by_law - by_paths
+            if (apart**2).sum() > 0:
+                weight[int(los)] = np.clip((by_law * apart).sum() / (apart**2).sum(), 0.0, 1.0)
+        return weight
+
+    @override
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        own, own_settings = self.field.state()
+        law, law_settings = self.kriging.state()
+        arrays = {f"paths/{name}": value for name, value in own.items()} \
+            | {f"law/{name}": value for name, value in law.items()}
+        return arrays | {"classes": self.classes, "weight": self.weight}, {
+            "lost": self.lost.tolist(),
+            "diffuse": list(self.diffuse), "map_error": self.map_error.state(),
+            "paths": own_settings, "law": law_settings, "seed": self.seed}
+
+    @classmethod
+    @override
+    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        require_names("settings", settings, ["diffuse", "map_error", "lost", "paths", "law",
+                                              "seed"])
+        strange = [name for name in arrays if name not in ("classes", "weight")
+                   and not name.startswith(("paths/", "law/"))]
+        if strange:
+            raise ValueError(f"array {strange[0][:60]!r} is unknown")
+        if not isinstance(settings["lost"], list):
+            raise ValueError("lost is no list of devices")
+        lost = {str(place): value for place, value in enumerate(settings["lost"])}
+        model = cls((MapError.from_state(settings["map_error"]),
+                     stored_diffuse(settings["diffuse"])),
+                    tuple(int(require_number(lost, place, 0, 2**31)) for place in lost))
+        model.seed = int(require_number(settings, "seed", 0, 2**63))
+        model.classes = require_array(arrays, "classes", (2, 2), -MAX_DB, MAX_DB)
+        if not ((model.classes[:, 1] > 0) & (model.classes[:, 1] <= MAX_SD_DB)).all():
+            raise ValueError("an error scale is impossible")
+        model.weight = require_array(arrays, "weight", (2,), 0.0, 1.0)
+        own, law = ({name.removeprefix(f"{part}/"): value for name, value in arrays.items()
+                     if name.startswith(f"{part}/")} for part in ("paths", "law"))
+        model.field = ResidualField.from_state(own, settings["paths"])
+        model.kriging = RegressionKriging.from_state(law, settings["law"])
+        return model
+
+
+def _mixture(share: np.ndarray, first: tuple[np.ndarray, np.ndarray],
+             second: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation (n,) of a mixture of two normal distributions."""
+    mean_db = share * first[0] + (1 - share) * second[0]
+    square_db = share * (first[1]**2 + (first[0] - mean_db)**2) \
+        + (1 - share) * (second[1]**2 + (second[0] - mean_db)**2)
+    return mean_db, np.sqrt(square_db)

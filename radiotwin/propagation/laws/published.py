@@ -1,0 +1,241 @@
+"""The base of published laws: predictions of a recommendation as they stand, fitted to nothing.
+
+They are priors, where no device of known position was measured, and baselines elsewhere. A link
+has two branches, with line of sight and without. A 3D map decides which one holds; without a map
+they are mixed by the law's probability of line of sight.
+
+Recommendations are written for a fixed station and a terminal. Paths are reciprocal, so most laws
+here know a higher and a lower end, heights above the ground.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+from typing_extensions import override
+
+from radiotwin.errors import BadInput
+from radiotwin.inference.gaussian import Limit
+from radiotwin.io.texts import percent, shortly
+from radiotwin.links import LinkGeometry
+from radiotwin.propagation.laws.base import MAX_DB, ChannelModel, require_names, require_number
+from radiotwin.scene.citymap import CityMap
+
+MAX_FACTOR = 2.0  # beyond its range of frequencies to which a law is extrapolated, with a warning
+MIN_ROOF_M = 2.5  # of what counts as a building
+GRID = 128  # points to each side of the map, at which its roofs are looked up
+MAX_ROOF_M = 1e4  # of a stored roof
+
+
+Bounds = tuple[float | np.ndarray, float | np.ndarray]
+"""Least and greatest value, of all links or (n,) of each."""
+
+
+class Validity(NamedTuple):
+    """Range that a law was published for.
+
+    Attributes:
+        frequency_hz: of the radio [Hz].
+        distance_m: between the ends [m].
+        high_m, low_m: height of the higher and of the lower end [m].
+    """
+
+    frequency_hz: Bounds
+    distance_m: Bounds
+    high_m: Bounds = (0.0, np.inf)
+    low_m: Bounds = (0.0, np.inf)
+
+
+class Branch(NamedTuple):
+    """Median loss (n,) [dB] of links of one class, and the standard deviation of shadowing."""
+
+    loss_db: np.ndarray
+    sd_db: np.ndarray | float
+
+
+class PublishedLaw(ChannelModel):
+    """A law of a recommendation; the gain is minus its median loss.
+
+    Attributes:
+        source: recommendation, and the section or table used.
+        frequency_range_hz: least and greatest frequency that any of its branches holds for [Hz].
+        needs_map: whether it has no probability of line of sight, so that a map must decide.
+        frequency_hz: of the radio [Hz].
+        with_map: whether `los` of links decides the branch.
+        roof_m: mean height of the map's roofs [m]; 0 without a map.
+        power_dbm: transmit power, where levels are received powers [dBm]; 0 for gains.
+    """
+
+    uses_map = True
+    needs_map: ClassVar[bool] = False
+    source: ClassVar[str]
+    frequency_range_hz: ClassVar[tuple[float, float]]
+
+    def __init__(self, frequency_hz: float = np.nan, with_map: bool = False, roof_m: float = 0.0,
+                 power_dbm: float = 0.0) -> None:
+        self.frequency_hz, self.with_map = frequency_hz, with_map
+        self.roof_m, self.power_dbm = roof_m, power_dbm
+
+    @abstractmethod
+    def branch(self, links: LinkGeometry, los: bool) -> Branch:
+        """Return loss and shadowing of n links, if all have line of sight, or if none has."""
+
+    @abstractmethod
+    def validity(self, links: LinkGeometry) -> Validity:
+        """Return what the branches that n links take were published for."""
+
+    def los_probability(self, links: LinkGeometry) -> np.ndarray:
+        """Return the probability (n,) of line of sight; needed unless `needs_map`."""
+        raise NotImplementedError(f"{self.name} has no probability of line of sight")
+
+    @override
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+            seed: int = 0) -> Self:
+        """Take frequency and map from links; nothing is fitted, and there may be no link at all.
+
+        Raises:
+            BadInput: the frequency is unknown or far outside the law's range, or a law that needs
+                a map with buildings has none.
+        """
+        low_hz, high_hz = self.frequency_range_hz
+        if not low_hz / MAX_FACTOR <= links.frequency_hz <= high_hz * MAX_FACTOR:
+            given = ("is not known; give frequency_hz" if np.isnan(links.frequency_hz)
+                     else f"is {links.frequency_hz / 1e9:g} GHz; take another model")
+            raise BadInput(f"the radio's frequency {given}: {self.name} ({self.source}) holds from "
+                           f"{low_hz / 1e9:g} to {high_hz / 1e9:g} GHz, and is used from half to "
+                           "twice that")
+        self.frequency_hz, self.with_map = links.frequency_hz, links.city is not None
+        if self.needs_map:
+            if links.city is None:
+                raise BadInput(f"{self.name} needs a 3D map, which says which links have line of "
+                               "sight and how high roofs are; give a scene, or take tr36777_uma or "
+                               "al_hourani_urban, which have a probability of line of sight")
+            self.roof_m = mean_roof_m(links.city)
+            if self.roof_m == 0.0:
+                raise BadInput(f"{self.name} is a law of cities, and the 3D map has no building "
+                               f"above {MIN_ROOF_M:g} m; take another model")
+        return self
+
+    @override
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and standard deviation [dB], see the base class.
+
+        Those of a mixture of both branches: its variance is the mean of theirs, plus that of the
+        two medians.
+        """
+        los, nlos = self.branch(links, True), self.branch(links, False)
+        share = links.los.astype(float) if self.with_map else self.los_probability(links)
+        loss_db = share * los.loss_db + (1 - share) * nlos.loss_db
+        variance = (share * np.square(los.sd_db) + (1 - share) * np.square(nlos.sd_db)
+                    + share * (1 - share) * (los.loss_db - nlos.loss_db) ** 2)
+        return self.power_dbm - loss_db, np.sqrt(variance)
+
+    def outside(self, links: LinkGeometry) -> list[str]:
+        """Return a sentence on each quantity that lies outside the law's validity."""
+        found = []
+        for what, value, least, most, unit in self._quantities(links):
+            odd = (value < least) | (value > most)
+            if not odd.any():
+                continue
+            ends = sorted({shortly(value[odd].min()), shortly(value[odd].max())}, key=_value)
+            share = "" if (value == value[0]).all() and odd.all() else f" in {percent(odd.mean())}"
+            ranges = sorted(set(zip(least[odd].tolist(), most[odd].tolist(), strict=True)))
+            published = " or ".join(_range(*each) for each in ranges)
+            found.append(f"{self.name} is used outside what {self.source} was published for: the "
+                         f"{what} is {' to '.join(ends)} {unit}{share and share + ' of the links'}"
+                         f", published is {published} {unit}")
+        return found
+
+    def inside(self, links: LinkGeometry) -> np.ndarray:
+        """Return whether all quantities of each link lie within the law's validity (n,)."""
+        result = np.ones(len(links), dtype=bool)
+        for _, value, least, most, _ in self._quantities(links):
+            result &= (value >= least) & (value <= most)
+        return result
+
+    def _quantities(self, links: LinkGeometry,
+                    ) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray, str]]:
+        """Return name, values, least and greatest published ones, (n,) each, and the unit."""
+        high_m, low_m = ends_m(links)
+        valid = self.validity(links)
+        least_hz, most_hz = valid.frequency_hz
+        frequency_ghz = np.full(len(links), self.frequency_hz / 1e9)
+        every = [("frequency", frequency_ghz, (np.divide(least_hz, 1e9), np.divide(most_hz, 1e9)),
+                  "GHz"),
+                 ("distance", links.distance_m, valid.distance_m, "m"),
+                 ("height of the higher end", high_m, valid.high_m, "m"),
+                 ("height of the lower end", low_m, valid.low_m, "m")]
+        return [(what, value, np.broadcast_to(least, value.shape),
+                 np.broadcast_to(most, value.shape), unit)
+                for what, value, (least, most), unit in every if len(value)]
+
+    @override
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        return {}, {"frequency_hz": float(self.frequency_hz), "with_map": bool(self.with_map),
+                    "roof_m": float(self.roof_m), "power_dbm": float(self.power_dbm)}
+
+    @classmethod
+    @override
+    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        require_names("arrays", arrays, [])
+        require_names("settings", settings, ["frequency_hz", "with_map", "roof_m", "power_dbm"])
+        if not isinstance(settings["with_map"], bool):
+            raise ValueError("with_map is neither true nor false")
+        if cls.needs_map and not settings["with_map"]:
+            raise ValueError(f"{cls.name} needs a map")
+        low_hz, high_hz = cls.frequency_range_hz
+        frequency_hz = require_number(settings, "frequency_hz", low_hz / MAX_FACTOR,
+                                      high_hz * MAX_FACTOR)
+        roof_m = require_number(settings, "roof_m", MIN_ROOF_M if cls.needs_map else 0.0,
+                                MAX_ROOF_M)
+        return cls(frequency_hz, settings["with_map"], roof_m,
+                   require_number(settings, "power_dbm", -MAX_DB, MAX_DB))
+
+
+def heights_m(links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+    """Return the heights (n,) above the ground of devices and of receivers [m]."""
+    device_m, receiver_m = links.device_m[:, 2], links.receiver_m[:, 2]
+    if links.city is not None and links.city.terrain is not None:
+        device_m = device_m - links.city.ground_height_m(*links.device_m[:, :2].T)
+        receiver_m = receiver_m - links.city.ground_height_m(*links.receiver_m[:, :2].T)
+    return device_m, receiver_m
+
+
+def ends_m(links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+    """Return the heights (n,) above the ground of the higher and of the lower end of links [m]."""
+    both_m = heights_m(links)
+    return np.maximum(*both_m), np.minimum(*both_m)
+
+
+def ground_m(links: LinkGeometry) -> np.ndarray:
+    """Return the horizontal distance (n,) between the ends [m]."""
+    offset_m = links.receiver_m[:, :2] - links.device_m[:, :2]
+    return np.hypot(offset_m[:, 0], offset_m[:, 1])
+
+
+def free_space_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
+    """Return the basic transmission loss of free space [dB] (ITU-R P.525-4, Eq. 4)."""
+    return 32.45 + 20 * np.log10(frequency_hz / 1e6) + 20 * np.log10(distance_m / 1e3)
+
+
+def mean_roof_m(city: CityMap) -> float:
+    """Return the mean height of a map's roofs above the ground below [m]; 0 without any."""
+    low_m, high_m = city.vertices[:, :2].min(axis=0), city.vertices[:, :2].max(axis=0)
+    share = (np.arange(GRID) + 0.5) / GRID
+    x_m, y_m = (low + share * (high - low) for low, high in zip(low_m, high_m, strict=True))
+    height_m = city.height_at(*np.meshgrid(x_m, y_m)) - city.ground_height_m(*np.meshgrid(x_m, y_m))
+    roofs_m = height_m[height_m > MIN_ROOF_M]
+    return float(roofs_m.mean()) if len(roofs_m) else 0.0
+
+
+def _range(least: float, most: float) -> str:
+    """Return the words for a published range."""
+    if np.isinf(most):
+        return f"{least:g} and more"
+    return f"{least:g} to {most:g}"
+
+
+def _value(text: str) -> float:
+    return float(text.replace(",", ""))

@@ -1,0 +1,209 @@
+"""Every channel model by name, and a fitted one as a safetensors file.
+
+Every channel model by name: the built-in ones, and what installed packages add.
+
+A package adds models under the entry-point group `radiotwin.channels`; a script adds one with
+`register`.
+
+A fitted channel model as one safetensors file: arrays and JSON, no code that loading runs.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from safetensors.numpy import save
+
+from radiotwin.errors import BadInput
+from radiotwin.inference.gaussian import Limit
+from radiotwin.io.array_file import parse_arrays
+from radiotwin.io.files import atomic_file
+from radiotwin.io.inputs import parse_json, read_bytes
+from radiotwin.links import LinkGeometry
+from radiotwin.propagation.laws.aerial import (
+    AlHouraniDenseUrban,
+    AlHouraniHighRise,
+    AlHouraniSuburban,
+    AlHouraniUrban,
+    UrbanMacro,
+    UrbanMicro,
+)
+from radiotwin.propagation.laws.base import ChannelModel
+from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.propagation.laws.kriging import RegressionKriging
+from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
+from radiotwin.propagation.laws.path_kriging import PathKriging
+from radiotwin.propagation.laws.segmented_nn import SegmentedNN
+from radiotwin.propagation.laws.urban import P1411, WalfischIkegami, WalfischIkegamiMetropolitan
+from radiotwin.runtime.pieces import kept
+from radiotwin.runtime.plugins import load_plugins
+
+ENTRY_POINTS = "radiotwin.channels"  # group of the packages' entry points
+BUILT_IN: tuple[type[ChannelModel], ...] = (
+    LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging, ImagePaths, PathKriging,
+    UrbanMacro, UrbanMicro, AlHouraniSuburban, AlHouraniUrban, AlHouraniDenseUrban,
+    AlHouraniHighRise, P1411, WalfischIkegami, WalfischIkegamiMetropolitan)
+ALIASES = {"raytrace": ImagePaths.name}  # as the command line calls it
+_registered: dict[str, type[ChannelModel]] = {}
+BESIDE = "beside/"  # begins the names of arrays that are not the model's
+# Distances and heights [m] at which a model that is read must predict numbers.
+_TRIED_M = np.array([(1.0, 0.0), (30.0, 10.0), (300.0, -50.0), (3e3, 100.0), (1e5, 3e3)])
+
+
+def register(model: type[ChannelModel]) -> type[ChannelModel]:
+    """Add a channel model to this process; usable as a decorator.
+
+    Args:
+        model: subclass of `ChannelModel`, with a name of its own.
+
+    Returns:
+        the class itself
+
+    Raises:
+        BadInput: not a channel model, or its name is taken.
+    """
+    if not (isinstance(model, type) and issubclass(model, ChannelModel)):
+        raise BadInput(f"{model!r} is not a subclass of radiotwin.propagation.laws.ChannelModel")
+    taken = {each.name: each for each in BUILT_IN} | _registered
+    if taken.get(model.name, model) is not model:
+        raise BadInput(f"the channel model {model.name!r} of {model.__module__} is in "
+                       f"{taken[model.name].__module__} already; give it another name")
+    _registered[model.name] = model
+    return model
+
+
+def channel_models() -> dict[str, type[ChannelModel]]:
+    """Return all channel models by name: built-in, of installed packages, and registered.
+
+    Warns where a package's model cannot be loaded, and goes on without it.
+    """
+    load_plugins(ENTRY_POINTS, register, "channel model")
+    return {each.name: each for each in BUILT_IN} | _registered
+
+
+def channel_named(name: str) -> type[ChannelModel]:
+    """Return a channel model's class.
+
+    Args:
+        name: of the model, or an alias of it.
+
+    Raises:
+        BadInput: no such model is installed.
+    """
+    models = channel_models()
+    name = ALIASES.get(name, name)
+    if name not in models:
+        allowed = [*(each for each in models if each not in ALIASES.values()), *ALIASES]
+        raise BadInput(f"channel model {name!r} is unknown; allowed are {', '.join(allowed)}")
+    return models[name]
+
+
+def save_channel(model: ChannelModel, path: str | Path) -> None:
+    """Write a fitted model, so that `load_channel` returns one with equal predictions.
+
+    Args:
+        model: fitted.
+        path: file to write; replaced if it is there.
+    """
+    with atomic_file(path) as file:
+        file.write(encode_channel(model))
+
+
+def fit_once(kind: type[ChannelModel], links: LinkGeometry, level_db: np.ndarray,
+             limit_db: Limit, seed: int) -> ChannelModel:
+    """Fit a new model, or take it from an earlier run that was to fit the same.
+
+    Args:
+        kind: of model.
+        links: n links.
+        level_db: (n,) [dB]; NaN: not detected.
+        limit_db: level below which the receiver does not detect [dB]; None: unknown.
+        seed: as of `ChannelModel.fit`.
+
+    Raises:
+        BadInput: as of `ChannelModel.fit`.
+    """
+    return kept("channel", (kind, links, level_db, limit_db, seed),
+                lambda: kind().fit(links, level_db, limit_db, seed), kind.state, kind.from_state)
+
+
+def load_channel(path: str | Path) -> ChannelModel:
+    """Read a model that `save_channel` wrote.
+
+    Args:
+        path: file to read.
+
+    Returns:
+        fitted model
+
+    Raises:
+        BadInput: the file is missing, damaged, of a model that is not installed, or of something
+            else.
+    """
+    return decode_channel(read_bytes(path, "channel model"), path)
+
+
+def encode_channel(model: ChannelModel, beside: dict[str, np.ndarray] | None = None) -> bytes:
+    """Return a fitted model as the content of a safetensors file.
+
+    Args:
+        model: fitted.
+        beside: arrays of something else that the file is to hold, by name.
+    """
+    arrays, settings = model.state()
+    arrays = arrays | {f"{BESIDE}{name}": array for name, array in (beside or {}).items()}
+    # One key, because safetensors writes several in an order that changes from run to run.
+    header = {"channel": json.dumps({"model": model.name, "settings": settings}, sort_keys=True)}
+    return save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, header)
+
+
+def decode_channel(data: bytes, source: object) -> ChannelModel:
+    """Return the model that `encode_channel` described; arguments as of `decode_both`."""
+    return decode_both(data, source)[0]
+
+
+def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np.ndarray]]:
+    """Return the model that `encode_channel` described, and the arrays beside it.
+
+    Args:
+        data: content of the file.
+        source: where it is from, for the message.
+
+    Raises:
+        BadInput: as `load_channel`.
+    """
+    models = channel_models()
+    try:
+        arrays, text = parse_arrays(data, "channel", source)
+        header = parse_json(text, source)
+        bad = [name for name, array in arrays.items() if not np.isfinite(array).all()]
+        if bad:
+            raise ValueError(f"{', '.join(bad)} holds values that are not finite")
+        beside = {name.removeprefix(BESIDE): array for name, array in arrays.items()
+                  if name.startswith(BESIDE)}
+        # A model may keep its arrays and change them.
+        model = models[header["model"]].from_state(
+            {name: array.copy() for name, array in arrays.items() if not name.startswith(BESIDE)},
+            header["settings"])
+        if type(model) in BUILT_IN:  # one of a package's own may need a map
+            _try_to_predict(model)
+        return model, beside
+    except (BadInput, LookupError, ValueError, TypeError, AttributeError, ArithmeticError,
+            RuntimeError) as error:
+        raise BadInput(f"{source}: not a whole channel model of one of {', '.join(models)} "
+                       f"({type(error).__name__}: {str(error)[:300]}); run `radiotwin fit` "
+                       "again") from error
+
+
+def _try_to_predict(model: ChannelModel) -> None:
+    """Raise ValueError where links without a map get a level that is no number."""
+    horizontal_m, rise_m = np.tile(_TRIED_M, (2, 1)).T
+    count, zero = len(rise_m), np.zeros(len(rise_m))
+    links = LinkGeometry(np.zeros((count, 3)), np.column_stack([horizontal_m, zero, rise_m]),
+                         np.arange(count) % 2 == 1, np.zeros(count, dtype=int))
+    with np.errstate(all="ignore"):
+        mean_db, sd_db = model.quick.predict(links)
+    if not (np.isfinite(mean_db).all() and np.isfinite(sd_db).all() and (sd_db >= 0).all()):
+        raise ValueError("it predicts levels that are no numbers")

@@ -1,0 +1,466 @@
+"""Sequences of interactions that are tried: found by shooting rays, and ways to edges.
+
+Sequences of interactions that are tried from one device.
+
+Ways from a device to the edges that it lights, directly or after reflections.
+
+A city has far more edges than a device sees. Points along each edge are therefore joined with the
+device, by way of the facets in between; an edge of which the device sees no such point is not
+tried. Of the facets that are seen from an edge only those count which the cone of diffracted rays
+can reach: by Keller's law a receiver, or its image, decides where on the edge the ray bends, so
+the corners of a facet bound that place.
+
+Sequences of facets that rays visit, found by shooting and bouncing rays.
+
+A path of several reflections visits a sequence of facets. A city has too many sequences to try
+them all, so rays are shot from the device in all directions and reflected where they hit; the
+sequences that they visit are the candidates (Ling, Chou, Lee, "Shooting and bouncing rays", IEEE
+Trans. Antennas Propag. 37(2), 1989). The paths themselves are then found by the image method,
+exactly. Facets that face the device, and their edges, are candidates whether a ray hits or not.
+"""
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from functools import lru_cache
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numba import njit
+
+from radiotwin.propagation.paths.clearance import clear_paths
+from radiotwin.propagation.paths.facets import (
+    Edges,
+    Facets,
+    build_topology,
+    expand,
+    extract_edges,
+    extract_facets,
+)
+from radiotwin.propagation.paths.images import (
+    MAX_INTERACTIONS,
+    Candidates,
+    PathBuffer,
+    reflections_back,
+    sequence_length,
+    source_images,
+)
+from radiotwin.propagation.paths.pruning import cone_misses, lit_part
+from radiotwin.propagation.paths.surfaces import (
+    ALONG,
+    LENGTH,
+    NORMAL_0,
+    NORMAL_N,
+    OFFSET,
+    START,
+    Surfaces,
+    pack,
+)
+from radiotwin.propagation.paths.two_edges import FacetEdges
+from radiotwin.propagation.paths.wedges import around_edge
+from radiotwin.scene.citymap import SKIN_M, CityMap
+
+SAMPLE_M, SAMPLE_RAD = 0.3, 0.002  # [m], [rad] seen from the device: step of points on an edge
+SAMPLE_CHUNK = 100_000  # points at once: about 50 MB
+RAY_CHUNK = 200_000  # rays at once: about 60 MB
+DEVICE_RAYS = 100_000  # about half a degree apart
+EDGE_RAYS = 300  # about 12 degrees apart
+EDGE_CHUNK = 500  # edges at once whose surroundings are searched: about 100 MB
+MAX_REMEMBERED_BYTES = 2**25  # of one search, so 400 MB of all that `candidate_search` keeps
+
+
+class Ways(NamedTuple):
+    """Ways to edges.
+
+    Attributes:
+        before: (w, a) facets before the edge; then -1.
+        edge: (w,) rows of the edges.
+        lit_m: (w, 2) start and end of the part of the edge that the device's image lights [m].
+        source_m: (w, 2) position of that image along the edge, and distance from its line [m].
+    """
+
+    before: np.ndarray
+    edge: np.ndarray
+    lit_m: np.ndarray
+    source_m: np.ndarray
+
+
+def open_ways(
+    city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
+) -> Ways:
+    """Keep the ways on which nothing blocks every point of the edge.
+
+    Args:
+        city: 3D map.
+        surfaces: of the map.
+        before: (w, a) facets before the edge; then -1.
+        edge: (w,) rows of the edges.
+        device_m: (3,) position of the device [m].
+
+    Returns:
+        Those of the ways that the device sees the edge by.
+    """
+    lit_m, source_m, samples = _lit_parts(surfaces, before, edge, device_m)
+    points = PathBuffer.allocate(SAMPLE_CHUNK + int(samples.max(initial=0)))
+    one_by_one = Candidates(before, np.full(len(edge), -1), before[:, :0])
+    way, is_seen = 0, np.zeros(len(edge), dtype=bool)
+    while way < len(edge):
+        found, way = _sample(surfaces, before, edge, device_m, lit_m, samples, way, points)
+        is_seen[points.candidate[clear_paths(city, surfaces, one_by_one, points, found)]] = True
+    seen = np.flatnonzero(is_seen)
+    return Ways(before[seen], edge[seen], lit_m[seen], source_m[seen])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lit_parts(
+    surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the lit part and the source as of `Ways`, and the number of points (w,) to try."""
+    image = np.empty((MAX_INTERACTIONS + 1, 3))
+    lit_m, source_m = np.zeros((len(edge), 2)), np.zeros((len(edge), 2))
+    samples = np.zeros(len(edge), dtype=np.int64)
+    for way in range(len(edge)):
+        facets = before[way, :sequence_length(before, way)]
+        if not source_images(surfaces.planes, facets, device_m, image):
+            continue
+        x, y, z = image[len(facets)]
+        is_open, along_m, across_m = around_edge(surfaces.edges, edge[way], x, y, z)
+        if not is_open:
+            continue
+        low_m, high_m = lit_part(surfaces.planes, surfaces.edges, edge[way], facets, image)
+        if low_m < high_m:
+            lit_m[way, 0], lit_m[way, 1] = low_m, high_m
+            source_m[way, 0], source_m[way, 1] = along_m, across_m
+            nearest_m = min(max(along_m, low_m), high_m) - along_m
+            step_m = max(SAMPLE_M, SAMPLE_RAD * np.sqrt(across_m ** 2 + nearest_m ** 2))
+            samples[way] = 2 + int((high_m - low_m) / step_m)
+    return lit_m, source_m, samples
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample(
+    surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray,
+    lit_m: np.ndarray, samples: np.ndarray, way: int, points: PathBuffer,
+) -> tuple[int, int]:
+    """Put paths to points of lit parts, just off the edge, in a buffer, from a way on.
+
+    Returns:
+        Their number, and the way to go on with.
+    """
+    edges = surfaces.edges
+    image = np.empty((MAX_INTERACTIONS + 1, 3))
+    found = 0
+    while way < len(edge) and found < SAMPLE_CHUNK:
+        facets = before[way, :sequence_length(before, way)]
+        if samples[way]:
+            source_images(surfaces.planes, facets, device_m, image)
+        at = edge[way]
+        out_x = edges[at, NORMAL_0] + edges[at, NORMAL_N]
+        out_y = edges[at, NORMAL_0 + 1] + edges[at, NORMAL_N + 1]
+        out_z = edges[at, NORMAL_0 + 2] + edges[at, NORMAL_N + 2]
+        skin = SKIN_M / np.sqrt(out_x ** 2 + out_y ** 2 + out_z ** 2)
+        for k in range(samples[way]):
+            share = (k + 0.5) / samples[way]
+            along_m = lit_m[way, 0] + share * (lit_m[way, 1] - lit_m[way, 0])
+            along_m = min(max(along_m, 0.0), edges[at, LENGTH])
+            x = edges[at, START] + along_m * edges[at, ALONG]
+            y = edges[at, START + 1] + along_m * edges[at, ALONG + 1]
+            z = edges[at, START + 2] + along_m * edges[at, ALONG + 2]
+            points_m = points.points_m[found]
+            if reflections_back(surfaces.planes, surfaces.triangle_uv_m, facets, x, y, z, image,
+                                points_m):
+                points_m[0, 0], points_m[0, 1], points_m[0, 2] = device_m
+                points_m[len(facets) + 1, 0] = x + skin * out_x
+                points_m[len(facets) + 1, 1] = y + skin * out_y
+                points_m[len(facets) + 1, 2] = z + skin * out_z
+                points.candidate[found], points.count[found] = way, len(facets) + 2
+                found += 1
+        way += 1
+    return found, way
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def with_facets_after(
+    surfaces: Surfaces, ways: Ways, first: np.ndarray, end: np.ndarray, after: np.ndarray,
+    depth: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Combine each way to an edge with the sequences of facets after it that rays can reach.
+
+    Args:
+        surfaces: of the map.
+        ways: to edges.
+        first: (e,) first row in `after` of each edge.
+        end: (e,) the row after its last one.
+        after: (m, b) facets after the edge; then -1.
+        depth: maximum number of interactions.
+
+    Returns:
+        (c,) row of the way, and (c,) row of `after`.
+    """
+    total = 0
+    for way in range(len(ways.edge)):
+        total += end[ways.edge[way]] - first[ways.edge[way]]
+    of_way, of_after = np.empty(total, dtype=np.int64), np.empty(total, dtype=np.int64)
+    count = 0
+    for way in range(len(ways.edge)):
+        edge = ways.edge[way]
+        room = depth - 1 - sequence_length(ways.before, way)
+        for row in range(first[edge], end[edge]):
+            length = sequence_length(after, row)
+            if length <= room and not cone_misses(
+                    surfaces.planes, surfaces.edges, edge, after[row, :length], ways.lit_m[way],
+                    ways.source_m[way]):
+                of_way[count], of_after[count] = way, row
+                count += 1
+    return of_way[:count], of_after[:count]
+
+
+@dataclass(frozen=True, eq=False)
+class FacetSequences:
+    """Sequences of facets that rays from sources visit; the first row of each source is empty.
+
+    Attributes:
+        source: (c,) row of the source.
+        facets: (c, depth) rows of `Surfaces`, then -1.
+        order: (c,) number of facets.
+        next_facets: (m, 2) a sequence, and a facet that rays hit after it.
+    """
+
+    source: np.ndarray
+    facets: np.ndarray
+    order: np.ndarray
+    next_facets: np.ndarray
+
+
+@lru_cache(maxsize=4)
+def sphere(count: int) -> np.ndarray:
+    """Return (count, 3) unit vectors of a Fibonacci lattice (Gonzalez, Math. Geosci. 42, 2010)."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    radius = np.sqrt(1 - z * z)
+    vectors = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
+    vectors.flags.writeable = False  # it is remembered
+    return vectors
+
+
+def device_sequences(
+    city: CityMap, facets: Facets, normal: np.ndarray, device_m: np.ndarray, depth: int,
+    rays: int = DEVICE_RAYS,
+) -> FacetSequences:
+    """Find the sequences of facets that rays from a device visit.
+
+    Args:
+        city: 3D map.
+        facets: of the city.
+        normal: (f + 1, 3) of `Surfaces`.
+        device_m: (3,) position [m].
+        depth: maximum number of facets of a sequence.
+        rays: that are shot.
+
+    Returns:
+        The sequences of up to `depth` facets.
+    """
+    direction = sphere(rays)
+    start_m = np.broadcast_to(device_m, direction.shape)
+    return _shoot(city, facets, normal, start_m, direction, np.zeros(len(direction), dtype=int), 1,
+                  depth)
+
+
+def edge_sequences(
+    city: CityMap, facets: Facets, normal: np.ndarray, edges: Edges, rows: np.ndarray, depth: int
+) -> FacetSequences:
+    """Find the sequences of facets that rays from edges visit.
+
+    Rays start at most 20 m apart along an edge. The surroundings of an edge are seen from many
+    starts, so fewer rays do than from a device.
+
+    Args:
+        city: 3D map.
+        facets: of the city.
+        normal: (f + 1, 3) of `Surfaces`.
+        edges: of the city.
+        rows: (n,) rows of `edges`: the sources.
+        depth: maximum number of facets of a sequence.
+
+    Returns:
+        The sequences of up to `depth` facets.
+    """
+    offset_m = (edges.end_m - edges.start_m)[rows]
+    starts = np.maximum(np.ceil(np.linalg.norm(offset_m, axis=1) / 20.0).astype(int), 1)
+    source, within = expand(starts)
+    outward = (edges.normal_0 + edges.normal_n)[rows]
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    share = (within + 0.5) / starts[source]
+    start_m = edges.start_m[rows[source]] + share[:, None] * offset_m[source] \
+        + SKIN_M * outward[source]
+    direction = sphere(EDGE_RAYS)
+    is_open = np.maximum(edges.normal_0[rows] @ direction.T, edges.normal_n[rows] @ direction.T) > 0
+    at, ray = np.nonzero(is_open[source])
+    return _shoot(city, facets, normal, start_m[at], direction[ray], source[at], len(rows), depth)
+
+
+def _shoot(
+    city: CityMap, facets: Facets, normal: np.ndarray, start_m: np.ndarray, direction: np.ndarray,
+    source: np.ndarray, sources: int, depth: int,
+) -> FacetSequences:
+    """Follow rays (n, 3) of sources (n,) through `depth` reflections, and to the facet after."""
+    row = source  # of each ray: the sequence that it has visited
+    sequences, of_source = [np.empty((sources, 0), dtype=int)], [np.arange(sources)]
+    first = [0]
+    seen = []
+    count = sources
+    for level in range(depth + 1):
+        distance_m, facet = np.concatenate(
+            [_first_facets(city, facets, start_m[a:a + RAY_CHUNK], direction[a:a + RAY_CHUNK])
+             for a in range(0, len(start_m), RAY_CHUNK)] or [np.empty((2, 0))], axis=1)
+        hit = np.flatnonzero(facet >= 0)
+        row, facet = row[hit], facet[hit].astype(int)
+        # Few are distinct: faster than `np.unique`, which sorts all.
+        inverse, pairs = pd.factorize(row * len(normal) + facet, sort=True)
+        parent, last = np.divmod(pairs, len(normal))
+        seen.append(np.column_stack([parent, last]))
+        if level == depth:
+            break
+        sequences.append(np.column_stack([sequences[-1][parent - first[-1]], last]))
+        of_source.append(of_source[-1][parent - first[-1]])
+        first.append(count)
+        row = count + inverse
+        count += len(pairs)
+        direction, outward = direction[hit], normal[facet]
+        start_m = start_m[hit] + distance_m[hit, None] * direction + SKIN_M * outward
+        direction = direction - 2 * np.einsum("ij,ij->i", direction, outward)[:, None] * outward
+    padded = [np.pad(part, ((0, 0), (0, depth - part.shape[1])), constant_values=-1)
+              for part in sequences]
+    order = np.repeat(np.arange(len(sequences)), [len(part) for part in sequences])
+    return FacetSequences(np.concatenate(of_source), np.concatenate(padded), order,
+                          np.concatenate(seen))
+
+
+def _first_facets(
+    city: CityMap, facets: Facets, start_m: np.ndarray, direction: np.ndarray
+) -> np.ndarray:
+    """Return (2, n) distance [m] and facet that rays hit first; -1: none, or a face's back."""
+    distance_m, face, cosine = city.first_hits_towards(start_m, direction)
+    facet = np.where(face >= 0, facets.of_face[face], -1)
+    facet[(face >= 0) & (cosine >= 0)] = -1
+    if city.terrain is not None:
+        return np.stack([distance_m, facet])
+    # Flat ground is infinite here; the city's mesh of it may end, or there may be none
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fall_m = np.where(direction[:, 2] < 0, -start_m[:, 2] / direction[:, 2], np.inf)
+    on_ground = (fall_m > 0) & (fall_m < np.inf) & (distance_m > fall_m - 0.1)
+    return np.stack([np.where(on_ground, np.maximum(fall_m, 0), distance_m),
+                     np.where(on_ground, len(facets), facet)])
+
+
+@lru_cache(maxsize=12)  # a map and those with errors that stand beside it
+def candidate_search(city: CityMap, depth: int) -> "CandidateSearch":
+    """Return the search of a city, made once: it keeps the surroundings of edges it has seen."""
+    return CandidateSearch(city, depth)
+
+
+class CandidateSearch:
+    """Search for the candidates of devices in one city; several threads may ask it.
+
+    Args:
+        city: 3D map.
+        depth: maximum number of interactions of a path, at least 1.
+
+    Attributes:
+        facets: of the city.
+        edges: of the city.
+        surfaces: both, for compiled code.
+        is_ground: (f + 1,) bool, rows of the ground in `surfaces.planes`.
+        facet_edges: edges at each facet.
+    """
+
+    def __init__(self, city: CityMap, depth: int) -> None:
+        topology = build_topology(city)
+        self.facets = extract_facets(city, topology)
+        self.edges = extract_edges(city, self.facets, topology)
+        self.surfaces = pack(self.facets, self.edges, city.terrain is None)
+        self.is_ground = np.zeros(len(self.facets) + 1, dtype=bool)
+        self.is_ground[-1] = True
+        if city.terrain is not None:
+            self.is_ground[self.facets.of_face[city.terrain]] = True
+        self._city, self._depth = city, depth
+        self._after = np.empty((0, depth - 1), dtype=int)
+        self._first_after, self._end_after = np.full((2, len(self.edges)), -1)
+        self._remembered: OrderedDict[tuple[bytes, int], Candidates] = OrderedDict()
+        self._one_at_a_time = Lock()
+        facet = self.edges.facet.ravel()
+        edge = np.repeat(np.arange(len(self.edges)), 2)
+        order = np.lexsort((edge, facet))
+        self.facet_edges = FacetEdges(self.facets.of_face, edge[order], np.searchsorted(
+            facet[order], np.arange(len(self.facets) + 2)))
+
+    def candidates(self, device_m: np.ndarray, rays: int = DEVICE_RAYS) -> Candidates:
+        """Find the sequences from a device, those without an edge first, and remember them.
+
+        Args:
+            device_m: (3,) position [m].
+            rays: that are shot from it.
+
+        Returns:
+            All sequences of up to `depth` interactions that are worth trying.
+        """
+        key = np.asarray(device_m, dtype=float).tobytes(), rays
+        with self._one_at_a_time:
+            if key in self._remembered:
+                self._remembered.move_to_end(key)
+                return self._remembered[key]
+        found = self._find(device_m, rays)
+        with self._one_at_a_time:
+            self._remembered[key] = found
+            while len(self._remembered) > 1 and sum(
+                    each.nbytes for of_device in self._remembered.values()
+                    for each in of_device) > MAX_REMEMBERED_BYTES:
+                self._remembered.popitem(last=False)
+        return found
+
+    def _find(self, device_m: np.ndarray, rays: int) -> Candidates:
+        normal, offset_m = self.surfaces.planes[:, :3], self.surfaces.planes[:, OFFSET]
+        sequences = device_sequences(self._city, self.facets, normal, device_m, self._depth,
+                                     rays)
+        facing = np.flatnonzero(normal @ device_m > offset_m)
+        single = np.full((len(facing), self._depth), -1)
+        single[:, 0] = facing
+        reflections = np.unique(np.concatenate([sequences.facets[sequences.order > 0], single]),
+                                axis=0)
+        ways = open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
+        with self._one_at_a_time:
+            self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
+            after = self._after  # others replace it, its rows stay
+        way, row = with_facets_after(self.surfaces, ways, self._first_after, self._end_after,
+                                     after, self._depth)
+        none = np.full((len(reflections), self._depth), -1)
+        return Candidates(np.concatenate([reflections, ways.before[way]]),
+                          np.concatenate([none[:, 0], ways.edge[way]]),
+                          np.concatenate([none[:, 1:], after[row]]))
+
+    def _to_edges(
+        self, sequences: FacetSequences, facing: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return facets (n, depth) and edge (n,) of the ways to the edges of all facets hit."""
+        direct = np.column_stack([np.zeros(len(facing), dtype=int), facing])
+        reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]
+        pairs = np.concatenate([direct, reflected])
+        pairs = pairs[sequences.order[pairs[:, 0]] < self._depth]
+        first = self.facet_edges.first[pairs[:, 1]]
+        row, within = expand(self.facet_edges.first[pairs[:, 1] + 1] - first)
+        edge = self.facet_edges.edge[first[row] + within]
+        both = np.unique(np.column_stack([pairs[row, 0], edge]), axis=0)
+        return sequences.facets[both[:, 0]], both[:, 1]
+
+    def _look_around(self, edges: np.ndarray) -> None:
+        """Find the sequences of facets after edges (n,)."""
+        for start in range(0, len(edges), EDGE_CHUNK):
+            part = edges[start:start + EDGE_CHUNK]
+            found = edge_sequences(self._city, self.facets, self.surfaces.planes[:, :3],
+                                   self.edges, part, self._depth - 1)
+            order = np.argsort(found.source, kind="stable")
+            bounds = np.searchsorted(found.source[order], np.arange(len(part) + 1))
+            self._first_after[part] = len(self._after) + bounds[:-1]
+            self._end_after[part] = len(self._after) + bounds[1:]
+            self._after = np.concatenate([self._after, found.facets[order]])

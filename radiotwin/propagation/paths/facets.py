@@ -1,0 +1,461 @@
+"""Facets and edges of a triangulated city.
+
+Planar facets of a city: triangles of one material that share a segment and lie in one plane.
+
+Edges of a city that diffract: roof edges and corners of buildings.
+
+Faces of two materials form no edge. In Sionna RT, whose gains are the truth here, they belong to
+two meshes, and no ray is diffracted where two meshes meet; `build-scene --material` gives a
+building one material where its roof is to diffract.
+
+Around a segment the triangles that meet there are sorted by angle; an open sector of more than
+180 degrees between two of them is a wedge. This also holds where several buildings touch: a shared
+wall that is built over leaves no wedge.
+
+A triangulated city as a graph: which triangles meet along which segments.
+
+City models are rarely clean: corners are stored once per building, walls are cut into slices that
+do not end where those of the neighbour do (T-junctions), and slivers are left over. So corners
+closer than `WELD_M` become one, every side of a triangle is split at the corners that lie on it,
+and slivers are dropped; their neighbours then meet along the same short segments.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from radiotwin.errors import BadInput
+from radiotwin.propagation.paths.vectors import cross, dot
+from radiotwin.propagation.paths.vectors import cross as cross_product
+from radiotwin.scene.citymap import CityMap
+
+WELD_M = 0.002  # [m], well above the single precision of PLY files: 0.06 mm at 1 km
+QUERY_CHUNK = 2_000  # sides per query of the tree: bounds the memory
+COPLANAR_M = 0.005  # [m], maximum distance of a neighbour's corner from the plane
+MAX_TRIANGLES_AT_SEGMENT = 12  # triangles that may meet at one segment
+TRIED_SIDES = 16  # of a facet's triangles, to lay its bounding rectangle along
+
+
+@dataclass(frozen=True, eq=False)
+class Topology:
+    """Triangles and the segments that they share.
+
+    Attributes:
+        vertices_m: (v, 3) welded corners [m].
+        triangles: (t, 3) indices of corners, counter-clockwise seen from outside; without slivers
+            and without faces on flat ground.
+        source: (t,) face of the city that each triangle is.
+        normal: (t, 3) outward unit normals.
+        segments: (s, 2) corners, lower index first, one row for each triangle that borders on the
+            segment, sorted.
+        owner: (s,) the triangle of each row.
+        group: (g + 1,) first row of each distinct segment.
+    """
+
+    vertices_m: np.ndarray
+    triangles: np.ndarray
+    source: np.ndarray
+    normal: np.ndarray
+    segments: np.ndarray
+    owner: np.ndarray
+    group: np.ndarray
+
+
+def build_topology(city: CityMap) -> Topology:
+    """Weld the corners of a city, split its triangles' sides and sort the segments.
+
+    Args:
+        city: 3D map.
+
+    Returns:
+        The topology of all faces but those of a flat ground, within 5 cm of z = 0.
+
+    Raises:
+        BadInput: a corner is not finite.
+    """
+    if not np.isfinite(city.vertices).all():
+        raise BadInput("the city has corners that are not finite numbers [m]; repair its meshes")
+    vertices_m, index = _weld(city.vertices)
+    corners = index[city.faces]
+    normal, height_m = _normals_and_heights(vertices_m[corners])
+    on_plane = city.on_ground if city.terrain is None else np.zeros(len(corners), dtype=bool)
+    source = np.flatnonzero((height_m > WELD_M) & ~on_plane)
+    triangles, normal = corners[source], normal[source]
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    unique, inverse = np.unique(sides, axis=0, return_inverse=True)
+    pieces, side_of_piece = _split(vertices_m, unique)
+    segments, owner = _rows_of_sides(pieces, side_of_piece, inverse.reshape(-1), len(unique))
+    order = np.lexsort((owner, segments[:, 1], segments[:, 0]))
+    segments, owner = segments[order], owner[order]
+    is_new = np.ones(len(segments), dtype=bool)
+    is_new[1:] = (segments[1:] != segments[:-1]).any(axis=1)
+    group = np.append(np.flatnonzero(is_new), len(segments))
+    return Topology(vertices_m, triangles, source, normal, segments, owner, group)
+
+
+def _weld(vertices_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean positions of corners within `WELD_M`, and the row of each vertex in them."""
+    exact, index = np.unique(vertices_m, axis=0, return_inverse=True)
+    pairs = cKDTree(exact).query_pairs(WELD_M, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T.reshape(2, -1)), shape=(len(exact),) * 2)
+    count, label = connected_components(graph, directed=False)
+    mean_m = np.zeros((count, 3))
+    np.add.at(mean_m, label, exact)
+    return mean_m / np.bincount(label)[:, None], label[index.reshape(-1)]
+
+
+def _normals_and_heights(triangle_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit normals (n, 3) and smallest heights (n,) [m] of triangles (n, 3, 3)."""
+    cross = np.cross(triangle_m[:, 1] - triangle_m[:, 0], triangle_m[:, 2] - triangle_m[:, 0])
+    twice_area = np.linalg.norm(cross, axis=1)
+    sides_m = np.linalg.norm(triangle_m - np.roll(triangle_m, 1, axis=1), axis=2)
+    longest_m = np.maximum(sides_m.max(axis=1), 1e-12)
+    return cross / np.maximum(twice_area, 1e-12)[:, None], twice_area / longest_m
+
+
+def _split(vertices_m: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split sides at the corners on them; return (p, 2) corners and the side of each piece (p,)."""
+    tree = cKDTree(vertices_m)
+    start, end = vertices_m[sides[:, 0]], vertices_m[sides[:, 1]]
+    length_m = np.linalg.norm(end - start, axis=1)
+    side, corner = [np.arange(len(sides))] * 2, [sides[:, 0], sides[:, 1]]
+    along_m = [np.zeros(len(sides)), length_m]
+    for first in range(0, len(sides), QUERY_CHUNK):
+        part = slice(first, first + QUERY_CHUNK)
+        found = tree.query_ball_point((start[part] + end[part]) / 2, length_m[part] / 2)
+        row = first + np.repeat(np.arange(len(found)), [len(near) for near in found])
+        near = np.concatenate([np.asarray(near, dtype=int) for near in found])
+        offset = vertices_m[near] - start[row]
+        direction = (end[row] - start[row]) / length_m[row, None]
+        at_m = np.einsum("ij,ij->i", offset, direction)
+        aside_m = np.linalg.norm(offset - at_m[:, None] * direction, axis=1)
+        on = (aside_m < WELD_M) & (at_m > WELD_M) & (at_m < length_m[row] - WELD_M)
+        side.append(row[on])
+        corner.append(near[on])
+        along_m.append(at_m[on])
+    sides, corners = np.concatenate(side), np.concatenate(corner)
+    order = np.lexsort((np.concatenate(along_m), sides))
+    sides, corners = sides[order], corners[order]
+    same_side = sides[1:] == sides[:-1]
+    return np.column_stack([corners[:-1], corners[1:]])[same_side], sides[:-1][same_side]
+
+
+def _rows_of_sides(
+    pieces: np.ndarray, side_of_piece: np.ndarray, side_of_row: np.ndarray, side_count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return corners (s, 2) and triangle (s,) of each piece of each side of each triangle."""
+    count = np.bincount(side_of_piece, minlength=side_count)
+    first = np.cumsum(count) - count
+    row, within = expand(count[side_of_row])
+    return np.sort(pieces[first[side_of_row[row]] + within], axis=1), row // 3
+
+
+def expand(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for `count[i]` repeats of each row i, the row and the number of the repeat.
+
+    >>> [array.tolist() for array in expand(np.array([2, 0, 1]))]
+    [[0, 0, 2], [0, 1, 0]]
+    """
+    row = np.repeat(np.arange(len(count)), count)
+    return row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
+
+
+@dataclass(frozen=True, eq=False)
+class Facets:
+    """Planar facets; the plane of each is normal · p = offset_m.
+
+    Attributes:
+        normal: (f, 3) outward unit normals.
+        offset_m: (f,) distances of the planes from the origin [m].
+        origin_m: (f, 3) a corner of the bounding rectangle [m].
+        axis_u: (f, 3) unit vectors along one side of it.
+        axis_v: (f, 3) unit vectors along the other; u × v = normal.
+        size_m: (f, 2) lengths of the sides [m].
+        full: (f,) bool: the facet fills its bounding rectangle.
+        first: (f + 1,) first row in `triangle_uv_m` of each facet.
+        triangle_uv_m: (t, 6) corners u, v, u, v, u, v of the triangles in the plane [m].
+        of_face: (city faces,) facet of each face of the city; -1: a sliver, or on flat ground.
+        material: (f,) row of the city's materials.
+    """
+
+    normal: np.ndarray
+    offset_m: np.ndarray
+    origin_m: np.ndarray
+    axis_u: np.ndarray
+    axis_v: np.ndarray
+    size_m: np.ndarray
+    full: np.ndarray
+    first: np.ndarray
+    triangle_uv_m: np.ndarray
+    of_face: np.ndarray
+    material: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.normal)
+
+
+def extract_facets(city: CityMap, topology: Topology | None = None) -> Facets:
+    """Merge the triangles of a city to facets; faces on flat ground, z = 0, are left out.
+
+    Args:
+        city: 3D map.
+        topology: of this city; None: built here.
+
+    Returns:
+        The facets, in the order of their first triangle.
+
+    Raises:
+        BadInput: a corner is not finite.
+    """
+    topology = topology or build_topology(city)
+    material = city.material[topology.source]
+    label = _coplanar_groups(topology, material)
+    count = int(label.max()) + 1 if len(label) else 0
+    order = np.argsort(label, kind="stable")
+    first = np.searchsorted(label[order], np.arange(count + 1))
+    corners_m = topology.vertices_m[topology.triangles[order]]
+    cross = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    normal, origin_m, axis_u, axis_v, size_m, full = np.split(
+        _frames(corners_m, cross, first), [3, 6, 9, 12, 14], axis=1)
+    of_row = label[order]
+    offset_m = corners_m - origin_m[of_row, None]
+    uv_m = np.stack([np.einsum("ikj,ij->ik", offset_m, axis[of_row]) for axis in (axis_u, axis_v)],
+                    axis=2)
+    of_face = np.full(len(city.faces), -1)
+    of_face[topology.source] = label
+    return Facets(normal, np.einsum("ij,ij->i", normal, origin_m), origin_m, axis_u, axis_v,
+                  size_m, full[:, 0] > 0, first, uv_m.reshape(-1, 6), of_face,
+                  material[order][first[:-1]])
+
+
+def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
+    """Return the facet (t,) of each triangle, which is of a material (t,)."""
+    size = np.diff(topology.group)
+    pairs = [np.empty((0, 2), dtype=int)]
+    for i in range(MAX_TRIANGLES_AT_SEGMENT):
+        for j in range(i + 1, MAX_TRIANGLES_AT_SEGMENT):
+            first = topology.group[:-1][size > j]
+            pairs.append(np.column_stack([topology.owner[first + i], topology.owner[first + j]]))
+    a, b = np.concatenate(pairs).T
+    corners_m = topology.vertices_m[topology.triangles]
+    normal = topology.normal
+    same = np.einsum("ij,ij->i", normal[a], normal[b]) > np.cos(np.radians(0.5))
+    same &= material[a] == material[b]
+    for one, other in ((a, b), (b, a)):
+        off_m = np.einsum("ikj,ij->ik", corners_m[other] - corners_m[one][:, :1], normal[one])
+        same &= (np.abs(off_m) < COPLANAR_M).all(axis=1)
+    graph = coo_matrix((np.ones(same.sum()), (a[same], b[same])), shape=(len(normal),) * 2)
+    return connected_components(graph, directed=False)[1]
+
+
+@njit(cache=True)
+def _frames(corners_m: np.ndarray, cross: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the planes of facets and their smallest bounding rectangles.
+
+    A rectangle is tried along the `TRIED_SIDES` longest sides of a facet's triangles.
+
+    Args:
+        corners_m: (t, 3, 3) triangles, facet after facet [m].
+        cross: (t, 3) outward normals of the triangles, twice as long as their areas [m²].
+        first: (f + 1,) first triangle of each facet.
+
+    Returns:
+        (f, 15) normal, origin, axes u and v, size, and whether the facet fills the rectangle.
+    """
+    out = np.empty((len(first) - 1, 15))
+    for facet in range(len(first) - 1):
+        points_m = corners_m[first[facet]:first[facet + 1]].copy().reshape(-1, 3)
+        weight = cross[first[facet]:first[facet + 1]]
+        normal = weight.sum(axis=0)
+        area_m2 = np.sqrt(dot(normal, normal)) / 2.0
+        normal = normal / (2.0 * area_m2)
+        distance_m = whole = 0.0
+        sides = np.empty_like(points_m)
+        for k in range(len(points_m)):
+            sides[k] = points_m[k + 1 if k % 3 < 2 else k - 2] - points_m[k]
+            share = np.sqrt(dot(weight[k // 3], weight[k // 3]))
+            distance_m += share * dot(points_m[k], normal)
+            whole += share
+        longest = np.argsort(-(sides ** 2).sum(axis=1), kind="mergesort")[:TRIED_SIDES]
+        min_area_m2 = np.inf
+        for k in longest:
+            along = sides[k] - dot(sides[k], normal) * normal
+            along = along / np.sqrt(dot(along, along))
+            across = cross_product(normal, along)
+            low_u = low_v = np.inf
+            high_u = high_v = -np.inf
+            for point_m in points_m:
+                u, v = dot(point_m, along), dot(point_m, across)
+                low_u, high_u = min(low_u, u), max(high_u, u)
+                low_v, high_v = min(low_v, v), max(high_v, v)
+            tried_m2 = (high_u - low_u) * (high_v - low_v)
+            if tried_m2 < min_area_m2 * (1.0 - 1e-9):
+                min_area_m2 = tried_m2
+                out[facet, 3:6] = low_u * along + low_v * across + distance_m / whole * normal
+                out[facet, 6:9], out[facet, 9:12] = along, across
+                out[facet, 12], out[facet, 13] = high_u - low_u, high_v - low_v
+        out[facet, :3] = normal
+        out[facet, 14] = area_m2 >= (1.0 - 1e-6) * min_area_m2
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Convex edges between two facets.
+
+    Where a building leans on a higher one without sharing its corners, the edge of its roof in
+    that wall is listed, too; it lies inside the other building, so no ray reaches it. A half plane
+    sweeps the open space when it is turned from face 0 by `exterior_rad` towards `normal_0`.
+
+    Attributes:
+        start_m: (e, 3) starts [m].
+        end_m: (e, 3) ends [m].
+        direction: (e, 3) unit vectors from start to end.
+        facet: (e, 2) face 0 and face n, rows of `Facets`.
+        tangent_0: (e, 3) unit vectors in face 0, at right angles to the edge, into the face.
+        normal_0: (e, 3) outward unit normals of face 0.
+        normal_n: (e, 3) outward unit normals of face n.
+        exterior_rad: (e,) angle of the open space [rad], π to 2 π.
+    """
+
+    start_m: np.ndarray
+    end_m: np.ndarray
+    direction: np.ndarray
+    facet: np.ndarray
+    tangent_0: np.ndarray
+    normal_0: np.ndarray
+    normal_n: np.ndarray
+    exterior_rad: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.start_m)
+
+
+def extract_edges(
+    city: CityMap, facets: Facets | None = None, topology: Topology | None = None
+) -> Edges:
+    """Find the convex edges of a city: roof edges and corners, without those on the ground.
+
+    Args:
+        city: 3D map.
+        facets: of this city; None: extracted here.
+        topology: of this city; None: built here.
+
+    Returns:
+        The edges, sorted by their facets.
+
+    Raises:
+        BadInput: a corner is not finite.
+    """
+    topology = topology or build_topology(city)
+    facets = facets or extract_facets(city, topology)
+    if not len(facets):
+        none = np.empty((0, 3))
+        no_facets = np.empty((0, 2), dtype=int)
+        return Edges(none, none, none, no_facets, none, none, none, np.empty(0))
+    # Folds flatter than 0.1 rad approximate curved surfaces and diffract too little to count
+    found = _wedges(topology.vertices_m, topology.triangles, topology.normal, topology.segments,
+                    topology.owner, topology.group, np.pi + 0.1)
+    segment = topology.segments[found[:, 0]]
+    pair = np.sort(facets.of_face[topology.source[found[:, 1:]]], axis=1)
+    keep = (pair[:, 0] != pair[:, 1]) \
+        & (facets.material[pair[:, 0]] == facets.material[pair[:, 1]])
+    start_m, end_m, pair = _join(topology.vertices_m[segment[keep]], pair[keep])
+    direction = end_m - start_m
+    direction /= np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
+    normal_0, normal_n = facets.normal[pair[:, 0]], facets.normal[pair[:, 1]]
+    # At a convex edge each face runs against the normal of the other
+    tangent_0 = _tangent(direction, normal_0, normal_n)
+    tangent_n = _tangent(direction, normal_n, normal_0)
+    sine = np.einsum("ij,ij->i", tangent_n, normal_0)
+    cosine = np.einsum("ij,ij->i", tangent_n, tangent_0)
+    exterior_rad = np.mod(np.arctan2(sine, cosine), 2 * np.pi)
+    return Edges(start_m, end_m, direction, pair, tangent_0, normal_0, normal_n, exterior_rad)
+
+
+def _tangent(direction: np.ndarray, normal: np.ndarray, other: np.ndarray) -> np.ndarray:
+    tangent = np.cross(normal, direction)
+    sign = -np.sign(np.einsum("ij,ij->i", tangent, other))
+    return tangent * np.where(sign == 0, 1.0, sign)[:, None]
+
+
+def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Join consecutive pieces between the same two facets; return starts, ends and facets."""
+    order = np.lexsort((pair[:, 1], pair[:, 0]))
+    ends_m, pair = ends_m[order], pair[order]
+    is_new = np.append(True, (pair[1:] != pair[:-1]).any(axis=1))[:len(pair)]
+    first = np.append(np.flatnonzero(is_new), len(pair))
+    joined_m, row = _joined(ends_m, first)
+    return joined_m[:, 0], joined_m[:, 1], pair[row]
+
+
+@njit(cache=True)
+def _joined(ends_m: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Join pieces (p, 2, 3) of groups that overlap; return ends (e, 2, 3) and one row (e,) each."""
+    out_m, row = np.empty_like(ends_m), np.empty(len(ends_m), dtype=np.int64)
+    count = 0
+    for g in range(len(first) - 1):
+        pieces = ends_m[first[g]:first[g + 1]].copy()
+        along = pieces[np.argmax(((pieces[:, 1] - pieces[:, 0]) ** 2).sum(axis=1))]
+        along = along[1] - along[0]
+        along = along / np.sqrt(dot(along, along))
+        low_m, high_m = np.empty(len(pieces)), np.empty(len(pieces))
+        for k in range(len(pieces)):
+            low_m[k], high_m[k] = dot(pieces[k, 0], along), dot(pieces[k, 1], along)
+            if low_m[k] > high_m[k]:
+                low_m[k], high_m[k] = high_m[k], low_m[k]
+                pieces[k] = pieces[k, ::-1].copy()
+        reached_m = -np.inf
+        for k in np.argsort(low_m, kind="mergesort"):
+            if low_m[k] > reached_m + COPLANAR_M:
+                out_m[count], row[count] = pieces[k], first[g]
+                reached_m = high_m[k]
+                count += 1
+            elif high_m[k] > reached_m:
+                out_m[count - 1, 1] = pieces[k, 1]
+                reached_m = high_m[k]
+    return out_m[:count], row[:count]
+
+
+@njit(cache=True)
+def _wedges(
+    vertices_m: np.ndarray, triangles: np.ndarray, normal: np.ndarray, segments: np.ndarray,
+    owner: np.ndarray, group: np.ndarray, min_rad: float,
+) -> np.ndarray:
+    """Return (w, 3) row of `segments` and the two triangles of each open sector over `min_rad`."""
+    found = []
+    for g in range(len(group) - 1):
+        a, n = group[g], group[g + 1] - group[g]
+        if n < 2:
+            continue
+        start = vertices_m[segments[a, 0]]
+        axis = vertices_m[segments[a, 1]] - start
+        axis = axis / np.sqrt((axis * axis).sum())
+        angle, opens = np.empty(n), np.empty(n)
+        for i in range(n):
+            corners = triangles[owner[a + i]]
+            middle = (vertices_m[corners[0]] + vertices_m[corners[1]] + vertices_m[corners[2]]) \
+                / 3.0 - start
+            middle = middle - (middle * axis).sum() * axis
+            if i == 0:
+                x = middle / np.sqrt((middle * middle).sum())
+                y = cross(axis, x)
+            cosine, sine = (middle * x).sum(), (middle * y).sum()
+            angle[i] = np.arctan2(sine, cosine)
+            turn = cosine * y - sine * x  # towards a larger angle
+            opens[i] = (turn * normal[owner[a + i]]).sum()
+        # Of two coincident faces the one that looks back comes first: no space opens between them
+        order = np.argsort(angle + np.where(opens > 0, 1e-4, -1e-4))
+        for k in range(n):
+            i, j = order[k], order[(k + 1) % n]
+            width = (angle[j] - angle[i]) % (2 * np.pi)
+            if opens[i] > 0 and opens[j] < 0 and min_rad < width < 2 * np.pi - 1e-3:
+                found.append((a, owner[a + i], owner[a + j]))
+    out = np.empty((len(found), 3), dtype=np.int64)
+    for k in range(len(found)):
+        out[k, 0], out[k, 1], out[k, 2] = found[k]
+    return out

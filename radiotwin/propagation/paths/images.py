@@ -1,0 +1,225 @@
+"""Points of interaction of paths over given facets and at most one edge, by the image method.
+
+The device is mirrored in the facets before the edge, one after another, and the receiver in those
+after it; the ray is reflected where the straight line between the images goes through a facet
+(Balanis, "Advanced Engineering Electromagnetics", 2nd ed., ch. 5). Obstacles are not tested here.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from radiotwin.propagation.paths.pruning import lit_part, over_edge, through_facet
+from radiotwin.propagation.paths.surfaces import (
+    ALONG,
+    LENGTH,
+    ON_PLANE_M,
+    START,
+    Surfaces,
+    height,
+    mirrored,
+    within,
+)
+from radiotwin.propagation.paths.wedges import around_edge
+
+MAX_INTERACTIONS = 6  # reflections and diffraction of one path: bounds the arrays
+
+
+class Candidates(NamedTuple):
+    """Sequences of interactions to try between one device and any receiver.
+
+    Attributes:
+        before: (c, a) facets before the edge, or all facets where there is no edge; then -1.
+        edge: (c,) row of the edges; -1: none.
+        after: (c, b) facets after the edge; then -1.
+    """
+
+    before: np.ndarray
+    edge: np.ndarray
+    after: np.ndarray
+
+
+class PathBuffer(NamedTuple):
+    """Paths that were found.
+
+    Attributes:
+        receiver: (capacity,) row of the receiver.
+        candidate: (capacity,) row of the candidate.
+        points_m: (capacity, MAX_INTERACTIONS + 2, 3) device, points of interaction, receiver [m].
+        count: (capacity,) number of points in use.
+    """
+
+    receiver: np.ndarray
+    candidate: np.ndarray
+    points_m: np.ndarray
+    count: np.ndarray  # type: ignore[assignment]  # hides an unused method of tuples
+
+    @classmethod
+    def allocate(cls, capacity: int) -> "PathBuffer":
+        """Return an empty buffer for `capacity` paths."""
+        receiver, candidate, count = np.empty((3, capacity), dtype=np.int64)
+        return cls(receiver, candidate, np.empty((capacity, MAX_INTERACTIONS + 2, 3)), count)
+
+
+@njit(cache=True, error_model="numpy")
+def sequence_length(facets: np.ndarray, row: int) -> int:
+    """Return how many facets a row of `Candidates` has before its first -1."""
+    length = 0
+    while length < facets.shape[1] and facets[row, length] >= 0:
+        length += 1
+    return length
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def find_paths(
+    surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray, receiver_m: np.ndarray,
+    cursor: int, buffer: PathBuffer,
+) -> tuple[int, int]:
+    """Try candidates × receivers in order from `cursor` until the buffer is full.
+
+    Args:
+        surfaces: of the map.
+        candidates: sequences to try.
+        device_m: (3,) position of the device [m].
+        receiver_m: (n, 3) positions of the receivers [m].
+        cursor: candidate · n + receiver to begin with.
+        buffer: output, filled from its first row on.
+
+    Returns:
+        The number of paths found, and the cursor to go on with.
+    """
+    planes, uv_m, edges = surfaces.planes, surfaces.triangle_uv_m, surfaces.edges
+    n = len(receiver_m)
+    image, mirror = np.empty((MAX_INTERACTIONS + 1, 3)), np.empty((MAX_INTERACTIONS + 1, 3))
+    possible = np.empty(n, dtype=np.int64)
+    found = 0
+    for row in range(cursor // n, len(candidates.edge)):
+        before = sequence_length(candidates.before, row)
+        after = sequence_length(candidates.after, row)
+        facets_before, facets_after = candidates.before[row, :before], candidates.after[row, :after]
+        if not source_images(planes, facets_before, device_m, image):
+            continue
+        edge = candidates.edge[row]
+        along_m = across_m = 0.0
+        if edge < 0:
+            count = through_facet(planes, facets_before[-1], image[before], receiver_m, possible)
+        else:
+            is_open, along_m, across_m = \
+                around_edge(edges, edge, image[before, 0], image[before, 1], image[before, 2])
+            if not is_open:
+                continue
+            low_m, high_m = lit_part(planes, edges, edge, facets_before, image)
+            count = 0
+            if low_m < high_m:
+                count = over_edge(planes, edges, edge, facets_after, low_m, high_m, along_m,
+                                  across_m, receiver_m, possible)
+        for i in range(count):
+            at = possible[i]
+            if row * n + at < cursor:
+                continue
+            if found == len(buffer.count):
+                return found, row * n + at
+            x, y, z = receiver_m[at, 0], receiver_m[at, 1], receiver_m[at, 2]
+            points_m = buffer.points_m[found]
+            interactions = before
+            if edge >= 0:
+                ok, x, y, z = _from_edge(planes, uv_m, edges, edge, facets_after, before + 1,
+                                         along_m, across_m, x, y, z, mirror, points_m)
+                if not ok:
+                    continue
+                interactions += after + 1
+            if not reflections_back(planes, uv_m, facets_before, x, y, z, image, points_m):
+                continue
+            points_m[0] = device_m
+            points_m[interactions + 1] = receiver_m[at]
+            buffer.receiver[found], buffer.candidate[found] = at, row
+            buffer.count[found] = interactions + 2
+            found += 1
+    return found, n * len(candidates.edge)
+
+
+@njit(cache=True, error_model="numpy")
+def source_images(
+    planes: np.ndarray, facets: np.ndarray, device_m: np.ndarray, image: np.ndarray
+) -> bool:
+    """Mirror the device in facets, one after another; return whether it lies before each."""
+    image[0] = device_m
+    for k in range(len(facets)):
+        x, y, z = image[k, 0], image[k, 1], image[k, 2]
+        if height(planes, facets[k], x, y, z) < ON_PLANE_M:
+            return False
+        image[k + 1, 0], image[k + 1, 1], image[k + 1, 2] = mirrored(planes, facets[k], x, y, z)
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def reflections_back(
+    planes: np.ndarray, uv_m: np.ndarray, facets: np.ndarray, x: float, y: float, z: float,
+    image: np.ndarray, points_m: np.ndarray,
+) -> bool:
+    """Find the reflections from a point, on the edge or the receiver, back to the device.
+
+    Returns:
+        Whether there is such a path; the points are in `points_m[1:]`.
+    """
+    for k in range(len(facets) - 1, -1, -1):
+        ok, x, y, z = _meet(planes, uv_m, facets[k], x, y, z,
+                            image[k + 1, 0], image[k + 1, 1], image[k + 1, 2])
+        if not ok:
+            return False
+        points_m[k + 1, 0], points_m[k + 1, 1], points_m[k + 1, 2] = x, y, z
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _from_edge(
+    planes: np.ndarray, uv_m: np.ndarray, edges: np.ndarray, edge: int, facets: np.ndarray,
+    first: int, along_m: float, across_m: float, x: float, y: float, z: float, mirror: np.ndarray,
+    points_m: np.ndarray,
+) -> tuple[bool, float, float, float]:
+    """Find the diffraction at an edge and the reflections from there to the receiver x, y, z.
+
+    Returns:
+        Whether there is such a path, and the point on the edge; all points are in
+        `points_m[first:]`.
+    """
+    for k in range(len(facets) - 1, -1, -1):  # mirror[k]: receiver in facets from the last to k
+        if height(planes, facets[k], x, y, z) < ON_PLANE_M:
+            return False, x, y, z
+        x, y, z = mirrored(planes, facets[k], x, y, z)
+        mirror[k, 0], mirror[k, 1], mirror[k, 2] = x, y, z
+    is_open, to_along_m, to_across_m = around_edge(edges, edge, x, y, z)
+    at_m = along_m + (to_along_m - along_m) * across_m / (across_m + to_across_m)
+    if not is_open or at_m < 0.0 or at_m > edges[edge, LENGTH]:
+        return False, x, y, z
+    edge_x = edges[edge, START] + at_m * edges[edge, ALONG]
+    edge_y = edges[edge, START + 1] + at_m * edges[edge, ALONG + 1]
+    edge_z = edges[edge, START + 2] + at_m * edges[edge, ALONG + 2]
+    points_m[first, 0], points_m[first, 1], points_m[first, 2] = edge_x, edge_y, edge_z
+    x, y, z = edge_x, edge_y, edge_z
+    for k in range(len(facets)):
+        ok, x, y, z = _meet(planes, uv_m, facets[k], x, y, z,
+                            mirror[k, 0], mirror[k, 1], mirror[k, 2])
+        if not ok:
+            return False, x, y, z
+        at = first + 1 + k
+        points_m[at, 0], points_m[at, 1], points_m[at, 2] = x, y, z
+    return True, edge_x, edge_y, edge_z
+
+
+@njit(cache=True, error_model="numpy")
+def _meet(
+    planes: np.ndarray, uv_m: np.ndarray, facet: int, x: float, y: float, z: float,
+    image_x: float, image_y: float, image_z: float,
+) -> tuple[bool, float, float, float]:
+    """Return whether and where the line from a point to an image goes through a facet."""
+    before_m = height(planes, facet, x, y, z)
+    behind_m = -height(planes, facet, image_x, image_y, image_z)
+    if before_m < ON_PLANE_M or behind_m < ON_PLANE_M:
+        return False, x, y, z
+    share = before_m / (before_m + behind_m)
+    x = x + share * (image_x - x)
+    y = y + share * (image_y - y)
+    z = z + share * (image_z - z)
+    return within(planes, uv_m, facet, x, y, z), x, y, z

@@ -1,0 +1,359 @@
+"""All paths between devices and points: each by itself, and as one NetCDF file.
+
+All paths between a scene's devices and any points, as one dataset and NetCDF file.
+
+The paths are a contiguous ragged array of the CF conventions, section 9.3.3: those of the first
+link, then those of the second, and so on; `path_count` has their numbers.
+
+Each path between devices and receivers by itself: field, way, angles and interactions.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import version
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+from scipy.constants import speed_of_light
+
+from radiotwin.errors import BadInput
+from radiotwin.io.budgets import PATHS, RESPONSE_VALUES, ROWS
+from radiotwin.io.files import atomic_file, require_suffix, require_writable
+from radiotwin.maps.form import CONVENTIONS
+from radiotwin.propagation.paths import statistics
+from radiotwin.propagation.paths.candidates import candidate_search
+from radiotwin.propagation.paths.clearance import found_clear
+from radiotwin.propagation.paths.coefficients import slabs_of
+from radiotwin.propagation.paths.fields import path_amplitudes
+from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer
+from radiotwin.propagation.paths.wedges import LUEBBERS
+from radiotwin.runtime.console import progress
+from radiotwin.scene import Scene
+from radiotwin.scene.citymap import CityMap
+from radiotwin.trace.run import device_indices
+
+RECEIVER_CHUNK = 500  # receivers at once
+PATH_CHUNK = 20_000  # paths at once: about 10 MB
+NO_INTERACTION, REFLECTION, DIFFRACTION = 0, 1, 2
+SCHEMA = "radiotwin.propagation.paths/1"
+_UNITS = {"db": "dB", "s": "s", "hz": "Hz", "deg": "degree", "rad": "rad", "m": "m"}
+_LONG_NAMES = {
+    "gain_db": "sum of the paths' powers (NaN: no path)",
+    "coherent_gain_db": "power of the sum of the paths' fields (NaN: no path)",
+    "rms_delay_spread_s": "power-weighted standard deviation of the delays",
+    "k_factor_db": "direct over all other power (NaN: no direct path, or no other)",
+    "path_gain_db": "power gain of the path, both antennas included",
+    "phase_rad": "phase of the received field with that of the delay, exp(+j omega t)",
+    "first_delay_s": "delay of the first path",
+    "doppler_hz": "Doppler shift, positive where the receiver approaches",
+    "tap_delay_s": "delay after the link's first path",
+    "interaction_m": "points of interaction, from device to receiver (NaN: none)",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Paths from one device, sorted by receiver and delay.
+
+    Attributes:
+        receiver: (p,) row of the receiver.
+        amplitude: (p,) complex gain between vertically polarised isotropic antennas, with the phase
+            of the delay, for fields that vary as exp(+j ω t).
+        length_m: (p,) [m].
+        kinds: (p, MAX_INTERACTIONS) of each interaction, then NO_INTERACTION.
+        points_m: (p, MAX_INTERACTIONS, 3) points of interaction [m], then NaN.
+        departure: (p, 3) unit vectors from the device along the path.
+        arrival: (p, 3) unit vectors from the receiver along the path.
+    """
+
+    receiver: np.ndarray
+    amplitude: np.ndarray
+    length_m: np.ndarray
+    kinds: np.ndarray
+    points_m: np.ndarray
+    departure: np.ndarray
+    arrival: np.ndarray
+
+    @property
+    def delay_s(self) -> np.ndarray:
+        """(p,) delays [s]."""
+        return self.length_m / speed_of_light
+
+
+def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float,
+                depth: int = 4) -> Iterator[tuple[Rays, int]]:
+    """Follow the paths from a device to receivers, some receivers at a time.
+
+    Args:
+        city: 3D map.
+        device_m: (3,) position [m].
+        receiver_m: (n, 3) positions [m].
+        frequency_hz: carrier frequency [Hz].
+        depth: maximum number of interactions of a path, 1 to 6.
+
+    Yields:
+        The paths to the next receivers, whose rows are among all, and the number of these.
+    """
+    search = candidate_search(city, depth)
+    candidates = search.candidates(device_m)
+    kinds = _kinds(candidates)
+    # Fields are added here: with Sionna RT's wedge they would step at the shadow boundary
+    wave_number = 2 * np.pi * frequency_hz / speed_of_light
+    slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
+    buffer = PathBuffer.allocate(PATH_CHUNK)
+    for first in range(0, len(receiver_m), RECEIVER_CHUNK):
+        ends_m = np.ascontiguousarray(receiver_m[first:first + RECEIVER_CHUNK], dtype=float)
+        parts = [_direct(city, device_m, ends_m, wave_number)]
+        for rows in found_clear(city, search.surfaces, candidates, device_m, ends_m, buffer):
+            amplitude, length_m = np.empty(len(rows), dtype=complex), np.empty(len(rows))
+            path_amplitudes(search.surfaces, candidates, wave_number, slabs, LUEBBERS, buffer,
+                            rows, amplitude, length_m)
+            parts.append(_rays(buffer, rows, kinds[buffer.candidate[rows]], amplitude, length_m))
+        yield _joined(parts, first), len(ends_m)
+
+
+def _direct(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, wave_number: float) -> Rays:
+    """Return the straight paths (ITU-R P.525-4, eq. 4) to the ends that see the device."""
+    seen = np.flatnonzero(city.line_of_sight(device_m, ends_m))
+    length_m = np.linalg.norm(ends_m[seen] - device_m, axis=1)
+    forth = (ends_m[seen] - device_m) / np.maximum(length_m, 1e-9)[:, None]
+    amplitude = np.exp(-1j * wave_number * length_m) / np.maximum(2 * wave_number * length_m, 1e-9)
+    return Rays(seen, amplitude, length_m, np.zeros((len(seen), MAX_INTERACTIONS), dtype=np.int8),
+                np.full((len(seen), MAX_INTERACTIONS, 3), np.nan), forth, -forth)
+
+
+def _rays(buffer: PathBuffer, rows: np.ndarray, kinds: np.ndarray, amplitude: np.ndarray,
+          length_m: np.ndarray) -> Rays:
+    points_m, last = buffer.points_m[rows], buffer.count[rows] - 1
+    path = np.arange(len(rows))
+    ends = [points_m[:, 1] - points_m[:, 0], points_m[path, last - 1] - points_m[path, last]]
+    departure, arrival = (each / np.maximum(np.linalg.norm(each, axis=1, keepdims=True), 1e-9)
+                          for each in ends)
+    between_m = np.where(kinds[:, :, None] == NO_INTERACTION, np.nan, points_m[:, 1:-1])
+    return Rays(buffer.receiver[rows], amplitude, length_m, kinds, between_m, departure, arrival)
+
+
+def _kinds(candidates: Candidates) -> np.ndarray:
+    """Return the (c, MAX_INTERACTIONS) kinds of interactions of each candidate."""
+    before, after = (candidates.before >= 0).sum(axis=1), (candidates.after >= 0).sum(axis=1)
+    over_edge = candidates.edge >= 0
+    place = np.arange(MAX_INTERACTIONS)
+    used = place < (before + over_edge + after)[:, None]
+    at_edge = over_edge[:, None] & (place == before[:, None])
+    return np.where(used, np.where(at_edge, DIFFRACTION, REFLECTION),
+                    NO_INTERACTION).astype(np.int8)
+
+
+def _joined(parts: list[Rays], first: int) -> Rays:
+    """Return the paths of several parts, sorted, with receivers counted from `first`."""
+    joined = [np.concatenate([getattr(part, name) for part in parts])
+              for name in Rays.__dataclass_fields__]
+    order = np.lexsort((joined[2], joined[0]))
+    receiver, *others = (each[order] for each in joined)
+    return Rays(receiver + first, *others)
+
+
+class _Paths(NamedTuple):
+    """Paths of one device; arrays (p, …) as in `Rays`, with antennas."""
+
+    link: np.ndarray
+    rays: Rays
+    amplitude: np.ndarray
+
+
+def list_paths(scene: Scene, points_m: np.ndarray, out_path: Path | str | None = None,
+               devices: list[str] | None = None, velocity_m_s: ArrayLike | None = None,
+               bandwidth_hz: float | None = None) -> xr.Dataset:
+    """Follow the paths from a scene's devices to points, and describe each link by them.
+
+    Paths have up to 4 interactions, one of them a diffraction; both ends are vertically polarised
+    and have the scene's antennas. Azimuths are clockwise from north, elevations above the horizon;
+    angles of arrival are of the direction that the path comes from.
+
+    Args:
+        scene: 3D map, devices and radio.
+        points_m: (n, 3) positions of the receiver [m].
+        out_path: NetCDF-4 file to write; None writes nothing.
+        devices: names; None: all devices of the scene.
+        velocity_m_s: (3,) of the receiver east, north and up [m/s], for Doppler shifts.
+        bandwidth_hz: of the impulse responses [Hz]; None: without them.
+
+    Returns:
+        Dims `link` (all points of the first device, then of the next), `path`, `interaction` and,
+        with a bandwidth, `tap`. Links inside buildings, below the ground, or within a wavelength
+        have no paths; `reason` says so.
+
+    Raises:
+        BadInput: an unknown device, points of another shape, a bandwidth or velocity that is none,
+            more paths than the budget, or an output that cannot be written.
+    """
+    points_m = np.asarray(points_m, dtype=float)
+    velocity = None if velocity_m_s is None else np.asarray(velocity_m_s, dtype=float)
+    _check(points_m, velocity, bandwidth_hz, out_path)
+    index = device_indices(scene, devices)
+    ROWS.check(len(index) * len(points_m), "points times devices")
+    reason = np.concatenate([_reasons(scene, row, points_m) for row in index])
+    parts = list(_follow(scene, index, points_m, reason.reshape(len(index), -1) == ""))
+    dataset = _links(scene, index, points_m)
+    dataset["reason"] = "link", reason
+    _describe(dataset, parts, scene.config.radio.frequency_hz, velocity, bandwidth_hz)
+    missing = (dataset["path_count"].to_numpy() == 0) & (reason == "")
+    dataset["reason"] = "link", np.where(missing, "no path", reason).astype(object)
+    dataset.attrs |= {
+        "schema": SCHEMA, "frequency_hz": scene.config.radio.frequency_hz,
+        "scene": scene.config.name, "scene_hash": scene.content_hash(),
+        "radiotwin_version": version("radiotwin"),
+        **({} if velocity is None else {"velocity_m_s": velocity}),
+        **({} if bandwidth_hz is None else {"bandwidth_hz": bandwidth_hz})}
+    for name, variable in dataset.variables.items():
+        unit = _UNITS.get(str(name).rpartition("_")[2])
+        variable.attrs |= ({"units": unit} if unit else {}) \
+            | ({"long_name": _LONG_NAMES[name]} if name in _LONG_NAMES else {})
+    if out_path is not None:
+        _write(dataset, out_path)
+    return dataset
+
+
+def _check(points_m: np.ndarray, velocity: np.ndarray | None, bandwidth_hz: float | None,
+           out_path: Path | str | None) -> None:
+    if points_m.ndim != 2 or points_m.shape[1] != 3 or not len(points_m) \
+            or not np.isfinite(points_m).all():
+        raise BadInput("points_m must hold finite positions [m] of shape (n, 3), n at least 1; it "
+                       f"has the shape {points_m.shape}")
+    if velocity is not None and (velocity.shape != (3,) or not np.isfinite(velocity).all()
+                                 or np.linalg.norm(velocity) > 0.01 * speed_of_light):
+        raise BadInput(f"the velocity is {velocity.tolist()}; give three numbers [m/s], east, "
+                       "north and up, of at most 1 % of the speed of light")
+    if bandwidth_hz is not None and not 0 < bandwidth_hz < np.inf:
+        raise BadInput(f"the bandwidth is {bandwidth_hz:g} Hz; it must be positive")
+    if out_path is not None:
+        require_suffix(out_path, ".nc")
+        require_writable(out_path)
+
+
+def _reasons(scene: Scene, device: int, points_m: np.ndarray) -> np.ndarray:
+    """Return why a device has no link to each point (n,), empty where it may have."""
+    inside, below = scene.city.inside(points_m), scene.city.below_ground(points_m)
+    wavelength_m = speed_of_light / scene.config.radio.frequency_hz
+    near = np.linalg.norm(points_m - scene.device_m[device], axis=1) < wavelength_m
+    return np.select([inside & below, inside, near],
+                     ["below the ground", "inside a building", "within a wavelength"], default="")
+
+
+def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.ndarray
+            ) -> Iterator[_Paths]:
+    """Yield the paths of some links at a time, in the order of the links."""
+    count = 0
+    with progress("following paths", total=int(usable.sum())) as advance:
+        for row, device in enumerate(index):
+            points = np.flatnonzero(usable[row])
+            for rays, receivers in follow_rays(scene.city, scene.device_m[device],
+                                               points_m[points],
+                                               scene.config.radio.frequency_hz):
+                gain_dbi = np.zeros(len(rays.length_m))
+                for antenna, way in ((scene.device_antennas[device], rays.departure),
+                                     (scene.uav_antenna, rays.arrival)):
+                    if antenna is not None:
+                        gain_dbi += antenna.gain_dbi(way)
+                count += len(gain_dbi)
+                PATHS.check(count, f"paths of {len(index)} devices to {len(points_m)} points")
+                yield _Paths(row * len(points_m) + points[rays.receiver], rays,
+                             rays.amplitude * 10 ** (gain_dbi / 20))
+                advance(receivers)
+
+
+def _links(scene: Scene, index: list[int], points_m: np.ndarray) -> xr.Dataset:
+    """Return the two ends of each link."""
+    names = np.array([scene.config.devices[device].device for device in index], dtype=object)
+    ends = {"device": np.repeat(names, len(points_m))}
+    for axis, name in enumerate("xyz"):
+        ends[f"device_{name}_m"] = np.repeat(scene.device_m[index, axis], len(points_m))
+        ends[f"receiver_{name}_m"] = np.tile(points_m[:, axis], len(index))
+    return xr.Dataset({name: ("link", values) for name, values in ends.items()})
+
+
+def _describe(dataset: xr.Dataset, parts: list[_Paths], frequency_hz: float,
+              velocity: np.ndarray | None, bandwidth_hz: float | None) -> None:
+    """Add the paths, and the figures of each link, to a dataset of links."""
+    links = dataset.sizes["link"]
+    link = np.concatenate([part.link for part in parts] or [np.zeros(0, dtype=int)])
+    amplitude = np.concatenate([part.amplitude for part in parts] or [np.zeros(0, dtype=complex)])
+    delay_s = _column(parts, "delay_s", ())
+    power = np.abs(amplitude) ** 2
+    first_s = np.full(links, np.inf)
+    np.minimum.at(first_s, link, delay_s)
+    kinds = _column(parts, "kinds", (MAX_INTERACTIONS,)).astype(np.int8)
+    with np.errstate(divide="ignore"):
+        path_gain_db = 10 * np.log10(np.maximum(power, 1e-300))
+    count = np.bincount(link, minlength=links)
+    values: dict[str, Any] = {
+        "path_count": (count, {"sample_dimension": "path", "long_name": "number of paths"}),
+        "gain_db": _db(statistics.sums(power, link, links)),
+        "coherent_gain_db": _db(np.abs(statistics.sums(amplitude, link, links)) ** 2),
+        "first_delay_s": np.where(count > 0, first_s, np.nan),
+        "rms_delay_spread_s": statistics.rms_spread(delay_s, power, link, links),
+        "k_factor_db": statistics.k_factor_db(power, kinds[:, 0] == NO_INTERACTION, link, links)}
+    of_paths: dict[str, np.ndarray] = {
+        "link_of_path": link.astype(np.int32), "path_gain_db": path_gain_db,
+        "phase_rad": np.angle(amplitude), "delay_s": delay_s}
+    for end in ("departure", "arrival"):
+        way = _column(parts, end, (3,))
+        azimuth = np.arctan2(way[:, 0], way[:, 1])
+        elevation = np.arcsin(np.clip(way[:, 2], -1, 1))
+        of_paths[f"{end}_azimuth_deg"] = np.degrees(azimuth) % 360
+        of_paths[f"{end}_elevation_deg"] = np.degrees(elevation)
+        values[f"{end}_azimuth_spread_deg"] = statistics.angular_spread_deg(
+            azimuth, power, link, links)
+        values[f"{end}_zenith_spread_deg"] = statistics.angular_spread_deg(
+            elevation, power, link, links)
+        if end == "arrival" and velocity is not None:
+            shift_hz = statistics.doppler_hz(way, velocity, speed_of_light / frequency_hz)
+            of_paths["doppler_hz"] = shift_hz
+            values["doppler_spread_hz"] = statistics.rms_spread(shift_hz, power, link, links)
+    for name, value in values.items():
+        dataset[name] = ("link", *value) if isinstance(value, tuple) else ("link", value)
+    for name, value in of_paths.items():
+        dataset[name] = "path", value
+    used = max(int((kinds != NO_INTERACTION).sum(axis=1).max(initial=1)), 1)
+    dataset["interactions"] = ("path", "interaction"), kinds[:, :used], {
+        "flag_values": np.array([NO_INTERACTION, REFLECTION, DIFFRACTION], dtype=np.int8),
+        "flag_meanings": "none reflection diffraction"}
+    dataset["interaction_m"] = (
+        ("path", "interaction", "axis"),
+        _column(parts, "points_m", (MAX_INTERACTIONS, 3))[:, :used].astype(np.float32))
+    dataset["axis"] = "axis", np.array(list("xyz"), dtype=object)
+    if bandwidth_hz is not None:
+        excess_s = delay_s - first_s[link]
+        taps = statistics.tap_count(excess_s, bandwidth_hz)
+        RESPONSE_VALUES.check(links * taps, f"impulse responses of {links} links, {taps} taps each")
+        response = statistics.impulse_response(amplitude, excess_s, link, links, bandwidth_hz, taps)
+        dataset["tap_delay_s"] = "tap", (np.arange(taps) - statistics.EDGE_TAPS) / bandwidth_hz
+        for name, part in (("real", response.real), ("imaginary", response.imag)):
+            dataset[f"response_{name}"] = ("link", "tap"), part, {
+                "long_name": f"{name} part of the band-limited impulse response"}
+
+
+def _column(parts: list[_Paths], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return (p, *shape) of all paths."""
+    return np.concatenate([getattr(part.rays, name) for part in parts] or [np.zeros((0, *shape))])
+
+
+def _db(power: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.where(power > 0, 10 * np.log10(power), np.nan)
+
+
+def _write(dataset: xr.Dataset, path: Path | str) -> None:
+    """Write the dataset as compressed NetCDF-4."""
+    packed = {"zlib": True, "complevel": 4}
+    encoding = {str(name): packed for name, each in dataset.data_vars.items()
+                if each.dtype.kind in "fi" and each.size}
+    content = BytesIO()
+    dataset.assign_attrs(Conventions=CONVENTIONS).to_netcdf(content, engine="h5netcdf",
+                                                            encoding=encoding)
+    with atomic_file(path) as file:
+        file.write(content.getbuffer())

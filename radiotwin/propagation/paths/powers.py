@@ -1,0 +1,255 @@
+"""Power of the paths between devices and receivers."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from scipy.constants import speed_of_light
+
+from radiotwin.errors import BadInput
+from radiotwin.propagation.paths.candidates import DEVICE_RAYS, CandidateSearch, candidate_search
+from radiotwin.propagation.paths.clearance import found_clear
+from radiotwin.propagation.paths.coefficients import Slabs, slabs_of
+from radiotwin.propagation.paths.fields import AVERAGE, VERTICAL, path_gains
+from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer
+from radiotwin.propagation.paths.two_edges import paths_over_two_edges, two_edge_gains
+from radiotwin.propagation.paths.wedges import LUEBBERS, SIONNA
+from radiotwin.runtime.console import progress
+from radiotwin.scene.citymap import CityMap
+
+POLARISATIONS = {"average": AVERAGE, "vertical": VERTICAL}
+WEDGES = {"luebbers": LUEBBERS, "sionna": SIONNA}
+PATH_CHUNK = 50_000  # paths at once: about 30 MB
+DARK_CHUNK = 100  # receivers at once that only two edges may reach
+DEPTH = 4  # interactions of a path at most
+SECTORS = 24  # of azimuth, 15 degrees each
+
+
+class PathsWithPoints(NamedTuple):
+    """Paths from one device.
+
+    Attributes:
+        receiver: (p,) row of the receiver.
+        power: (p,) linear gain between isotropic antennas.
+        points_m: (p, m, 3) device, points of interaction, receiver [m]; what follows means nothing.
+        points: (p,) number of these points.
+    """
+
+    receiver: np.ndarray
+    power: np.ndarray
+    points_m: np.ndarray
+    points: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class PathPowers:
+    """Linear power gains (n,) of links between isotropic antennas, by the kind of path; 0: none.
+
+    A reflection by the ground counts as a reflection where there are other interactions; alone it
+    is `ground`. Powers are added, not fields: where direct and reflected or diffracted rays nearly
+    coincide, their fields would cancel or add up.
+
+    Attributes:
+        direct: free space; 0 where blocked.
+        reflected_1: one reflection, not by the ground.
+        reflected_2: two reflections, at most one of them by the ground.
+        reflected_more: three or more reflections.
+        diffracted: one diffraction, on either side of the shadow boundary.
+        reflected_diffracted: one diffraction, and reflections before or after it.
+        diffracted_2: diffractions at two edges; looked for where there is no other path.
+        ground: one reflection, by the ground: z = 0, or a triangle of the terrain.
+        departures: (n, SECTORS, 3) power times the unit vector from the device along the path,
+            summed over the paths that leave the device in each sector of azimuth; the first
+            sector begins at east, they go on counter-clockwise.
+        arrivals: (n, SECTORS, 3) the same at the receiver, from the receiver along the path.
+    """
+
+    direct: np.ndarray
+    reflected_1: np.ndarray
+    reflected_2: np.ndarray
+    reflected_more: np.ndarray
+    diffracted: np.ndarray
+    reflected_diffracted: np.ndarray
+    diffracted_2: np.ndarray
+    ground: np.ndarray
+    departures: np.ndarray
+    arrivals: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """Sum of all kinds, (n,) linear."""
+        return np.sum([getattr(self, name) for name in COMPONENTS], axis=0)
+
+
+COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
+
+
+def path_powers(
+    city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray,
+    frequency_hz: float, polarisation: str = "average", depth: int = DEPTH,
+    wedge: str = "sionna", rays: int = DEVICE_RAYS,
+) -> PathPowers:
+    """Follow the paths from devices to receivers and add up their powers.
+
+    Surfaces are slabs of the map's materials, and flat ground is one of `city.ground_material`.
+    Ends inside buildings are accepted, but their results mean little. At the depth of 4 the RMS
+    difference from Sionna RT with a million rays is 0.9 dB in scenes/rbm and 3.7 dB in Munich,
+    without line of sight (`python -m studies engine`).
+
+    Args:
+        city: 3D map.
+        device_m: (k, 3) positions of the devices [m].
+        receiver_m: (n, 3) positions of the receivers [m].
+        device: (n,) row of `device_m` of each receiver.
+        frequency_hz: carrier frequency [Hz].
+        polarisation: `vertical` of both antennas, or `average` over all.
+        depth: maximum number of interactions of a path, 1 to 6.
+        wedge: coefficient of diffraction: `luebbers`, reciprocal and exact for conductors; or
+            `sionna`, that of Sionna RT. See `radiotwin.propagation.paths.coefficients`.
+        rays: shot from each device to find what paths of several interactions visit.
+
+    Returns:
+        The powers of the n links.
+
+    Raises:
+        BadInput: an array has another shape, a value is not finite, a row does not exist, or an
+            argument is out of its range.
+    """
+    device_m = np.asarray(device_m, dtype=float)
+    receiver_m = np.ascontiguousarray(receiver_m, dtype=float)
+    device = np.asarray(device)
+    _check(device_m, receiver_m, device, frequency_hz, polarisation, depth, wedge, rays)
+    wave_number = 2 * np.pi * frequency_hz / speed_of_light
+    powers = np.zeros((len(COMPONENTS), len(receiver_m)))
+    powers[0] = _direct(city, device_m[device], receiver_m, wave_number)
+    departures, arrivals = np.zeros((2, len(receiver_m), SECTORS, 3))
+    straight_m = receiver_m - device_m[device]
+    _add_rays(departures, np.arange(len(receiver_m)), straight_m, powers[0])
+    _add_rays(arrivals, np.arange(len(receiver_m)), -straight_m, powers[0])
+    search = candidate_search(city, depth)
+    buffer = PathBuffer.allocate(PATH_CHUNK)
+    slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
+    rows = np.unique(device)
+    with progress("following paths", total=len(rows)) as advance:
+        for row in rows:
+            links = np.flatnonzero(device == row)
+            candidates = search.candidates(device_m[row], rays)
+            kind = _kinds(candidates, search.is_ground)
+            for clear, gain in clear_paths_gains(
+                    city, search, candidates, device_m[row], receiver_m[links], buffer,
+                    wave_number, slabs, POLARISATIONS[polarisation], WEDGES[wedge]):
+                link, points_m = links[buffer.receiver[clear]], buffer.points_m[clear]
+                last, path = buffer.count[clear] - 1, np.arange(len(clear))
+                np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
+                _add_rays(departures, link, points_m[:, 1] - points_m[:, 0], gain)
+                _add_rays(arrivals, link, points_m[path, last - 1] - points_m[path, last], gain)
+            dark = links[powers[:, links].sum(axis=0) == 0]
+            seen = np.unique(candidates.edge[(candidates.before[:, 0] < 0)])
+            for first in range(0, len(dark) if depth > 1 else 0, DARK_CHUNK):
+                part = dark[first:first + DARK_CHUNK]
+                pairs = paths_over_two_edges(city, search.surfaces, search.facet_edges, seen,
+                                             device_m[row], receiver_m[part])
+                gain = two_edge_gains(search.surfaces, wave_number, slabs,
+                                      POLARISATIONS[polarisation], WEDGES[wedge], pairs.edge,
+                                      pairs.points_m)
+                link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)
+                np.add.at(powers, (COMPONENTS.index("diffracted_2"), link), gain)
+                _add_rays(departures, link, legs_m[:, 0], gain)
+                _add_rays(arrivals, link, -legs_m[:, 2], gain)
+            advance(1)
+    return PathPowers(*powers, departures, arrivals)  # type: ignore[call-arg]  # a row a kind
+
+
+def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
+                      frequency_hz: float) -> PathsWithPoints:
+    """Follow the paths of vertical antennas as `path_powers` does, and return each by itself.
+
+    Without the direct ones, and those over two edges.
+
+    Args:
+        city: 3D map.
+        device_m: (3,) position [m].
+        receiver_m: (n, 3) positions [m].
+        frequency_hz: carrier frequency [Hz].
+    """
+    search = candidate_search(city, DEPTH)
+    buffer = PathBuffer.allocate(PATH_CHUNK)
+    slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
+    no_points = np.zeros((0, *buffer.points_m.shape[1:]), dtype=np.float32)
+    no_rows = np.zeros(0, dtype=int)
+    parts = [PathsWithPoints(no_rows, np.zeros(0), no_points, no_rows)]
+    for clear, gain in clear_paths_gains(
+            city, search, search.candidates(device_m), device_m,
+            np.ascontiguousarray(receiver_m, dtype=float), buffer,
+            2 * np.pi * frequency_hz / speed_of_light, slabs, VERTICAL, WEDGES["sionna"]):
+        parts.append(PathsWithPoints(buffer.receiver[clear], gain,
+                                     buffer.points_m[clear].astype(np.float32),
+                                     buffer.count[clear]))
+    return PathsWithPoints(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def clear_paths_gains(
+    city: CityMap, search: CandidateSearch, candidates: Candidates, device_m: np.ndarray,
+    receiver_m: np.ndarray, buffer: PathBuffer, wave_number: float, slabs: Slabs,
+    polarisation: int, wedge: int,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield rows (p,) of a buffer that hold paths which nothing blocks, and their gains (p,)."""
+    for clear in found_clear(city, search.surfaces, candidates, device_m, receiver_m, buffer):
+        gain = np.empty(len(clear))
+        path_gains(search.surfaces, candidates, wave_number, slabs, polarisation, wedge, buffer,
+                   clear, gain)
+        yield clear, gain
+
+
+def _add_rays(sums: np.ndarray, link: np.ndarray, ray_m: np.ndarray, power: np.ndarray) -> None:
+    """Add power times direction of rays (p, 3) of links (p,) to sums (n, SECTORS, 3)."""
+    azimuth_rad = np.arctan2(ray_m[:, 1], ray_m[:, 0]) % (2 * np.pi)
+    sector = (azimuth_rad * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
+    length_m = np.maximum(np.linalg.norm(ray_m, axis=1, keepdims=True), 1e-9)
+    np.add.at(sums, (link, sector), ray_m / length_m * power[:, None])
+
+
+def _direct(
+    city: CityMap, from_m: np.ndarray, to_m: np.ndarray, wave_number: float
+) -> np.ndarray:
+    """Return the free-space gains (n,) (ITU-R P.525-4, eq. 4), 0 where blocked."""
+    distance_m = np.linalg.norm(to_m - from_m, axis=1)
+    gain = 1 / np.maximum(2 * wave_number * distance_m, 1e-9) ** 2
+    return np.where(city.line_of_sight(from_m, to_m), gain, 0.0)
+
+
+def _kinds(candidates: Candidates, is_ground: np.ndarray) -> np.ndarray:
+    """Return the row of COMPONENTS (c,) of each candidate."""
+    reflections = (candidates.before >= 0).sum(axis=1) + (candidates.after >= 0).sum(axis=1)
+    only_ground = ((candidates.before >= 0) <= is_ground[candidates.before]).all(axis=1)
+    over_edge = np.where(reflections > 0, COMPONENTS.index("reflected_diffracted"),
+                         COMPONENTS.index("diffracted"))
+    reflected = np.where(only_ground, COMPONENTS.index("ground"), np.minimum(reflections, 3))
+    return np.where(candidates.edge >= 0, over_edge, reflected)
+
+
+def _check(
+    device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray, frequency_hz: float,
+    polarisation: str, depth: int, wedge: str, rays: int,
+) -> None:
+    for name, points_m in (("device_m", device_m), ("receiver_m", receiver_m)):
+        if points_m.ndim != 2 or points_m.shape[1] != 3 or not np.isfinite(points_m).all():
+            raise BadInput(f"{name} must hold finite positions [m] of shape (n, 3), it has the "
+                           f"shape {points_m.shape}")
+    if device.shape != (len(receiver_m),) or device.dtype.kind not in "iu":
+        raise BadInput(f"device must hold one row of device_m for each of {len(receiver_m)} "
+                       f"receivers; it has the shape {device.shape} and holds {device.dtype}")
+    if len(device) and not (0 <= device.min() and device.max() < len(device_m)):
+        raise BadInput(f"device holds rows from {device.min()} to {device.max()}, device_m has "
+                       f"{len(device_m)}")
+    if not 0 < frequency_hz < np.inf:
+        raise BadInput(f"frequency_hz is {frequency_hz}; it must be positive")
+    if polarisation not in POLARISATIONS:
+        raise BadInput(f"polarisation is {polarisation!r}; allowed are {', '.join(POLARISATIONS)}")
+    if wedge not in WEDGES:
+        raise BadInput(f"wedge is {wedge!r}; allowed are {', '.join(WEDGES)}")
+    if not 1 <= depth <= MAX_INTERACTIONS:
+        raise BadInput(f"depth is {depth}; allowed are 1 to {MAX_INTERACTIONS}")
+    if rays < 1:
+        raise BadInput(f"rays is {rays}; it must be 1 or more")

@@ -1,0 +1,113 @@
+"""Facets and edges in arrays for compiled code; the last facet is the flat ground, all of z = 0.
+
+On a terrain its triangles are facets like any other, and nothing lies above the last one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from radiotwin.propagation.paths.facets import Edges, Facets
+
+ON_PLANE_M = 1e-4  # [m], a point this close to a plane is on neither side of it
+GROUND_MATERIAL = -1  # last row of `Slabs`
+
+# First columns of the fields of `Surfaces.planes` and `Surfaces.edges`. Numba counts references to
+# each array that a function is given; with an array for each field, that would take longer than
+# the geometry.
+NORMAL, OFFSET, ORIGIN, AXIS_U, AXIS_V, SIZE, FULL, FIRST, END, MATERIAL = (
+    0, 3, 4, 7, 10, 13, 15, 16, 17, 18)
+START, ALONG, LENGTH, TANGENT, NORMAL_0, NORMAL_N, EXTERIOR, MATERIAL_0, MATERIAL_N = (
+    0, 3, 6, 7, 10, 13, 16, 17, 18)
+
+
+class Surfaces(NamedTuple):
+    """Facets, with the ground after the last one, and edges.
+
+    Attributes:
+        planes: (f + 1, 19) of `Facets`: unit normal, offset, origin, axes u and v, sizes, whether
+            it is full, its first triangle and the one after its last, material.
+        triangle_uv_m: (t, 6) as in `Facets`.
+        edges: (e, 19) of `Edges`: start, direction, length, tangent in face 0, normals of face 0
+            and face n, exterior angle, materials of face 0 and face n.
+    """
+
+    planes: np.ndarray
+    triangle_uv_m: np.ndarray
+    edges: np.ndarray
+
+
+def pack(facets: Facets, edges: Edges, flat_ground: bool = True) -> Surfaces:
+    """Put facets, the ground and edges into arrays for compiled code.
+
+    Args:
+        facets: of a city.
+        edges: of the city.
+        flat_ground: whether its ground is all of z = 0; else no path meets that plane.
+    """
+    planes = np.column_stack([
+        facets.normal, facets.offset_m, facets.origin_m, facets.axis_u, facets.axis_v,
+        facets.size_m, facets.full, facets.first[:-1], facets.first[1:], facets.material])
+    ground = [0, 0, 1, 0.0 if flat_ground else np.inf, 0, 0, 0, 1, 0, 0, 0, 1, 0, np.inf, np.inf,
+              1, 0, 0, GROUND_MATERIAL]
+    length_m = np.linalg.norm(edges.end_m - edges.start_m, axis=1)
+    return Surfaces(
+        np.concatenate([planes, [ground]]).astype(float),
+        np.ascontiguousarray(facets.triangle_uv_m, dtype=float),
+        np.column_stack([edges.start_m, edges.direction, length_m, edges.tangent_0, edges.normal_0,
+                         edges.normal_n, edges.exterior_rad,
+                         facets.material[edges.facet]]).astype(float))
+
+
+@njit(cache=True, error_model="numpy")
+def height(planes: np.ndarray, facet: int, x: float, y: float, z: float) -> float:
+    """Return the signed distance of a point from the plane of a facet [m]; negative: behind it."""
+    return planes[facet, NORMAL] * x + planes[facet, NORMAL + 1] * y \
+        + planes[facet, NORMAL + 2] * z - planes[facet, OFFSET]
+
+
+@njit(cache=True, error_model="numpy")
+def within(
+    planes: np.ndarray, triangle_uv_m: np.ndarray, facet: int, x: float, y: float, z: float
+) -> bool:
+    """Return whether a point in the plane of a facet is on the facet."""
+    if facet == len(planes) - 1:
+        return True
+    x = x - planes[facet, ORIGIN]
+    y = y - planes[facet, ORIGIN + 1]
+    z = z - planes[facet, ORIGIN + 2]
+    at_u = x * planes[facet, AXIS_U] + y * planes[facet, AXIS_U + 1] \
+        + z * planes[facet, AXIS_U + 2]
+    if at_u < 0.0 or at_u > planes[facet, SIZE]:
+        return False
+    at_v = x * planes[facet, AXIS_V] + y * planes[facet, AXIS_V + 1] \
+        + z * planes[facet, AXIS_V + 2]
+    if at_v < 0.0 or at_v > planes[facet, SIZE + 1]:
+        return False
+    if planes[facet, FULL] > 0.0:
+        return True
+    corners = triangle_uv_m
+    for k in range(int(planes[facet, FIRST]), int(planes[facet, END])):
+        au, av, bu, bv, cu, cv = corners[k]
+        if _side(au, av, bu, bv, at_u, at_v) >= 0.0 \
+                and _side(bu, bv, cu, cv, at_u, at_v) >= 0.0 \
+                and _side(cu, cv, au, av, at_u, at_v) >= 0.0:
+            return True
+    return False
+
+
+@njit(cache=True)
+def _side(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
+    """Return twice the area of a, b, (x, y): positive where the point is left of a to b."""
+    return (bx - ax) * (y - ay) - (by - ay) * (x - ax)
+
+
+@njit(cache=True, error_model="numpy")
+def mirrored(
+    planes: np.ndarray, facet: int, x: float, y: float, z: float
+) -> tuple[float, float, float]:
+    """Return the mirror image of a point in the plane of a facet."""
+    twice = 2.0 * height(planes, facet, x, y, z)
+    return (x - twice * planes[facet, NORMAL], y - twice * planes[facet, NORMAL + 1],
+            z - twice * planes[facet, NORMAL + 2])

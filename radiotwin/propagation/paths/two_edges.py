@@ -1,0 +1,272 @@
+"""Diffraction at two edges, one after the other: over two roofs, or round a corner and over a roof.
+
+It is for links that no other path reaches. The first edge is one that the device sees. The second
+is looked for where the way from the first to the receiver is blocked: on the facets that such a
+straight line hits first, from either end.
+
+The field is that of two wedges in sequence. For parallel edges the distances in the coefficients
+and the spreading are those of Kouyoumjian and Pathak's theory with an edge as the second source,
+and equal those of the first of ITU-R P.526-15's methods for two isolated edges (section 4.4.1:
+Epstein and Peterson's with Millington's correction). For others the curvatures of the wave at the
+edges depend on the angle between them. Terms of the field's slope are left out: over the two edges
+of one flat roof, along which the field vanishes, nothing is found.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numba import njit
+
+from radiotwin.propagation.paths.coefficients import Slabs
+from radiotwin.propagation.paths.facets import expand
+from radiotwin.propagation.paths.fields import VERTICAL, send, vertical
+from radiotwin.propagation.paths.surfaces import ALONG, LENGTH, NORMAL_0, NORMAL_N, START, Surfaces
+from radiotwin.propagation.paths.vectors import cross, dot
+from radiotwin.propagation.paths.wedges import around_edge, diffract
+from radiotwin.scene.citymap import SKIN_M, CityMap
+
+STEPS = 30  # of the search for the points on two edges; it mostly takes five
+PRECISION_M = 1e-6  # [m], of these points
+
+
+class EdgePairs(NamedTuple):
+    """Paths over two edges.
+
+    Attributes:
+        receiver: (p,) row of the receiver.
+        edge: (p, 2) rows of the edges.
+        points_m: (p, 4, 3) device, points on the edges, receiver [m].
+    """
+
+    receiver: np.ndarray
+    edge: np.ndarray
+    points_m: np.ndarray
+
+
+class FacetEdges(NamedTuple):
+    """The edges of each facet.
+
+    Attributes:
+        of_face: (city faces,) as in `Facets`.
+        edge: (m,) edges, facet after facet.
+        first: (f + 2,) first row in `edge` of each facet, and of the ground, which has none.
+    """
+
+    of_face: np.ndarray
+    edge: np.ndarray
+    first: np.ndarray
+
+
+def paths_over_two_edges(
+    city: CityMap, surfaces: Surfaces, facet_edges: FacetEdges, seen: np.ndarray,
+    device_m: np.ndarray, receiver_m: np.ndarray,
+) -> EdgePairs:
+    """Find the paths from a device to receivers over two edges.
+
+    Args:
+        city: 3D map.
+        surfaces: of the map.
+        facet_edges: of the map.
+        seen: (s,) edges that the device sees.
+        device_m: (3,) position [m].
+        receiver_m: (n, 3) positions [m].
+    """
+    bend_m = _bends(surfaces.edges, seen, device_m, receiver_m).reshape(-1, 3)
+    receiver, first = np.repeat(np.arange(len(receiver_m)), len(seen)), np.tile(
+        seen, len(receiver_m))
+    end_m = receiver_m[receiver]
+    face = np.concatenate([city.first_face(bend_m, end_m), city.first_face(end_m, bend_m)])
+    blocked = np.flatnonzero(face >= 0)
+    facet = facet_edges.of_face[face[blocked]]
+    start = facet_edges.first[facet]  # of a facet -1 the last one, behind which nothing is
+    row, within = expand(np.where(facet >= 0, facet_edges.first[facet + 1] - start, 0))
+    way = blocked[row] % max(len(bend_m), 1)
+    second, edges = facet_edges.edge[start[row] + within], len(surfaces.edges)
+    # As one number each, and hashed: thirty times faster than `np.unique` of rows.
+    key = (receiver[way] * edges + first[way]) * edges + second
+    pair, second = np.divmod(np.sort(pd.unique(key[first[way] != second])), max(edges, 1))
+    tried = np.column_stack([*np.divmod(pair, max(edges, 1)), second])
+    points_m, possible = _solve(surfaces.edges, tried, device_m, receiver_m)
+    tried, points_m = tried[possible], points_m[possible]
+    faces = surfaces.edges[tried[:, 1:]]
+    outward = faces[..., NORMAL_0:NORMAL_0 + 3] + faces[..., NORMAL_N:NORMAL_N + 3]
+    off_m = points_m.copy()
+    off_m[:, 1:3] += SKIN_M * outward / np.linalg.norm(outward, axis=2, keepdims=True)
+    clear = np.arange(len(tried))
+    for leg in (1, 2, 0):  # the leg between two edges is blocked most often
+        clear = clear[city.line_of_sight(off_m[clear, leg], off_m[clear, leg + 1])]
+    return EdgePairs(tried[clear, 0], tried[clear, 1:], points_m[clear])
+
+
+@njit(cache=True, error_model="numpy")
+def _bends(
+    edges: np.ndarray, seen: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray
+) -> np.ndarray:
+    """Return where a ray from the device to a receiver bends on an edge, (n, s, 3) just off it."""
+    out = np.empty((len(receiver_m), len(seen), 3))
+    for j in range(len(seen)):
+        row = edges[seen[j]]
+        outward = row[NORMAL_0:NORMAL_0 + 3] + row[NORMAL_N:NORMAL_N + 3]
+        outward = SKIN_M * outward / np.sqrt(dot(outward, outward))
+        _, from_m, off_m = around_edge(edges, seen[j], device_m[0], device_m[1], device_m[2])
+        for i in range(len(receiver_m)):
+            _, to_m, to_off_m = around_edge(edges, seen[j], receiver_m[i, 0], receiver_m[i, 1],
+                                            receiver_m[i, 2])
+            at_m = from_m + (to_m - from_m) * off_m / (off_m + to_off_m)
+            at_m = min(max(at_m, 0.0), row[LENGTH])
+            out[i, j] = row[START:START + 3] + at_m * row[ALONG:ALONG + 3] + outward
+    return out
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(
+    edges: np.ndarray, tried: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the shortest paths (t, 4, 3) over pairs of edges, and the rows where there is one."""
+    points_m, possible = np.empty((len(tried), 4, 3)), np.empty(len(tried), dtype=np.int64)
+    count = 0
+    for i in range(len(tried)):
+        end_m, one, other = receiver_m[tried[i, 0]], tried[i, 1], tried[i, 2]
+        if not around_edge(edges, other, end_m[0], end_m[1], end_m[2])[0]:
+            continue
+        s, t = shortest(edges[one], edges[other], device_m, end_m)
+        if not (0.0 < s < edges[one, LENGTH] and 0.0 < t < edges[other, LENGTH]):
+            continue
+        first_m = edges[one, START:START + 3] + s * edges[one, ALONG:ALONG + 3]
+        second_m = edges[other, START:START + 3] + t * edges[other, ALONG:ALONG + 3]
+        if around_edge(edges, one, second_m[0], second_m[1], second_m[2])[0] \
+                and around_edge(edges, other, first_m[0], first_m[1], first_m[2])[0]:
+            points_m[i, 0], points_m[i, 1] = device_m, first_m
+            points_m[i, 2], points_m[i, 3] = second_m, end_m
+            possible[count] = i
+            count += 1
+    return points_m, possible[:count]
+
+
+@njit(cache=True, error_model="numpy")
+def shortest(
+    one: np.ndarray, other: np.ndarray, from_m: np.ndarray, to_m: np.ndarray
+) -> tuple[float, float]:
+    """Return where the shortest way over two edges' lines crosses them (Fermat's principle).
+
+    The length is convex in both positions; Newton's method with halved steps finds its minimum,
+    where the angles of the ray to each edge are equal before and after it (Keller's law).
+
+    Args:
+        one: row of `Surfaces.edges`: the first edge.
+        other: the second.
+        from_m: (3,) start of the way [m].
+        to_m: (3,) its end [m].
+
+    Returns:
+        Positions along the edges from their starts [m]; -1 where the way goes through the point in
+        which the edges meet.
+    """
+    a, b = one[ALONG:ALONG + 3], other[ALONG:ALONG + 3]
+    s, t = 0.5 * one[LENGTH], 0.5 * other[LENGTH]
+    cosine = dot(a, b)
+    length_m = np.inf
+    step_s = step_t = 0.0
+    for _ in range(STEPS):
+        p = one[START:START + 3] + s * a
+        q = other[START:START + 3] + t * b
+        legs_m = np.array([np.sqrt(((p - from_m) ** 2).sum()), np.sqrt(((q - p) ** 2).sum()),
+                           np.sqrt(((to_m - q) ** 2).sum())])
+        if legs_m.min() < PRECISION_M:
+            return -1.0, -1.0
+        if legs_m.sum() > length_m + PRECISION_M:  # too far: go back by half
+            step_s, step_t = 0.5 * step_s, 0.5 * step_t
+            s, t = s - step_s, t - step_t
+            continue
+        length_m = legs_m.sum()
+        first, second, third = (p - from_m) / legs_m[0], (q - p) / legs_m[1], (to_m - q) / legs_m[2]
+        slope_s, slope_t = dot(first, a) - dot(second, a), dot(second, b) - dot(third, b)
+        ss = (1.0 - dot(first, a) ** 2) / legs_m[0] + (1.0 - dot(second, a) ** 2) / legs_m[1]
+        tt = (1.0 - dot(second, b) ** 2) / legs_m[1] + (1.0 - dot(third, b) ** 2) / legs_m[2]
+        st = -(cosine - dot(second, a) * dot(second, b)) / legs_m[1]
+        scale = ss * tt - st * st
+        if not scale > 0.0:
+            return -1.0, -1.0
+        step_s = (st * slope_t - tt * slope_s) / scale
+        step_t = (st * slope_s - ss * slope_t) / scale
+        s, t = s + step_s, t + step_t
+        if abs(step_s) + abs(step_t) < PRECISION_M:
+            return s, t
+    return -1.0, -1.0
+
+
+@njit(cache=True, error_model="numpy")
+def wave_at_edge(
+    near_m: float, between_m: float, far_m: float, sine2: float
+) -> tuple[float, float]:
+    """Return what the wave from one edge is at another edge.
+
+    Args:
+        near_m: length of the leg on the other side of the edge in question [m].
+        between_m: length between the edges [m].
+        far_m: length of the leg beyond the first edge [m].
+        sine2: squared sine of the angle between the planes that the ray between the edges forms
+            with the one and with the other.
+
+    Returns:
+        Distance in the transition function of the edge in question, over sin² of the angle between
+        ray and edge [m] (Kouyoumjian and Pathak, eq. 33), and the length [m] that together with
+        `near_m` gives this distance as s s' / (s + s').
+    """
+    curvature = (1.0 - sine2) / (between_m + far_m) + sine2 / between_m
+    distance_m = near_m * (1.0 + near_m * curvature) * between_m * (between_m + far_m) \
+        / ((between_m + near_m) * (between_m + far_m + near_m))
+    return distance_m, distance_m * near_m / (near_m - distance_m)
+
+
+@njit(cache=True, error_model="numpy")
+def two_edge_gains(
+    surfaces: Surfaces, wave_number: float, slabs: Slabs, polarisation: int, wedge: int,
+    edge: np.ndarray, points_m: np.ndarray,
+) -> np.ndarray:
+    """Compute the power gains of paths over two edges between isotropic antennas.
+
+    Args:
+        surfaces: of the map.
+        wave_number: 2 π / wavelength [1/m].
+        slabs: materials of the map.
+        polarisation: as of `radiotwin.propagation.paths.fields.path_gains`.
+        wedge: as there.
+        edge: (p, 2) as in `EdgePairs`.
+        points_m: (p, 4, 3) as there.
+
+    Returns:
+        (p,) linear.
+    """
+    gain = np.empty(len(edge))
+    direction, field = np.empty((3, 3)), np.empty(3, dtype=np.complex128)
+    for i in range(len(edge)):
+        legs = points_m[i, 1:] - points_m[i, :3]
+        a, b, c = np.sqrt((legs ** 2).sum(axis=1))
+        for k, length_m in enumerate((a, b, c)):
+            direction[k] = legs[k] / length_m
+        sine2 = _twist(surfaces.edges[edge[i, 0], ALONG:ALONG + 3],
+                       surfaces.edges[edge[i, 1], ALONG:ALONG + 3], direction[1])
+        power = 0.0
+        for sent in range(1 + polarisation):
+            send(direction[0], sent, field)
+            diffract(surfaces.edges, edge[i, 0], direction[0], direction[1], a,
+                     wave_at_edge(a, b, c, sine2)[1], wave_number, slabs, wedge, field)
+            diffract(surfaces.edges, edge[i, 1], direction[1], direction[2],
+                     wave_at_edge(c, b, a, sine2)[1], c, wave_number, slabs, wedge, field)
+            if polarisation == VERTICAL:
+                power += abs(dot(field, vertical(direction[2]))) ** 2
+            else:
+                power += 0.5 * (abs(field[0]) ** 2 + abs(field[1]) ** 2 + abs(field[2]) ** 2)
+        spread = 1.0 / (a * c * (b * (a + b + c) + a * c * sine2))
+        gain[i] = spread * power / (2.0 * wave_number) ** 2
+    return gain
+
+
+@njit(cache=True, error_model="numpy")
+def _twist(one: np.ndarray, other: np.ndarray, ray: np.ndarray) -> float:
+    """Return the squared sine of the angle between the planes of a ray and either edge."""
+    across, to = cross(one, ray), cross(other, ray)
+    size2 = dot(across, across) * dot(to, to)
+    return 0.0 if size2 < 1e-12 else max(1.0 - dot(across, to) ** 2 / size2, 0.0)

@@ -1,0 +1,346 @@
+"""A comparison of models: its tables, its figures, and its part of a run's page.
+
+Read further models for a comparison, write its tables, and read them.
+
+Draw a comparison of models: maps, held-out links and located devices.
+
+Make the part of a run's page on a comparison of models.
+"""
+
+import json
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from pydantic import field_validator
+
+from radiotwin.display.axes import plain
+from radiotwin.errors import BadInput
+from radiotwin.io.cells import write_csv
+from radiotwin.io.files import atomic_path
+from radiotwin.io.forms import Real, Record, Whole, read_record, validated
+from radiotwin.links.measurements import Measurements
+from radiotwin.maps.form import is_zarr
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.report.html import Table, read_picture
+from radiotwin.report.labels import MODELS
+from radiotwin.report.map_figures import model_maps_figure, panels, true_positions_m
+from radiotwin.report.style import LOS_COLOUR, NLOS_COLOUR, save
+from radiotwin.runtime.execution import Executor
+from radiotwin.scene import Scene
+from radiotwin.scene.plot import height_grid
+from radiotwin.scene.preview import draw_heights
+from radiotwin.twin import Twin
+from radiotwin.twin.compare import (
+    CLASSES,
+    DEFAULT_MODELS,
+    Comparison,
+    compare_models,
+    published_models,
+    split_flights,
+)
+
+SCHEMA = "radiotwin.comparison/1"  # of compare.json
+MAX_COLUMNS = 5  # panels in a row
+SHOWN = ("log_distance", "segmented_nn")  # models with maps and located devices
+FIGURES = (
+    ("maps.png", "One device: truth, twin and log-distance model",
+     "Gain of the truth, of the learned twin and of the log-distance model, and the differences."),
+    ("scatter.png", "Held-out flights",
+     "Predicted over measured gain of every detected link of flights that no model was fitted to."),
+    ("estimates.png", "Positions of the unknown devices",
+     "Estimates by the log-distance model and by the twin; a circle contains 90 % of the "
+     "posterior."),
+)
+
+
+class ScoreRecord(Record):
+    """Errors of a model on a class of links."""
+
+    model: str
+    against: str
+    positions: Literal["estimated", "true"]
+    links: Literal["all", "LoS", "NLoS"]
+    n: Whole
+    rmse_db: Real | None
+    mae_db: Real | None
+    bias_db: Real | None
+
+
+class LocationRecord(Record):
+    """Where a model located a device."""
+
+    model: str
+    device: str
+    x_m: Real | None = None
+    y_m: Real | None = None
+    error_m: Real | None
+    credible_radius_m: Real | None = None
+    located: bool = False
+
+
+class ComparisonRecord(Record):
+    """Content of `compare.json`."""
+
+    scores: list[ScoreRecord]
+    locations: list[LocationRecord]
+
+    @field_validator("scores")
+    @classmethod
+    def _complete(cls, scores: list[ScoreRecord]) -> list[ScoreRecord]:
+        classes = Counter((each.model, each.against, each.positions) for each in scores)
+        rows = {(each.model, each.against, each.positions, each.links) for each in scores}
+        if len(rows) < len(scores) or any(count != len(CLASSES) for count in classes.values()):
+            raise ValueError(f"not one row for each of {', '.join(CLASSES)} of a model")
+        return scores
+
+
+def compare_held_out(measurements: Measurements, scene: Scene, truth: RadioMap | None = None, *,
+                     held_out: int = 1, raytrace: bool = False, also: Sequence[Path | str] = (),
+                     seed: int = 0, executor: Executor | None = None) -> Comparison:
+    """Compare all channel models on the last flights, which none of them is fitted to.
+
+    Published laws that hold at the scene's frequency are among them, fitted to nothing.
+
+    Args:
+        measurements: of several flights.
+        scene: where they were flown.
+        truth: the whole map to judge on, too; None: there is none.
+        held_out: number of the last flights.
+        raytrace: compare the model `raytrace`, too; takes minutes.
+        also: folders of twins and, with a truth, files of radio maps, to compare with the models.
+        seed: of all fits.
+        executor: where the models are fitted; None: in this process.
+
+    Raises:
+        BadInput: too few flights, or what `judge_also` and `compare_models` refuse.
+    """
+    train, test = split_flights(measurements, held_out)
+    twins, maps = judge_also([Path(path) for path in also], truth, test.flights)
+    models = (*DEFAULT_MODELS, *published_models(scene.config.radio.frequency_hz),
+              *["raytrace"] * raytrace)
+    return compare_models(train, test, scene, truth, seed=seed, models=models, twins=twins,
+                          maps=maps, executor=executor)
+
+
+def judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
+               ) -> tuple[dict[str, Twin], dict[str, RadioMap]]:
+    """Read twins and radio maps that are to be compared with the models.
+
+    Warns where a twin was fitted to one of the held-out flights.
+
+    Args:
+        paths: folders of twins, and files of radio maps.
+        truth: map of reference gains; None: there is none.
+        held_out: names of the held-out flights.
+
+    Returns:
+        twins and maps, by their paths
+
+    Raises:
+        BadInput: neither a twin's folder nor a radio map, or a map without a truth.
+    """
+    twins, maps = {}, {}
+    for path in paths:
+        if path.is_dir() and not is_zarr(path):
+            twins[str(path)] = Twin.load(path)
+            fitted_to = set(twins[str(path)].provenance.get("flights", []))
+            seen = sorted(fitted_to & set(held_out))
+            if seen:
+                warnings.warn(
+                    f"{path} was fitted to {', '.join(seen[:4])}, which is held out here: its "
+                    "error on held-out flights is too good", stacklevel=2)
+        elif truth is None:
+            raise BadInput(f"{path}: a radio map can only be judged on a whole map; give --truth, "
+                           "too")
+        else:
+            maps[str(path)] = RadioMap.read(path)
+    return twins, maps
+
+
+def write_comparison(comparison: Comparison, scene: Scene, folder: Path | str) -> None:
+    """Write the tables of a comparison.
+
+    Args:
+        comparison: result of `compare_models`.
+        scene: whose name is recorded.
+        folder: for `compare.json`, `scores.csv`, `locations.csv` and `predictions.csv.gz`; made if
+            needed, files of these names are replaced.
+    """
+    folder = Path(folder)
+    record = {"schema": SCHEMA, "scene": scene.config.name, "scores": _rows(comparison.scores),
+              "locations": _rows(comparison.locations),
+              "location_summary": _rows(comparison.location_summary())}
+    with atomic_path(folder / "compare.json") as temporary:
+        temporary.write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
+    for name, table in (("scores.csv", comparison.scores), ("locations.csv", comparison.locations),
+                        ("predictions.csv.gz", comparison.predictions)):
+        with atomic_path(folder / name) as temporary:
+            write_csv(table, temporary, "%.4f")
+
+
+def read_comparison(path: Path) -> Comparison:
+    """Read the tables of a comparison.
+
+    Args:
+        path: of a `compare.json`.
+
+    Returns:
+        scores and locations; twins and predictions are empty.
+
+    Raises:
+        BadInput: it cannot be read, it is of another version, or it is damaged.
+    """
+    record = read_record(path, "comparison (compare.json)")
+    if record.get("schema") != SCHEMA:
+        raise BadInput(f"{path}: schema is {repr(record.get('schema'))[:60]}, this version reads "
+                       f"{SCHEMA!r}; make the run again")
+    record = validated(ComparisonRecord, record, path, "run `radiotwin compare` again")
+    scores = pd.DataFrame(record["scores"], columns=list(ScoreRecord.model_fields))
+    locations = pd.DataFrame(record["locations"], columns=list(LocationRecord.model_fields))
+    for table in (scores, locations):
+        numbers = [name for name in table if name.endswith(("_db", "_m"))]
+        table[numbers] = table[numbers].astype(float)
+    return Comparison(scores, locations, {}, pd.DataFrame())
+
+
+def _rows(table: pd.DataFrame) -> list[dict]:
+    """Return the rows of a table for JSON; numbers that are not finite are null."""
+    return [{key: None if isinstance(value, float) and not np.isfinite(value) else value
+             for key, value in row.items()} for row in table.to_dict("records")]
+
+
+def write_comparison_figures(comparison: Comparison, scene: Scene, truth: RadioMap | None,
+                             folder: Path | str) -> None:
+    """Write the figures of a comparison as PNG files.
+
+    Args:
+        comparison: result of `compare_models`.
+        scene: whose buildings are drawn.
+        truth: map of reference gains; None: no maps are drawn.
+        folder: for `scatter.png`, `estimates.png` where all true positions are known, and
+            `maps.png`.
+    """
+    folder = Path(folder)
+    save(scatter_figure(comparison, list(comparison.twins)), folder / "scatter.png")
+    shown = [name for name in SHOWN if name in comparison.twins] or list(comparison.twins)[:2]
+    if len(comparison.locations) and comparison.locations["error_m"].notna().all():
+        save(estimates_figure(comparison, shown, scene), folder / "estimates.png")
+    if truth is not None:
+        maps = {name: comparison.twins[name].radio_map(scene) for name in reversed(shown)}
+        figure = model_maps_figure(truth, maps, scene, typical_device(truth, maps))
+        save(figure, folder / "maps.png")
+
+
+def typical_device(truth: RadioMap, maps: dict[str, RadioMap]) -> str:
+    """Return the device in all maps whose share of line of sight is nearest to the mean."""
+    devices = [name for name in truth.devices
+               if all(name in radio_map.devices for radio_map in maps.values())]
+    los = np.array([truth.los[truth.devices.index(name)].mean() for name in devices])
+    return devices[int(np.abs(los - los.mean()).argmin())]
+
+
+def scatter_figure(comparison: Comparison, models: list[str]) -> Figure:
+    """Draw predicted over measured levels of the held-out links, LoS and NLoS apart.
+
+    Args:
+        comparison: with its held-out predictions.
+        models: names of the models, a panel for each.
+    """
+    columns = min(len(models), MAX_COLUMNS)
+    figure, axes = panels(-(-len(models) // columns), columns, 4.2, 4.6)
+    for unused in axes.flat[len(models):]:
+        unused.set_visible(False)
+    links = comparison.predictions.dropna(subset=["measured_db"])
+    levels_db = [links["measured_db"], *(links[model].dropna() for model in models)]
+    both_db = np.concatenate(levels_db)
+    ends_db = np.floor(both_db.min() / 5) * 5, np.ceil(both_db.max() / 5) * 5
+    for ax, model in zip(axes.flat, models):
+        for los, colour, label in ((False, NLOS_COLOUR, "NLoS"), (True, LOS_COLOUR, "LoS")):
+            part = links[links["los"] == los]
+            ax.plot(part["measured_db"], part[model], ".", color=colour, markersize=3, alpha=0.5,
+                    label=label)
+        ax.plot(ends_db, ends_db, color="black", linewidth=0.8)
+        error_db = (links[model] - links["measured_db"]).dropna()
+        rmse_db = np.sqrt(np.mean(error_db**2))
+        ax.set(title=f"{plain(MODELS.get(model, model))}, RMSE {rmse_db:.1f} dB", aspect="equal",
+               xlabel="measured [dB]", ylabel="predicted [dB]", xlim=ends_db, ylim=ends_db)
+        ax.grid(alpha=0.25)
+        ax.legend(markerscale=4, loc="upper left")
+    return figure
+
+
+def estimates_figure(comparison: Comparison, models: list[str], scene: Scene) -> Figure:
+    """Draw the estimated positions of the unknown devices; circles contain 90 % of the posterior.
+
+    Args:
+        comparison: with its located devices.
+        models: names of the models, a panel for each.
+        scene: whose buildings and true positions are drawn.
+    """
+    extent = scene.config.extent
+    ratio = (extent.x_max_m - extent.x_min_m) / (extent.y_max_m - extent.y_min_m)
+    figure, axes = panels(1, len(models), 6.4 * min(max(ratio, 0.7), 1.4), 6.4)
+    height_m, bounds = height_grid(scene, 500)
+    true_m = true_positions_m(scene)
+    max_radius_m = 2 * (bounds[1] - bounds[0])
+    for ax, model in zip(axes.flat, models):
+        image = draw_heights(ax, height_m, bounds)
+        for device in comparison.twins[model].devices:
+            if device.role == "anchor":
+                ax.plot(device.x_m, device.y_m, "^", color="black", markersize=8, label="anchor")
+                continue
+            x_m, y_m, _ = true_m[device.device]
+            ax.plot(x_m, y_m, "*", color="#f08a00", markersize=14, markeredgecolor="white",
+                    label="true position")
+            if np.isfinite([device.x_m, device.y_m]).all():
+                ax.plot([x_m, device.x_m], [y_m, device.y_m], color=NLOS_COLOUR, linewidth=1)
+                ax.plot(device.x_m, device.y_m, "x", color=NLOS_COLOUR, markersize=8,
+                        markeredgewidth=2, label="estimate")
+                radius_m = min(device.credible_radius_m, max_radius_m)
+                ax.add_artist(Circle((device.x_m, device.y_m), radius_m, fill=False,
+                                     color=NLOS_COLOUR, linewidth=1, alpha=0.8))
+        errors_m = comparison.locations.query("model == @model")["error_m"]
+        ax.set_title(f"{plain(MODELS.get(model, model))}: median error {errors_m.median():.1f} m")
+        ax.set(xlim=bounds[:2], ylim=bounds[2:])
+    handles = dict(zip(*reversed(axes[0, 0].get_legend_handles_labels())))
+    figure.colorbar(image, ax=axes, label="height [m]", shrink=0.8)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3,
+                  frameon=False)
+    return figure
+
+
+def comparison_context(comparison: Comparison, folder: Path) -> dict[str, Any]:
+    """Collect the variables of the template `comparison_sections.html`.
+
+    Args:
+        comparison: scores and located devices.
+        folder: of the figures.
+    """
+    pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
+    return {"lead": _summary(comparison),
+            "tables": [Table(list(columns), rows, title)
+                       for title, columns, rows in comparison.tables()],
+            "figures": [picture for picture in pictures if picture]}
+
+
+def _summary(comparison: Comparison) -> str:
+    """Summarise the result in a sentence; empty without a whole map to compare on."""
+    scores = comparison.scores.query(
+        "against == 'whole map' and positions == 'estimated' and links == 'all'")
+    rmse_db = scores.set_index("model")["rmse_db"]
+    located = comparison.location_summary().set_index("model")
+    if not {"segmented_nn", "log_distance"} <= set(rmse_db.index) & set(located.index):
+        return ""
+    median_m = located["median_m"]
+    return ("Fitted to a few flights, the twin predicts the gain over the whole map with an RMSE "
+            f"of {rmse_db['segmented_nn']:.1f} dB (log-distance model: "
+            f"{rmse_db['log_distance']:.1f} dB) and locates the unknown devices with a median "
+            f"error of {median_m['segmented_nn']:.1f} m (log-distance model: "
+            f"{median_m['log_distance']:.1f} m).")

@@ -1,0 +1,1 @@
+"""Workers, kept pieces, signals, progress, and what commands print."""

@@ -1,0 +1,204 @@
+"""What commands print: messages, warnings, tables and progress bars.
+
+Print messages, warnings and tables the same way in every command.
+
+Names come from strangers' files: what a terminal would obey is shown as an escape.
+
+One progress display for the whole project.
+"""
+
+import logging
+import re
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, TextIO
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.markup import escape
+from rich.measure import Measurement
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.segment import Segment
+from rich.table import Table
+
+# C0 but tab and line feed, DEL, C1; marks, embeddings, overrides and isolates of direction; line
+# and paragraph separators; halves of characters, as Python reads names that are not UTF-8.
+_OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"
+                     "\ud800-\udfff]")
+MAX_LINE = 10_000  # characters of a table that is not on a terminal
+silent = False  # True hides every bar
+_displays: list[Progress] = []  # at most one: a terminal has room for one display
+
+
+def printable(text: str) -> str:
+    """Return a text with escapes in place of what a terminal would obey or could not show.
+
+    Args:
+        text: any; tabs and line feeds are kept.
+    """
+    return _OBEYED.sub(lambda match: repr(match[0])[1:-1], text)
+
+
+class PrintableConsole(Console):
+    """A console on which no text gives orders to the terminal, whatever prints it."""
+
+    def render(self, renderable: RenderableType,
+               options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Yield segments of printable text; see `rich.console.Console.render`.
+
+        Args:
+            renderable: anything that rich can print.
+            options: of the console.
+        """
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(printable(segment.text), segment.style)
+
+
+console = PrintableConsole(highlight=False)
+error_console = PrintableConsole(stderr=True, highlight=False)
+collected: dict[str, Any] = {}
+"""Messages, tables and results printed so far, for `--json`."""
+
+
+def complain(message: str) -> None:
+    """Print one message on standard error, without markup and without wrapping inside paths."""
+    with suppress(OSError):  # standard error is closed, or its disk is full: nobody to tell
+        error_console.print("[bold red]radiotwin:[/] ", end="")
+        error_console.print(printable(message), markup=False, soft_wrap=True)
+
+
+def notice(message: str) -> None:
+    """Print one line about the run itself on standard error; nothing if it is empty."""
+    if message and not console.quiet:
+        error_console.print(f"radiotwin: {message}", markup=False, soft_wrap=True)
+
+
+def say(message: str) -> None:
+    """Print one line on standard output."""
+    collected.setdefault("messages", []).append(message)
+    console.print(printable(message), markup=False, soft_wrap=True)
+
+
+def show_warnings_plainly() -> None:
+    """Show warnings of both packages as one line each, once, without source lines, and no others.
+
+    Each model that is fitted to the same measurements says the same of them.
+    """
+    shown: set[str] = set()
+
+    def show(message: Warning | str, category: type[Warning], filename: str, lineno: int,
+             file: TextIO | None = None, line: str | None = None) -> None:
+        path = filename.replace("\\", "/")
+        if issubclass(category, UserWarning) and ("/radiotwin/" in path or "/marl/" in path):
+            text = printable(str(message))
+            if text in shown:
+                return
+            shown.add(text)
+            with suppress(OSError):
+                error_console.print("[yellow]warning:[/] ", end="")
+                error_console.print(text, markup=False, soft_wrap=True)
+
+    warnings.showwarning = show
+    if logging.lastResort is not None:  # of libraries that log; nothing else sets up logging
+        logging.lastResort.setFormatter(_PrintableLog())
+
+
+class _PrintableLog(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
+
+
+def result(name: str, value: Any) -> None:
+    """Add an entry to the document of `--json`, such as numbers that a table shows rounded."""
+    collected[name] = value
+
+
+def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
+    """Print a table.
+
+    Args:
+        title: line above it.
+        columns: heading -> `left` or `right`.
+        rows: cells; of floats two decimals or, of small ones, digits are printed, of NaN a dash.
+    """
+    names = [heading or f"column {number}" for number, heading in enumerate(columns, start=1)]
+    collected.setdefault("tables", []).append(
+        {"title": title, "rows": [dict(zip(names, row)) for row in rows]})
+    table = Table(title=escape(_text(title)), title_justify="left", title_style="bold",
+                  box=SIMPLE_HEAD, pad_edge=False)
+    for heading, justify in columns.items():
+        table.add_column(escape(_text(heading)), justify=justify,  # type: ignore[arg-type]  # a Literal
+                         overflow="fold")
+    for row in rows:
+        table.add_row(*(escape(_text(cell)) for cell in row))
+    print_table(table, console)
+
+
+def print_table(table: Table, to: Console) -> None:
+    """Print a table with all of its text.
+
+    A file or a pipe has no width: there lines are as long as they need to be. On a terminal, what
+    is wider than it goes on in the next line of its cell.
+
+    Args:
+        table: whose columns overflow by `fold`.
+        to: where to print it.
+    """
+    if to.is_terminal:
+        to.print(table)
+        return
+    wanted = Measurement.get(to, to.options.update(max_width=MAX_LINE), table).maximum
+    width, to.width = to.width, max(to.width, wanted)
+    try:
+        to.print(table)
+    finally:
+        to.width = width
+
+
+def _text(cell: Any) -> str:
+    if isinstance(cell, float):
+        return "–" if cell != cell else f"{cell:.2g}" if 0 < abs(cell) < 0.005 else f"{cell:.2f}"
+    return printable(str(cell)).replace("\n", "\\n").replace("\t", "\\t")
+
+
+@contextmanager
+def progress(description: str, total: float | None) -> Iterator[Callable[..., None]]:
+    """Show a progress bar on standard error; show nothing where that is no terminal.
+
+    A bar inside another one gets a line below it in the same display.
+
+    Args:
+        description: text before the bar.
+        total: number of steps; None if unknown.
+
+    Yields:
+        `advance(n=1, description=None)`, which adds `n` steps and may change the text.
+    """
+    if _displays:
+        task = _displays[0].add_task(description, total=total)
+        try:
+            yield lambda n=1, description=None: _displays[0].update(
+                task, advance=n, description=description)
+        finally:
+            _displays[0].remove_task(task)
+        return
+    console = PrintableConsole(stderr=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
+               TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True,
+                  disable=silent or not console.is_terminal) as display:
+        _displays.append(display)
+        try:
+            task = display.add_task(description, total=total)
+            yield lambda n=1, description=None: display.update(
+                task, advance=n, description=description)
+        finally:
+            _displays.remove(display)

@@ -1,0 +1,281 @@
+"""Workers on a Ray cluster: one actor each."""
+
+import contextlib
+import json
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+from radiotwin.errors import BadInput, RunFailed
+from radiotwin.io.signals import deferred, kept_from_children
+from radiotwin.runtime.execution.job import (
+    SHARE_ROUNDING,
+    Death,
+    Outcome,
+    PieceRunner,
+    Pool,
+    Resources,
+    Worker,
+    thread_variables,
+)
+from radiotwin.runtime.pieces import versions
+from radiotwin.runtime.processes import usable_cores
+
+OWN = "auto"
+STORE_BYTES = 128 * 2**20  # for objects, of a cluster of our own: pieces and results are small
+START_S = 120  # for workers of a cluster to begin
+STOP_S = 20
+# All are read when Ray is imported. Without the possibility of other machines Ray listens on the
+# loopback interface only; that variable's name is from the systems where this is the default.
+_OF_OWN_CLUSTER = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
+                   "RAY_AUTH_MODE": "token"}
+
+
+class RayPool(Pool):
+    """Actors of a Ray cluster.
+
+    Args:
+        address: Of a cluster that runs, HOST:PORT; `auto`: one of its own on this machine, with a
+            token, on the loopback interface, without a dashboard; it ends with the pool.
+        workers: Most of them; None: as many as the cluster has free cores and memory for.
+
+    Raises:
+        BadInput: No Ray, no such cluster, or one that runs other versions.
+    """
+
+    name = "a Ray cluster"
+
+    def __init__(self, address: str, workers: int | None = None) -> None:
+        self._most = workers
+        self._workers: list[_RayWorker] = []
+        self._head: _Head | None = None
+        if address == OWN:
+            _require_token()
+        self._ray = _import_ray()
+        try:
+            if address == OWN:
+                self._head = _Head(workers or usable_cores())
+                self.name, address = "a Ray cluster of this machine", self._head.address
+            self._connect(address)
+        except BaseException:
+            self.close()
+            raise
+
+    def _connect(self, address: str) -> None:
+        ray = self._ray
+        if ray.is_initialized():
+            raise BadInput("--cluster: this process is connected to a Ray cluster already; end "
+                           "that with ray.shutdown()")
+        # Workers search for modules in the driver's working folder first: that may be a stranger's.
+        with tempfile.TemporaryDirectory() as empty, contextlib.chdir(empty), _own_handlers():
+            try:
+                ray.init(address=address, log_to_driver=False, configure_logging=False)
+            except Exception as error:  # noqa: BLE001  # of many kinds
+                raise BadInput(f"--cluster {address[:200]}: cannot be joined "
+                               f"({_first_line(error)}); `ray status` there says whether it runs, "
+                               "RAY_AUTH_TOKEN must be its token") from None
+        self._require_same_versions(address)
+
+    def _require_same_versions(self, address: str) -> None:
+        """Refuse a node whose Python, radiotwin or libraries are not those of this process."""
+        ray = self._ray
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        ask = ray.remote(num_cpus=0, max_retries=0)(_versions)
+        nodes = [node for node in ray.nodes() if node["Alive"]]
+        asked = {node["NodeManagerAddress"]: ask.options(
+            scheduling_strategy=NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)).remote()
+            for node in nodes}
+        for host, answer in asked.items():
+            try:
+                there = ray.get(answer, timeout=START_S)
+            except Exception as error:  # noqa: BLE001  # of many kinds
+                raise BadInput(f"--cluster {address}: node {host} cannot run radiotwin "
+                               f"({_first_line(error)}); install the same version of it there"
+                               ) from None
+            different = sorted(set(there) ^ set(versions()))
+            if different:
+                raise BadInput(
+                    f"--cluster {address}: node {host} has other versions than this machine: "
+                    f"{', '.join(map(_named, sorted(set(there) - set(versions()))))} there, "
+                    f"{', '.join(map(_named, sorted(set(versions()) - set(there))))} here; install "
+                    "the same on all, or results would differ")
+
+    def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
+        """Return workers for a job.
+
+        Raises:
+            RunFailed: the cluster has no room for one, or for the number that was asked for.
+        """
+        wanted = min(self._capacity(resources), count)
+        same = [each for each in self._workers if each.resources == resources][:wanted]
+        for each in self._workers:
+            if each not in same:
+                each.close()
+        new = [_RayWorker(self._ray, resources) for _ in range(wanted - len(same))]
+        self._workers = same + new
+        sent = self._ray.put(function)
+        for each in self._workers:
+            each.function = sent
+        return self._workers
+
+    def _capacity(self, resources: Resources) -> int:
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        needs = {"CPU": resources.cores, "memory": resources.memory_bytes,
+                 "GPU": resources.gpu_share}
+        fitting = sum(min(int(node.get(name, 0) / need + SHARE_ROUNDING)
+                          for name, need in needs.items() if need) for node in nodes)
+        if fitting < (self._most or 1):
+            raise RunFailed(
+                f"{self.name} has room for {fitting} workers of {resources.cores} core(s), "
+                f"{resources.memory_bytes / 2**30:.1f} GiB and {resources.gpu_share:g} GPUs each; "
+                f"{self._most or 1} are asked for: ask for fewer, or add nodes")
+        return self._most or fitting
+
+    def close(self) -> None:
+        """End all workers, and the cluster if it is our own."""
+        with deferred():
+            for each in self._workers:
+                each.close()
+            self._workers = []
+            self._ray.shutdown()
+            if self._head is not None:
+                self._head.close()
+                self._head = None
+
+
+class _Head:
+    """A cluster of our own; it ends when this process does."""
+
+    def __init__(self, cores: int) -> None:
+        self._folder = Path(tempfile.mkdtemp(prefix="radiotwin-ray-"))
+        with kept_from_children():
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", str(Path(__file__).with_name("ray_head.py"))],
+                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                start_new_session=True, cwd=self._folder)
+        assert self._process.stdin is not None and self._process.stdout is not None
+        options = {"num_cpus": cores, "_temp_dir": str(self._folder),
+                   "object_store_memory": STORE_BYTES,
+                   # Processes that it would start beforehand have not the workers' environment.
+                   "_system_config": {"prestart_worker_first_driver": False}}
+        self._process.stdin.write(json.dumps(options) + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            said = self._process.stderr.read() if self._process.stderr else ""
+            self.close()
+            raise RunFailed("a Ray cluster could not be started on this machine: "
+                            + (said.strip().splitlines() or ["no reason is given"])[-1][:300])
+        self.address: str = json.loads(line)["address"]
+
+    def close(self) -> None:
+        """End the cluster and remove its files."""
+        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
+            if stream is not None:
+                stream.close()
+        try:
+            self._process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(self._process.pid, 9)
+            self._process.wait()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+
+class _RayWorker(Worker):
+    def __init__(self, ray: Any, resources: Resources) -> None:
+        self._ray, self.resources = ray, resources
+        self.function: Any = None
+        self._sent: Any = None
+        self._actor: Any = None
+
+    def submit(self, piece: Any) -> "Future[Outcome]":
+        if self._actor is None:
+            resources = self.resources
+            self._actor = self._ray.remote(PieceRunner).options(
+                num_cpus=resources.cores, num_gpus=resources.gpu_share or None,
+                memory=resources.memory_bytes or None, max_restarts=0,
+                runtime_env={"env_vars": thread_variables(resources.cores)}).remote()
+            self._sent = None
+        if self._sent is self.function:
+            return self._actor.run.remote(piece).future()
+        self._sent = self.function
+        return self._actor.run.remote(piece, self.function).future()
+
+    def death(self, error: BaseException) -> Death | None:
+        exceptions = self._ray.exceptions
+        if isinstance(error, exceptions.OutOfMemoryError):
+            self.close()
+            return Death("its machine was short of memory", memory=True)
+        if isinstance(error, exceptions.RayActorError | exceptions.WorkerCrashedError
+                      | exceptions.NodeDiedError):
+            self.close()
+            return Death(_first_line(error))
+        return None
+
+    def raised(self, error: BaseException) -> BaseException:
+        return getattr(error, "cause", None) or error
+
+    def check(self) -> None:
+        """Do nothing: Ray ends workers that a node is short of memory for."""
+
+    def close(self) -> None:
+        if self._actor is not None:
+            self._ray.kill(self._actor)
+            self._actor = None
+
+
+@contextlib.contextmanager
+def _own_handlers() -> Iterator[None]:
+    """Keep the handler of SIGTERM, which Ray replaces by its own."""
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)
+
+
+def _versions() -> tuple[str, ...]:
+    """Return `versions()`: Ray takes functions, and that is a cached one."""
+    return versions()
+
+
+def _require_token() -> None:
+    """Set what a cluster of our own needs: a token, above all, without which it runs any code."""
+    if any(os.environ.get(name) != value for name, value in _OF_OWN_CLUSTER.items()):
+        if "ray" in sys.modules:
+            raise BadInput("--cluster auto: this process imported Ray before its token was set; "
+                           "import radiotwin's part first, or give the address of your cluster")
+        os.environ.update(_OF_OWN_CLUSTER)
+    os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+
+
+def _import_ray() -> Any:
+    try:
+        import ray
+    except ImportError:
+        raise BadInput("--cluster needs Ray, which is not installed; install it with `pip install "
+                       "'radiotwin[ray]'`, or leave the option out") from None
+    return ray
+
+
+def _first_line(error: BaseException) -> str:
+    lines = [line for line in str(error).strip().splitlines() if line.strip()]
+    return (lines[-1] if "Traceback" in str(error) else lines[0])[:300] if lines else \
+        type(error).__name__
+
+
+def _named(version: str) -> str:
+    """Return a version as a message has it; that of the sources is a hash."""
+    return version if " " in version or "." in version or not version.isalnum() else \
+        f"radiotwin's sources {version[:8]}"

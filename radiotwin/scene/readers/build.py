@@ -1,0 +1,445 @@
+"""Scene folders from maps with footprints.
+
+The file `buildings.csv`: position, height and material of each building, and their sources.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import shapely
+
+from radiotwin.errors import BadInput
+from radiotwin.geo.geodesy import to_local
+from radiotwin.io.budgets import FEATURES, SHAPES
+from radiotwin.io.forms import Origin
+from radiotwin.io.inputs import check_input
+from radiotwin.scene import checks
+from radiotwin.scene.build import BuildOptions, Declared, check_target, finish_scene
+from radiotwin.scene.checks import Problem
+from radiotwin.scene.folder import scene_name, source_text
+from radiotwin.scene.importer import ImportedCity
+from radiotwin.scene.materials import (
+    RESERVED_NAMES,
+    Material,
+    Names,
+    itu_material,
+    safe_name,
+    unique_name,
+)
+from radiotwin.scene.placement import choose_extent, make_extent
+from radiotwin.scene.readers.citygml import read_citygml
+from radiotwin.scene.readers.cityjson import read_cityjson
+from radiotwin.scene.readers.extrude import make_blocks, split_roof
+from radiotwin.scene.readers.features import (
+    Feature,
+    MapFile,
+    OutlineBudget,
+    left_out_problems,
+    problems_of,
+)
+from radiotwin.scene.readers.gis_files import read_geojson, read_geopackage, read_geoparquet
+from radiotwin.scene.readers.heights import (
+    HeightColumn,
+    check_declared,
+    height_sds_m,
+    no_height_text,
+)
+from radiotwin.scene.readers.heights import source_text as height_text
+from radiotwin.scene.readers.material_table import STANDARD, MaterialTable
+from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml
+from radiotwin.scene.readers.shapefiles import read_shapefile
+from radiotwin.scene.readers.solids import (
+    Contacts,
+    Prism,
+    elevation_fact,
+    find_contacts,
+    find_overlaps,
+    make_prisms,
+    make_shell_prisms,
+)
+from radiotwin.scene.readers.systems import check_declared_system
+from radiotwin.scene.readers.terrain import Ground, make_ground, stand_on
+from radiotwin.scene.readers.vegetation import make_vegetation, vegetation_fact
+from radiotwin.scene.report import BuildReport
+from radiotwin.scene.surfaces import Surfaces
+from radiotwin.scene.vegetation import VegetationConfig
+
+OSM_SUFFIXES = (".osm", ".osm.pbf")
+READERS: dict[str, Callable[[Path, str | None], MapFile]] = {
+    ".osm": lambda path, _: assemble(read_osm_xml(path)),
+    ".osm.pbf": lambda path, _: assemble(read_osm_pbf(path)),
+    ".geojson": read_geojson, ".gpkg": read_geopackage,
+    ".parquet": read_geoparquet,
+    ".shp": read_shapefile, ".zip": read_shapefile,
+    ".city.json": read_cityjson, ".city.json.gz": read_cityjson, ".json": read_cityjson,
+    ".cityjson": read_cityjson, ".jsonl": read_cityjson, ".gml": read_citygml,
+    ".citygml": read_citygml}
+GROUND = "ground"  # name of its shape
+GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent
+MAX_WIDTH_M = 50e3  # [m], chosen so that a plane and single precision are good enough
+ORIGIN_DECIMALS = 6  # of latitude and longitude [degrees]: a decimetre
+DEFAULT_HEIGHT_M = 10.0  # [m], about three storeys
+Bounds = tuple[float, float, float, float]
+
+
+def building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
+                   on_terrain: bool = False) -> pd.DataFrame:
+    """Return the table of buildings, with one row a prism.
+
+    Args:
+        prisms: of all buildings.
+        shape_of: prism -> name of its shape in `city.xml`.
+        on_terrain: whether the ground is not flat.
+
+    Returns:
+        Columns building, shape, x_m, y_m (a point inside), area_m2, on terrain ground_m (the lowest
+        ground under the building), bottom_m and top_m (as ground_m above the datum), height_from,
+        height_sd_m (see `height_sds_m`), unusable (tags that were skipped), material and
+        material_from.
+    """
+    rows, heights_sd_m = [], height_sds_m(
+        np.array([prism.height.top_m - prism.ground_m for prism in prisms]),
+        np.array([prism.height.sd_m for prism in prisms]))
+    for index, prism in enumerate(prisms):
+        inside = prism.area.representative_point()
+        rows.append({
+            "building": prism.name, "shape": shape_of.get(index, ""),
+            "x_m": round(inside.x, 2), "y_m": round(inside.y, 2),
+            "area_m2": round(prism.area.area, 1),
+            **({"ground_m": prism.ground_m} if on_terrain else {}),
+            "bottom_m": round(prism.height.bottom_m, 3),
+            "top_m": round(prism.height.top_m, 3), "height_from": prism.height.source,
+            "height_sd_m": round(float(heights_sd_m[index]), 1),
+            "unusable": "; ".join(prism.height.unusable), "material": prism.material.name,
+            "material_from": prism.material_from})
+    return pd.DataFrame(rows)
+
+
+def height_counts(table: pd.DataFrame) -> dict[str, int]:
+    """Count the buildings by the source of their height, once for each source of a building."""
+    return dict(Counter(table.drop_duplicates(["building", "height_from"])["height_from"]))
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How to read a map.
+
+    Attributes:
+        bbox_deg: (south, west, north, east) [degrees]: only buildings that reach into it are kept,
+            and it becomes the extent; None: all of the file.
+        default_height_m: height of buildings whose tags give none [m]; None: 10 m, with a warning,
+            and an error where a table has columns of numbers and none of them is known.
+        height_column: column that goes before all known ones; None: the known ones.
+        materials: by tag.
+        terrain: GeoTIFF of the ground's heights; None: the ground is flat.
+        crs: coordinate reference system of a file that names none; None: such a file is refused,
+            and GeoJSON is in degrees.
+    """
+
+    bbox_deg: Bounds | None = None
+    default_height_m: float | None = None
+    materials: MaterialTable = STANDARD
+    height_column: HeightColumn | None = None
+    terrain: Path | None = None
+    crs: str | None = None
+
+    @property
+    def height_m(self) -> float:
+        """Height of buildings whose tags give none [m]."""
+        return DEFAULT_HEIGHT_M if self.default_height_m is None else self.default_height_m
+
+    def check(self) -> None:
+        """Raise BadInput for an impossible value."""
+        if not 0 < self.height_m <= 1000:
+            raise BadInput(f"a default height of {self.height_m:g} m is not possible; give "
+                           "more than 0 and at most 1000 m")
+        if self.crs is not None:
+            check_declared_system(self.crs)
+        if self.bbox_deg is not None:
+            south, west, north, east = self.bbox_deg
+            if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
+                raise BadInput(f"bbox {self.bbox_deg} is not possible; give SOUTH,WEST,NORTH,EAST "
+                               "in degrees, the south below the north and the west below the east")
+
+
+def map_suffix(source: Path | str) -> str | None:
+    """Return the suffix of a map file's name, a key of `READERS`; None for other files."""
+    name = str(source).lower()
+    return next((suffix for suffix in READERS if name.endswith(suffix)), None)
+
+
+def map_name(source: Path | str) -> str:
+    """Return the name of the scene made from a map.
+
+    >>> map_name("data/old town.osm.pbf")
+    'old_town'
+    """
+    text = str(source)
+    return scene_name(f"{text[:len(text) - len(map_suffix(source) or '')]}.osm")
+
+
+def build_scene_from_map(
+    source: Path | str, out_folder: Path | str, map_options: MapOptions | None = None,
+    options: BuildOptions | None = None, check_only: bool = False,
+) -> BuildReport:
+    """Read footprints, extrude them, and write a scene folder with a table of all buildings.
+
+    Args:
+        source: a file with one of the endings of `READERS`.
+        out_folder: scene folder to write; a scene in it is replaced.
+        map_options: how to read the map; None: the defaults.
+        options: frequency, devices, UAVs, seed, origin and lattice; `bbox`, `scale`, `up`,
+            `materials` are for city models. None: the defaults.
+        check_only: write nothing.
+
+    Returns:
+        The report of the scene.
+
+    Raises:
+        BadInput: the file cannot be read, holds no buildings (in the box), or an option is
+            impossible.
+    """
+    path, out_folder = Path(source), Path(out_folder)
+    map_options, options = map_options or MapOptions(), options or BuildOptions()
+    map_options.check()
+    options.check()
+    if not check_only:
+        check_target(out_folder, source=path)
+    check_input(path, f"map ({', '.join(READERS)})")
+    suffix = map_suffix(path)
+    if suffix is None:
+        raise BadInput(f"{path} is not a map; allowed are {', '.join(READERS)}")
+    if map_options.crs is not None and suffix in OSM_SUFFIXES:
+        raise BadInput(f"{path} is in longitude and latitude, as all of OpenStreetMap; leave --crs "
+                       "out")
+    found = READERS[suffix](path, map_options.crs)
+    FEATURES.check(len(found.features), path)
+    features = _within(found.features, map_options.bbox_deg, path)
+    SHAPES.check(len(features), path)
+    origin = options.origin or _origin(features, map_options.bbox_deg)
+    _check_sizes(features, origin, path)
+    if map_options.height_column is not None:
+        check_declared(map_options.height_column, [one.tags for one in features], path)
+    flat, shells = ([one for one in features if (one.shell is not None) == has_shell]
+                    for has_shell in (False, True))
+    prisms, problems = make_prisms(flat, origin, map_options.materials, map_options.height_m,
+                                   map_options.height_column)
+    bodies, found_in_bodies = make_shell_prisms(shells, origin, map_options.materials)
+    prisms += bodies
+    problems += found_in_bodies
+    problems = (found.problems + left_out_problems(found.left_out, map_options.bbox_deg)
+                + problems + _without_height(prisms, features, map_options, path))
+    if not prisms:
+        raise BadInput("\n".join([f"{path}: none of its {len(features)} buildings can be used:",
+                                  *(problem.message for problem in problems)]))
+    around = choose_extent(_bounds_m(prisms, origin, map_options.bbox_deg))
+    extent = around if options.extent_m is None else make_extent(options.extent_m)
+    _check_width(max(np.ptp(extent.bounds[:2]), np.ptp(extent.bounds[2:])), MAX_WIDTH_M)
+    ground = make_ground(map_options.terrain, origin, _ground_box(prisms, extent.bounds), GROUND)
+    if ground.config is not None:
+        origin = origin.model_copy(update={"altitude_m": ground.config.datum_m})
+        prisms = stand_on(prisms, ground)
+    contacts = find_contacts(prisms)
+    problems += [*_overlaps(prisms, contacts), *ground.problems]
+    city, shape_of = _city(prisms, contacts, ground, map_options.materials, problems)
+    table = building_table(prisms, shape_of, ground.config is not None)
+    counts = height_counts(table)
+    vegetation, unusable = make_vegetation(found.vegetation, origin,
+                                           _both(around.bounds, extent.bounds))
+    city.problems.extend(unusable)
+    declared = Declared(str(source), map_name(source), extent, origin,
+                        _provenance(str(source), counts, map_options, options),
+                        _facts(table["building"].nunique(), len(set(shape_of.values())), counts,
+                               origin, map_options, vegetation, shells, ground), vegetation,
+                        ground.config)
+    return finish_scene(city, declared, out_folder, options, check_only, table)
+
+
+def _facts(
+    buildings: int, blocks: int, counts: dict[str, int], origin: Origin, map_options: MapOptions,
+    vegetation: list[VegetationConfig], shells: list[Feature], ground: Ground,
+) -> tuple[tuple[str, str], ...]:
+    """Return lines for the report."""
+    heights = ", ".join(
+        [f"{height_text(key, map_options.height_column)}: {number:,}"
+         for key, number in counts.items() if key != "default"]
+        + [f"default: {counts.get('default', 0):,}"])
+    return (("buildings", f"{buildings:,} in {blocks:,} blocks"),
+            ("heights from", f"{heights} ({map_options.height_m:g} m)"),
+            *([("elevations", elevation_fact(shells))] if shells else []),
+            ("ground", ground.fact),
+            *([("vegetation", vegetation_fact(vegetation))] if vegetation else []),
+            ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"))
+
+
+def _provenance(
+    source: str, counts: dict[str, int], map_options: MapOptions, options: BuildOptions
+) -> dict[str, str]:
+    """Return `[provenance]` of `scene.toml`."""
+    known = {"source": source_text(source), "seed": str(options.seed),
+             "height_default_m": f"{map_options.height_m:g}",
+             "heights_from": ", ".join(f"{key} {number}" for key, number in counts.items())}
+    if map_options.bbox_deg is not None:
+        known["bbox_deg"] = ", ".join(map(repr, map_options.bbox_deg))
+    return known
+
+
+def _without_height(prisms: list[Prism], features: list[Feature], map_options: MapOptions,
+                    path: Path) -> list[Problem]:
+    """Return a warning if the default height was taken though nobody declared one.
+
+    Raises:
+        BadInput: it was taken for every building of a table that has other columns of numbers.
+    """
+    buildings = {prism.name for prism in prisms}
+    guessed = {prism.name for prism in prisms if prism.height.source == "default"}
+    if not guessed or map_options.default_height_m is not None:
+        return []
+    text = no_height_text([feature.tags for feature in features])
+    if guessed == buildings and text and map_suffix(path) not in OSM_SUFFIXES:
+        raise BadInput(f"{path}: {text}")
+    return problems_of(
+        sorted(guessed), f"of {len(buildings):,} building(s) have no height in the map: "
+        f"{map_options.height_m:g} m was taken for them. Give the height of such buildings with "
+        "--height-default M, or name a column with --height-column")
+
+
+def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
+    """Return the features that reach into the box, of 3D models with all parts of the building."""
+    if not features:
+        raise BadInput(f"{path} holds no buildings (closed ways or multipolygons with the tag "
+                       "building or building:part; of a table polygons)")
+    bounds_deg = np.array([feature.area.bounds for feature in features])  # NaN of an empty area
+    for feature, bounds in zip(features, bounds_deg):
+        if (np.abs(bounds) > (180, 90, 180, 90)).any():
+            raise BadInput(f"{path}: {feature.name} lies at {bounds[0]:g}, {bounds[1]:g}, which is "
+                           "no longitude and latitude in degrees; export the map in EPSG:4326 or "
+                           "with the name of its system, or declare it with --crs")
+    budget = OutlineBudget(path)
+    if bbox_deg is None:
+        for feature in features:
+            budget.check(feature.name, feature.area)
+        return features
+    south, west, north, east = bbox_deg
+    box = shapely.box(west, south, east, north)
+    near = [feature for feature, (x0, y0, x1, y1) in zip(features, bounds_deg)
+            if x0 <= east and x1 >= west and y0 <= north and y1 >= south]
+    for feature in near:
+        budget.check(feature.name, feature.area)
+    kept = [feature for feature in near if shapely.intersects(
+        shapely.make_valid(shapely.get_parts(feature.area)), box).any()]
+    if not kept:
+        west_, south_ = np.nanmin(bounds_deg[:, :2], axis=0)
+        east_, north_ = np.nanmax(bounds_deg[:, 2:], axis=0)
+        swapped = ((bounds_deg[:, 1] <= east) & (bounds_deg[:, 3] >= west)
+                   & (bounds_deg[:, 0] <= north) & (bounds_deg[:, 2] >= south)).any()
+        hint = ("; latitude and longitude seem to be swapped: --bbox is "
+                "LAT_MIN,LON_MIN,LAT_MAX,LON_MAX; if it is right, the file's are swapped"
+                ) if swapped else ""
+        raise BadInput(f"{path}: no building reaches into the bbox "
+                       f"{south:g},{west:g},{north:g},{east:g}; the file's lie in "
+                       f"{south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} "
+                       f"(south,west,north,east){hint}")
+    chosen, models = set(kept), {one.name for one in kept if one.shell is not None}
+    return [one for one in features
+            if one in chosen or (one.shell is not None and one.name in models)]
+
+
+def _origin(features: list[Feature], bbox_deg: Bounds | None) -> Origin:
+    """Return the middle of the box, or of the buildings."""
+    if bbox_deg is None:
+        bounds = np.array([feature.area.bounds for feature in features])
+        finite = np.isfinite(bounds)
+        bounds = bounds[finite.all(axis=1)] if finite.any() else np.zeros((1, 4))
+        (west, south), (east, north) = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
+    else:
+        south, west, north, east = bbox_deg
+    return Origin(latitude_deg=round(float(south + north) / 2, ORIGIN_DECIMALS),
+                  longitude_deg=round(float(west + east) / 2, ORIGIN_DECIMALS))
+
+
+def _bounds_m(prisms: list[Prism], origin: Origin, bbox_deg: Bounds | None) -> Bounds:
+    """Return (x_min, x_max, y_min, y_max) of the box, or of the buildings [m]."""
+    if bbox_deg is not None:
+        south, west, north, east = bbox_deg
+        x_m, y_m = to_local(origin, np.array([west, east, west, east]),
+                            np.array([south, south, north, north]))
+    else:
+        bounds = np.array([prism.area.bounds for prism in prisms])
+        x_m, y_m = bounds[:, [0, 2]], bounds[:, [1, 3]]
+    box = float(np.min(x_m)), float(np.max(x_m)), float(np.min(y_m)), float(np.max(y_m))
+    _check_width(max(box[1] - box[0], box[3] - box[2]), MAX_WIDTH_M)
+    return box
+
+
+def _both(one_m: Bounds, other_m: Bounds) -> Bounds:
+    """Return (x_min, x_max, y_min, y_max) of what holds two areas [m]."""
+    return (min(one_m[0], other_m[0]), max(one_m[1], other_m[1]),
+            min(one_m[2], other_m[2]), max(one_m[3], other_m[3]))
+
+
+def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:
+    """Raise BadInput if a building, or all together, are so wide that no projection is good."""
+    bounds = np.array([feature.area.bounds for feature in features])
+    middle = [origin.longitude_deg, origin.latitude_deg]
+    bounds = np.where(np.isfinite(bounds), bounds, [middle * 2])
+    corners = np.stack(to_local(origin, bounds[:, [0, 2, 2, 0]], bounds[:, [1, 1, 3, 3]]))
+    widths_m = np.ptp(corners, axis=2).max(axis=0)
+    widest = int(np.nan_to_num(widths_m, nan=np.inf).argmax())
+    if not widths_m[widest] <= MAX_WIDTH_M:
+        raise BadInput(f"{path}: {features[widest].name} is {widths_m[widest] / 1000:.0f} km wide, "
+                       "as no building is; correct or remove it")
+    # From the middle: across the antimeridian all may lie close together, on the earth's other side
+    _check_width(2 * float(np.abs(corners).max()), 10 * MAX_WIDTH_M)
+
+
+def _check_width(width_m: float, most_m: float) -> None:
+    if not width_m <= most_m:  # NaN, too
+        raise BadInput(f"the area is {width_m / 1000:.0f} km wide, {MAX_WIDTH_M / 1000:g} km are "
+                       "allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
+
+
+def _overlaps(prisms: list[Prism], contacts: Contacts) -> list[Problem]:
+    """Return a warning about buildings that overlap, the largest overlap first."""
+    overlaps = sorted(find_overlaps(prisms, contacts), key=lambda overlap: -overlap[2])
+    names = [f"{a.name} and {b.name}: {shared_m2:.0f} m²" for a, b, shared_m2 in overlaps]
+    return problems_of(names, "pair(s) of buildings overlap: their common part is built once")
+
+
+def _ground_box(prisms: list[Prism], extent_m: Bounds) -> Bounds:
+    """Return (x_min, x_max, y_min, y_max) of the ground, beyond buildings and extent [m]."""
+    bounds = np.array([prism.area.bounds for prism in prisms])
+    x0, y0 = np.minimum(bounds[:, :2].min(axis=0), extent_m[::2]) - GROUND_MARGIN_M
+    x1, y1 = np.maximum(bounds[:, 2:].max(axis=0), extent_m[1::2]) + GROUND_MARGIN_M
+    return x0, x1, y0, y1
+
+
+def _city(
+    prisms: list[Prism], contacts: Contacts, ground: Ground, table: MaterialTable,
+    problems: list[Problem],
+) -> tuple[ImportedCity, dict[int, str]]:
+    """Return the city with its ground, and the name of the shape of each prism."""
+    names, meshes = [GROUND], [(ground.vertices, ground.faces)]
+    materials: list[Material | None] = [itu_material(table.ground)]
+    taken = Names({*RESERVED_NAMES, GROUND})
+    shape_of: dict[int, str] = {}
+    for block in make_blocks(prisms, contacts):
+        name = unique_name(safe_name(prisms[block.members[0]].name), taken)
+        shape_of |= dict.fromkeys(block.members, name)
+        walls, roof = split_roof(block.mesh) if table.roof else (block.mesh, None)
+        names.append(name)
+        materials.append(block.material)
+        meshes.append((np.asarray(walls.vertices), np.asarray(walls.faces)))
+        if roof is not None:
+            names.append(unique_name(f"{name}_roof", taken))
+            materials.append(itu_material(table.roof or ""))
+            meshes.append((np.asarray(roof.vertices), np.asarray(roof.faces)))
+    surfaces = Surfaces(meshes)
+    is_ground = surfaces.shape == 0
+    city = ImportedCity(names, materials, surfaces, is_ground, problems)
+    city.problems.extend(checks.check_closed(surfaces, is_ground, names))
+    return city, shape_of

@@ -1,0 +1,139 @@
+"""Reader of CityJSON 1.0 to 2.0 [1] and CityJSON text sequences, which are plain JSON.
+
+The package of the format's authors, cjio, is a command line for changing such files: it had its
+last release in May 2025, takes a file as a whole without any limit, and triangulates with further
+packages only.
+
+[1] https://www.cityjson.org/specs/2.0.1
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from radiotwin.errors import BadInput
+from radiotwin.io.budgets import DOCUMENT_BYTES, FEATURES, VERTICES
+from radiotwin.io.inputs import decode_text, open_gzip, parse_json
+from radiotwin.scene.readers.city_objects import CityObject, Geometry, Polygon, city_features
+from radiotwin.scene.readers.features import MapFile
+
+# Levels of lists around a surface (a list of rings) in `boundaries`
+_DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2,
+           "CompositeSolid": 2}
+
+
+def read_cityjson(path: Path, crs: str | None = None) -> MapFile:
+    """Read the buildings of a CityJSON file.
+
+    Args:
+        path: `.json`, `.city.json.gz` or `.cityjson` file, or `.jsonl` with a feature in each
+            line.
+        crs: coordinate reference system of a file that names none; None: refuse it.
+
+    Returns:
+        Their surfaces; of objects that have an outline only, that.
+
+    Raises:
+        BadInput: no such file, not CityJSON, or an impossible value, with the object's name.
+    """
+    with open_gzip(path, "CityJSON file", DOCUMENT_BYTES) as file:
+        text = decode_text(file.read(), path)
+    if path.suffix.lower() == ".jsonl":
+        lines = [line for line in text.split("\n") if line.strip()]
+        FEATURES.check(len(lines), path)
+        documents = [parse_json(line, f"{path}, row {row}") for row, line in
+                     enumerate(lines, start=1)]
+    else:
+        documents = [parse_json(text, path)]
+    head = documents[0] if documents else None
+    if not isinstance(head, dict) or head.get("type") != "CityJSON":
+        raise BadInput(f"{path} is not CityJSON (\"type\": \"CityJSON\"); export the model as "
+                       "CityJSON 1.1 or 2.0")
+    transform = _transform(path, head)
+    objects: list[CityObject] = []
+    for document in documents:
+        objects += _objects(path, document, *transform)
+    metadata = head.get("metadata")
+    system = metadata.get("referenceSystem") if isinstance(metadata, dict) else None
+    return city_features(path, objects, [system] if isinstance(system, str) else [], crs)
+
+
+def _transform(path: Path, head: Mapping) -> tuple[np.ndarray, np.ndarray]:
+    """Return scale and translation of the vertices, which are whole numbers."""
+    known = head.get("transform")
+    if known is None:  # optional up to version 1.0
+        return np.ones(3), np.zeros(3)
+    try:
+        scale, offset = (np.array(known[key], dtype=float).reshape(3)
+                         for key in ("scale", "translate"))
+        if not (np.isfinite(scale).all() and np.isfinite(offset).all()):
+            raise ValueError
+    except (TypeError, ValueError, KeyError, IndexError, OverflowError):
+        raise BadInput(f"{path}: its transform is not a scale and a translate of three finite "
+                       "numbers; export the model again") from None
+    return scale, offset
+
+
+def _objects(path: Path, document: Any, scale: np.ndarray,
+             offset: np.ndarray) -> Iterator[CityObject]:
+    try:
+        vertices = np.array(document["vertices"], dtype=float).reshape(-1, 3)
+        objects = document["CityObjects"]
+        if not isinstance(objects, dict):
+            raise TypeError
+    except (TypeError, ValueError, KeyError, OverflowError):
+        raise BadInput(f"{path}: vertices or CityObjects are missing, or no vertices of three "
+                       "numbers; export the model again") from None
+    VERTICES.check(len(vertices), path)
+    corners = vertices * scale + offset
+    parents = {child: name for name, known in objects.items() if isinstance(known, dict)
+               for child in _names(known.get("children"))}
+    for name, known in objects.items():
+        try:
+            geometries = [one for geometry in known.get("geometry") or []
+                          for one in _geometries(geometry, corners)]
+            yield CityObject(name[:200], str(known["type"]).lstrip("+"),
+                             _attributes(known.get("attributes")),
+                             (_names(known.get("parents")) or [parents.get(name, "")])[0][:200],
+                             geometries)
+        except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
+            raise BadInput(f"{path}: the object {name[:60]!r} is not as CityJSON has it (a type, "
+                           "and geometries whose boundaries are indices of vertices); export the "
+                           "model again") from None
+
+
+def _names(value: Any) -> list[str]:
+    return [name for name in value if isinstance(name, str)] if isinstance(value, list) else []
+
+
+def _attributes(known: Any) -> dict[str, str]:
+    """Return what is a number or a text."""
+    if not isinstance(known, dict):
+        return {}
+    return {str(key).lower(): f"{value:g}" if isinstance(value, float) else str(value)
+            for key, value in known.items()
+            if isinstance(value, str | int | float) and not isinstance(value, bool)}
+
+
+def _geometries(geometry: Mapping, corners: np.ndarray) -> Iterator[Geometry]:
+    """Yield a set of surfaces as one, and each solid by itself; others are left out."""
+    kind = geometry["type"]
+    if kind not in _DEPTHS:
+        return
+    boundaries = geometry["boundaries"]
+    lod = float(geometry.get("lod", 2))
+    depth = _DEPTHS[kind]
+    solids = boundaries if depth == 2 else [boundaries] if depth == 1 else [[boundaries]]
+    for shells in solids:
+        # Cavities are inner shells: no ray gets there
+        yield Geometry(lod, [_polygon(surface, corners) for surface in shells[0]]
+                       if shells else [])
+
+
+def _polygon(rings: list, corners: np.ndarray) -> Polygon:
+    indices = [np.array(ring, dtype=np.int64).reshape(-1) for ring in rings]
+    if any((ring < 0).any() for ring in indices):
+        raise IndexError
+    return [corners[ring] for ring in indices]

@@ -1,0 +1,174 @@
+"""Watertight meshes from prisms, one for each group of touching prisms of one material.
+
+A ray tracer would hit coincident walls twice, so neighbours of one material are united, and between
+neighbours of different materials a slot of 2 cm is left open.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mapbox_earcut
+import numpy as np
+import shapely
+import trimesh
+from manifold3d import Manifold, Mesh64, OpType
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from radiotwin.runtime.console import progress
+from radiotwin.scene.materials import Material
+from radiotwin.scene.meshes import clean, is_volume
+from radiotwin.scene.readers.solids import GRID_M, Contacts, Prism
+
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+MIN_ROOF_COSINE = 0.2  # of a roof's normal to the vertical: the steepest have about 78 degrees
+SLOT_M = 0.02  # [m], more than the 1 cm below which the 3D map takes two surfaces for one
+# [m], how far a surface may move to remove a splinter; files hold single precision, 0.1 mm at 1 km
+SIMPLIFY_M = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """One mesh of the city.
+
+    Attributes:
+        members: indices of its prisms, the largest first.
+        material: of all of them.
+        mesh: watertight, normals outwards, unless it is that of an open body [m].
+    """
+
+    members: list[int]
+    material: Material
+    mesh: trimesh.Trimesh
+
+
+def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
+    """Unite touching prisms of one material.
+
+    Args:
+        prisms: of all buildings.
+        contacts: of these prisms; a common wall or more joins them, a corner does not.
+
+    Returns:
+        The blocks; where blocks of different materials meet, the larger one stays whole.
+    """
+    if not prisms:
+        return []
+    is_open = np.array([prism.body is not None and prism.body.solid is None for prism in prisms])
+    pairs = contacts.pairs[contacts.shared_m > GRID_M]
+    pairs = pairs[~is_open[pairs].any(axis=1)]
+    same = np.array([prisms[a].material == prisms[b].material for a, b in pairs], dtype=bool)
+    graph = coo_matrix((np.ones(same.sum()), pairs[same].T), shape=(len(prisms), len(prisms)))
+    block_of = connected_components(graph, directed=False)[1]
+    volume_m3 = np.array([prism.area.area * (prism.height.top_m - prism.height.bottom_m)
+                          for prism in prisms])
+    block_m3 = np.bincount(block_of, volume_m3)
+    cut_by: dict[int, set[int]] = {}  # block -> touching prisms of larger blocks
+    for a, b in pairs[~same]:
+        large, small = sorted((a, b), key=lambda i: (-block_m3[block_of[i]], block_of[i]))
+        cut_by.setdefault(int(block_of[small]), set()).add(int(large))
+    order = np.argsort(block_of, kind="stable")
+    blocks = []
+    with progress("extruding buildings", total=len(block_m3)) as advance:
+        for block, part in enumerate(np.split(order, np.cumsum(np.bincount(block_of))[:-1])):
+            members = sorted(part.tolist(), key=lambda i: -volume_m3[i])
+            advance(1)
+            body = prisms[members[0]].body
+            if body is not None and body.mesh is not None:
+                vertices, faces = body.mesh
+                rise_m = prisms[members[0]].height.top_m - vertices[:, 2].max()
+                mesh = trimesh.Trimesh(vertices + [0, 0, rise_m], faces, process=False)
+                blocks.append(Block(members, prisms[members[0]].material, mesh))
+                continue
+            solid = _union([_solid(prisms[i]) for i in members])
+            if block in cut_by:
+                solid -= _union([_solid(prisms[i], SLOT_M) for i in sorted(cut_by[block])])
+            solid = solid.simplify(SIMPLIFY_M)
+            if not solid.is_empty():
+                blocks.append(Block(members, prisms[members[0]].material, _mesh(solid)))
+    return blocks
+
+
+def split_roof(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, trimesh.Trimesh | None]:
+    """Part the roofs of a block, which face upwards, from its walls and bottom.
+
+    Args:
+        mesh: of the block.
+
+    Returns:
+        Walls with bottom, and roofs; None where nothing, or everything, faces upwards.
+    """
+    is_roof = mesh.face_normals[:, 2] > MIN_ROOF_COSINE
+    if is_roof.all() or not is_roof.any():
+        return mesh, None
+    walls, roof = (trimesh.Trimesh(mesh.vertices, mesh.faces[which], process=False)
+                   for which in (~is_roof, is_roof))
+    for part in (walls, roof):
+        part.remove_unreferenced_vertices()
+    return walls, roof
+
+
+def _union(solids: list[Manifold]) -> Manifold:
+    return Manifold.batch_boolean(solids, OpType.Add)
+
+
+def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
+    """Return a prism, with all its faces moved outwards by `wider_m`."""
+    if prism.body is not None:
+        solid = _placed(prism)
+        return _union([solid.translate(wider_m * corner) for corner in _CORNERS]) if wider_m \
+            else solid
+    assert isinstance(prism.area, shapely.Polygon)
+    area = prism.area.buffer(wider_m, join_style="mitre") if wider_m else prism.area
+    return _extruded(area, prism.height.bottom_m - wider_m, prism.height.top_m + wider_m)
+
+
+def _placed(prism: Prism) -> Manifold:
+    """Return the solid of a body with its top at that of the prism, and walls down to its bottom.
+
+    A building on terrain begins below the ground that its file has.
+    """
+    assert prism.body is not None and prism.body.solid is not None
+    _, _, low_m, _, _, high_m = prism.body.solid.bounding_box()
+    rise_m, height = prism.height.top_m - high_m, prism.height
+    solid = prism.body.solid.translate((0, 0, rise_m))
+    if low_m + rise_m - height.bottom_m <= GRID_M:
+        return solid
+    return _union([solid, *(_extruded(polygon, height.bottom_m, low_m + rise_m)
+                            for polygon in shapely.get_parts(prism.area))])
+
+
+def _extruded(area: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
+    """Return a solid with vertical walls."""
+    rings = [shapely.get_coordinates(ring) for ring in (area.exterior, *area.interiors)]
+    points, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])
+    roof: np.ndarray = mapbox_earcut.triangulate_float64(points, ends).reshape(-1, 3)
+    corner = np.arange(len(points))
+    corner[ends - 1] = [0, *ends[:-1]]  # a ring's last point is its first
+    used, roof = np.unique(corner[roof], return_inverse=True)  # none in the middle of a wall
+    points, roof, n = points[used], roof.reshape(-1, 3), len(used)
+    (ax, ay), (bx, by) = ((points[roof[:, side]] - points[roof[:, 0]]).T for side in (1, 2))
+    if (ax * by - ay * bx).sum() < 0:
+        roof = roof[:, ::-1]
+    start, end = roof[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
+    outer = ~np.isin(start * n + end, end * n + start)
+    start, end = start[outer], end[outer]
+    walls = np.stack([end + n, start + n, end, end, start + n, start], axis=1).reshape(-1, 3)
+    height_m = np.repeat([bottom_m, top_m], n)
+    vertices = np.column_stack([np.tile(points, (2, 1)), height_m])
+    faces = np.concatenate([roof[:, ::-1], roof + n, walls])
+    return Manifold(Mesh64(vertices, faces.astype(np.uint64)))
+
+
+def _mesh(solid: Manifold) -> trimesh.Trimesh:
+    """Return a clean mesh, or the mesh as it is where cleaning would open it.
+
+    Cleaning merges corners that coincide and drops triangles without area. Where a solid touches
+    itself along a vertical edge, its two sides need corners of their own.
+    """
+    found = solid.to_mesh64()
+    vertices, faces = found.vert_properties[:, :3], found.tri_verts.astype(np.int64)
+    cleaned = clean(vertices, faces)[:2]
+    if is_volume(*cleaned):
+        vertices, faces = cleaned
+    return trimesh.Trimesh(vertices, faces, process=False)

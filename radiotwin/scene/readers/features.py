@@ -1,0 +1,174 @@
+"""Areas of a map file with their tags, as every reader returns them.
+
+Budgets of outlines, checked before geometry is computed from them.
+
+To take apart an outline that crosses itself costs time and memory by the number of crossings,
+which can be the square of the number of corners.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from radiotwin.io.budgets import CROSSINGS, OUTLINE_CORNERS, VERTICES
+from radiotwin.scene.checks import Problem, Severity, listed
+
+BUILDING_KEYS = ("building", "building:part")  # tags of OpenStreetMap
+_CHUNK = 256  # segments: bounds the pairs that are found at once
+
+
+@dataclass(frozen=True, eq=False)
+class Shell:
+    """Surfaces of a building in three dimensions.
+
+    Attributes:
+        points: (n, 3) longitude, latitude [degrees] and elevation [m].
+        polygons: rings of each surface, the outer one first: indices of points, the first not
+            again at the end.
+        ground_m: elevation of the ground beside the building: that of its lowest point [m].
+    """
+
+    points: np.ndarray
+    polygons: Sequence[Sequence[np.ndarray]]
+    ground_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Feature:
+    """One building or part of a building, or an area or line of vegetation.
+
+    Attributes:
+        name: as in the file: `way/17`, `relation/3`, `feature 4`.
+        tags: as in OpenStreetMap: `building`, `building:part`, `height`, `building:levels`, ….
+        area: polygons, or the line of a row of trees, in longitude and latitude [degrees]; as in
+            the file, so possibly invalid. Of a feature with a shell, the hull of its points.
+        shell: its surfaces; None: the area is to be extruded.
+    """
+
+    name: str
+    tags: Mapping[str, str]
+    area: BaseGeometry
+    shell: Shell | None = None
+
+    @property
+    def is_part(self) -> bool:
+        """Whether it is part of a building and not a building itself."""
+        return _is_set(self.tags, "building:part") and not _is_set(self.tags, "building")
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Something of a map file that could not be used.
+
+    Attributes:
+        name: as in the file.
+        reason: what it is and why, as `problems_of` continues a number with.
+        place: where it lies, longitude and latitude [degrees]; None: unknown.
+    """
+
+    name: str
+    reason: str
+    place: BaseGeometry | None
+
+
+@dataclass
+class MapFile:
+    """Buildings and vegetation of a map file.
+
+    Attributes:
+        features: buildings and parts, in the file's order.
+        vegetation: areas, and lines of trees, see `radiotwin.scene.readers.vegetation`.
+        left_out: parts of the file that could not be used.
+        problems: findings about the whole file.
+    """
+
+    features: list[Feature]
+    left_out: list[LeftOut] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)
+    vegetation: list[Feature] = field(default_factory=list)
+
+
+def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:
+    """Return one problem about several features, with their number and first names; none: empty."""
+    return [Problem(severity, "", f"{len(names)} {text} ({listed(names)})")] if names else []
+
+
+def left_out_problems(left_out: Sequence[LeftOut],
+                      bbox_deg: tuple[float, float, float, float] | None) -> list[Problem]:
+    """Return one problem about all that was left out for the same reason.
+
+    Args:
+        left_out: in the file's order.
+        bbox_deg: (south, west, north, east) [degrees]: only what reaches into it is named; None:
+            all.
+    """
+    by_reason: dict[str, list[str]] = {}
+    for one in left_out:
+        if bbox_deg is not None:
+            south, west, north, east = bbox_deg
+            if one.place is None or one.place.is_empty:
+                continue
+            x0, y0, x1, y1 = one.place.bounds
+            if not (x0 <= east and x1 >= west and y0 <= north and y1 >= south):
+                continue
+        by_reason.setdefault(one.reason, []).append(one.name)
+    return [problem for reason, names in by_reason.items()
+            for problem in problems_of(names, reason)]
+
+
+def is_building(tags: Mapping[str, str]) -> bool:
+    """Return whether tags describe something built above the ground."""
+    return any(_is_set(tags, key) for key in BUILDING_KEYS) \
+        and tags.get("location") != "underground"
+
+
+def _is_set(tags: Mapping[str, str], key: str) -> bool:
+    return tags.get(key, "").strip().lower() not in ("", "no", "none", "false", "0")
+
+
+class OutlineBudget:
+    """Corners and crossings of the outlines of one map so far.
+
+    Args:
+        source: of the outlines; messages begin with it.
+    """
+
+    def __init__(self, source: object) -> None:
+        self.source = source
+        self.corners = self.crossings = 0
+
+    def check(self, name: str, area: BaseGeometry) -> None:
+        """Check one building, and all so far.
+
+        Args:
+            name: of the building.
+            area: polygons, valid or not.
+
+        Raises:
+            BadInput: it has too many corners, or all have, or their outlines cross themselves too
+                often.
+        """
+        subject = f"{self.source}: {name}"
+        corners = int(shapely.get_num_coordinates(area))
+        OUTLINE_CORNERS.check(corners, subject)
+        self.corners += corners
+        VERTICES.check(self.corners, self.source)
+        if not area.is_valid:
+            self.crossings += self._count_crossings(subject, area)
+
+    def _count_crossings(self, subject: str, area: BaseGeometry) -> int:
+        rings = shapely.get_rings(shapely.get_parts(shapely.get_parts(area)))
+        points = [shapely.get_coordinates(ring) for ring in rings]
+        ends = [np.stack([ring[:-1], ring[1:]], axis=1) for ring in points]
+        segments: Any = shapely.linestrings(np.concatenate([np.zeros((0, 2, 2)), *ends]))
+        tree, found = shapely.STRtree(segments), 0
+        for start in range(0, len(segments), _CHUNK):
+            part = segments[start:start + _CHUNK]
+            # Each meets itself and the two beside it; both of a pair find it
+            found += max(tree.query(part, predicate="intersects").shape[1] - 3 * len(part), 0)
+            CROSSINGS.check(self.crossings + found // 2, subject)
+        return found // 2

@@ -1,0 +1,380 @@
+"""Readers of GeoJSON, GeoPackage and GeoParquet.
+
+Reader of GeoJSON, and what it shares with that of GeoPackages: columns of a table as tags.
+
+Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only such
+rows are buildings; else every polygon is one. `_` may stand for the `:` of a tag, and case does not
+matter. The tags in GDAL's column `other_tags` are read, too.
+
+Reader of GeoPackages [1]: their tables by SQLite, without GDAL.
+
+GDAL looks at a file's content, not at its ending: a `.gpkg` can be an XML that names other files
+or servers.
+
+[1] https://www.geopackage.org/spec140
+
+Reader of GeoParquet [1]: geometries in well-known binary, read by pyarrow.
+
+[1] https://geoparquet.org/releases/v1.1.0
+"""
+
+import re
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from radiotwin.errors import BadInput
+from radiotwin.io.budgets import COLUMNS, DOCUMENT_BYTES, FEATURES, FILE_BYTES
+from radiotwin.io.cells import read_cells, require_pyarrow
+from radiotwin.io.inputs import open_input, parse_json, read_text
+from radiotwin.io.sqlite_tables import open_tables, require_table, scan, stored_columns
+from radiotwin.scene.readers.features import (
+    BUILDING_KEYS,
+    Feature,
+    LeftOut,
+    MapFile,
+    is_building,
+)
+from radiotwin.scene.readers.heights import ALIASES
+from radiotwin.scene.readers.systems import WGS84, chosen_system, degrees_from, find_system
+
+_OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*+)"', re.DOTALL)
+_NAME_LENGTH = 200  # characters of an id that are kept
+_KINDS = ("POLYGON", "MULTIPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE", "MULTISURFACE",
+          "CURVEPOLYGON")
+_ENVELOPE_DOUBLES = (0, 4, 6, 6, 8)  # of a geometry's header, by its code
+
+
+def read_geojson(path: Path, crs: str | None = None) -> MapFile:
+    """Read the polygons of a GeoJSON file.
+
+    Args:
+        path: file after RFC 7946 (longitude, latitude), or with an older `crs` member.
+        crs: coordinate reference system of a file without that member; None: that of RFC 7946.
+
+    Returns:
+        The buildings.
+
+    Raises:
+        BadInput: no such file, not GeoJSON, or coordinates that are not numbers; with the
+            feature's number.
+    """
+    data = parse_json(read_text(path, "GeoJSON file"), path, allow_nan=True)
+    features = data.get("features") if isinstance(data, dict) else None
+    if not isinstance(features, list):
+        raise BadInput(f"{path} is not a GeoJSON FeatureCollection; export polygons as GeoJSON")
+    rows = []
+    for number, feature in enumerate(features, start=1):
+        geometry, tags = (feature.get(key) or {} if isinstance(feature, dict) else None
+                          for key in ("geometry", "properties"))
+        if not isinstance(geometry, dict) or not isinstance(tags, dict):
+            raise BadInput(f"{path}: feature {number} is not a GeoJSON feature; export the map "
+                           "again")
+        known = feature.get("id") or tags.get("@id")
+        name = (str(known)[:_NAME_LENGTH] if isinstance(known, str | int | float)
+                else f"feature {number}")
+        rows.append((name, tags, _polygons(path, number, geometry)))
+    return map_file(path, rows, chosen_system(path, _crs_name(path, data), crs) or WGS84[0])
+
+
+def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None:
+    """Return the polygons of a GeoJSON geometry, or the points of another type; None: none."""
+    kind = geometry.get("type")
+    coordinates: Any = geometry.get("coordinates")  # unchecked: no list raises TypeError below
+    if kind not in ("Polygon", "MultiPolygon"):
+        return _points(coordinates)
+    try:
+        polygons = [[np.array([point[:2] for point in ring], dtype=float) for ring in polygon]
+                    for polygon in ([coordinates] if kind == "Polygon" else coordinates)]
+        if not all(np.isfinite(ring).all() and ring.ndim == 2
+                   for polygon in polygons for ring in polygon):
+            raise ValueError
+        # RFC 7946 wants at least four points a ring; shorter ones have no area anyway
+        return shapely.MultiPolygon([(polygon[0], [ring for ring in polygon[1:] if len(ring) > 3])
+                                     for polygon in polygons if polygon and len(polygon[0]) > 3])
+    except (TypeError, ValueError, LookupError, OverflowError):
+        raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite "
+                       "numbers; export the map again") from None
+
+
+def area_of_wkb(data: bytes) -> BaseGeometry | None:
+    """Return a geometry in well-known binary, in the plane; None: not finite.
+
+    Raises:
+        shapely.errors.GEOSException: damaged.
+    """
+    area = shapely.from_wkb(data)
+    return shapely.force_2d(area) if np.isfinite(shapely.get_coordinates(area)).all() else None
+
+
+def _points(coordinates: Any) -> BaseGeometry | None:
+    """Return all positions of a geometry that is no area, for where it lies."""
+    points, waiting = [], [coordinates]
+    while waiting:
+        part = waiting.pop()
+        if not isinstance(part, list):
+            return None
+        if len(part) > 1 and all(isinstance(value, int | float) for value in part[:2]):
+            points.append(part[:2])
+        else:
+            waiting += part
+    try:
+        known = np.array(points, dtype=float).reshape(-1, 2)
+    except OverflowError:
+        return None
+    return shapely.MultiPoint(known) if np.isfinite(known).all() else None
+
+
+def _crs_name(path: Path, data: Mapping) -> str | None:
+    crs = data.get("crs")
+    if crs is None:
+        return None
+    try:
+        return str(crs["properties"]["name"])
+    except (TypeError, KeyError):
+        raise BadInput(f"{path}: its crs is {crs!r:.60}, which names no system; remove it "
+                       "(longitude, latitude) or name one") from None
+
+
+def map_file(
+    path: Path, rows: Iterable[tuple[str, Mapping, BaseGeometry | None]], crs: str | None
+) -> MapFile:
+    """Return the buildings among the rows of a table.
+
+    Args:
+        path: file, for messages.
+        rows: name, properties and area of each.
+        crs: name of the coordinate reference system of the areas; None: not known.
+
+    Raises:
+        BadInput: no system, or one that is not known.
+    """
+    tagged = [(name, _tags(properties), area) for name, properties, area in rows]
+    marked = any(key in tags for _, tags, _ in tagged for key in BUILDING_KEYS)
+    features, unusable = [], []
+    for name, tags, area in tagged:
+        if marked and not is_building(tags):
+            continue
+        if area is None or area.geom_type not in ("Polygon", "MultiPolygon", "GeometryCollection"):
+            unusable.append(Feature(name, {}, shapely.Point() if area is None else area))
+            continue
+        features.append(Feature(name, tags if marked else tags | {"building": "yes"}, area))
+    return MapFile(_to_degrees(path, features, crs), [
+        LeftOut(one.name, "building(s) are points or lines, without an area: left out", one.area)
+        for one in _to_degrees(path, unusable, crs)])
+
+
+def _tags(properties: Mapping) -> dict[str, str]:
+    """Return columns as tags, without empty cells."""
+    tags: dict[str, str] = {}
+    for key, value in properties.items():
+        if (value is None or isinstance(value, dict | list | bytes)
+                or (isinstance(value, float) and not np.isfinite(value))):
+            continue
+        key = str(key).lower()
+        if key == "other_tags":
+            tags |= _other_tags(str(value))
+        else:
+            is_float = isinstance(value, float | np.floating)
+            tags[ALIASES.get(key, key)] = f"{value:g}" if is_float else str(value)
+    return tags
+
+
+def _other_tags(text: str) -> dict[str, str]:
+    """Return the pairs of `"key"=>"value","key"=>"value"`, as GDAL writes rare tags."""
+    tags, found = {}, _OTHER_TAG.match(text)
+    while found:  # one after the other: a search would try every quotation mark of a long text
+        tags[found[1]] = found[2]
+        found = _OTHER_TAG.match(text, found.end())
+    return tags
+
+
+def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Feature]:
+    if not features or crs in WGS84:
+        return features
+    if crs is None:
+        raise BadInput(f"{path} has no coordinate reference system; declare it with --crs, such as "
+                       "--crs EPSG:25832")
+    project = degrees_from(path, find_system(path, crs))
+    return [Feature(feature.name, feature.tags, shapely.transform(feature.area, project))
+            for feature in features]
+
+
+def read_geopackage(path: Path, crs: str | None = None) -> MapFile:
+    """Read the polygons of all layers of a GeoPackage, in any coordinate reference system.
+
+    Args:
+        path: `.gpkg` file.
+        crs: coordinate reference system of layers whose own is undefined; None: refuse them.
+
+    Returns:
+        The buildings, layer by layer.
+
+    Raises:
+        BadInput: no such file, not a GeoPackage, one that another program has open, or a layer
+            that is a view.
+    """
+    found = MapFile([])
+    try:
+        with open_tables(path, "GeoPackage") as database:
+            for layer, geometry, srs in _layers(database):
+                rows = _rows(path, database, layer, geometry)
+                part = map_file(path, rows, chosen_system(path, _system(database, srs), crs))
+                found.features += part.features
+                found.left_out += part.left_out
+    except (sqlite3.Error, shapely.errors.GEOSException, OverflowError) as error:
+        raise _unreadable(path, error) from None
+    return found
+
+
+def _unreadable(path: Path, reason: object) -> BadInput:
+    return BadInput(f"{path} is not a readable GeoPackage ({reason}); export it again")
+
+
+def _layers(database: sqlite3.Connection) -> list[tuple[str, str, int]]:
+    """Return table, column of the geometry, and number of the system of each layer of areas."""
+    for table in ("gpkg_contents", "gpkg_geometry_columns", "gpkg_spatial_ref_sys"):
+        require_table(database, table)
+    registered = {str(name).lower() for name, kind in scan(
+        database, "gpkg_contents", ["table_name", "data_type"]) if kind == "features"}
+    layers = []
+    for table, column, kind, srs in scan(
+            database, "gpkg_geometry_columns",
+            ["table_name", "column_name", "geometry_type_name", "srs_id"]):
+        if str(table).lower() in registered and str(kind).upper() in _KINDS:
+            require_table(database, str(table))
+            if not isinstance(srs, int):  # of SQLite's columns the type is a wish
+                raise sqlite3.DataError(f"srs_id of {str(table)[:100]!r} is {srs!r:.100}")
+            layers.append((str(table), str(column), srs))
+    return layers
+
+
+def _rows(path: Path, database: sqlite3.Connection, layer: str,
+          geometry: str) -> Iterator[tuple[str, dict[str, Any], Any]]:
+    """Yield name, columns and area of each row of a layer."""
+    # The integer primary key is no attribute
+    columns = [name for _, name, kind, _, _, key in stored_columns(database, layer)
+               if name.lower() != geometry.lower() and not (key and kind.upper() == "INTEGER")]
+    COLUMNS.check(len(columns), f"{path}, layer {layer}")
+    read = 0
+    for number, (blob, *values) in enumerate(
+            scan(database, layer, [geometry, *columns]), start=1):
+        read += sum(len(value) for value in (blob, *values) if isinstance(value, bytes | str))
+        FILE_BYTES.check(read, f"{path}, layer {layer}")
+        yield f"{layer} {number}", dict(zip(columns, values)), _area(blob)
+
+
+def _area(blob: Any) -> Any:
+    """Return the geometry of a blob [1, section 2.1.3]; None where there is none."""
+    if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
+        return None
+    flags = blob[3]
+    extended, empty, code = flags & 32, flags & 16, (flags >> 1) & 7
+    if extended or empty or code >= len(_ENVELOPE_DOUBLES):
+        return None
+    return area_of_wkb(blob[8 + 8 * _ENVELOPE_DOUBLES[code]:])
+
+
+def _system(database: sqlite3.Connection, number: int) -> str | None:
+    """Return the coordinate reference system of a number: authority and code, or WKT."""
+    for known, authority, code, definition in scan(
+            database, "gpkg_spatial_ref_sys",
+            ["srs_id", "organization", "organization_coordsys_id", "definition"]):
+        if known == number and number not in (0, -1):  # 0 and -1: undefined
+            name = str(authority).upper()
+            return f"{name}:{code}" if name in ("EPSG", "ESRI", "OGC") else str(definition)
+    return None
+
+
+def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
+    """Read the polygons of a GeoParquet file, in any coordinate reference system.
+
+    Nested columns, such as the names and sources of Overture Maps, are left out.
+
+    Args:
+        path: `.parquet` file.
+        crs: coordinate reference system of a file that names none; None: longitude and latitude, as
+            [1] has it, or where it says that the system is not known, refuse it.
+
+    Raises:
+        BadInput: no such file, no GeoParquet, damaged, or too large; no pyarrow.
+    """
+    names, geometry, own = _schema(path)
+    system = chosen_system(path, _name(path, own) if own else None, crs)
+    if own is None and system is None:
+        system = WGS84[0]
+    cells = read_cells(path, [geometry], names)
+    columns = [name for name in cells.columns if name != geometry]
+    values = [cells[name].tolist() for name in columns]
+
+    def rows() -> Iterator[tuple[str, dict[str, Any], Any]]:
+        for number, data in enumerate(cells[geometry], start=1):
+            tags = {name: column[number - 1] for name, column in zip(columns, values)}
+            yield (f"row {number}", tags,
+                   area_of_wkb(data) if isinstance(data, bytes) else None)
+
+    try:
+        return map_file(path, rows(), system)
+    except shapely.errors.GEOSException as error:
+        raise BadInput(f"{path}: a geometry is damaged ({str(error)[:100]}); export it again"
+                       ) from None
+
+
+def _schema(path: Path) -> tuple[list[str], str, dict | str | None]:
+    """Return the flat columns, that of the geometry, and its system: "" unknown, None default."""
+    require_pyarrow(path)
+    from pyarrow import ArrowException, types
+    from pyarrow.parquet import ParquetFile
+
+    with open_input(path, "GeoParquet file") as file:
+        try:
+            content = ParquetFile(file)
+            schema = content.schema_arrow
+            FEATURES.check(content.metadata.num_rows, path)
+        except (ArrowException, OSError, ValueError) as error:
+            raise BadInput(f"{path} cannot be read as Parquet ({str(error)[:200]}); export it "
+                           "again") from None
+    text = (schema.metadata or {}).get(b"geo")
+    if text is None:
+        raise BadInput(f"{path} is Parquet without geometries (no metadata `geo`); export it as "
+                       "GeoParquet")
+    DOCUMENT_BYTES.check(len(text), f"{path}: its metadata")
+    known = parse_json(text.decode("utf-8", "replace"), f"{path}: its metadata `geo`")
+    try:
+        geometry = str(known["primary_column"])
+        column = known["columns"][geometry]
+        if column["encoding"] != "WKB":
+            raise BadInput(f"{path}: its geometries are encoded as {column['encoding']!r:.40}; "
+                           "only WKB is read: export it again with that")
+        own = column.get("crs")
+        if own is None and "crs" in column:
+            own = ""
+        if not isinstance(own, dict | str | None) or geometry not in schema.names:
+            raise TypeError
+    except (KeyError, TypeError):
+        raise BadInput(f"{path}: its metadata `geo` is not as GeoParquet has it (primary_column, "
+                       "and of that encoding and crs); export it again") from None
+    names = [field.name for field in schema if not types.is_nested(field.type)]
+    return names, geometry, own
+
+
+def _name(path: Path, own: dict | str) -> str:
+    """Return the name of a system in PROJ's JSON: authority and code, else WKT."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    if isinstance(own, str):
+        return own
+    known = own.get("id")
+    if isinstance(known, dict) and {"authority", "code"} <= known.keys():
+        return f"{known['authority']}:{known['code']}"
+    try:
+        return CRS.from_json_dict(own).to_wkt()
+    except CRSError as error:
+        raise BadInput(f"{path}: its coordinate reference system is unknown ({error!s:.100}); "
+                       "export it in EPSG:4326") from None

@@ -1,0 +1,493 @@
+"""OpenStreetMap: areas of buildings, from .osm and .osm.pbf files and from the Overpass API.
+
+Areas of buildings from OpenStreetMap's nodes, ways and relations.
+
+A closed way is an area, and so is a relation of type multipolygon whose ways form closed rings
+[1]; rings of role `inner` are courtyards.
+
+[1] https://wiki.openstreetmap.org/wiki/Relation:multipolygon
+
+Reader of `.osm` files: the XML of OpenStreetMap's API, of Overpass and of JOSM.
+
+Reader of `.osm.pbf` files, with libosmium [1].
+
+The file is read in several passes that keep only what belongs to buildings and vegetation, so that
+an extract of a whole region needs little memory.
+
+[1] https://osmcode.org/pyosmium
+
+Download of an area's buildings and vegetation from OpenStreetMap's database (Overpass API [1]).
+
+[1] https://wiki.openstreetmap.org/wiki/Overpass_API
+"""
+
+import http.client
+import math
+import time
+import urllib.parse
+import urllib.request
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import IO, Any, Literal
+
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from radiotwin.errors import BadInput, RunFailed
+from radiotwin.io.budgets import FEATURES, FILE_BYTES, OUTLINE_CORNERS, VERTICES
+from radiotwin.io.files import atomic_file
+from radiotwin.io.inputs import check_input
+from radiotwin.io.safe_xml import parse_elements
+from radiotwin.scene.readers.features import (
+    BUILDING_KEYS,
+    Feature,
+    LeftOut,
+    MapFile,
+    OutlineBudget,
+    is_building,
+)
+from radiotwin.scene.readers.vegetation import TAGS, kind_of
+
+INCOMPLETE = ("building(s) lack nodes or ways, as where an extract was cut off: left out; take a "
+              "larger extract")
+UNCLOSED = "building(s) have an outline that is not closed: left out"
+NO_VEGETATION = "area(s) of vegetation are incomplete, not closed or too intricate: left out"
+_PLACE_NODES = 1000  # that say where something lies: many relations may name one long way
+MIN_RING_NODES = 4  # a triangle, with the first node again at the end
+_IDS_PER_BLOCK = 100  # elements: 40 kB of the filter for each that is looked for
+SERVER = "https://overpass-api.de/api/interpreter"
+TIMEOUT_S = 180  # [s], the default of Overpass itself
+MAX_DOWNLOAD_S = 1800.0  # [s], chosen: some 100 MB on a slow line
+MAX_AREA_KM2 = 100.0  # [km²], chosen so that one request does not burden a public server
+
+
+@dataclass
+class Way:
+    """A polyline.
+
+    Attributes:
+        nodes: ids, in order.
+        tags: of the way.
+    """
+
+    nodes: list[int]
+    tags: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class Relation:
+    """A group of ways.
+
+    Attributes:
+        members: id of a way, and its role.
+        tags: of the relation.
+    """
+
+    members: list[tuple[int, str]] = field(default_factory=list)
+    tags: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass
+class OsmElements:
+    """Elements of a map file, by their ids.
+
+    Attributes:
+        positions: node -> longitude and latitude [degrees].
+        ways: at least the buildings, and the ways of relations that are buildings.
+        relations: at least those of type multipolygon.
+    """
+
+    positions: dict[int, tuple[float, float]] = field(default_factory=dict)
+    ways: dict[int, Way] = field(default_factory=dict)
+    relations: dict[int, Relation] = field(default_factory=dict)
+
+
+def assemble(elements: OsmElements) -> MapFile:
+    """Assemble the areas of buildings and building parts, and of vegetation.
+
+    Args:
+        elements: of a map file.
+
+    Returns:
+        The areas, ways first; incomplete or open outlines are left out and reported.
+    """
+    budget = OutlineBudget("the map")
+    left_out: list[LeftOut] = []
+    relations: list[Feature] = []
+    used: set[int] = set()
+    for number, relation in elements.relations.items():
+        tags = _relation_tags(relation, elements)
+        if tags is None:
+            continue
+        area = _relation_area(f"relation/{number}", relation, elements, budget)
+        if isinstance(area, str):
+            left_out.append(LeftOut(f"relation/{number}", INCOMPLETE if area == "incomplete"
+                                    else UNCLOSED, _place(relation, elements)))
+            continue
+        used.update(way for way, role in relation.members if role != "inner")
+        relations.append(Feature(f"relation/{number}", tags, area))
+    ways = []
+    for number, way in elements.ways.items():
+        if number in used or not is_building(way.tags):
+            continue
+        if any(node not in elements.positions for node in way.nodes):
+            left_out.append(LeftOut(f"way/{number}", INCOMPLETE, _place(way, elements)))
+        elif len(way.nodes) < MIN_RING_NODES or way.nodes[0] != way.nodes[-1]:
+            left_out.append(LeftOut(f"way/{number}", UNCLOSED, _place(way, elements)))
+        else:
+            OUTLINE_CORNERS.check(len(way.nodes), f"way/{number}")
+            ways.append(Feature(f"way/{number}", way.tags, _polygon(way.nodes, elements)))
+    left_out.sort(key=lambda one: one.reason != INCOMPLETE)
+    vegetation, unusable = _vegetation(elements)
+    return MapFile(ways + relations, left_out + unusable, vegetation=vegetation)
+
+
+def _place(element: Way | Relation, elements: OsmElements) -> BaseGeometry:
+    """Return the first points that are known of a way, or of the ways of a relation."""
+    ways = [element] if isinstance(element, Way) else [
+        elements.ways[number] for number, _ in element.members if number in elements.ways]
+    nodes = islice((node for way in ways for node in way.nodes), _PLACE_NODES)
+    return shapely.MultiPoint([elements.positions[node] for node in nodes
+                               if node in elements.positions])
+
+
+def _vegetation(elements: OsmElements) -> tuple[list[Feature], list[LeftOut]]:
+    """Return areas of vegetation and rows of trees, and those that are unusable."""
+    found: list[Feature] = []
+    unusable: list[LeftOut] = []
+    budget = OutlineBudget("the map")
+    ways: list[tuple[str, Way | Relation]] = [
+        (f"way/{number}", way) for number, way in elements.ways.items()]
+    for name, element in [*ways, *((f"relation/{number}", relation)
+                                   for number, relation in elements.relations.items())]:
+        kind = kind_of(element.tags)
+        if kind is None or is_building(element.tags):
+            continue
+        try:
+            area = _way_area(name, element, kind, elements) if isinstance(element, Way) \
+                else _relation_area(name, element, elements, budget)
+            if not isinstance(area, str):
+                budget.check(name, area)
+        except BadInput:  # a wood may have more corners than any building
+            area = "incomplete"
+        if isinstance(area, str):
+            unusable.append(LeftOut(name, NO_VEGETATION, _place(element, elements)))
+        else:
+            found.append(Feature(name, element.tags, area))
+    return found, unusable
+
+
+def _way_area(name: str, way: Way, kind: str,
+              elements: OsmElements) -> BaseGeometry | Literal["incomplete"]:
+    closed = len(way.nodes) >= MIN_RING_NODES and way.nodes[0] == way.nodes[-1]
+    complete = all(node in elements.positions for node in way.nodes)
+    OUTLINE_CORNERS.check(len(way.nodes), name)
+    if not complete or not (closed or (kind == "tree_row" and len(way.nodes) > 1)):
+        return "incomplete"
+    if kind == "tree_row":
+        return shapely.LineString([elements.positions[node] for node in way.nodes])
+    return _polygon(way.nodes, elements)
+
+
+def _relation_tags(relation: Relation, elements: OsmElements) -> dict[str, str] | None:
+    """Return the tags of a building, in old maps those of its outer ways; None: not a building."""
+    if relation.tags.get("type") != "multipolygon":
+        return None
+    outer = [elements.ways[way].tags for way, role in relation.members
+             if role != "inner" and way in elements.ways]
+    if is_building(relation.tags):
+        inherited = outer if len(outer) == 1 else []
+    elif len(relation.tags) == 1 and outer and all(is_building(tags) for tags in outer):
+        inherited = outer
+    else:
+        return None
+    merged: dict[str, str] = {}
+    for tags in inherited:
+        merged |= tags
+    return merged | relation.tags
+
+
+def _relation_area(
+    name: str, relation: Relation, elements: OsmElements, budget: OutlineBudget
+) -> BaseGeometry | Literal["incomplete", "open"]:
+    """Return the area, or that ways or nodes are missing, or that the ways do not close."""
+    chains: dict[bool, list[Sequence[int]]] = {True: [], False: []}
+    corners = 0
+    for number, role in relation.members:
+        way = elements.ways.get(number)
+        corners += len(way.nodes) if way is not None else 0
+        OUTLINE_CORNERS.check(corners, name)
+        if way is None or any(node not in elements.positions for node in way.nodes):
+            return "incomplete"
+        chains[role != "inner"].append(way.nodes)
+    outer, inner = stitch(chains[True]), stitch(chains[False])
+    if not outer or inner is None:
+        return "open"
+    outlines, holes = ([_polygon(ring, elements) for ring in rings] for rings in (outer, inner))
+    budget.check(name, shapely.MultiPolygon([*outlines, *holes]))
+    area = _union(outlines)
+    return area.difference(_union(holes)) if holes else area
+
+
+def _union(polygons: list[shapely.Polygon]) -> BaseGeometry:
+    return shapely.union_all([shapely.make_valid(polygon) for polygon in polygons])
+
+
+def stitch(chains: list[Sequence[int]]) -> list[list[int]] | None:
+    """Join ways that meet at their ends to closed rings.
+
+    Args:
+        chains: node ids of each way.
+
+    Returns:
+        Node ids of each ring, the first again at its end; None where an end remains open.
+    """
+    rings = [list(chain) for chain in chains
+             if len(chain) >= MIN_RING_NODES and chain[0] == chain[-1]]
+    loose = {number: list(chain) for number, chain in enumerate(chains)
+             if len(chain) > 1 and chain[0] != chain[-1]}
+    at_node: dict[int, deque[int]] = {}
+    for number, chain in loose.items():
+        for node in (chain[0], chain[-1]):
+            at_node.setdefault(node, deque()).append(number)
+    while loose:
+        _, ring = loose.popitem()
+        while ring[0] != ring[-1]:
+            waiting = at_node[ring[-1]]
+            while waiting and waiting[0] not in loose:
+                waiting.popleft()
+            if not waiting:
+                return None
+            chain = loose.pop(waiting.popleft())
+            ring += (chain if chain[0] == ring[-1] else chain[::-1])[1:]
+        if len(ring) >= MIN_RING_NODES:
+            rings.append(ring)
+    return rings
+
+
+def _polygon(nodes: Sequence[int], elements: OsmElements) -> shapely.Polygon:
+    return shapely.Polygon([elements.positions[node] for node in nodes])
+
+
+def read_osm_xml(path: Path) -> OsmElements:
+    """Read all nodes, ways and relations that are not deleted.
+
+    Args:
+        path: `.osm` file.
+
+    Returns:
+        The elements.
+
+    Raises:
+        BadInput: no such file, malformed XML, not a map of OpenStreetMap, or an impossible value;
+            with file and line.
+    """
+    reader = _Reader(path)
+    parse_elements(path, reader.start, reader.end)
+    return reader.elements
+
+
+class _Reader:
+    """Callbacks of the XML parser that collect the elements of one file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.elements = OsmElements()
+        self.depth = 0
+        self.most = VERTICES.limit  # read once: there are millions of nodes
+        self.open: Way | Relation | None = None
+
+    def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        self.depth += 1
+        if self.depth == 1 and tag != "osm":
+            raise BadInput(f"{self.path}, line {line}: the file begins with <{tag}>, not <osm>; "
+                           "give a map in OpenStreetMap's XML, as its export, Overpass "
+                           "([out:xml]) or JOSM make it")
+        if self.depth == 2:
+            self.open = None
+            if attributes.get("action") != "delete" and attributes.get("visible") != "false":
+                self._element(tag, attributes, line)
+        elif self.depth == 3 and self.open is not None:
+            self._content(tag, attributes, line)
+
+    def end(self, tag: str) -> None:
+        self.depth -= 1
+
+    def _element(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        if tag == "node":
+            position = (self._degrees(attributes, "lon", 180, line),
+                        self._degrees(attributes, "lat", 90, line))
+            self.elements.positions[self._integer(attributes, "id", line)] = position
+            if len(self.elements.positions) > self.most:
+                VERTICES.check(len(self.elements.positions), self.path)
+        elif tag == "way":
+            self.open = self.elements.ways[self._integer(attributes, "id", line)] = Way([])
+        elif tag == "relation":
+            self.open = self.elements.relations[self._integer(attributes, "id", line)] = Relation()
+
+    def _content(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        assert self.open is not None
+        if tag == "tag":
+            self.open.tags[attributes.get("k", "")] = attributes.get("v", "")
+        elif tag == "nd" and isinstance(self.open, Way):
+            self.open.nodes.append(self._integer(attributes, "ref", line))
+        elif (tag == "member" and isinstance(self.open, Relation)
+              and attributes.get("type") == "way"):
+            way = self._integer(attributes, "ref", line)
+            self.open.members.append((way, attributes.get("role", "")))
+
+    def _integer(self, attributes: dict[str, str], name: str, line: int) -> int:
+        try:
+            return int(attributes[name])
+        except (KeyError, ValueError):
+            raise BadInput(f"{self.path}, line {line}: {name}={attributes.get(name)!r} is not a "
+                           "whole number; export the map again") from None
+
+    def _degrees(self, attributes: dict[str, str], name: str, limit: float, line: int) -> float:
+        try:
+            value = float(attributes[name])
+        except (KeyError, ValueError):
+            value = math.nan
+        if not -limit <= value <= limit:
+            raise BadInput(f"{self.path}, line {line}: a node has {name}={attributes.get(name)!r}; "
+                           f"allowed is -{limit} to {limit} degrees; export the map again")
+        return value
+
+
+def read_osm_pbf(path: Path) -> OsmElements:
+    """Read the elements that belong to buildings and vegetation.
+
+    Args:
+        path: `.osm.pbf` file.
+
+    Returns:
+        Buildings and vegetation, their ways and their nodes.
+
+    Raises:
+        BadInput: pyosmium is not installed, no such file, or not a PBF file.
+    """
+    try:
+        import osmium
+    except ImportError:
+        raise BadInput(
+            f"{path}: .osm.pbf is read with the package osmium, which is not installed; install it "
+            "with `pip install 'radiotwin[gis]'`, or convert the file: `osmium cat area.osm.pbf -o "
+            "area.osm`") from None
+    check_input(path, "map in OpenStreetMap's PBF format")
+    # An absolute path: what begins with `http:` would be fetched, `-` is standard input
+    file = osmium.io.File(str(path.absolute()), "pbf")
+    kinds, filters = osmium.osm, osmium.filter
+
+    def matching(kind: Any, selected: Any) -> Iterable[Any]:
+        return osmium.FileProcessor(file, kind).with_filter(selected)
+
+    def selected(kind: Any, ids: set[int]) -> Iterable[Any]:
+        # The filter takes 4 MiB for every 2^25 numbers of which there is one, and no negative ones
+        if min(ids) > 0 and len({number >> 25 for number in ids}) * _IDS_PER_BLOCK <= len(ids):
+            return matching(kind, filters.IdFilter(ids))
+        return (each for each in osmium.FileProcessor(file, kind) if each.id in ids)
+
+    elements = OsmElements()
+    try:
+        for relation in matching(kinds.RELATION, filters.TagFilter(("type", "multipolygon"))):
+            members = [(member.ref, member.role) for member in relation.members
+                       if member.type == "w"]
+            elements.relations[relation.id] = Relation(members, dict(relation.tags))
+        _add_ways(elements, matching(kinds.WAY, filters.KeyFilter(*BUILDING_KEYS)))
+        _add_ways(elements, matching(kinds.WAY, filters.TagFilter(*TAGS)))
+        _drop_other_relations(elements)
+        member_ids = {way for relation in elements.relations.values()
+                       for way, _ in relation.members}
+        missing = member_ids - elements.ways.keys()
+        if missing:
+            _add_ways(elements, selected(kinds.WAY, missing))
+        nodes = {node for way in elements.ways.values() for node in way.nodes}
+        if nodes:
+            for node in selected(kinds.NODE, nodes):
+                if node.location.valid():
+                    elements.positions[node.id] = node.location.lon, node.location.lat
+    except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
+        raise BadInput(f"{path} is not a readable .osm.pbf file ({error}); download it again"
+                       ) from None
+    return elements
+
+
+def _add_ways(elements: OsmElements, ways: Iterable[Any]) -> None:
+    corners = sum(len(way.nodes) for way in elements.ways.values())
+    for way in ways:
+        nodes = [node.ref for node in way.nodes]
+        corners += len(nodes)
+        VERTICES.check(corners, "the map")
+        elements.ways[way.id] = Way(nodes, dict(way.tags))
+    FEATURES.check(len(elements.ways), "the map")
+
+
+def _drop_other_relations(elements: OsmElements) -> None:
+    """Keep vegetation, and buildings that are so themselves or, as in old maps, by their ways."""
+    for number, relation in list(elements.relations.items()):
+        if kind_of(relation.tags) is None and not any(
+                key in relation.tags for key in BUILDING_KEYS) and not any(
+                way in elements.ways for way, role in relation.members if role != "inner"):
+            del elements.relations[number]
+
+
+def download_osm(
+    path: Path, bbox_deg: tuple[float, float, float, float], server: str = SERVER
+) -> None:
+    """Download the buildings and the vegetation of an area to an `.osm` file.
+
+    Args:
+        path: `.osm` file that does not exist yet.
+        bbox_deg: south, west, north, east [degrees].
+        server: address of an Overpass interpreter.
+
+    Raises:
+        BadInput: the file exists, is not called `.osm`, or the area is too large.
+        RunFailed: no network, or the server refuses.
+    """
+    from pyproj import Geod
+
+    if path.suffix.lower() != ".osm":
+        raise BadInput(f"--overpass writes {path}, which is not called .osm; choose such a name")
+    if path.exists():
+        raise BadInput(f"{path} exists already; leave --overpass out to build from it, or choose "
+                       "another name")
+    south, west, north, east = bbox_deg
+    area_m2, _ = Geod(ellps="WGS84").polygon_area_perimeter(
+        [west, east, east, west], [south, south, north, north])
+    if abs(area_m2) > MAX_AREA_KM2 * 1e6:
+        raise BadInput(f"--overpass: {abs(area_m2) / 1e6:.0f} km² are too much for a public "
+                       f"server, {MAX_AREA_KM2:g} km² are allowed; make --bbox smaller, or "
+                       "download an extract (.osm.pbf)")
+    box = ",".join(f"{value:.7f}" for value in bbox_deg)
+    wanted = [*(f'["{key}"]' for key in BUILDING_KEYS),
+              *(f'["{key}"="{value}"]' for key, value in TAGS)]
+    selectors = "".join(f"{kind}{each}({box});" for kind in ("way", "relation") for each in wanted)
+    query = f"[out:xml][timeout:{TIMEOUT_S}];({selectors});(._;>;);out body;"
+    request = urllib.request.Request(
+        server, urllib.parse.urlencode({"data": query}).encode(),
+        {"User-Agent": "radiotwin (https://pypi.org/project/radiotwin)"})
+    try:
+        with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer, \
+                atomic_file(path) as file:
+            _copy(answer, file, path)
+    except (OSError, http.client.HTTPException) as error:
+        reason = getattr(error, "reason", error)
+        raise RunFailed(f"--overpass needs a network, and {server} did not answer ({reason}); try "
+                        "again later, or download an extract and give the file") from None
+
+
+def _copy(answer: Any, file: IO[bytes], path: Path) -> None:
+    """Copy an answer that ends in time, is not too large, and is complete."""
+    read, deadline = 0, time.monotonic() + MAX_DOWNLOAD_S
+    while part := answer.read1(2**16):
+        read += len(part)
+        FILE_BYTES.check(read, f"{path}, as the server sends it")
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"its answer has not ended after {MAX_DOWNLOAD_S:g} s")
+        file.write(part)
+    if getattr(answer, "length", None):  # bytes that were announced and did not come
+        raise ConnectionError("its answer was cut off")

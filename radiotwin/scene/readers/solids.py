@@ -1,0 +1,495 @@
+"""Prisms of buildings in the local frame, from areas with tags or from shells in three dimensions.
+
+Prisms in the local frame from areas with tags, and a report of their defects.
+
+Prisms of buildings that a file has in three dimensions: their shells, in the local frame.
+
+Closed shells become solids like the extruded ones, so that coincident walls of neighbours are
+united. Open ones are kept as they are, and reported. Each building stands on the flat ground, with
+its lowest point: where the file has terrain below it, that is left out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import mapbox_earcut
+import numpy as np
+import shapely
+import trimesh
+from manifold3d import Error, Manifold, Mesh64
+from shapely.geometry.base import BaseGeometry
+
+from radiotwin.geo.geodesy import to_local
+from radiotwin.io.budgets import CORNERS, FACES, OVERLAPS, PART_PAIRS, TOUCHING_CORNERS
+from radiotwin.io.forms import Origin
+from radiotwin.scene.checks import Problem, Severity
+from radiotwin.scene.materials import Material
+from radiotwin.scene.meshes import clean
+from radiotwin.scene.readers.features import Feature, Shell, problems_of
+from radiotwin.scene.readers.heights import KNOWN, MAX_HEIGHT_M, Height, HeightColumn, height_of
+from radiotwin.scene.readers.material_table import MaterialTable
+from radiotwin.scene.surfaces import Surfaces
+
+GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do
+MIN_OVERLAP_M2 = 1.0  # [m²], that is reported
+_CHUNK = 64  # prisms: bounds the pairs that are found at once
+_PAIRS_AT_ONCE = 10_000
+SLIVER_AREA_M2 = 1.0  # [m²]
+SLIVER_WIDTH_M = 0.3  # [m], mean width; the thickness of one wall
+MIN_COVERED_SHARE = 0.9  # of an outline that its parts cover for it to be left out
+HEADROOM_M = 2.5  # [m] above the ground: a building that begins higher, with all parts, is named
+Area = tuple[Feature, shapely.MultiPolygon]
+_WALL_SINE = 0.02  # of a triangle's area, seen from above, below which it belongs to a wall
+_DECIMALS = 4  # of corners [m]: those that are equal are one, as in `meshes.WELD_M`
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Surfaces of a building that its file has in three dimensions, in the local frame [m].
+
+    Attributes:
+        solid: where they are closed, else None.
+        mesh: (v, 3) corners and (f, 3) faces where they are not, else None.
+    """
+
+    solid: Manifold | None
+    mesh: tuple[np.ndarray, np.ndarray] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Prism:
+    """A solid with vertical walls and a flat roof, or with a body of its own.
+
+    Attributes:
+        name: of the feature; several prisms may share one.
+        area: one valid polygon in the local frame, or of a body what it covers [m].
+        height: bottom and top, and their source.
+        material: of its surfaces.
+        material_from: the tag that the material follows from, or `default`.
+        body: its surfaces; None: walls and a roof over its area.
+        site: area of the whole building that it is part of, whose ground its height counts from;
+            None: its own.
+        ground_m: height of that ground above the datum [m].
+    """
+
+    name: str
+    area: shapely.Polygon | shapely.MultiPolygon
+    height: Height
+    material: Material
+    material_from: str
+    body: Body | None = None
+    site: BaseGeometry | None = None
+    ground_m: float = 0.0
+
+    def overlaps_in_height(self, other: "Prism") -> bool:
+        """Return whether both share some height."""
+        top_m = min(self.height.top_m, other.height.top_m)
+        return top_m > max(self.height.bottom_m, other.height.bottom_m)
+
+
+def make_prisms(
+    features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float,
+    height_column: HeightColumn | None = None
+) -> tuple[list[Prism], list[Problem]]:
+    """Make prisms from buildings and their parts.
+
+    Args:
+        features: buildings and parts.
+        origin: of the local frame.
+        table: materials by tag.
+        default_height_m: of a building whose tags give no height [m].
+        height_column: column that goes before all known ones.
+
+    Returns:
+        The prisms, parts first, and the defects that were found.
+    """
+    defects = _Defects()
+    areas = _clean(features, origin, defects)
+    wholes = [(feature, area) for feature, area in areas if not feature.is_part]
+    parts = [(feature, area) for feature, area in areas if feature.is_part]
+    prisms = []
+    lowest_m: dict[str, float] = {}  # by building
+    for feature, area, (whole, site) in _resolve_parts(wholes, parts, defects):
+        height = height_of(feature.tags, default_height_m, height_column)
+        if height.unusable:
+            defects.add("height", f"{feature.name}: {', '.join(height.unusable)}")
+        if height.bottom_m >= height.top_m:
+            defects.add("upside down", feature.name)
+            continue
+        unknown = table.unknown(feature.tags)
+        if unknown:
+            defects.add("material", f"{feature.name}: {unknown}")
+        material, material_from = table.material_of(feature.tags)
+        prisms += [Prism(feature.name, polygon, height, material, material_from, site=site)
+                   for polygon in shapely.get_parts(area)]
+        if not whole.is_part:  # what a part without its outline stands on is not known
+            lowest_m[whole.name] = min(lowest_m.get(whole.name, np.inf), height.bottom_m)
+    for name, bottom_m in lowest_m.items():
+        if bottom_m > HEADROOM_M:
+            defects.add("floating", name)
+    return prisms, defects.problems()
+
+
+class _Defects:
+    """Defects of features, gathered by kind."""
+
+    _KINDS: ClassVar[dict[str, tuple[Severity, str]]] = {
+        "invalid": ("fixed", "outline(s) cut or touched themselves: taken apart"),
+        "nested": ("fixed", "outline(s) had parts that overlap or lie in each other: united"),
+        "no area": ("warning", "building(s) have no area: left out"),
+        "sliver": ("warning", f"sliver(s), under {SLIVER_AREA_M2:g} m² or {SLIVER_WIDTH_M:g} m "
+                              "wide: left out"),
+        "height": ("warning", "building(s) have an impossible height, level or bottom; the next "
+                              "tag, or the default, was taken"),
+        "upside down": ("warning", "building(s) begin (min_height) no lower than they end: left "
+                                   "out"),
+        "material": ("warning", "building(s) have a building:material that is not in the table; "
+                                "the default was taken. Name it in --material-table or with "
+                                "--material NAME=ITU"),
+        "rest": ("warning", f"outline(s) are covered to less than {MIN_COVERED_SHARE:.0%} by their "
+                            "parts: the rest keeps the outline's own height"),
+        "floating": ("warning", f"building(s) begin more than {HEADROOM_M:g} m above the ground, "
+                                "with all their parts: nothing of them reaches it. They are built "
+                                "so; where that is wrong, correct min_height or add what is below"),
+    }
+
+    def __init__(self) -> None:
+        self.names: dict[str, list[str]] = {}
+
+    def add(self, kind: str, name: str) -> None:
+        self.names.setdefault(kind, []).append(name)
+
+    def problems(self) -> list[Problem]:
+        return [problem for kind, (severity, text) in self._KINDS.items()
+                for problem in problems_of(self.names.get(kind, ()), text, severity)]
+
+
+def _clean(features: Sequence[Feature], origin: Origin, defects: _Defects) -> list[Area]:
+    """Return the features of which something is left, with their areas in the local frame."""
+    def to_metres(points: np.ndarray) -> np.ndarray:
+        return np.column_stack(to_local(origin, *points.T))
+
+    areas = shapely.transform([feature.area for feature in features], to_metres)
+    return [(feature, kept) for feature, area in zip(features, areas)
+            if (kept := _clean_one(feature, area, defects)) is not None]
+
+
+def _clean_one(feature: Feature, area: BaseGeometry,
+               defects: _Defects) -> shapely.MultiPolygon | None:
+    """Return the valid polygons of an area that are no slivers; None where nothing is left."""
+    invalid = not area.is_valid
+    area, shared_m2 = _united(area)
+    if area.area < GRID_M**2:
+        defects.add("no area", feature.name)
+        return None
+    area = _polygons(shapely.set_precision(area, GRID_M))
+    if any(_touches_itself(polygon) for polygon in shapely.get_parts(area)):
+        shrunk = area.buffer(-0.01, join_style="mitre")  # [m], enough to separate the rings
+        area, invalid = _polygons(shapely.set_precision(shrunk, GRID_M / 2)), True
+    kept = [polygon for polygon in shapely.get_parts(area) if polygon.area >= SLIVER_AREA_M2
+            and 2 * polygon.area / polygon.length >= SLIVER_WIDTH_M]
+    if len(kept) < shapely.get_num_geometries(area):
+        defects.add("sliver", feature.name)
+    if shared_m2 > MIN_OVERLAP_M2:
+        defects.add("nested", feature.name)
+    elif invalid:
+        defects.add("invalid", feature.name)
+    return shapely.MultiPolygon(kept) if kept else None
+
+
+def _united(area: BaseGeometry) -> tuple[shapely.MultiPolygon, float]:
+    """Return the valid polygons of an area, and the area by which its parts overlap.
+
+    A courtyard is a ring of its polygon [1]: a polygon in another one is built, too.
+
+    [1] OGC 06-103r4, Simple feature access, section 6.1.14 (MultiPolygon).
+    """
+    whole = _polygons(area)
+    if whole.is_valid:
+        return whole, 0.0
+    parts = [shapely.make_valid(polygon) for polygon in whole.geoms]
+    united = _polygons(shapely.union_all(parts) if len(parts) > 1 else parts[0])
+    return united, sum(part.area for part in parts) - united.area
+
+
+def _polygons(area: BaseGeometry) -> shapely.MultiPolygon:
+    """Return the polygons of any geometry."""
+    flat = shapely.get_parts(shapely.get_parts(area))
+    return shapely.MultiPolygon([part for part in flat if part.geom_type == "Polygon"])
+
+
+def _touches_itself(polygon: shapely.Polygon) -> bool:
+    """Return whether two rings, or one ring twice, go through one point."""
+    rings = (polygon.exterior, *polygon.interiors)
+    points = np.concatenate([shapely.get_coordinates(ring)[:-1] for ring in rings])
+    return len(np.unique(points, axis=0)) < len(points)
+
+
+def _resolve_parts(
+    wholes: list[Area], parts: list[Area], defects: _Defects
+) -> list[tuple[Feature, shapely.MultiPolygon, Area]]:
+    """Return parts with inherited tags, and buildings without the areas of their parts.
+
+    With each comes the whole building with its area; a part that lies in none is its own.
+    """
+    tree, found = shapely.STRtree([area for _, area in wholes]), 0
+    whole_m2 = [area.area for _, area in wholes]
+    parts_of: dict[int, list[shapely.MultiPolygon]] = {}
+    resolved = []
+    for feature, area in parts:
+        inside = area.representative_point()
+        owners = [int(index) for index in tree.query(inside, predicate="within")]
+        found += len(owners)
+        PART_PAIRS.check(found, "the map")
+        whole = feature, area
+        if owners:
+            owner = min(owners, key=whole_m2.__getitem__)
+            parts_of.setdefault(owner, []).append(area)
+            whole = wholes[owner]
+            feature = _inherit(feature, whole[0])
+        resolved.append((feature, area, whole))
+    for index, (feature, area) in enumerate(wholes):
+        if index in parts_of:
+            rest = _polygons(area.difference(shapely.union_all(parts_of[index])))
+            if rest.area <= (1 - MIN_COVERED_SHARE) * area.area:
+                continue
+            defects.add("rest", feature.name)
+            area = shapely.MultiPolygon([polygon for polygon in rest.geoms
+                                         if polygon.area >= SLIVER_AREA_M2])
+        resolved.append((feature, area, wholes[index]))
+    return resolved
+
+
+def _inherit(part: Feature, whole: Feature) -> Feature:
+    """Return a part with the tags of its building that it lacks, except the bottom."""
+    tags = {key: value for key, value in whole.tags.items()
+            if key not in ("min_height", "building:min_level")}
+    known = [column.name for column in KNOWN]
+    own = next((row for row, name in enumerate(known) if name in part.tags), 0)
+    for name in known[:own]:  # which would take precedence over what the part itself has
+        tags.pop(name, None)
+    return replace(part, tags=tags | dict(part.tags))
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Pairs of prisms that touch or overlap in the plane, and in height touch or overlap.
+
+    Attributes:
+        pairs: (n, 2) indices of prisms, the lower one first.
+        shared_m2: (n,) area of their common part [m²].
+        shared_m: (n,) length of its outline, or of the common wall [m].
+    """
+
+    pairs: np.ndarray
+    shared_m2: np.ndarray
+    shared_m: np.ndarray
+
+
+def find_contacts(prisms: Sequence[Prism]) -> Contacts:
+    """Find prisms that touch or overlap.
+
+    Args:
+        prisms: of all buildings.
+
+    Raises:
+        BadInput: there are too many such pairs.
+    """
+    areas: Any = np.array([prism.area for prism in prisms], dtype=object)
+    pairs = _touching(prisms, areas)
+    shared_m2, shared_m = np.zeros(len(pairs)), np.zeros(len(pairs))
+    overlapping = 0
+    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
+        part = slice(start, start + _PAIRS_AT_ONCE)
+        common = shapely.intersection(*areas[pairs[part].T])
+        shared_m2[part], shared_m[part] = shapely.area(common), shapely.length(common)
+        overlapping += int(np.count_nonzero(shared_m2[part] > MIN_OVERLAP_M2))
+        OVERLAPS.check(overlapping, "the map")
+    return Contacts(pairs, shared_m2, shared_m)
+
+
+def _touching(prisms: Sequence[Prism], areas: Any) -> np.ndarray:
+    """Return the (n, 2) pairs of prisms that touch, the lower index first."""
+    bottom_m = np.array([prism.height.bottom_m for prism in prisms])
+    top_m = np.array([prism.height.top_m for prism in prisms])
+    corners, found = shapely.get_num_coordinates(areas), 0
+    tree, parts = shapely.STRtree(areas), [np.zeros((0, 2), dtype=int)]
+    for start in range(0, len(areas), _CHUNK):
+        a, b = tree.query(areas[start:start + _CHUNK], predicate="intersects")
+        a = a + start
+        slack_m = np.minimum(top_m[a], top_m[b]) - np.maximum(bottom_m[a], bottom_m[b])
+        kept = (a < b) & (slack_m > -GRID_M)
+        parts.append(np.stack([a[kept], b[kept]], axis=1))
+        found += int(corners[parts[-1]].sum())
+        TOUCHING_CORNERS.check(found, "the map")
+    return np.concatenate(parts)
+
+
+def find_overlaps(prisms: Sequence[Prism],
+                  contacts: Contacts) -> list[tuple[Prism, Prism, float]]:
+    """Find prisms of different buildings that overlap.
+
+    Args:
+        prisms: of all buildings.
+        contacts: of these prisms.
+
+    Returns:
+        Pairs of prisms, with the area they share, if it is more than 1 m² [m²].
+    """
+    found = []
+    for (a, b), shared_m2 in zip(contacts.pairs.tolist(), contacts.shared_m2.tolist()):
+        first, second = prisms[a], prisms[b]
+        if (shared_m2 > MIN_OVERLAP_M2 and first.name != second.name
+                and first.overlaps_in_height(second)):
+            found.append((first, second, shared_m2))
+    return found
+
+
+def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: MaterialTable
+                      ) -> tuple[list[Prism], list[Problem]]:
+    """Make a prism with a body from each feature that has a shell.
+
+    Args:
+        features: buildings and parts, with shells.
+        origin: of the local frame.
+        table: materials by tag.
+
+    Returns:
+        The prisms, and the defects that were found.
+    """
+    prisms: list[Prism] = []
+    no_area, too_high, opened, unknown = [], [], [], []
+    faces_so_far = 0
+    for feature in features:
+        assert feature.shell is not None
+        vertices, faces = triangulate(feature.shell, origin)
+        faces_so_far += len(faces)
+        FACES.check(faces_so_far, "the map")
+        area = _footprint(vertices, faces)
+        if area.area < SLIVER_AREA_M2:
+            no_area.append(feature.name)
+            continue
+        bottom_m, top_m = vertices[:, 2].min(), vertices[:, 2].max()
+        if not 0 < top_m <= MAX_HEIGHT_M:
+            too_high.append(f"{feature.name}: {top_m:.4g} m")
+            continue
+        body, closed = _body(vertices, faces)
+        if not closed:
+            opened.append(feature.name)
+        if value := table.unknown(feature.tags):
+            unknown.append(f"{feature.name}: {value}")
+        height = Height(float(bottom_m), float(top_m), "model")
+        prisms.append(Prism(feature.name, area, height, *table.material_of(feature.tags), body))
+    return _with_sites(prisms), [
+        *problems_of(no_area, "building(s) have no area seen from above: left out"),
+        *problems_of(too_high, f"building(s) are not between 0 and {MAX_HEIGHT_M:g} m tall: left "
+                               "out; are their elevations in metres?"),
+        *problems_of(opened, "building(s) are not closed, or cross themselves: kept as they are, "
+                             "and not united with what they touch"),
+        *problems_of(unknown, "building(s) have a building:material that is not in the table; the "
+                              "default was taken. Name it in --material-table or with --material "
+                              "NAME=ITU")]
+
+
+def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
+    """Return prisms that know the area of their whole building: heights count from its ground."""
+    areas: dict[str, list[BaseGeometry]] = {}
+    for prism in prisms:
+        areas.setdefault(prism.name, []).append(prism.area)
+    sites = {name: shapely.union_all(parts) for name, parts in areas.items()}
+    return [replace(prism, site=sites[prism.name]) for prism in prisms]
+
+
+def elevation_fact(features: Sequence[Feature]) -> str:
+    """Return where the ground of buildings was, a line for a report.
+
+    Args:
+        features: buildings with shells, at least one.
+    """
+    ground_m = [feature.shell.ground_m for feature in features if feature.shell is not None]
+    return (f"buildings begin at {min(ground_m):.1f} to {max(ground_m):.1f} m above the file's "
+            "vertical datum; each was put on the ground")
+
+
+def triangulate(shell: Shell, origin: Origin) -> tuple[np.ndarray, np.ndarray]:
+    """Cut the polygons of a shell into triangles.
+
+    Args:
+        shell: as in the file.
+        origin: of the local frame.
+
+    Returns:
+        (v, 3) corners in the local frame, above the ground of the building [m], and (f, 3) faces.
+    """
+    points = shell.points
+    x_m, y_m = to_local(origin, points[:, 0], points[:, 1])
+    vertices = np.column_stack([x_m, y_m, points[:, 2] - shell.ground_m])
+    vertices, same = np.unique(np.round(vertices, _DECIMALS), axis=0, return_inverse=True)
+    same = same.reshape(-1)
+    found = [np.zeros((0, 3), dtype=np.int64)]
+    for rings in shell.polygons:
+        faces = _cut(vertices, [same[ring] for ring in rings])
+        found.append(faces)
+    return vertices, np.concatenate(found)
+
+
+def _cut(vertices: np.ndarray, rings: list[np.ndarray]) -> np.ndarray:
+    """Return the triangles of a polygon with holes, which turn as its outline does."""
+    rings = [ring[ring != np.roll(ring, 1)] for ring in rings]
+    rings = [rings[0], *(ring for ring in rings[1:] if len(ring) > 2)]
+    outline = vertices[rings[0]]
+    if len(outline) < 3:
+        return np.zeros((0, 3), dtype=np.int64)
+    if len(outline) == 3 and len(rings) == 1:
+        return rings[0][None]
+    corners = np.concatenate(rings)
+    CORNERS.check(len(corners), "the map")
+    # Twice its area, as a vector (Newell)
+    normal = np.cross(outline - outline[0], np.roll(outline, -1, axis=0) - outline[0]).sum(axis=0)
+    axis = int(np.abs(normal).argmax())
+    flat = np.delete(vertices[corners], axis, axis=1)
+    ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
+    ears: Any = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends)
+    faces = corners[ears.astype(np.int64).reshape(-1, 3)]
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    turned = np.cross(b - a, c - a).sum(axis=0) @ normal < 0
+    return faces[:, ::-1] if turned else faces
+
+
+def _footprint(vertices: np.ndarray, faces: np.ndarray) -> shapely.MultiPolygon:
+    """Return what a building covers, seen from above."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    level = np.abs(normals[:, 2]) > _WALL_SINE * np.linalg.norm(normals, axis=1)
+    if not level.any():
+        return shapely.MultiPolygon()
+    flat: Any = shapely.polygons(corners[level][:, :, :2])
+    area = shapely.union_all(shapely.set_precision(flat, GRID_M))
+    parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
+    return shapely.MultiPolygon(parts)
+
+
+def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
+    """Return the surfaces, as a solid where they are closed, and whether they are."""
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used], faces.reshape(-1, 3)
+    solid = _solid(vertices, faces)
+    if solid is None:  # surfaces that stand beside a solid may face either way
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        trimesh.repair.fix_winding(mesh)
+        faces = np.asarray(mesh.faces)
+        solid = _solid(vertices, faces)
+    if solid is not None:
+        return Body(solid, None), True
+    cleaned = clean(vertices, faces)[:2]
+    surfaces = Surfaces([cleaned])
+    return Body(None, (cleaned[0], surfaces.turned(surfaces.inward()).faces)), False
+
+
+def _solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold | None:
+    """Return the solid that triangles enclose; None where they do not."""
+    solid = Manifold(Mesh64(vertices, faces.astype(np.uint64)))
+    if solid.status() == Error.NoError and solid.volume() < 0:
+        solid = Manifold(Mesh64(vertices, faces[:, ::-1].astype(np.uint64)))
+    return solid if solid.status() == Error.NoError and solid.volume() > 0 else None

@@ -1,0 +1,176 @@
+"""Coordinate reference systems that files name, and their coordinates in degrees."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from radiotwin.errors import BadInput
+from radiotwin.geo.geodesy import reference_system
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+WGS84 = ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::4326")
+# Names in GML and CityJSON: URN, URI, and lists of a horizontal and a vertical system
+_EPSG = re.compile(r"EPSG(?::|/)(?:[\d.]*(?::|/))?(\d{4,6})(?!\d)", re.IGNORECASE)
+_EPSG_OLD = re.compile(r"epsg\.xml#(\d{4,6})$", re.IGNORECASE)
+# Names of the German states' survey (AdV, "ETRS89_UTM32*DE_DHHN2016_NH")
+_ADV = re.compile(r"urn:adv:crs:(?:ETRS89_UTM(3[123])|DE_DHDN_3GK([2345]))", re.IGNORECASE)
+_MARGIN_DEG = 1.0  # around the area of use that a system declares
+
+
+def find_system(path: Path, name: str) -> "CRS":
+    """Find a coordinate reference system by its name.
+
+    Args:
+        path: file that names it, for the message.
+        name: `AUTHORITY:CODE`, URN, title of PROJ's database, or WKT.
+
+    Raises:
+        BadInput: it is not known, or a name that could open a file.
+    """
+    from pyproj.exceptions import CRSError
+
+    try:
+        return reference_system(name)
+    except CRSError as error:
+        raise BadInput(f"{path}: its coordinate reference system {name[:60]!r} is unknown "
+                       f"({error!s:.200}); export it in EPSG:4326") from None
+
+
+def degrees_from(path: Path, system: "CRS") -> Callable[[np.ndarray], np.ndarray]:
+    """Return a conversion of (n, 2) east and north to (n, 2) longitude and latitude [degrees].
+
+    Args:
+        path: file that names the system, for the message.
+        system: of two dimensions.
+
+    Raises:
+        BadInput: now or when it is used, the system cannot be converted.
+    """
+    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
+
+    def refuse(error: ProjError) -> BadInput:
+        return BadInput(f"{path}: its coordinate reference system {system.name[:60]!r} cannot be "
+                        f"converted ({error!s:.120}); export it in EPSG:4326")
+
+    def convert(points: np.ndarray) -> np.ndarray:
+        try:
+            return np.column_stack(transformer.transform(*points.T))
+        except ProjError as error:
+            raise refuse(error) from None
+
+    try:
+        transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    except ProjError as error:
+        raise refuse(error) from None
+    return convert
+
+
+def chosen_system(path: Path, named: str | None, declared: str | None) -> str | None:
+    """Return the system of a file: the one that it names, else the one that the user declared.
+
+    Args:
+        path: file, for the message.
+        named: by the file; None: nothing.
+        declared: by the user; None: nothing.
+
+    Raises:
+        BadInput: they differ.
+    """
+    if named is None or declared is None:
+        return declared if named is None else named
+    own, other = (plane_of(find_city_system(path, name)) for name in (named, declared))
+    if not own.equals(other, ignore_axis_order=True):
+        raise BadInput(f"{path} is in {own.name[:80]!r}, and --crs says {other.name[:80]!r}; leave "
+                       "--crs out, or correct the file if its system is wrong")
+    return named
+
+
+def check_declared_system(name: str) -> None:
+    """Raise BadInput unless the user's name is that of a coordinate reference system."""
+    try:
+        find_system(Path(), name)
+    except BadInput:
+        raise BadInput(f"--crs {name[:60]!r} is no coordinate reference system that is known; give "
+                       "AUTHORITY:CODE, such as EPSG:25832") from None
+
+
+def find_city_system(path: Path, name: str) -> "CRS":
+    """Find the system of a 3D city model, as GML and CityJSON name it.
+
+    Args:
+        path: file that names it, for the message.
+        name: `urn:ogc:def:crs:EPSG::25832`, `https://www.opengis.net/def/crs/EPSG/0/7415`,
+            `urn:ogc:def:crs,crs:EPSG::25832,crs:EPSG::7837`, `urn:adv:crs:ETRS89_UTM32`, …
+
+    Raises:
+        BadInput: it is not known.
+    """
+    if found := _EPSG.search(name) or _EPSG_OLD.search(name):
+        return find_system(path, f"EPSG:{found[1]}")
+    if found := _ADV.match(name):
+        return find_system(path, f"EPSG:258{found[1]}" if found[1]
+                           else f"EPSG:3146{int(found[2]) + 4}")
+    if name.upper().endswith("CRS84"):
+        return find_system(path, "OGC:CRS84")
+    return find_system(path, name)
+
+
+def vertical_unit_m(system: "CRS") -> float:
+    """Return the unit of elevations [m]; where the system names none, that of its plane."""
+    axes = system.axis_info
+    if len(axes) > 2:
+        return float(axes[2].unit_conversion_factor)
+    return 1.0 if system.is_geographic or not axes else float(axes[0].unit_conversion_factor)
+
+
+def to_degrees(path: Path, system: "CRS", points: np.ndarray) -> np.ndarray:
+    """Convert points of a 3D city model to longitude and latitude.
+
+    Standards want a system's own order of axes, many programs write east before north. The
+    points tell: they lie in the area that the system is meant for.
+
+    Args:
+        path: file, for the message.
+        system: of the points.
+        points: (n, 2) in the file's order.
+
+    Returns:
+        (n, 2) longitude and latitude [degrees].
+
+    Raises:
+        BadInput: in neither order the points lie where the system is used.
+    """
+    convert = degrees_from(path, plane_of(system))
+    is_own_north_first = system.is_geographic and system.to_authority() != ("OGC", "CRS84")
+    orders = [points[:, ::-1], points] if is_own_north_first else [points, points[:, ::-1]]
+    area = system.area_of_use
+    for ordered in orders:
+        degrees = convert(ordered)
+        if area is None:
+            return degrees
+        middle = np.median(degrees, axis=0)  # NaN and infinite compare as outside
+        west, east = area.west, area.east if area.east >= area.west else area.east + 360
+        if (area.south - _MARGIN_DEG <= middle[1] <= area.north + _MARGIN_DEG
+                and any(west - _MARGIN_DEG <= middle[0] + turn <= east + _MARGIN_DEG
+                        for turn in (0, 360))):
+            return degrees
+    first, second = np.median(points, axis=0)
+    raise BadInput(f"{path}: coordinates such as {first:.8g}, {second:.8g} are not in the area of "
+                   f"{system.name!r} ({area.name[:80] if area else ''}); correct the coordinate "
+                   "reference system that the file names, or the order of its coordinates")
+
+
+def plane_of(system: "CRS") -> "CRS":
+    """Return the horizontal part of a system.
+
+    Args:
+        system: of two or three dimensions, or of two systems.
+    """
+    parts = system.sub_crs_list
+    return parts[0] if parts else system.to_2d()

@@ -1,0 +1,386 @@
+"""The ground of a scene from a map: flat, or a terrain that buildings stand on.
+
+Heights of the ground from a GeoTIFF, at the nodes of a grid in the local frame.
+
+GDAL opens the file with the driver for GeoTIFF alone, so a file that is something else under its
+name (a VRT, which names other files or servers) is refused, and looks at no file beside it. It
+reads windows in full resolution: for others it would open the overviews that a file names.
+"""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+from scipy.ndimage import distance_transform_edt, map_coordinates
+
+from radiotwin.errors import BadInput
+from radiotwin.geo.geodesy import to_geographic, to_local
+from radiotwin.io.budgets import TERRAIN_BLOCK_BYTES, TERRAIN_PIXELS
+from radiotwin.io.forms import Origin
+from radiotwin.io.inputs import check_input
+from radiotwin.runtime.console import progress
+from radiotwin.scene.checks import Problem, warning
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.folder import source_text
+from radiotwin.scene.readers.solids import Prism
+from radiotwin.scene.readers.systems import find_system
+from radiotwin.scene.terrain import GroundMesh, HeightGrid, Kind, TerrainConfig, triangulate
+
+if TYPE_CHECKING:
+    from pyproj import CRS
+
+MAX_NODES = 400_000  # of the grid, which is wider than the raster's where that has more
+MIN_SPACING_M = 1.0
+MARGIN_PIXELS = 2  # around the grid, for the interpolation at its border
+HEIGHTS_M = (-500.0, 9_000.0)  # on land; what is outside was meant to be no height
+MIN_KNOWN = 0.5  # share of the nodes that the raster must have a height for
+_FEET = {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937,
+         "us-ft": 1200 / 3937, "us_survey_feet": 1200 / 3937}
+_METRES = ("", "m", "metre", "metres", "meter", "meters")
+_GDAL = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO",
+         "GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 2**26}
+Bounds = tuple[float, float, float, float]
+TOLERANCE_M = 0.5  # of the triangles: better than most terrain models are
+MAX_FACES = 20_000
+SKIRT_M = 1.0  # that walls reach below the lowest ground under them, so that no gap opens
+SAMPLE_M = 2.0  # along outlines: on a slope of 45 degrees the ground falls by a skirt in half of it
+FLAT_FACT = "flat, at z = 0: a map holds no terrain (--terrain FILE.tif adds one)"
+
+
+def read_heights(path: Path, origin: Origin, box_m: Bounds) -> HeightGrid:
+    """Read the heights of an area, averaged or interpolated to a grid.
+
+    Args:
+        path: GeoTIFF of one band, in any known coordinate reference system.
+        origin: of the local frame.
+        box_m: (x_min, x_max, y_min, y_max) of the area [m].
+
+    Returns:
+        The heights above the zero of the file's vertical reference. A node without one, where the
+        file has no data, has that of the nearest pixel which has one.
+
+    Raises:
+        BadInput: rasterio is not installed; not a GeoTIFF, or one without a system, with several
+            bands, or of numbers that are no heights; too large; or it does not cover the area.
+    """
+    with _opened(path) as file:
+        system = _system(path, file)
+        to_pixel = _pixels_of(file, system, origin)
+        factor, reference, kind = _vertical(path, file, system)
+        x_m, y_m, every = _nodes(file, system, origin, box_m)
+        column, row = to_pixel(*np.meshgrid(x_m, y_m))
+        height, first = _window(path, file, column, row, every)
+    height = height * factor
+    wrong = (height < HEIGHTS_M[0]) | (height > HEIGHTS_M[1])
+    height[wrong] = np.nan
+    known = np.isfinite(height)
+    at = [(row - first[0]) / every - 0.5, (column - first[1]) / every - 0.5]
+    nearest = [np.clip(np.round(axis), 0, size - 1).astype(int)
+               for axis, size in zip(at, height.shape)]
+    covered = (known[tuple(nearest)] & (np.abs(at[0] - nearest[0]) <= 0.51)
+               & (np.abs(at[1] - nearest[1]) <= 0.51))
+    if not covered.mean() >= MIN_KNOWN:
+        raise _uncovered(path, origin, box_m, float(covered.mean()))
+    if not known.all():
+        height = height[tuple(distance_transform_edt(~known, return_distances=False,
+                                                     return_indices=True))]
+    heights_m = map_coordinates(height, at, order=1, mode="nearest")
+    notes = []
+    if wrong.any():
+        notes.append(f"{np.count_nonzero(wrong):,} pixel(s) are no heights on land "
+                     f"({HEIGHTS_M[0]:g} to {HEIGHTS_M[1]:g} m): taken for no data")
+    if factor != 1.0:
+        notes.append(f"heights in feet were converted to metres ({factor:.7g})")
+    return HeightGrid(x_m, y_m, heights_m, float(1 - covered.mean()), reference, kind, tuple(notes))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a GeoTIFF of one band whose blocks are small enough."""
+    check_input(path, "terrain raster (GeoTIFF)")
+    try:
+        import rasterio
+        from rasterio.errors import NotGeoreferencedWarning, RasterioError
+    except ImportError:
+        raise BadInput(f"{path}: terrain is read with the package rasterio, which is not installed;"
+                       " install it with `pip install 'radiotwin[gis]'`") from None
+    from pyproj.exceptions import ProjError
+
+    try:
+        with rasterio.Env(**_GDAL), warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotGeoreferencedWarning)
+            with rasterio.open(str(path.resolve()), driver="GTiff", sharing=False,
+                               GEOREF_SOURCES="INTERNAL") as file:
+                _check(path, file)
+                yield file
+    except (RasterioError, ProjError, UnicodeDecodeError) as error:  # of names in the file
+        reason = " ".join(str(error).split())
+        raise BadInput(f"{path} cannot be read as a GeoTIFF ({reason}); give a .tif of terrain "
+                       "heights, or convert it with `gdal_translate -of GTiff`") from None
+
+
+def _check(path: Path, file: Any) -> None:
+    if file.count != 1:
+        raise BadInput(f"{path} has {file.count} bands, as a picture has; give a GeoTIFF with one "
+                       "band of heights")
+    if np.dtype(file.dtypes[0]).kind not in "iuf":
+        raise BadInput(f"{path} has pixels of type {file.dtypes[0]}, which are no heights; give a "
+                       "GeoTIFF of integers or real numbers")
+    block = file.block_shapes[0]
+    TERRAIN_BLOCK_BYTES.check(float(block[0]) * block[1] * np.dtype(file.dtypes[0]).itemsize,
+                              f"{path}, a block of {block[1]:,} x {block[0]:,} pixels")
+    if file.tags(ns="OVERVIEWS"):
+        raise BadInput(f"{path} names another file as its overview; make a copy without, with "
+                       "`gdal_translate -of GTiff`")
+
+
+def _system(path: Path, file: Any) -> "CRS":
+    if file.crs is None or file.transform.is_identity:
+        raise BadInput(f"{path} does not say where on the earth it lies (no coordinate reference "
+                       "system, or no position); export it as a GeoTIFF with both")
+    if not abs(file.transform.determinant) > 0:
+        raise BadInput(f"{path} has pixels without an area; export it again")
+    return find_system(path, file.crs.to_wkt(version="WKT2_2019"))
+
+
+def _pixels_of(file: Any, system: "CRS", origin: Origin) -> Any:
+    """Return the function from x, y in the local frame [m] to column and row of the raster."""
+    from pyproj import Transformer
+
+    transformer = Transformer.from_crs("EPSG:4326", system.to_2d(), always_xy=True)
+    inverse = ~file.transform
+
+    def to_pixel(x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        east, north = transformer.transform(*to_geographic(origin, x_m, y_m))
+        east, north = np.asarray(east), np.asarray(north)
+        return (inverse.a * east + inverse.b * north + inverse.c,
+                inverse.d * east + inverse.e * north + inverse.f)
+
+    return to_pixel
+
+
+def _vertical(path: Path, file: Any, system: "CRS") -> tuple[float, str, Kind]:
+    """Return the factor to metres, the name of the vertical reference, and its kind."""
+    vertical = next((part for part in system.sub_crs_list if part.is_vertical), None)
+    axis = vertical.axis_info[0] if vertical is not None else (
+        system.axis_info[2] if len(system.axis_info) == 3 else None)
+    unit = (file.units[0] or "").strip().lower()
+    if unit in _METRES:
+        factor = axis.unit_conversion_factor if axis is not None and not unit else 1.0
+    elif unit in _FEET:
+        factor = _FEET[unit]
+    else:
+        raise BadInput(f"{path} has heights in {unit[:40]!r}; allowed are metres and feet")
+    if vertical is not None:
+        kind: Kind = "ellipsoid" if "ellipsoid" in vertical.name.lower() else "geoid"
+        return factor, vertical.name, kind
+    if axis is not None:
+        return factor, f"ellipsoid of {system.name}", "ellipsoid"
+    return factor, "not declared", "unknown"
+
+
+def _nodes(file: Any, system: "CRS", origin: Origin,
+           box_m: Bounds) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the coordinates of the grid's lines [m], and how many pixels go to one along each."""
+    from pyproj import Transformer
+
+    x_min, x_max, y_min, y_max = box_m
+    middle = (x_min + x_max) / 2, (y_min + y_max) / 2
+    to_degrees = Transformer.from_crs(system.to_2d(), "EPSG:4326", always_xy=True)
+    to_system = Transformer.from_crs("EPSG:4326", system.to_2d(), always_xy=True)
+    centre = np.array(to_system.transform(*to_geographic(origin, *middle)))
+    forth = file.transform
+    beside = np.array([[0, 0], [forth.a, forth.d], [forth.b, forth.e]]) + centre
+    x_m, y_m = to_local(origin, *to_degrees.transform(*beside.T))
+    pixel_m2 = abs((x_m[1] - x_m[0]) * (y_m[2] - y_m[0]) - (x_m[2] - x_m[0]) * (y_m[1] - y_m[0]))
+    pixel_m = float(np.sqrt(pixel_m2)) if np.isfinite(pixel_m2) else 0.0
+    if not pixel_m > 0:
+        raise BadInput("the terrain raster's system is not defined around the scene; give one that "
+                       "covers it")
+    spacing_m = max(pixel_m, MIN_SPACING_M, np.sqrt((x_max - x_min) * (y_max - y_min) / MAX_NODES))
+    lines = [np.linspace(low, high, max(int(np.ceil((high - low) / spacing_m)), 1) + 1)
+             for low, high in ((x_min, x_max), (y_min, y_max))]
+    return lines[0], lines[1], max(int(spacing_m / pixel_m), 1)
+
+
+def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray,
+            every: int) -> tuple[np.ndarray, tuple[int, int]]:
+    """Return the mean heights of squares of pixels around all nodes, and the first row and column.
+
+    A square without data is not a number.
+    """
+    finite = np.isfinite(column) & np.isfinite(row)
+    bounds = []
+    for values, size in ((row, file.height), (column, file.width)):
+        low = np.floor(np.min(values[finite], initial=np.inf)) - MARGIN_PIXELS * every
+        high = np.ceil(np.max(values[finite], initial=-np.inf)) + MARGIN_PIXELS * every
+        low, high = max(low, 0), min(high, size)
+        if not low < high:
+            return np.full((1, 1), np.nan), (0, 0)
+        bounds.append((int(low), int(high)))
+    (top, bottom), (left, right) = bounds
+    TERRAIN_PIXELS.check(float(bottom - top) * (right - left), path)
+    rows, columns = -(-(bottom - top) // every), -(-(right - left) // every)
+    out = np.empty((rows, columns))
+    at_once = max(1, 8_000_000 // (every * (right - left)))
+    with progress("reading terrain", total=rows) as advance:
+        for first in range(0, rows, at_once):
+            count = min(at_once, rows - first)
+            start, end = top + first * every, min(top + (first + count) * every, bottom)
+            part = file.read(1, window=((start, end), (left, right)), masked=True)
+            values = np.full((count * every, columns * every), np.nan)
+            with np.errstate(invalid="ignore"):  # NaN that signal
+                values[:end - start, :right - left] = np.ma.filled(part.astype(float), np.nan)
+            out[first:first + count] = _means(values, every)
+            advance(count)
+    scale, offset = file.scales[0], file.offsets[0]
+    return out * scale + offset, (top, left)
+
+
+def _means(values: np.ndarray, every: int) -> np.ndarray:
+    """Return the means of squares of pixels, without those that are not finite."""
+    squares = values.reshape(values.shape[0] // every, every, values.shape[1] // every, every)
+    known = np.isfinite(squares)
+    count = known.sum(axis=(1, 3))
+    total = np.where(known, squares, 0.0).sum(axis=(1, 3))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def _uncovered(path: Path, origin: Origin, box_m: Bounds, share: float) -> BadInput:
+    x_min, x_max, y_min, y_max = box_m
+    west, south = (float(value) for value in to_geographic(origin, x_min, y_min))
+    east, north = (float(value) for value in to_geographic(origin, x_max, y_max))
+    return BadInput(f"{path} has heights for {share:.0%} of the scene, {MIN_KNOWN:.0%} are needed; "
+                    f"give a raster that covers {south:.5f},{west:.5f},{north:.5f},{east:.5f} "
+                    "(south,west,north,east), or choose a part with --bbox")
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The ground of a scene.
+
+    Attributes:
+        vertices, faces: of its shape [m].
+        fact: on it, for a report.
+        config: for `scene.toml`; None: flat.
+        problems: on how it was read.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    fact: str = FLAT_FACT
+    config: TerrainConfig | None = None
+    problems: tuple[Problem, ...] = ()
+
+
+def make_ground(terrain: Path | None, origin: Origin, box_m: Bounds, shape: str) -> Ground:
+    """Return the ground of an area.
+
+    Args:
+        terrain: GeoTIFF of heights; None: the ground is flat.
+        origin: of the local frame; an altitude other than 0 becomes the datum of a terrain.
+        box_m: (x_min, x_max, y_min, y_max) [m].
+        shape: name of its shape.
+
+    Returns:
+        The ground, above its datum.
+
+    Raises:
+        BadInput: the raster cannot be used, or the declared altitude is above the lowest ground.
+    """
+    x0, x1, y0, y1 = box_m
+    if terrain is None:
+        corners = np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
+        return Ground(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    grid = read_heights(terrain, origin, box_m)
+    low_m = round(float(grid.height_m.min()), 3)
+    # Of 0 m, an origin declares no altitude
+    datum_m = origin.altitude_m or float(np.floor(low_m)) or -1.0
+    if datum_m > low_m:
+        raise BadInput(f"the altitude of --origin, {datum_m:g} m, is above the lowest ground of "
+                       f"the scene, {low_m:.1f} m; give one at or below it, or none")
+    mesh = triangulate(grid, TOLERANCE_M, MAX_FACES)
+    config = TerrainConfig(shape=shape, source=source_text(str(terrain))[:300], datum_m=datum_m,
+                           reference=grid.reference[:200], kind=grid.kind)
+    problems = [warning(f"{terrain}: {note}") for note in grid.notes]
+    if grid.filled > 0:
+        problems.append(warning(f"{terrain} has no height for {grid.filled:.1%} of the ground: the "
+                                "nearest one was taken"))
+    if mesh.max_error_m > TOLERANCE_M:
+        problems.append(warning(
+            f"the terrain was cut to {len(mesh.faces):,} triangles, which are up to "
+            f"{mesh.max_error_m:.1f} m off its heights; take a smaller --bbox for finer ones"))
+    if grid.kind == "unknown":
+        problems.append(warning(
+            f"{terrain} does not declare a vertical reference: whether its heights count from the "
+            "geoid (mean sea level) or from the ellipsoid, tens of metres apart, is not known. It "
+            "matters only where other data with altitudes join the scene"))
+    return Ground(mesh.vertices - [0, 0, datum_m], mesh.faces, _fact(grid, mesh, datum_m), config,
+                  tuple(problems))
+
+
+def _fact(grid: HeightGrid, mesh: GroundMesh, datum_m: float) -> str:
+    above = {"geoid": "above the geoid", "ellipsoid": "above the ellipsoid",
+             "unknown": "reference not declared"}[grid.kind]
+    name = f"{grid.reference}, " if grid.kind != "unknown" else ""
+    low_m, high_m = grid.height_m.min(), grid.height_m.max()
+    return (f"terrain from {low_m:.1f} to {high_m:.1f} m ({name}{above});"
+            f" z = 0 is at {datum_m:g} m; {len(mesh.faces):,} triangles within "
+            f"{mesh.max_error_m:.2f} m of the heights (RMS {mesh.rms_error_m:.2f} m)")
+
+
+def stand_on(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
+    """Put buildings on a terrain.
+
+    Heights of OpenStreetMap count from the lowest point where the building meets the ground [1], as
+    those of most 3D city models do: so do those of all its parts. A wall from the ground begins
+    `SKIRT_M` below that point.
+
+    [1] https://wiki.openstreetmap.org/wiki/Key:height
+
+    Args:
+        prisms: with heights above the ground.
+        ground: that they are put on; flat ground leaves them as they are.
+
+    Returns:
+        The prisms, with heights above the datum.
+    """
+    if ground.config is None:
+        return list(prisms)
+    # Parts of a building share its site, of which the ground is looked up once
+    sites = {id(site): site for site in (prism.site or prism.area for prism in prisms)}
+    lowest_m = dict(zip(sites, lowest_ground_m(list(sites.values()), ground).tolist()))
+    stood = []
+    for prism in prisms:
+        low_m, height = round(lowest_m[id(prism.site or prism.area)], 3), prism.height
+        bottom_m = low_m + height.bottom_m if height.bottom_m > 0 else low_m - SKIRT_M
+        body = prism.body
+        if body is not None and body.mesh is not None:  # a solid one follows its height
+            body = replace(body, mesh=(body.mesh[0] + [0.0, 0.0, low_m], body.mesh[1]))
+        stood.append(replace(prism, ground_m=low_m, body=body, height=replace(
+            height, bottom_m=bottom_m, top_m=low_m + height.top_m)))
+    return stood
+
+
+def lowest_ground_m(areas: Sequence[shapely.Geometry], ground: Ground) -> np.ndarray:
+    """Return the (n,) lowest height of the ground under areas [m].
+
+    Args:
+        areas: n polygons, in the rectangle of the ground [m].
+        ground: with a terrain.
+    """
+    surface = CityMap(ground.vertices, ground.faces,
+                      terrain=np.ones(len(ground.faces), dtype=bool))
+    outlines = shapely.segmentize(shapely.boundary(np.asarray(areas, dtype=object)), SAMPLE_M)
+    points_m, owner = shapely.get_coordinates(outlines, return_index=True)
+    lowest_m = np.full(len(areas), np.inf)
+    np.minimum.at(lowest_m, owner, surface.ground_height_m(*points_m.T))
+    tree = shapely.STRtree(np.asarray(shapely.points(ground.vertices[:, :2])))
+    area, corner = tree.query(np.asarray(areas, dtype=object), predicate="contains")
+    np.minimum.at(lowest_m, area, ground.vertices[corner, 2])
+    return lowest_m

@@ -1,0 +1,21 @@
+"""Positions of unknown devices: over a 3D map, along paths over it, and without one."""
+
+from radiotwin.twin.localize.along_paths import Relocation
+from radiotwin.twin.localize.calibration import RadiusCalibration, calibrate_radii, misfit
+from radiotwin.twin.localize.estimate import (
+    DeviceEstimate,
+    LocalizeSettings,
+    TwinDevice,
+    read_device,
+)
+from radiotwin.twin.localize.on_map import localize
+from radiotwin.twin.localize.without_map import (
+    PositionEstimate,
+    locate,
+    position_log_likelihood,
+    whole_area,
+)
+
+__all__ = ["DeviceEstimate", "LocalizeSettings", "PositionEstimate", "RadiusCalibration",
+           "Relocation", "TwinDevice", "calibrate_radii", "localize", "locate", "misfit",
+           "position_log_likelihood", "read_device", "whole_area"]

@@ -1,0 +1,427 @@
+"""Unknown devices where paths over the map put them, searched for around where a law does.
+
+A law with two classes of links takes one just behind an edge, a few decibels below line of sight,
+for one with it, and moves a device in a narrow street to where it would have line of sight. Paths
+tell the two apart, and take long. So the likelihood of each position is that of some of the
+device's links, by the law in all cells around, by paths in the best of these and downhill of them.
+
+Followed paths, as arrays that can be kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from scipy.special import stdtrit
+
+from radiotwin.effects.base import ResidualView
+from radiotwin.inference.censored_regression import CensoredRegression, FitResult
+from radiotwin.links import LinkData
+from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.runtime.console import progress
+from radiotwin.runtime.execution import Executor, Job, Resources
+from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept_with_name
+from radiotwin.runtime.processes import in_threads
+from radiotwin.scene.citymap import CityMap
+from radiotwin.twin.localize.estimate import TwinDevice, read_device
+from radiotwin.twin.model.fold_model import FoldModel
+
+Followed = dict[tuple[float, ...], dict[int, float]]
+"""Position -> hash of the other end's position -> power."""
+LINKS = 150  # of a device, about
+MIN_HEARD = 30  # of these; what is not heard says little, and fits many positions
+MAX_DEVICES = 30  # of unknown position; each takes some ten seconds
+CELL_M, CELLS_APART_M = 7.0, 9.0
+MAX_CELLS = 4000  # or wider ones
+MIN_REACH_M, REACH_RADII = 70.0, 1.5  # of the search, in metres or in radii of the law's circle
+FOLLOWED_SHARE, MIN_FOLLOWED, MAX_FOLLOWED = 0.12, 16, 40  # of the cells
+DESCENTS, DESCENTS_APART_M = 2, 15.0
+STEPS_M = (4.0, 2.0, 1.0, 0.5)
+AROUND_M = (14.0, 7.0)  # rings about where a descent has ended, in case it was a local minimum
+RAYS = 10_000  # from each position, 2 degrees apart: ten times as many find the same places
+DOF = 4.0
+MAX_MISFIT = 4.0  # square of how many times the errors of other devices
+CREDIBLE = 0.9
+WORKER_BYTES = 2 * 2**30  # of a process that searches
+
+
+def followed_since(known: dict[tuple[float, ...], int], followed: Followed
+                   ) -> dict[str, np.ndarray]:
+    """Return positions (p, 3), numbers (p,) of ends, and hashes and powers of those, new ones."""
+    new = {position_m: list(powers.items())[known.get(position_m, 0):]
+           for position_m, powers in followed.items() if len(powers) > known.get(position_m, 0)}
+    ends = [end for powers in new.values() for end in powers]
+    return {"position_m": np.array(list(new)).reshape(-1, 3),
+            "count": np.array([len(powers) for powers in new.values()], dtype=int),
+            "hash": np.array([key for key, _ in ends], dtype=np.uint64),
+            "power": np.array([power for _, power in ends], dtype=float)}
+
+
+def add_followed(arrays: dict[str, np.ndarray], followed: Followed) -> None:
+    """Add what `followed_since` returned."""
+    ends = list(zip(arrays["hash"].tolist(), arrays["power"].tolist(), strict=True))
+    if arrays["count"].sum() != len(ends):
+        raise ValueError("other counts")
+    last = np.cumsum(arrays["count"]).tolist()
+    for position_m, end, count in zip(arrays["position_m"].tolist(), last,
+                                      arrays["count"].tolist(), strict=True):
+        if count:
+            followed.setdefault(tuple(position_m), {}).update(ends[end - count:end])
+
+
+@dataclass(eq=False)
+class Relocation:
+    """Search along paths; remembers what was followed for other parts of the same links.
+
+    Attributes:
+        bounds: west, east, south and north end of where devices may be [m].
+        max_radius_m: of the circle by the law [m]; a device with a wider one stays.
+        thresholds: of each device: the least hash of a link's position to take part, so that all
+            parts of the links use the same ones.
+        positions: where each device was found before, which is worth trying with other links, too.
+        history: hash of all searches so far, which decide what is remembered.
+        powers: map -> position -> hash of the other end's position -> power.
+        executor: where devices are searched for side by side, inside `keep_pieces`.
+    """
+
+    bounds: tuple[float, float, float, float]
+    max_radius_m: float
+    thresholds: dict[str, np.uint64] = field(default_factory=dict)
+    positions: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    history: str = ""
+    powers: WeakKeyDictionary[CityMap, Followed] = field(default_factory=WeakKeyDictionary)
+    executor: Executor = field(default_factory=Executor)
+
+    def relocate(self, links: LinkData, devices: list[TwinDevice],
+                 channel: ImagePaths) -> list[TwinDevice]:
+        """Return the devices, unknown ones where paths put them.
+
+        A device stays unless paths explain its links better than the law. Where more than
+        `MAX_DEVICES` are unknown, all stay.
+
+        Args:
+            links: n links over a map.
+            devices: located by the channel's law.
+            channel: follows paths.
+        """
+        unknown = sum(device.role == "unknown" for device in devices)
+        if unknown > MAX_DEVICES:
+            return list(devices)
+        device_m = np.array([(each.x_m, each.y_m, each.z_m) for each in devices])
+        models = [FoldModel.build(links, each, DOF, device_m=device_m)
+                  for each in (channel.law, channel)]
+        fits = [model.fit() for model in models]
+        searches: dict[int, _Question] = {}
+        for number, device in enumerate(devices):
+            if device.role != "unknown":
+                continue
+            rows = self._rows(links, number)
+            heard = np.isfinite(links.level_db[rows]).sum()
+            if device.credible_radius_m <= self.max_radius_m and heard >= MIN_HEARD:
+                by_law, by_paths = (_Likelihood(model, fit, rows, number)
+                                    for model, fit in zip(models, fits, strict=True))
+                before = self.positions.setdefault(device.device, [])
+                searches[number] = _Search(by_law, by_paths, self), device, before
+        self._search_ahead(list(searches.values()))
+        found = list(devices)
+        with progress("looking for devices along paths", total=len(searches)) as advance:
+            for number, (search, device, before) in searches.items():
+                found[number] = self._search(search, device, before)
+                before.append((found[number].x_m, found[number].y_m))
+                advance()
+        return found
+
+    def _search_ahead(self, searches: list[_Question]) -> None:
+        """Search on the executor's workers; `_search` finds the results among the kept parts."""
+        if not self.executor.is_worth_it or not keeps() or len(searches) < 2:
+            return
+        inputs: list[tuple] = []
+        parts: KeptParts[int, Piece] = KeptParts("position", inputs.__getitem__,
+                                                 lambda found: found, lambda *piece: piece)
+        history = self.history
+        for search, device, before in searches:
+            inputs.append((history, self.bounds, search.by_law, search.by_paths, device, before))
+            history = parts.name(len(inputs) - 1)
+        self.executor.run_ahead(Job("looking for devices along paths", _Searches(searches),
+                                    Resources(WORKER_BYTES, False)), range(len(searches)), parts)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Leave out what was followed, and where: another process follows what it needs."""
+        return type(self), (self.bounds, self.max_radius_m, self.thresholds, self.positions,
+                            self.history)
+
+    def _search(self, search: _Search, device: TwinDevice,
+                before: list[tuple[float, float]]) -> TwinDevice:
+        """Return a device where paths put it, and remember what was followed for that."""
+        city = search.by_law.model.links.city
+        assert city is not None
+        followed = self.powers.setdefault(city, {})
+        known = {position_m: len(powers) for position_m, powers in followed.items()}
+
+        def write(found: TwinDevice) -> Piece:
+            return followed_since(known, followed), asdict(found)
+
+        def read(arrays: dict[str, np.ndarray], content: Any) -> TwinDevice:
+            found = read_device(content)
+            add_followed(arrays, followed)
+            return found
+
+        inputs = self.history, self.bounds, search.by_law, search.by_paths, device, before
+        found, self.history = kept_with_name(
+            "position", inputs, partial(search.from_law, device, before), write, read)
+        return found
+
+    def _rows(self, links: LinkData, device: int) -> np.ndarray:
+        """Return some links of a device: the same ones in each part of them."""
+        rows = np.flatnonzero(links.device == device)
+        hashes = _hashes(links.receiver_m[rows])
+        name = links.device_names[device]
+        if name not in self.thresholds:
+            least = np.sort(hashes)[-LINKS] if len(rows) > LINKS else np.uint64(0)
+            self.thresholds[name] = least
+        return rows[hashes >= self.thresholds[name]]
+
+    def follow(self, city: CityMap, position_m: tuple[float, ...], ends_m: np.ndarray,
+               frequency_hz: float) -> np.ndarray:
+        """Return the power (n,) from a position to ends (n, 3)."""
+        from radiotwin.propagation.paths import path_powers  # late: numba is large
+
+        known = self.powers.setdefault(city, {}).setdefault(position_m, {})
+        hashes = _hashes(ends_m).tolist()
+        missing = {key: row for row, key in enumerate(hashes) if key not in known}
+        if missing:
+            new_m = ends_m[list(missing.values())]
+            followed = path_powers(city, np.array([position_m]), new_m,
+                                   np.zeros(len(new_m), int), frequency_hz, "vertical", rays=RAYS)
+            known.update(zip(missing, followed.total.tolist(), strict=True))
+        return np.array([known[key] for key in hashes])
+
+
+@dataclass(frozen=True, eq=False)
+class _Likelihood:
+    """Likelihood of some links of a device, wherever it is.
+
+    Attributes:
+        model, result: of all links.
+        rows: links of the device that take part.
+        device: its row.
+    """
+
+    model: FoldModel
+    result: FitResult
+    rows: np.ndarray
+    device: int
+
+    def at(self, position_m: np.ndarray) -> LinkData:
+        """Return the links with the device at a position (2,)."""
+        device_m = self.model.links.device_m.copy()
+        device_m[self.device, :2] = position_m
+        return self.model.links.select(self.rows).with_devices(device_m)
+
+    def problem(self, links: LinkData, mean_db: np.ndarray) -> CensoredRegression:
+        """Return the regression on the links, of which the channel predicts (n,)."""
+        return FoldModel.build(links, self.model.channel, DOF, channel_db=mean_db).regression()
+
+    def nll(self, links: LinkData, mean_db: np.ndarray) -> float:
+        """Return the negative log-likelihood [nats]."""
+        return float(self.problem(links, mean_db).nll(self.result).sum())
+
+
+@dataclass(eq=False)
+class _Search:
+    """Search for one device.
+
+    Attributes:
+        by_law, by_paths: likelihood of its links.
+        relocation: its bounds, and what was followed.
+        tried: position -> negative log-likelihood by paths [nats].
+    """
+
+    by_law: _Likelihood
+    by_paths: _Likelihood
+    relocation: Relocation
+    tried: dict[tuple[float, float], float] = field(default_factory=dict)
+
+    def from_law(self, device: TwinDevice, known: list[tuple[float, float]]) -> TwinDevice:
+        """Return the device where paths put it, or where it is.
+
+        It stays if paths explain its links nowhere better than the law does there, or not as well
+        as they explain those of others.
+
+        Args:
+            device: as the law located it.
+            known: positions from other links; where there are any, only their surroundings, and the
+                law's position, are tried.
+        """
+        start_m = np.array([device.x_m, device.y_m])
+        known_m = self._free(np.array(known).reshape(-1, 2))
+        worth_m = known_m if len(known_m) else self._likely_cells(device)
+        self._try([*self._free(np.round(start_m)[None]), *worth_m])
+        if not self.tried:
+            return device
+        ranked_m = np.array(sorted(self.tried, key=self.tried.__getitem__))
+        for position_m in _apart(ranked_m, DESCENTS_APART_M, 1 if len(known_m) else DESCENTS):
+            self._descend(position_m)
+        if not len(known_m):
+            self._look_around()
+        best = min(self.tried, key=self.tried.__getitem__)
+        view = self._view(best)
+        # Of errors that are scattered as those of other devices the median is 1.
+        z = view.residual_db / view.scale_db
+        misfit = np.median(z**2) / float(stdtrit(DOF, 0.75)) ** 2
+        if self.tried[best] >= self._law_nll(start_m) or misfit > MAX_MISFIT:
+            return device
+        radius_m = self._radius_m(best, view.design_effect * max(misfit, 1.0))
+        return replace(device, x_m=best[0], y_m=best[1], credible_radius_m=radius_m, located=True,
+                       second_mode=None)
+
+    def _likely_cells(self, device: TwinDevice) -> list[np.ndarray]:
+        """Return centres of cells around a device that are worth following paths from."""
+        start_m = np.array([device.x_m, device.y_m])
+        reach_m = max(REACH_RADII * device.credible_radius_m, MIN_REACH_M)
+        cells_m = self._free(_cells(start_m, reach_m, self.relocation.bounds))
+        order = np.argsort([self._law_nll(cell_m) for cell_m in cells_m])
+        count = int(np.clip(FOLLOWED_SHARE * len(cells_m), MIN_FOLLOWED, MAX_FOLLOWED))
+        return _apart(cells_m[order], CELLS_APART_M, count)
+
+    def _descend(self, from_m: np.ndarray) -> None:
+        """Go to the best of the four neighbours, and again, with shorter and shorter steps."""
+        best, (value,) = from_m, self._try([from_m])
+        for step_m in STEPS_M:
+            better = True
+            while better:
+                cross = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
+                around_m = self._free(best + step_m * cross)
+                values = self._try(around_m)
+                better = min(values, default=np.inf) < value
+                if better:
+                    best, value = around_m[np.argmin(values)], min(values)
+
+    def _look_around(self) -> None:
+        """Descend from a better position around the best, as long as there is one."""
+        better = True
+        while better:
+            best = min(self.tried, key=self.tried.__getitem__)
+            angles = np.arange(8) * np.pi / 4
+            ring = np.column_stack([np.cos(angles), np.sin(angles)])
+            rings = np.vstack([best + away_m * ring for away_m in AROUND_M])
+            around_m = self._free(np.round(rings))
+            values = self._try(around_m)
+            better = min(values, default=np.inf) < self.tried[best]
+            if better:
+                self._descend(around_m[np.argmin(values)])
+
+    def _free(self, positions_m: np.ndarray) -> np.ndarray:
+        """Return those of positions (c, 2) that are within bounds and not inside a building."""
+        west, east, south, north = self.relocation.bounds
+        x_m, y_m = positions_m.T
+        inside = (x_m >= west) & (x_m <= east) & (y_m >= south) & (y_m <= north)
+        positions_m = positions_m[inside]
+        links = self.by_law.model.links
+        assert links.city is not None
+        height_m = np.full(len(positions_m), links.device_m[self.by_law.device, 2])
+        return positions_m[~links.city.inside(np.column_stack([positions_m, height_m]))]
+
+    def _law_nll(self, position_m: np.ndarray) -> float:
+        links = self.by_law.at(position_m)
+        return self.by_law.nll(links, self.by_law.model.level_at(links))
+
+    def _paths_db(self, links: LinkData) -> np.ndarray:
+        position_m = tuple(map(float, links.device_m[self.by_paths.device]))
+        assert links.city is not None
+        power = self.relocation.follow(links.city, position_m, links.receiver_m,
+                                       links.frequency_hz)
+        channel = self.by_paths.model.channel
+        assert isinstance(channel, ImagePaths)
+        return channel.level_db(power, links.geometry)
+
+    def _try(self, positions_m: Iterable[np.ndarray]) -> list[float]:
+        """Return the negative log-likelihood by paths of each position (2,) [nats]."""
+        keys = [(float(x_m), float(y_m)) for x_m, y_m in positions_m]
+        new = [key for key in dict.fromkeys(keys) if key not in self.tried]
+        self.tried.update(zip(new, in_threads(self._paths_nll, new), strict=True))
+        return [self.tried[key] for key in keys]
+
+    def _paths_nll(self, position_m: tuple[float, float]) -> float:
+        links = self.by_paths.at(np.array(position_m))
+        return self.by_paths.nll(links, self._paths_db(links))
+
+    def _view(self, best: tuple[float, float]) -> ResidualView:
+        """Return the links with the device where it was found."""
+        likelihood, links = self.by_paths, self.by_paths.at(np.array(best))
+        problem = likelihood.problem(links, self._paths_db(links))
+        reading = problem.predict(likelihood.result)
+        return ResidualView(links, problem.residual_db(likelihood.result), reading.scale_db,
+                            reading.mean_db, likelihood.model.level_at)
+
+    def _radius_m(self, best: tuple[float, float], links_as_one: float) -> float:
+        """Return the radius of a circle that holds 90 % of the probability of what was tried [m].
+
+        Each position stands for the ground that is nearer to it than to others.
+        """
+        positions_m, values = np.array(list(self.tried)), np.array(list(self.tried.values()))
+        apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
+        area = np.where(apart_m > 0, apart_m, np.inf).min(axis=1) ** 2
+        share = area * np.exp((values.min() - values) / links_as_one)
+        from_best_m = np.linalg.norm(positions_m - best, axis=1)
+        order = np.argsort(from_best_m)
+        held = np.searchsorted(np.cumsum(share[order]) / share.sum(), CREDIBLE)
+        return float(from_best_m[order][min(held, len(order) - 1)] + STEPS_M[-1])
+
+
+_Question = tuple[_Search, TwinDevice, list[tuple[float, float]]]  # where, which, known positions
+
+
+@dataclass(frozen=True)
+class _Searches:
+    """Searches by their number, each as if it were the only one."""
+
+    searches: list[_Question]
+
+    def __call__(self, number: int) -> Piece:
+        search, device, before = self.searches[number]
+        alone = replace(search.relocation, powers=WeakKeyDictionary())
+        found = replace(search, relocation=alone, tried={}).from_law(device, before)
+        city = search.by_law.model.links.city
+        assert city is not None
+        return followed_since({}, alone.powers.get(city, {})), asdict(found)
+
+
+def _apart(positions_m: np.ndarray, apart_m: float, maximum: int) -> list[np.ndarray]:
+    """Return the first of positions (c, 2) that are so far apart."""
+    chosen: list[np.ndarray] = []
+    for position_m in positions_m:
+        far = all(np.hypot(*(position_m - other_m)) >= apart_m for other_m in chosen)
+        if len(chosen) < maximum and far:
+            chosen.append(position_m)
+    return chosen
+
+
+def _cells(around_m: np.ndarray, reach_m: float,
+           bounds: tuple[float, float, float, float]) -> np.ndarray:
+    """Return whole metres (c, 2) near the centres of cells within reach and about the bounds.
+
+    The grid is the same wherever it is looked at, as long as its cells need not be wider.
+    """
+    low, high = np.array(bounds[::2]), np.array(bounds[1::2])
+    low, high = np.maximum(around_m - reach_m, low), np.minimum(around_m + reach_m, high)
+    cell_m = max(CELL_M, float(np.sqrt(np.prod(np.maximum(high - low, 0)) / MAX_CELLS)))
+    first, last = np.floor(low / cell_m).astype(int), np.ceil(high / cell_m).astype(int)
+    axes = [(np.arange(start, end) + 0.5) * cell_m for start, end in zip(first, last, strict=True)]
+    cells_m = np.round(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
+    return cells_m[np.linalg.norm(cells_m - around_m, axis=1) <= reach_m]
+
+
+def _hashes(positions_m: np.ndarray) -> np.ndarray:
+    """Return a hash (n,) of each position (n, 3), to the centimetre."""
+    keys = np.round(positions_m * 100).astype(np.int64).astype(np.uint64)
+    number = np.zeros(len(positions_m), dtype=np.uint64)
+    for axis in range(3):
+        number = (number ^ keys[:, axis]) * np.uint64(0x9E3779B97F4A7C15)
+        number ^= number >> np.uint64(29)
+    return number

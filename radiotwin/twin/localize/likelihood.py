@@ -1,0 +1,292 @@
+"""Log-likelihood of device positions given the measurements.
+
+Correction for correlated residuals: how many of a device's links count as one.
+
+A channel model that is wrong in one street is wrong in the same way at every position along it.
+Multiplying the likelihoods of all links as if they were independent then claims too small a
+credible region. The remedy here is a composite likelihood [1]: the log-likelihood is divided by the
+design effect, the factor by which correlation between residuals widens the distribution of the
+position's estimate beyond what independence would give.
+
+[1] Varin, Reid, Firth, "An overview of composite likelihood methods", Statistica Sinica 21, 2011,
+section 2.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.distance import pdist, squareform
+from scipy.special import ndtr
+
+from radiotwin.twin.localize.observations import (
+    DeviceObservations,
+    DirectChannel,
+    LinkTable,
+    Observations,
+)
+
+if TYPE_CHECKING:
+    from radiotwin.scene.citymap import CityMap
+
+BIN_M, N_BINS = 20.0, 20  # width of a bin of distance [m], and number of bins
+SIGNIFICANT = 3.0  # standard errors above which a correlation is taken for real
+MAX_Z = 3.0  # an outlier counts as this many standard deviations
+MAX_POSITIONS = 1500  # of one device: memory grows with their square
+OUTLIER_SHARE = 0.02  # probability that the channel does not explain a level at all
+OUTLIER_SPAN_DB = 100.0  # width of the outliers' uniform density: the range of plausible levels
+CHUNK_LINKS = 1 << 18  # links that are predicted at a time: bounds memory
+SLOPE_STEP_M = 2.0  # to each side, of the difference quotient of a link's mean
+
+
+@dataclass(frozen=True)
+class DeviceResiduals:
+    """Residuals of a device at its most likely position.
+
+    Attributes:
+        receiver_m: (n, 3) positions of the receivers [m].
+        z: (n,) residuals in standard deviations.
+        slope: (n, 2) change of the link's mean with the device's x and y at constant line of sight,
+            in standard deviations per metre.
+    """
+
+    receiver_m: np.ndarray
+    z: np.ndarray
+    slope: np.ndarray
+
+    def thinned(self) -> DeviceResiduals:
+        """Return at most MAX_POSITIONS of them, evenly over the rows, with outliers clipped."""
+        pick = slice(None, None, -(-len(self.z) // MAX_POSITIONS) or 1)
+        return DeviceResiduals(self.receiver_m[pick], np.clip(self.z[pick], -MAX_Z, MAX_Z),
+                               self.slope[pick])
+
+
+def residual_correlation(devices: list[DeviceResiduals]) -> np.ndarray:
+    """Return the correlation of residuals by distance between receivers, pooled over devices.
+
+    Args:
+        devices: residuals of each.
+
+    Returns:
+        (N_BINS,) in bins of BIN_M. It is 0 from the first bin on that is not above SIGNIFICANT
+        standard errors of independent residuals, so that uncorrelated data give zeros.
+    """
+    product, pairs, square, n = np.zeros(N_BINS), np.zeros(N_BINS), 0.0, 0
+    for each in devices:
+        if len(each.z) < 2:
+            continue
+        bins = np.minimum((pdist(each.receiver_m) / BIN_M).astype(int), N_BINS)
+        first, second = np.triu_indices(len(each.z), k=1)
+        product += np.bincount(bins, each.z[first] * each.z[second], N_BINS + 1)[:N_BINS]
+        pairs += np.bincount(bins, minlength=N_BINS + 1)[:N_BINS]
+        square += float(each.z @ each.z)
+        n += len(each.z)
+    if n == 0 or square == 0.0:
+        return np.zeros(N_BINS)
+    correlation = product / np.maximum(pairs, 1) / (square / n)
+    noise = (pairs > 0) & (correlation <= SIGNIFICANT / np.sqrt(np.maximum(pairs, 1)))
+    return np.where(np.cumsum(noise) > 0, 0.0, correlation)
+
+
+def design_effect(residuals: DeviceResiduals, correlation: np.ndarray) -> float:
+    """Return the factor by which to divide a device's log-likelihood.
+
+    trace(H^-1 J) / 2 with H = sum_i a_i a_i', J = sum_ij rho_ij a_i a_j' over the slopes a: the
+    mean widening of the position's variance; times the residuals' mean square, where that is above
+    1 (the standard deviation is too small).
+
+    Args:
+        residuals: of the device.
+        correlation: (N_BINS,) as from `residual_correlation`.
+
+    Returns:
+        at least 1
+    """
+    if len(residuals.z) < 3:
+        return 1.0
+    bins = np.minimum((squareform(pdist(residuals.receiver_m)) / BIN_M).astype(int), N_BINS)
+    rho = np.append(correlation, 0.0)[bins]
+    np.fill_diagonal(rho, 1.0)
+    information = residuals.slope.T @ residuals.slope
+    score_covariance = residuals.slope.T @ rho @ residuals.slope
+    widening = np.trace(np.linalg.pinv(information) @ score_covariance) / 2.0
+    return float(max(1.0, widening) * max(1.0, np.mean(residuals.z**2)))
+
+
+class Likelihood:
+    """Log-likelihood of positions for devices that share one height.
+
+    A merged level of n repeats varies about the channel's mean with the variance
+    sd^2 (1 - f) + sd^2 f / n, where sd is the channel's and f = `repeat_share` is the part of its
+    variance that is drawn anew at every measurement; the rest belongs to the position and no
+    repetition averages it out. Every level is, with probability OUTLIER_SHARE, from a uniform
+    density over OUTLIER_SPAN_DB instead, so that one link far from the model cannot outweigh all
+    others. A link that was not detected counts as P(level < limit), with the same share of
+    outliers.
+
+    Attributes:
+        devices: (k,) indices in `Observations.devices`, by which the methods identify them.
+        z_m: height of the devices [m].
+        receiver_m: (r, 3) as in `Observations` [m].
+        repeat_share: f, 1 until it is set.
+    """
+
+    def __init__(
+        self,
+        observations: Observations,
+        channel: LinkTable | DirectChannel,
+        devices: np.ndarray,
+        z_m: float,
+        city: CityMap | None,
+        limit_db: float | None,
+        chunk_links: int = CHUNK_LINKS,
+    ) -> None:
+        """Prepare the likelihood of some devices.
+
+        Args:
+            observations: of all devices.
+            channel: predicts links to the receivers of the observations.
+            devices: (k,) indices in `observations.devices`.
+            z_m: their height [m].
+            city: 3D map; None: every link has line of sight.
+            limit_db: limit of detection [dB]; None only where nothing is `missed`.
+            chunk_links: links in memory at once.
+        """
+        self.devices, self.z_m, self._channel, self._city = devices, z_m, channel, city
+        self.receiver_m, self._all = observations.receiver_m, observations.devices
+        self._limit_db, self._chunk_links = limit_db, chunk_links
+        self.repeat_share = 1.0
+
+    def of_device(self, k: int, xy_m: np.ndarray) -> np.ndarray:
+        """Return the log-likelihood of one device's data at positions.
+
+        Args:
+            k: index in `Observations.devices`.
+            xy_m: (p, 2) [m].
+
+        Returns:
+            (p,) [nats]
+        """
+        data = self._all[k]
+        rows = np.union1d(data.seen, data.missed)
+        total = np.zeros(len(xy_m))
+        for part, los in self._sight(xy_m, rows):
+            link = self._channel.look_up(xy_m[part], rows, los, data.device)
+            total[part] = self._score(data, rows, *link)
+        return total
+
+    def of_all(self, xy_m: np.ndarray) -> np.ndarray:
+        """Return the log-likelihood of each device's data at the same positions.
+
+        Lines of sight are computed once for all, and so is the channel where it does not
+        distinguish devices.
+
+        Args:
+            xy_m: (p, 2) [m].
+
+        Returns:
+            (k, p) [nats]
+        """
+        used = [np.concatenate([self._all[k].seen, self._all[k].missed]) for k in self.devices]
+        rows = np.unique(np.concatenate(used))
+        total = np.zeros((len(self.devices), len(xy_m)))
+        for part, los in self._sight(xy_m, rows):
+            link = None
+            for i, k in enumerate(self.devices):
+                data = self._all[k]
+                if link is None or self._channel.by_device:
+                    link = self._channel.look_up(xy_m[part], rows, los, data.device)
+                total[i, part] = self._score(data, rows, *link)
+        return total
+
+    def link_at(self, k: int, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the channel between one position of a device and the receivers that detected it.
+
+        Args:
+            k: index in `Observations.devices`.
+            xy_m: (2,) position [m].
+
+        Returns:
+            (n,) mean [dB], and (n,) standard deviation [dB].
+        """
+        data = self._all[k]
+        los = self._line_of_sight(xy_m[None], data.seen)
+        mean_db, sd_db = self._channel.look_up(xy_m[None], data.seen, los, data.device)
+        return mean_db[0], sd_db[0]
+
+    def residuals(self, k: int, xy_m: np.ndarray) -> DeviceResiduals:
+        """Return standardised residuals of a device's merged levels, and their slopes.
+
+        Args:
+            k: index in `Observations.devices`.
+            xy_m: (2,) position of the device [m].
+
+        Returns:
+            n residuals, with slopes at constant line of sight.
+        """
+        data = self._all[k]
+        mean_db, sd_db = self.link_at(k, xy_m)
+        merged_sd_db = sd_db * np.sqrt(self.variance_share(data.count))
+        los = np.repeat(self._line_of_sight(xy_m[None], data.seen), 4, axis=0)
+        steps = SLOPE_STEP_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        around, _ = self._channel.look_up(xy_m + steps, data.seen, los, data.device)
+        slope = np.column_stack([around[0] - around[1], around[2] - around[3]])
+        slope = slope / (2 * SLOPE_STEP_M)
+        return DeviceResiduals(self.receiver_m[data.seen], (data.level_db - mean_db) / merged_sd_db,
+                               slope / merged_sd_db[:, None])
+
+    def variance_share(self, count: np.ndarray) -> np.ndarray:
+        """Return the variance of the mean of `count` repeats over the channel's variance."""
+        return 1.0 - self.repeat_share + self.repeat_share / count
+
+    def _sight(self, xy_m: np.ndarray, rows: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
+        step = max(1, self._chunk_links // max(len(rows), 1))
+        for start in range(0, len(xy_m), step):
+            part = slice(start, start + step)
+            yield part, self._line_of_sight(xy_m[part], rows)
+
+    def _line_of_sight(self, xy_m: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return line of sight (p, c) between positions (p, 2) and rows (c,) of the receivers."""
+        p, c = len(xy_m), len(rows)
+        if self._city is None:
+            return np.ones((p, c), bool)
+        ends_m = np.repeat(np.column_stack([xy_m, np.full(p, self.z_m)]), c, axis=0)
+        others_m = np.tile(self.receiver_m[rows], (p, 1))
+        return self._city.line_of_sight(ends_m, others_m).reshape(p, c)
+
+    def _score(self, data: DeviceObservations, rows: np.ndarray, mean_db: np.ndarray,
+               sd_db: np.ndarray) -> np.ndarray:
+        """Return the log-likelihood (p,) given the channel (p, c) at rows (c,) of the receivers."""
+        total = np.zeros(len(mean_db))
+        if len(data.seen):
+            columns = _columns(rows, data.seen)
+            scale = np.sqrt(self.variance_share(data.count)).astype(np.float32)
+            # log[(1 - e) N(level) + e / span] as log(e / span) + log(1 + ratio), ratio >= 0: no
+            # cancellation.
+            merged_sd_db = sd_db[:, columns] * scale
+            ratio = (data.level_db.astype(np.float32) - mean_db[:, columns]) / merged_sd_db
+            ratio *= ratio
+            ratio *= np.float32(-0.5)
+            np.exp(ratio, out=ratio)
+            ratio /= merged_sd_db
+            ratio *= np.float32(
+                (1 - OUTLIER_SHARE) / np.sqrt(2 * np.pi) * OUTLIER_SPAN_DB / OUTLIER_SHARE)
+            total += np.log1p(ratio, out=ratio).sum(axis=1, dtype=float)
+            total += len(data.seen) * np.log(OUTLIER_SHARE / OUTLIER_SPAN_DB)
+        if len(data.missed):
+            columns = _columns(rows, data.missed)
+            # k misses at one position count k only as far as repeats are independent (design
+            # effect).
+            weight = data.missed_count / (1 + (data.missed_count - 1) * (1 - self.repeat_share))
+            below = ndtr((np.float32(self._limit_db) - mean_db[:, columns]) / sd_db[:, columns])
+            below *= np.float32(1 - OUTLIER_SHARE)
+            below += np.float32(OUTLIER_SHARE / 2)
+            total += np.log(below, out=below) @ weight
+        return total
+
+
+def _columns(rows: np.ndarray, wanted: np.ndarray) -> np.ndarray | slice:
+    return slice(None) if len(rows) == len(wanted) else np.searchsorted(rows, wanted)

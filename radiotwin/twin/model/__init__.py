@@ -1,0 +1,1 @@
+"""The model of a level: channel, effects, and their fit."""

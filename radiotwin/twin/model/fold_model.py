@@ -1,0 +1,267 @@
+"""A channel and the effects found so far, as one regression on one set of training links.
+
+This is the one place where the level of a link is put together: the channel's mean, its refitted
+level and slope, and every stage of the effects. Selection, localisation and the twin's predictions
+all use it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from radiotwin.effects.base import DetectionEffect, Effect, LevelAt, LimitEffect, ResidualView, Term
+from radiotwin.effects.params import EffectParams
+from radiotwin.inference import censored_regression
+from radiotwin.inference.censored_regression import (
+    CensoredRegression,
+    FitResult,
+    Linearisation,
+    Response,
+)
+from radiotwin.inference.student import NO_LOSSES, Losses
+from radiotwin.links import LinkData
+from radiotwin.propagation.laws import ChannelModel
+from radiotwin.scene.citymap import CityMap
+
+VIEWS = 8  # that are remembered: of a model and its folds, which every candidate asks for
+
+
+@dataclass(frozen=True, eq=False)
+class AppliedEffect:
+    """An effect with its parameters, and what it adds to all links of a model."""
+
+    effect: Effect
+    params: Any
+    term: Term
+
+    @property
+    def acts(self) -> np.ndarray:
+        """(n,) bool, links whose level it may change."""
+        return (self.term.offset_db != 0) | (self.term.columns != 0).any(axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedEffect:
+    """An effect with its parameters (`Effect.Params`) and the coefficients (q,) of its term."""
+
+    effect: Effect
+    params: EffectParams
+    coefficients: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class FoldModel:
+    """All links, of which some are learnt from: one fold, or the whole.
+
+    Attributes:
+        links: n links, with the devices where the channel has them.
+        train: (n,) bool, links that are learnt from.
+        usable: (n,) bool, links to devices that have a position.
+        channel: fitted to the training links.
+        channel_db: (n,) its mean level [dB].
+        level_columns: (n, p0) what is fitted again of the channel: `ChannelModel.level_columns`.
+        level_prior_sd_db: (p0,) prior standard deviations of it.
+        group: (n,) index of the error scale.
+        groups: number of these, also where no link is of one.
+        dof: degrees of freedom of the errors.
+        effects: found so far.
+    """
+
+    links: LinkData
+    train: np.ndarray
+    usable: np.ndarray
+    channel: ChannelModel
+    channel_db: np.ndarray
+    level_columns: np.ndarray
+    level_prior_sd_db: np.ndarray
+    group: np.ndarray
+    groups: int
+    dof: float
+    effects: list[AppliedEffect] = field(default_factory=list)
+
+    @classmethod
+    def build(cls, links: LinkData, channel: ChannelModel, dof: float, *,
+              device_m: np.ndarray | None = None, train: np.ndarray | None = None,
+              channel_db: np.ndarray | None = None) -> FoldModel:
+        """Return a model without effects.
+
+        Args:
+            links: n links.
+            channel: fitted.
+            dof: degrees of freedom of the errors.
+            device_m: (k, 3) where the channel has the devices [m], NaN for one that it has nowhere;
+                None: where the links have them.
+            train: (n,) bool, links to learn from; None: all.
+            channel_db: (n,) the channel's mean level where it is known already [dB].
+        """
+        usable = np.ones(len(links), dtype=bool)
+        if device_m is not None:
+            usable = np.isfinite(device_m).all(axis=1)[links.device]
+            # A stand-in for devices that are nowhere, whose links are not looked at.
+            links = links.with_devices(np.where(np.isfinite(device_m), device_m, 0.0))
+        geometry = links.geometry
+        if channel_db is None:
+            channel_db = channel.predict(geometry)[0]
+        columns, prior_sd_db = channel.level_columns(geometry)
+        return cls(links, usable if train is None else train & usable, usable, channel, channel_db,
+                   columns, prior_sd_db, channel.error_group(geometry),
+                   channel.error_groups(geometry), dof)
+
+    @property
+    def level_at(self) -> LevelAt:
+        """The channel's levels of any links, quickly or exactly."""
+        return self.channel.level_at
+
+    @property
+    def effect_names(self) -> frozenset[str]:
+        """Names of the effects found so far, without those that were declared."""
+        return frozenset(each.effect.name for each in self.effects if not each.effect.is_declared)
+
+    @property
+    def corrected_map(self) -> CityMap | None:
+        """The map with what effects add to it and take from it; None without a map."""
+        city = self.links.city
+        for each in self.effects:
+            city = None if city is None else each.effect.corrected_map(city, each.params)
+        return city
+
+    def apply(self, effect: Effect, params: Any) -> AppliedEffect:
+        """Return an effect on these links."""
+        return AppliedEffect(effect, params, effect.term(self.links, params, self.level_at))
+
+    def with_effects(self, effects: list[AppliedEffect]) -> FoldModel:
+        """Return the same with other effects."""
+        return replace(self, effects=effects)
+
+    def restrict(self, rows: np.ndarray, effects: list[AppliedEffect]) -> FoldModel:
+        """Return the model of some links (r,), all to be learnt from, with some of its effects."""
+        everything = np.ones(len(rows), dtype=bool)
+        return replace(
+            self, links=self.links.select(rows), train=everything, usable=everything,
+            channel_db=self.channel_db[rows], level_columns=self.level_columns[rows],
+            group=self.group[rows],
+            effects=[replace(each, term=each.term.select(rows)) for each in effects])
+
+    def regression(self, rows: np.ndarray | slice = slice(None)) -> CensoredRegression:
+        """Return the regression on the links of a mask, an index array or a slice."""
+        links, terms = self.links, [each.term for each in self.effects]
+        n = len(self.channel_db[rows])
+        return CensoredRegression(
+            links.level_db[rows], self.limit_db[rows],
+            self.channel_db[rows], self.level_columns[rows], response(self.effects, "paths", rows),
+            sum((term.offset_db[rows] for term in terms), np.zeros(n)),
+            censored_regression.design([term.columns[rows] for term in terms], n),
+            np.concatenate([self.level_prior_sd_db, *(term.prior_sd_db for term in terms)]),
+            self.group[rows], response(self.effects, "receiver", rows), self.dof,
+            self.losses.select(rows), self._random_effect_sd_db(rows))
+
+    @cached_property
+    def training(self) -> CensoredRegression:
+        """The regression on the training links."""
+        return self.regression(self.train)
+
+    @cached_property
+    def limit_db(self) -> np.ndarray:
+        """(n,) level below which a link is blank [dB]; -inf where none is known."""
+        limit_db = self.links.limit_db
+        for each in self.effects:
+            if isinstance(each.effect, LimitEffect):
+                own_db = each.effect.limits_db(self.links, each.params)
+                limit_db = np.maximum(limit_db, own_db)
+        return limit_db
+
+    def fit(self, start: FitResult | None = None) -> FitResult:
+        """Fit to the training links; a class that none of them is of has another one's scale."""
+        found = censored_regression.fit(self.training, start)
+        there = np.unique(self.training.group)
+        scale_db = np.full(self.groups, found.scale_db[there].max())
+        scale_db[there] = found.scale_db[there]
+        return replace(found, scale_db=scale_db)
+
+    def predict(self, result: FitResult) -> Linearisation:
+        """Return mean and scale of the readings of all links, before the limit of detection."""
+        return self.regression().predict(result)
+
+    def view(self, result: FitResult) -> ResidualView:
+        """Return the training links as an effect sees them; the same object if asked again."""
+        return _view(self, result)
+
+    @property
+    def coefficient_slices(self) -> list[slice]:
+        """Of each effect: where its coefficients are among all."""
+        widths = [each.term.columns.shape[1] for each in self.effects]
+        ends = np.cumsum([self.level_columns.shape[1], *widths]).tolist()
+        return [slice(first, end) for first, end in zip(ends, ends[1:], strict=False)]
+
+    def fitted_effects(self, result: FitResult) -> tuple[FittedEffect, ...]:
+        """Return the effects with their coefficients, without their terms on these links."""
+        return tuple(FittedEffect(each.effect, each.params, result.coefficients[own])
+                     for each, own in zip(self.effects, self.coefficient_slices, strict=True))
+
+    @cached_property
+    def losses(self) -> Losses:
+        """Losses of all links whatever their level."""
+        every = [each.effect.losses(self.links, each.params)
+                 for each in self.effects if isinstance(each.effect, DetectionEffect)]
+        if not every:
+            return NO_LOSSES
+        kept = np.prod([1.0 - np.asarray(each.blank) for each in every], axis=0)
+        # Two effects that lower levels of the same links are not looked for.
+        most = max(every, key=lambda each: float(np.mean(each.drop)))
+        return Losses(1.0 - kept, most.drop, most.drop_db)
+
+    def predict_parts(self, result: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return mean of the readings, error scale without unheard levels, and sd of these [dB].
+
+        (n,) each. What is interpolated counts in units of the second; with the third it makes the
+        scale of `predict`.
+        """
+        reading = self.predict(result)
+        mean_db, whole = reading.mean_db, reading.scale_db
+        if all(each.term.unheard_sd_db is None for each in self.effects):
+            return mean_db, whole, np.zeros(len(whole))
+        known = replace(self.regression(), random_effect_sd_db=self._scatter_sd_db(slice(None)))
+        scale_db = known.predict(result).scale_db
+        return mean_db, scale_db, np.sqrt(np.maximum(whole**2 - scale_db**2, 0.0))
+
+    def _scatter_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
+        return _joined_sd_db([each.term.random_effect_sd_db for each in self.effects], rows)
+
+    def _random_effect_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
+        """Return (n,) the sd of all that is not learnt of a link; 0 where there is none."""
+        unheard = [each.term.unheard_sd_db for each in self.effects]
+        return np.hypot(self._scatter_sd_db(rows), _joined_sd_db(unheard, rows))
+
+
+def _joined_sd_db(parts: list[np.ndarray | None], rows: np.ndarray | slice) -> np.ndarray | float:
+    return np.sqrt(sum(each[rows] ** 2 for each in parts if each is not None))
+
+
+def response(effects: list[AppliedEffect], stage: str, rows: np.ndarray | slice) -> Response | None:
+    """Return the response of all effects of a stage, one after the other; None without any."""
+    effects = [each for each in effects if each.effect.stage == stage]
+    if not effects:
+        return None
+    inputs = [None if each.term.inputs is None else each.term.inputs[rows] for each in effects]
+
+    def chained(level_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        slope = np.ones_like(level_db)
+        for each, own_inputs in zip(effects, inputs, strict=True):
+            level_db, own = each.effect.response(level_db, each.params, own_inputs)  # type: ignore[attr-defined]
+            slope = slope * own
+        return level_db, slope
+    return chained
+
+
+@lru_cache(maxsize=VIEWS)
+def _view(model: FoldModel, result: FitResult) -> ResidualView:
+    predicted = model.training.predict(result)
+    # All links stay the same object, of which things are remembered.
+    links = model.links if model.train.all() else model.links.select(model.train)
+    return ResidualView(links, model.training.residual_db(result),
+                        predicted.scale_db, predicted.mean_db, model.level_at,
+                        tuple((each.effect.name, each.params) for each in model.effects))

@@ -1,0 +1,243 @@
+"""Outputs are whole or absent."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+
+import pytest
+
+from radiotwin.errors import BadInput, RunFailed
+from radiotwin.io import files
+from radiotwin.io.files import (
+    atomic_file,
+    atomic_folder,
+    atomic_path,
+    require_writable,
+    scratch_folder,
+)
+
+
+def test_a_file_appears_when_it_is_finished(tmp_path):
+    target = tmp_path / "new" / "out.csv.gz"
+    with atomic_path(target) as temporary:
+        assert temporary.suffixes[-2:] == [".csv", ".gz"], "writers choose their format by the suffix"
+        temporary.write_text("whole")
+        assert not target.exists()
+    assert target.read_text() == "whole"
+    assert [path.name for path in target.parent.iterdir()] == ["out.csv.gz"]
+
+
+def test_a_failed_file_leaves_the_old_one_and_nothing_else(tmp_path):
+    target = tmp_path / "out.csv"
+    target.write_text("old")
+    with pytest.raises(ZeroDivisionError), atomic_path(target) as temporary:
+        temporary.write_text("half")
+        1 / 0
+    assert target.read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["out.csv"]
+
+
+def test_a_failed_folder_leaves_the_old_one_and_nothing_else(tmp_path):
+    target = tmp_path / "scene"
+    target.mkdir()
+    (target / "old").touch()
+    with pytest.raises(ZeroDivisionError), atomic_folder(target) as temporary:
+        (temporary / "half").touch()
+        1 / 0
+    assert [path.name for path in tmp_path.rglob("*")] == ["scene", "old"]
+
+
+def test_a_folder_replaces_the_old_one_whole(tmp_path):
+    target = tmp_path / "scene"
+    target.mkdir()
+    (target / "old").touch()
+    with atomic_folder(target) as temporary:
+        (temporary / "new").touch()
+    assert [path.name for path in target.iterdir()] == ["new"]
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_what_cannot_be_written_is_bad_input(tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder").mkdir()
+    for path in (tmp_path / "folder", tmp_path / "file" / "out.csv"):
+        with pytest.raises(BadInput, match="choose another|name of a file"), atomic_path(path):
+            pass
+    with pytest.raises(BadInput, match="name of a folder"), atomic_folder(tmp_path / "file"):
+        pass
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="needs a folder that even root cannot write to")
+def test_a_place_where_nothing_can_be_made_is_bad_input():
+    for out in ("/proc/out.csv", "/proc/new/out.csv"):
+        for make in (atomic_path, atomic_folder):
+            with pytest.raises(BadInput, match=f"cannot write {out}: .*choose another"), make(out):
+                pass
+        with pytest.raises(BadInput, match="cannot write"):
+            require_writable(out)
+
+
+def test_a_device_file_is_not_replaced():
+    with pytest.raises(BadInput, match="not an ordinary file"), atomic_path("/dev/null"):
+        pass
+
+
+@pytest.mark.parametrize("make", [atomic_path, atomic_folder])
+def test_a_failed_rename_is_bad_input_and_leaves_the_old_one(tmp_path, monkeypatch, make):
+    target = tmp_path / "out"
+    if make is atomic_folder:
+        target.mkdir()
+        (target / "old").touch()
+    else:
+        target.write_text("old")
+    before, replace = sorted(tmp_path.rglob("*")), os.replace
+
+    def refuse_new(source, destination):
+        if os.fspath(destination) == os.fspath(target) and "aside" not in os.fspath(source):
+            raise OSError(errno.EBUSY, "Device or resource busy")
+        replace(source, destination)
+
+    monkeypatch.setattr("os.replace", refuse_new)
+    with pytest.raises(BadInput, match="cannot write .*out: Device or resource busy"), make(target):
+        pass
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_full_disk_is_a_failure_of_the_run_other_errors_of_the_body_are_not(tmp_path):
+    with pytest.raises(RunFailed, match="No space left"), atomic_path(tmp_path / "out"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "out"):
+        open(tmp_path / "an input that is missing")
+
+
+def test_no_empty_folders_stay_where_nothing_was_written(tmp_path):
+    for make in (atomic_path, atomic_folder):
+        with pytest.raises(ZeroDivisionError), make(tmp_path / "new" / "deep" / "out"):
+            1 / 0
+        assert list(tmp_path.iterdir()) == []
+    require_writable(tmp_path / "new" / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a file that is always full")
+def test_an_error_that_a_library_must_not_see_is_raised_in_the_end(tmp_path):
+    target = tmp_path / "out.nc"
+    target.write_text("old")
+    with pytest.raises(RunFailed, match="cannot write .*out.nc: No space left .* unchanged"), \
+            atomic_file(target, hide_errors=True) as file:
+        file._file.close()
+        file._file = open("/dev/full", "r+b", buffering=0)
+        assert file.write(b"abc") == 3, "the library goes on"
+        assert file.write(b"def") == 3
+    assert target.read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["out.nc"]
+
+
+def test_what_is_written_to_an_open_file_is_there(tmp_path):
+    for hide in (False, True):
+        with atomic_file(tmp_path / "out", hide_errors=hide) as file:
+            file.write(b"abcdef")
+            file.seek(1)
+            file.write(b"B")
+            file.seek(0)
+            assert file.read(6) == b"aBcdef"
+            file.truncate(4)
+        assert (tmp_path / "out").read_bytes() == b"aBcd"
+
+
+def test_an_error_when_the_file_is_flushed_is_a_failure_of_the_run(tmp_path, monkeypatch):
+    (tmp_path / "out").write_text("old")
+
+    def fail(handle):
+        raise FULL
+
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(RunFailed, match="cannot write"), atomic_path(tmp_path / "out") as temporary:
+        temporary.write_text("new")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(RunFailed, match="cannot write"), atomic_folder(tmp_path / "folder") as temporary:
+        (temporary / "new").write_text("new")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["folder", "out"]
+    assert (tmp_path / "out").read_text() == "old"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="temporaries are locked and swept on POSIX only")
+def test_temporaries_of_a_killed_process_are_swept_by_the_next_one_that_writes_there(tmp_path):
+    program = ("import sys, time; from radiotwin.io.files import *\n"
+               "with atomic_path(sys.argv[1] + '/a.csv'), atomic_folder(sys.argv[1] + '/b') as b:\n"
+               "    (b / 'c').touch(); print('ready', flush=True); time.sleep(60)")
+    child = subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE)
+    assert child.stdout.readline() == b"ready\n"
+    alive = sorted(tmp_path.iterdir())
+    assert len(alive) == 2 and all(path.is_dir() for path in alive)
+    files._sweep.cache_clear()
+    require_writable(tmp_path / "other")
+    assert sorted(tmp_path.iterdir()) == alive, "those of a living process are kept"
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    child.stdout.close()
+    (tmp_path / ".radiotwin-notes").touch()
+    files._sweep.cache_clear()
+    require_writable(tmp_path / "other")
+    assert [path.name for path in tmp_path.iterdir()] == [".radiotwin-notes"], "no file of the user's"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="temporaries are locked and swept on POSIX only")
+def test_a_folder_that_was_put_aside_by_a_killed_process_is_put_back(tmp_path):
+    aside = tmp_path / ".radiotwin-abcdefgh-aside"
+    (aside / "scene").mkdir(parents=True)
+    (aside / "scene" / "old").touch()
+    files._sweep.cache_clear()
+    require_writable(tmp_path / "other")
+    assert [path.name for path in tmp_path.rglob("*")] == ["scene", "old"]
+
+
+def test_a_scratch_folder_is_gone_in_the_end():
+    with scratch_folder() as folder:
+        (folder / "a").touch()
+    assert not folder.exists()
+
+
+def test_names_that_are_too_long_are_bad_input(tmp_path):
+    for make in (atomic_path, atomic_folder):
+        with pytest.raises(BadInput, match="cannot write"), make(tmp_path / ("a" * 300)):
+            pass
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_another_process_removes_meanwhile_is_written(tmp_path):
+    """Rationale: asked twice whether it is there, a file could be missing the second time."""
+    path, done = tmp_path / "new" / "part.bin", threading.Event()
+
+    def remove():
+        while not done.is_set():
+            with suppress(FileNotFoundError):
+                path.unlink()
+
+    other = threading.Thread(target=remove)
+    other.start()
+    try:
+        for _ in range(2000):
+            with atomic_path(path, flush=False) as temporary:
+                temporary.write_bytes(b"x")
+    finally:
+        done.set()
+        other.join()
+
+
+def test_a_folder_that_was_only_tried_is_removed_and_a_written_one_stays(tmp_path):
+    path = tmp_path / "a" / "b" / "part.bin"
+    require_writable(path)
+    assert not (tmp_path / "a").exists()
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(b"x")
+    path.unlink()
+    require_writable(path)
+    assert path.parent.is_dir()

@@ -1,0 +1,195 @@
+"""Radio maps of strangers: what an HDF5 file may hold is decided before a value is read."""
+
+import os
+import tracemalloc
+import zlib
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+
+from radiotwin.errors import BadInput
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.scene.lattice import Lattice
+
+LATTICE = Lattice.over(0, 40, 0, 20, 20, [50, 60])
+
+
+@pytest.fixture
+def path(tmp_path):
+    gain_db = -np.arange(24, dtype=float).reshape(2, 2, 2, 3)
+    RadioMap.build(["a", "b"], LATTICE, gain_db, gain_db > -10).write(tmp_path / "map.nc")
+    return tmp_path / "map.nc"
+
+
+def replace(file, name="gain_db"):
+    """Remove an array, whose dimension scales would refer to it."""
+    del file[name]
+
+
+def external_link(file, folder):
+    replace(file)
+    file["gain_db"] = h5py.ExternalLink("secret.nc", "gain_db")
+
+
+def soft_link(file, folder):
+    replace(file)
+    file["gain_db"] = h5py.SoftLink("/los")
+
+
+def external_storage(file, folder):
+    replace(file)
+    file.create_dataset("gain_db", (2, 2, 2, 3), "f4", external=[(folder / "secret.bin", 0, 96)])
+
+
+def virtual(file, folder):
+    replace(file)
+    layout = h5py.VirtualLayout((2, 2, 2, 3), "f4")
+    layout[:] = h5py.VirtualSource(str(folder / "secret.nc"), "gain_db", (2, 2, 2, 3))
+    file.create_virtual_dataset("gain_db", layout)
+
+
+def another_filter(file, folder):
+    replace(file)
+    file.create_dataset("gain_db", data=np.zeros((2, 2, 2, 3), "f4"), chunks=(1, 1, 2, 3), compression="lzf")
+
+
+def two_deflates(file, folder):
+    replace(file)
+    plan = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    plan.set_chunk((1, 1, 2, 3))
+    plan.set_deflate(9)
+    plan.set_filter(h5py.h5z.FILTER_DEFLATE, 0, (9,))
+    h5py.h5d.create(file.id, b"gain_db", h5py.h5t.NATIVE_FLOAT, h5py.h5s.create_simple((2, 2, 2, 3)), plan)
+
+
+def group(file, folder):
+    file.create_group("more")
+
+
+def compound(file, folder):
+    file.create_dataset("more", (2,), np.dtype([("a", "f4"), ("b", "i4")]))
+
+
+def reference(file, folder):
+    file.create_dataset("more", (2,), h5py.ref_dtype)
+
+
+def reference_attribute(file, folder):
+    file.attrs["more"] = file["los"].ref
+
+
+def sparse(file, folder):
+    replace(file)
+    file.create_dataset("gain_db", (1, 1, 60_000, 60_000), "f4", chunks=(1, 1, 1000, 1000), compression="gzip")
+
+
+def many_pieces(file, folder):
+    replace(file)
+    file.create_dataset("gain_db", (1, 1, 20_000, 20_000), "f4", chunks=(1, 1, 1, 1))
+
+
+def wide_piece(file, folder):
+    replace(file)
+    file.create_dataset("gain_db", (2, 2, 2, 3), "f4", chunks=(2, 2, 2, 30_000_000), maxshape=(2, 2, 2, None))
+
+
+def inflating_piece(file, folder):
+    replace(file)
+    gain = file.create_dataset("gain_db", (2, 2, 2, 3), "f4", chunks=(2, 2, 2, 3), compression="gzip")
+    packer = zlib.compressobj(9)
+    data = b"".join(packer.compress(bytes(2**20)) for _ in range(8)) + packer.flush()
+    gain.id.write_direct_chunk((0, 0, 0, 0), data)
+
+
+def million_devices(file, folder):
+    replace(file, "device")
+    file.create_dataset("device", (1_000_000,), "S8", chunks=(1000,), compression="gzip")
+
+
+def many_attributes(file, folder):
+    for number in range(1200):
+        file.attrs[f"a{number}"] = number
+
+
+def large_attribute(file, folder):
+    file.attrs.create("more", "a" * 20_000_000)
+
+
+def many_objects(file, folder):
+    for number in range(1100):
+        file.create_dataset(f"more{number}", data=0)
+
+
+HOSTILE = {
+    external_link: "'gain_db' is a link", soft_link: "'gain_db' is a link",
+    external_storage: "takes its values from other files", virtual: "takes its values from other files",
+    another_filter: "other filters", two_deflates: "other filters", group: "'more' is not an array",
+    compound: "neither numbers nor texts", reference: "neither numbers nor texts",
+    reference_attribute: "neither a number nor a text", sparse: "3,600,000,000 values.*RADIOTWIN_MAX_MAP_VALUES",
+    many_pieces: "400,000,000 pieces.*RADIOTWIN_MAX_MAP_CHUNKS", wide_piece: "pieces of 240,000,000 values",
+    inflating_piece: "compressed piece larger than it is", million_devices: "readable",
+    many_attributes: "attributes.*RADIOTWIN_MAX_MAP_ATTRIBUTES", large_attribute: "its attributes.*RADIOTWIN_MAX",
+    many_objects: "more than 1000 objects",
+}
+
+
+@pytest.mark.parametrize("change", HOSTILE, ids=lambda change: change.__name__)
+def test_what_no_radio_map_has_is_refused_before_memory_is_taken(path, tmp_path, change):
+    path.rename(tmp_path / "secret.nc")
+    (tmp_path / "secret.bin").write_bytes(bytes(96))
+    (tmp_path / "map.nc").write_bytes((tmp_path / "secret.nc").read_bytes())
+    with h5py.File(path, "r+") as file:
+        change(file, tmp_path)
+    tracemalloc.start()
+    try:
+        with pytest.raises(BadInput, match=HOSTILE[change]):
+            RadioMap.read(path)
+        assert tracemalloc.get_traced_memory()[1] < 100e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_piece_that_swells_is_refused(path, monkeypatch):
+    monkeypatch.setattr("radiotwin.io.hdf5._MAX_INFLATED", 2**16)
+    with h5py.File(path, "r+") as file:
+        del file["gain_db"]
+        gain = file.create_dataset("gain_db", (1, 1, 100, 100), "f4", chunks=(1, 1, 100, 100), compression="gzip")
+        gain.id.write_direct_chunk((0, 0, 0, 0), zlib.compress(bytes(2**22), 9))
+    with pytest.raises(BadInput, match="a piece of more than 40,000 bytes when decompressed"):
+        RadioMap.read(path)
+
+
+def test_a_pipe_is_no_radio_map(tmp_path):
+    os.mkfifo(tmp_path / "map.nc")
+    with pytest.raises(BadInput, match="a pipe or a device"):
+        RadioMap.read(tmp_path / "map.nc")
+    with pytest.raises(BadInput, match="is a folder"):
+        RadioMap.read(tmp_path)
+
+
+def test_a_file_that_was_cut_or_changed_is_never_more_than_a_message(path, tmp_path):
+    data, rng = path.read_bytes(), np.random.default_rng(0)
+    for number in range(60):
+        changed = bytearray(data[:rng.integers(len(data))] if number % 4 == 0 else data)
+        for at in rng.integers(len(changed), size=8) if changed else ():
+            changed[at] = rng.integers(256)
+        (tmp_path / "changed.nc").write_bytes(changed)
+        try:
+            RadioMap.read(tmp_path / "changed.nc")
+        except BadInput as error:
+            assert "changed.nc" in str(error) or "axis" in str(error)
+
+
+def test_netcdf_of_other_writers_is_read(path, tmp_path):
+    """With shuffle and fletcher32, a boolean `los`, other variables, and packed gains."""
+    dataset = RadioMap.read(path).dataset
+    dataset["more"] = ("t", np.arange(3.0))
+    dataset.to_netcdf(tmp_path / "other.nc", engine="h5netcdf", encoding={
+        "gain_db": {"dtype": "int16", "scale_factor": 0.5, "_FillValue": -9999, "zlib": True, "shuffle": True,
+                    "fletcher32": True}})
+    again = RadioMap.read(tmp_path / "other.nc")
+    np.testing.assert_array_equal(again.gain_db, dataset["gain_db"].values)
+    assert set(again.dataset.data_vars) == {"gain_db", "los"} and again.los.dtype == bool
+    assert isinstance(again.dataset, xr.Dataset)

@@ -1,0 +1,42 @@
+"""Texts of a run as they are shown."""
+
+import pytest
+
+from radiotwin.display.axes import plain
+from radiotwin.io.texts import MAX_TEXT, percent, shortly, shown, shown_data
+from radiotwin.report.style import shorten
+
+
+@pytest.mark.parametrize("text, expected", [
+    ("a b\tc\nd", "a b\tc\nd"), ("Gerät 7 · آنتن · 天线 · 👩‍🚀", "Gerät 7 · آنتن · 天线 · 👩‍🚀"),
+    ("\x1b[2J\x07", r"\x1b[2J\x07"), ("a\u202eb\u2066c\u200f", r"a\u202eb\u2066c\u200f"), ("\0", r"\x00"),
+    ("\ufeff\u200b", r"\ufeff\u200b"), ("\u2028", r"\u2028"), ("\ud800", r"\ud800")])
+def test_what_is_hidden_is_shown(text, expected):
+    assert shown(text) == expected
+
+
+def test_long_texts_are_cut():
+    assert len(shown("x" * 10**7)) == MAX_TEXT and shown("x" * 10**7).endswith("x…")
+    assert shown("x" * MAX_TEXT) == "x" * MAX_TEXT
+
+
+def test_data_for_a_script_keeps_its_arrays():
+    packed = {"type": "uint8", "shape": [3], "data": "A" * 10_000}
+    assert shown_data({"name": "\x1b", "values": packed, "list": ["\u202e", 1, None]}) == {
+        "name": r"\x1b", "values": packed, "list": [r"\u202e", 1, None]}
+
+
+@pytest.mark.parametrize("share, text", [(0, "0%"), (1e-6, "under 1%"), (0.0099, "under 1%"), (0.01, "1%"), (0.5, "50%"),
+                                         (0.99, "99%"), (0.9999, "over 99%"), (1, "100%")])
+def test_no_share_is_rounded_to_nothing_or_all(share, text):
+    assert percent(share) == text
+
+
+@pytest.mark.parametrize("value, text", [(0.8, "0.8"), (123.4, "123"), (6012.0, "6,012"), (-1e5, "-100,000")])
+def test_numbers_have_three_digits_or_all_before_the_point(value, text):
+    assert shortly(value) == text
+
+
+def test_names_in_figures_are_no_formulas_and_short():
+    assert plain(r"a $\frac{$ b") == r"a \$\frac{\$ b" and plain("a\nb\x1b") == r"a b\x1b"
+    assert len(plain("x" * 10**6)) == 100 and shorten("a name that is long") == "a name that i…"

@@ -1,0 +1,104 @@
+"""Measurements and scene in one frame: converted, refused with the translation that fits, or told to be the same."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.geo.frames import between_frames
+from radiotwin.io.forms import Origin
+from radiotwin.links.alignment import best_shift, in_scene_frame
+from radiotwin.links.measurements import Measurements
+from radiotwin.scene import Scene
+
+RBM = Path(__file__).parents[2] / "scenes" / "rbm"
+HERE = Origin(latitude_deg=36.0001, longitude_deg=-78.93575)
+THERE = Origin(latitude_deg=35.999274, longitude_deg=-78.935964)
+
+
+@pytest.fixture(scope="module")
+def rbm():
+    return Scene.load(RBM)
+
+
+def walked(scene, seed, number=1500, indoors=0.02):
+    """Receivers in the streets, a few indoors: uniform over the extent, those within walls mostly left out."""
+    rng = np.random.default_rng(seed)
+    x0, x1, y0, y1 = scene.config.extent.bounds
+    position_m = np.column_stack([rng.uniform(x0, x1, 4 * number), rng.uniform(y0, y1, 4 * number),
+                                  np.full(4 * number, 1.5)])
+    keep = ~scene.city.inside(position_m) | (rng.random(4 * number) < indoors)
+    return position_m[keep][:number]
+
+
+def measured(receiver_m, origin=None):
+    table = pd.DataFrame({"flight": "f", "receiver": "r", "receiver_x_m": receiver_m[:, 0],
+                          "receiver_y_m": receiver_m[:, 1], "receiver_z_m": receiver_m[:, 2], "device": "a",
+                          "rssi_dbm": -90.0})
+    devices = pd.DataFrame({"device": ["a"], "x_m": 0.0, "y_m": 0.0, "z_m": 30.0, "role": "anchor"})
+    return Measurements(table, devices, origin)
+
+
+def placed(scene, origin):
+    """The scene with another origin."""
+    config = scene.config.model_copy(update={"origin": origin, "crs": None})
+    return Scene(scene.folder, config)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("wrong_m", [(60.0, -40.0), (-130.0, 20.0), (8.0, 210.0)])
+def test_the_translation_is_found(rbm, seed, wrong_m):
+    shift_m = best_shift(rbm, walked(rbm, seed) + [*wrong_m, 0.0])
+    assert shift_m is not None
+    assert np.hypot(shift_m[0] + wrong_m[0], shift_m[1] + wrong_m[1]) <= 4.0  # two cells
+
+
+def test_none_is_proposed_above_the_roofs(rbm):
+    assert best_shift(rbm, walked(rbm, 0) + [100.0, 0.0, 500.0]) is None
+
+
+def test_unknown_frames_that_fit_are_taken_for_one(rbm):
+    right = measured(walked(rbm, 0))
+    assert in_scene_frame(right, rbm) is right
+
+
+def test_unknown_frames_that_do_not_fit_are_refused_with_the_translation(rbm):
+    wrong = measured(walked(rbm, 1) + [60.0, -40.0, 0.0])
+    with pytest.raises(BadInput, match="not in one frame.*--shift=-60,40 would make them fit") as said:
+        in_scene_frame(wrong, rbm)
+    assert "is not known of the measurements and of the scene" in str(said.value)
+    moved = in_scene_frame(wrong, rbm, (-60.0, 40.0))
+    np.testing.assert_allclose(moved.receiver_m, walked(rbm, 1), atol=1e-9)
+    np.testing.assert_allclose(moved.device_m, [[-60.0, 40.0, 30.0]])
+
+
+def test_receivers_indoors_in_a_frame_that_is_said_to_be_the_same(rbm):
+    inside = measured(walked(rbm, 2, indoors=1.0))
+    with pytest.raises(BadInput, match="--shift=0,0"):
+        in_scene_frame(inside, rbm)
+    np.testing.assert_array_equal(in_scene_frame(inside, rbm, (0.0, 0.0)).receiver_m, inside.receiver_m)
+
+
+@pytest.mark.parametrize(("shift_m", "message"), [
+    ((1e308, 0.0), r"a shift by 1e\+308, 0 m is not possible; allowed are -1e\+07 to 1e\+07 m"),
+    ((1e7, 0.0), r"takes 100.0% of the links' receivers off the 3D map")])
+def test_a_shift_off_the_map(rbm, shift_m, message):
+    with pytest.raises(BadInput, match=message):
+        in_scene_frame(measured(walked(rbm, 1)), rbm, shift_m)
+
+
+def test_known_frames_are_converted_and_told(rbm):
+    receiver_m = walked(rbm, 3)
+    there = placed(rbm, THERE)
+    elsewhere = measured(between_frames(receiver_m, THERE, HERE), HERE)
+    with pytest.warns(UserWarning, match=r"moved by \+19\.3 m east, \+91\.7 m north"):
+        here = in_scene_frame(elsewhere, there)
+    np.testing.assert_allclose(here.receiver_m, receiver_m, atol=1e-6)
+    assert here.origin == THERE and in_scene_frame(here, there) is here
+
+
+def test_known_frames_let_receivers_be_indoors(rbm):
+    inside = measured(walked(rbm, 2, indoors=1.0), THERE)
+    assert in_scene_frame(inside, placed(rbm, THERE)) is inside

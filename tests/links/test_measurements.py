@@ -1,0 +1,255 @@
+"""Reading and writing of measurements: what is accepted, and how the rest is refused."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.links.measurements import Measurements, read_measurements
+
+DEVICES = "device,x_m,y_m,z_m,role\na,10,20,1.5,anchor\nb,,,1.5,unknown\n"
+HEADER = "time_s,flight,receiver,receiver_x_m,receiver_y_m,receiver_z_m,device,gain_db\n"
+ROWS = "0,f0,uav0,0,0,55,a,-80.5\n2,f0,uav0,20,0,55,b,\n,f1,uav0,40,0,,a,-90\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(text: str, devices: str = DEVICES):
+        (tmp_path / "devices.csv").write_text(devices)
+        path = tmp_path / "measurements.csv"
+        path.write_text(text)
+        return path
+    return write
+
+
+def test_reads_blank_gains_times_and_heights_as_nan(write):
+    measurements = read_measurements(write(HEADER + ROWS))
+    np.testing.assert_array_equal(measurements.level_db, [-80.5, np.nan, -90])
+    np.testing.assert_array_equal(measurements.receiver_m[:, 2], [55, 55, np.nan])
+    assert np.isnan(measurements.table["time_s"][2])
+    assert measurements.flights == ["f0", "f1"]
+    np.testing.assert_array_equal(measurements.device_index, [0, 1, 0])
+    np.testing.assert_array_equal(measurements.is_anchor, [True, False])
+    np.testing.assert_array_equal(measurements.device_m, [[10, 20, 1.5], [np.nan, np.nan, 1.5]])
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".parquet", ".CSV.GZ", ".PARQUET"])
+def test_written_and_read_again_is_the_same(write, tmp_path, suffix):
+    if suffix.lower() == ".parquet":
+        pytest.importorskip("pyarrow")
+    measurements = read_measurements(write(HEADER + ROWS))
+    path = tmp_path / "again" / f"m{suffix}"
+    measurements.write(path)
+    again = read_measurements(path)
+    np.testing.assert_array_equal(again.level_db, measurements.level_db)
+    np.testing.assert_array_equal(again.receiver_m, measurements.receiver_m)
+    assert again.table.equals(measurements.table) and again.devices.equals(measurements.devices)
+
+
+def test_a_parquet_table_that_was_sorted_and_filtered_before_is_read_in_its_own_order(write, tmp_path):
+    pytest.importorskip("pyarrow")
+    plain = read_measurements(write(HEADER + ROWS))
+    plain.table.iloc[[2, 1]].to_parquet(tmp_path / "m.parquet")
+    plain.devices.iloc[::-1].to_parquet(tmp_path / "devices.parquet")
+    again = read_measurements(tmp_path / "m.parquet", tmp_path / "devices.parquet")
+    np.testing.assert_array_equal(again.level_db, [-90, np.nan])
+    assert [again.devices["device"][row] for row in again.device_index] == ["a", "b"]
+    np.testing.assert_array_equal(again.is_anchor, [False, True])
+    plain.devices.set_index("device").to_parquet(tmp_path / "named.parquet")  # the index is a column like any other
+    np.testing.assert_array_equal(read_measurements(tmp_path / "m.parquet", tmp_path / "named.parquet").is_anchor,
+                                  [True, False])
+
+
+def test_select_keeps_the_devices(write):
+    part = read_measurements(write(HEADER + ROWS)).select([False, True, False])
+    assert len(part.table) == 1 and len(part.devices) == 2
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    (HEADER.replace(",gain_db", "") + "0,f,u,0,0,5,a\n", r"gain_db"),
+    (HEADER.replace("receiver_y_m,", "") + "0,f,u,0,5,a,-80\n", r"column 'receiver_y_m' is missing"),
+    (HEADER + "0,f,u,zero,0,5,a,-80\n", r"row 2, column receiver_x_m: 'zero' is not a number"),
+    (HEADER + "0,f,u,0,0,5,a,-80\n0,f,u,0,0,5,a,weak\n", r"row 3, column gain_db: 'weak' is not a number"),
+    (HEADER + "0,f,u,0,0,5,a,-inf\n", r"row 2, column gain_db: '-inf' is not finite; leave the cell empty"),
+    (HEADER + "0,f,u,0,0,5,a,nan\n", r"row 2, column gain_db: 'nan' is not a number; leave the cell empty"),
+    (HEADER + "0,f,u,,0,5,a,-80\n", r"row 2, column receiver_x_m: '' is empty"),
+    (HEADER + "0,f,u,0,0,5,c,-80\n", r"row 2, column device: 'c' is not in .*devices.csv"),
+    (HEADER + "0,f,u,0,0,5,,-80\n", r"row 2, column device: '' is empty"),
+    (HEADER, r"no rows"),
+    (HEADER + "0,f,u,0,0,5,a,3.5\n", r"row 2, column gain_db: '3.5' is above 0 dB.*rssi_dbm"),
+    (HEADER + "0,f,u,0,0,5,a,-301\n", r"row 2, column gain_db: '-301' is no level; allowed are -300 to 300"),
+    (HEADER.replace("gain_db", "rssi_dbm") + "0,f,u,0,0,5,a,1e3\n", r"row 2, column rssi_dbm: '1e3' is no level"),
+    (HEADER + "0,f,u,0,0,5,a,-80\n0,f,u,0,-2e7,5,a,-80\n",
+     r"row 3, column receiver_y_m: '-2e7' is too far away; allowed are -1e\+07 to 1e\+07 m"),
+    (HEADER.replace("time_s", "gain_db") + "-1,f,u,0,0,5,a,-80\n", r"row 1: column 'gain_db' occurs twice"),
+    (HEADER + "0,f,u,0,0,5,a,-80\n0,f,u,0,0,5,a\n", r"row 3 has 7 fields, the header has 8"),
+    (HEADER + "0,f,u,0,0,5,a,-80,1\n", r"row 2 has 9 fields, the header has 8"),
+    (HEADER.replace(",", ";") + "0;f;u;0;0;5;a;-80,5\n", r"comma-separated, UTF-8"),
+    (HEADER.replace(",", "\t") + "0\tf\tu\t0\t0\t5\ta\t-80\n", r"comma-separated, UTF-8"),
+])
+def test_bad_rows_name_file_row_and_column(write, text, message):
+    path = write(text)
+    with pytest.raises(BadInput, match=message) as error:
+        read_measurements(path)
+    assert str(path) in str(error.value)
+
+
+@pytest.mark.parametrize(("devices", "message"), [
+    ("device,x_m,y_m,z_m\na,1,2,3\n", "column 'role' is missing"),
+    ("device,x_m,y_m,z_m,role\na,1,2,3,anchr\n", r"row 2, column role: 'anchr'; allowed are"),
+    ("device,x_m,y_m,z_m,role\na,,2,3,anchor\n", r"row 2: anchor 'a' has no x_m, y_m"),
+    ("device,x_m,y_m,z_m,role\na,1,2,3e7,anchor\n", r"row 2, column z_m: '3e7' is too far away"),
+    ("device,x_m,y_m,z_m,role,tilt_deg\na,1,2,3,anchor,-91\n", r"row 2, column tilt_deg: '-91' is no tilt; allowed are -90"),
+    ("device,x_m,y_m,x_m,role\na,1,2,3,anchor\n", r"row 1: column 'x_m' occurs twice"),
+    ("device,x_m,y_m,z_m,role\na,1,2,3,anchor\na,1,2,3,anchor\n", r"row 3, column device: 'a' occurs twice"),
+])
+def test_bad_devices(write, devices, message):
+    with pytest.raises(BadInput, match=message):
+        read_measurements(write(HEADER + ROWS, devices))
+
+
+def test_both_levels_are_one_too_many(write):
+    text = HEADER.replace("gain_db", "gain_db,rssi_dbm") + "0,f,u,0,0,5,a,-80,-60\n"
+    with pytest.raises(BadInput, match="exactly one"):
+        read_measurements(write(text))
+
+
+def test_files_that_are_not_tables(tmp_path, write):
+    write(HEADER + ROWS)
+    with pytest.raises(BadInput, match="does not exist"):
+        read_measurements(tmp_path / "no.csv")
+    with pytest.raises(BadInput, match="unknown format"):
+        read_measurements(tmp_path / "measurements.xlsx")
+    (tmp_path / "m.csv.gz").write_bytes(b"not gzip")
+    with pytest.raises(BadInput, match="cannot be read"):
+        read_measurements(tmp_path / "m.csv.gz")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "latin-1"])
+def test_another_encoding_is_named(write, encoding):
+    path = write(HEADER + ROWS)
+    path.write_bytes((HEADER + ROWS.replace("f0", "Flügel")).encode(encoding))
+    with pytest.raises(BadInput, match="comma-separated, UTF-8"):
+        read_measurements(path)
+
+
+def test_a_byte_order_mark_and_blank_lines_do_no_harm(write):
+    path = write(HEADER + ROWS)
+    path.write_bytes(b"\xef\xbb\xbf" + (HEADER + "\n" + ROWS).encode())
+    np.testing.assert_array_equal(read_measurements(path).level_db, [-80.5, np.nan, -90])
+
+
+def test_a_parquet_file_with_one_name_twice(write, tmp_path):
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    write(HEADER + ROWS)
+    parquet.write_table(pyarrow.table([[1.0], [2.0]], names=["gain_db", "gain_db"]), tmp_path / "m.parquet")
+    with pytest.raises(BadInput, match="column 'gain_db' occurs twice"):
+        read_measurements(tmp_path / "m.parquet")
+
+
+def test_a_missing_table_of_devices_says_what_it_needs(write):
+    path = write(HEADER + ROWS)
+    (path.parent / "devices.csv").unlink()
+    with pytest.raises(BadInput, match=r"devices\.csv does not exist; .*device, x_m, y_m, z_m, role .*--devices"):
+        read_measurements(path)
+
+
+def test_links_do_not_take_the_name_of_the_devices(write, tmp_path):
+    measurements = read_measurements(write(HEADER + ROWS))
+    with pytest.raises(BadInput, match="give the links another name"):
+        measurements.write(tmp_path / "new" / "devices.csv")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("other", ["device,x_m,y_m,z_m,role\na,1,2,3,anchor\n", "my gadgets\nphone\n"])
+def test_a_table_of_other_devices_is_not_overwritten(write, tmp_path, other):
+    measurements = read_measurements(write(HEADER + ROWS))
+    (tmp_path / "out").mkdir()
+    devices = tmp_path / "out" / "devices.csv"
+    devices.write_text(other)
+    with pytest.raises(BadInput, match="is not overwritten"):
+        measurements.write(tmp_path / "out" / "m.csv")
+    assert devices.read_text() == other and list((tmp_path / "out").iterdir()) == [devices]
+    devices.write_text("device,x_m,y_m,z_m,role\nb,,,9,unknown\na,1,2,3,anchor\n")
+    measurements.write(tmp_path / "out" / "m.csv")
+    assert read_measurements(tmp_path / "out" / "m.csv").devices.equals(measurements.devices)
+
+
+@pytest.mark.parametrize(("column", "cell", "message"), [
+    ("time_s", "1e308", "'1e308' is no time; allowed are -1e.11 to 1e.11 s; the unit is s, not ms"),
+    ("time_s", "1.65e12", "is no time"), ("time_s", "9e9", "more than a century"),
+    ("heading_deg", "1e300", "is out of range"), ("quality", "-1e300", "is out of range"),
+    ("gain_db", "-" + "9" * 5000, "row 2, column gain_db: '-9999.*… is n"),
+    ("receiver_z_m", "1e300", "is too far away")])
+def test_numbers_that_nobody_measured(write, column, cell, message):
+    header = HEADER.strip().split(",")
+    if column not in header:
+        header.append(column)
+    rows = [dict(zip(header, row)) | {column: value} for row, value in
+            (("0,f0,u,0,0,5,a,-80".split(","), cell), ("0,f0,u,0,0,5,a,-81".split(","), ""))]
+    text = "\n".join([",".join(header), *[",".join(row.get(name, "") for name in header) for row in rows], "1,f,u,0,0,5,a,-8"
+                      + ("," if len(header) == 9 else "")])
+    with pytest.raises(BadInput, match=message) as error:
+        read_measurements(write(text + "\n"))
+    assert len(str(error.value)) < 1000
+
+
+@pytest.mark.parametrize("name", ["a\x1b[2J", "a\u202eb", "a\nb", "\u2066a", "x" * 10_000, "a\tb", "\x7f"])
+def test_names_that_show_as_something_else(write, name):
+    quoted = f'"{name}"'
+    for devices in (DEVICES, DEVICES.replace("\na,", f"\n{quoted},")):
+        with pytest.raises(BadInput, match="column (device|flight): .* is no name; it has") as error:
+            read_measurements(write(HEADER + f"0,{quoted},u,0,0,5,a,-80\n", devices))
+        assert len(str(error.value)) < 500 and "\x1b" not in str(error.value)
+
+
+def test_names_of_any_other_kind_survive(write, tmp_path):
+    names = ["=cmd()", "'=x", "../../etc", "Zürich-東京", "-5", "a\u200cb", "@x", "'"]
+    devices = "device,x_m,y_m,z_m,role\n" + "".join(f"{name},1,2,3,anchor\n" for name in names[1:])
+    rows = "".join(f"0,f,u,0,0,5,{name},-80\n" for name in names[2:])
+    measurements = read_measurements(write(HEADER + rows, devices.replace("'=x", "''=x")))
+    assert list(measurements.devices["device"]) == names[1:]
+    for suffix in (".csv", ".csv.gz"):
+        measurements.write(tmp_path / "again" / f"m{suffix}")
+        again = read_measurements(tmp_path / "again" / f"m{suffix}")
+        assert again.table.equals(measurements.table) and again.devices.equals(measurements.devices)
+
+
+def test_an_anchor_at_the_end_of_the_world(write):
+    devices = DEVICES + "c,9e6,0,1.5,anchor\n"
+    with pytest.raises(BadInput, match=r"devices.csv: row 4: anchor 'c' at \(9e\+06, 0\) m is more than 1000 km"):
+        read_measurements(write(HEADER + ROWS, devices))
+    assert len(read_measurements(write(HEADER + ROWS, DEVICES + "c,9e5,0,1.5,anchor\n")).devices) == 3
+
+
+def test_too_many_devices(write, monkeypatch):
+    monkeypatch.setenv("RADIOTWIN_MAX_DEVICES", "1")
+    with pytest.raises(BadInput, match="RADIOTWIN_MAX_DEVICES"):
+        read_measurements(write(HEADER + ROWS))
+
+
+def test_a_table_of_devices_that_nobody_named_is_in_its_folder(write, tmp_path):
+    path = write(HEADER + ROWS)
+    (tmp_path / "work").mkdir()
+    path = path.rename(tmp_path / "work" / "measurements.csv")
+    (tmp_path / "work" / "devices.csv").symlink_to(tmp_path / "devices.csv")
+    with pytest.raises(BadInput, match="link out of its folder; name the table .* --devices"):
+        read_measurements(path)
+    assert len(read_measurements(path, tmp_path / "work" / "devices.csv").devices) == 2
+
+
+def test_heights_above_the_ground():
+    table = pd.DataFrame({"flight": "f", "receiver": "r", "receiver_x_m": [10.0, 20.0], "receiver_y_m": 0.0,
+                          "receiver_z_m": [np.nan, 70.0], "receiver_above_ground_m": [5.0, np.nan], "device": "d",
+                          "gain_db": -80.0})
+    devices = pd.DataFrame({"device": ["d", "e"], "x_m": [30.0, np.nan], "y_m": [0.0, np.nan], "z_m": [np.nan, 9.0],
+                            "role": ["anchor", "unknown"], "above_ground_m": [2.0, np.nan]})
+    data = Measurements(table, devices)
+    on_slope = data.on_ground(lambda x_m, y_m: 0.5 * x_m)
+    assert on_slope.receiver_m[:, 2].tolist() == [10, 70] and on_slope.device_m[:, 2].tolist() == [17, 9]
+    assert "above_ground_m" not in on_slope.devices
+    assert data.on_ground(None).receiver_m[:, 2].tolist() == [5, 70]
+    with pytest.raises(BadInput, match=r"row 2: receiver_z_m \(above the datum\) and receiver_above_ground_m are both"):
+        Measurements(table.assign(receiver_z_m=1.0), devices).on_ground(None)
+    with pytest.raises(BadInput, match="devices, row 3: above_ground_m needs a known position"):
+        Measurements(table, devices.assign(above_ground_m=2.0, z_m=np.nan)).on_ground(lambda x_m, y_m: x_m)

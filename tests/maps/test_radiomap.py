@@ -1,0 +1,138 @@
+"""Radio maps in memory and as files."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from radiotwin.cli.options import open_model
+from radiotwin.errors import BadInput
+from radiotwin.maps.form import BLOCK_VALUES, MapStream, parts_of, write_blocks
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.scene.lattice import Lattice
+
+LATTICE = Lattice.over(0, 40, 0, 20, 20, [50, 60])
+
+
+def example() -> RadioMap:
+    gain_db = -np.arange(2 * 2 * 2 * 3, dtype=float).reshape(2, 2, 2, 3)
+    gain_db[1, 0, 1, 2] = np.nan
+    return RadioMap.build(["a", "b"], LATTICE, gain_db, gain_db > -10, attributes={"frequency_hz": 2.4e9})
+
+
+def test_a_map_comes_back_from_its_file_as_it_was(tmp_path):
+    example().write(tmp_path / "map.nc")
+    again = RadioMap.read(tmp_path / "map.nc")
+    xr.testing.assert_identical(again.dataset, example().dataset)
+    assert again.devices == ["a", "b"]
+    assert again.los.dtype == bool and again.gain_db.dtype == np.float32
+    np.testing.assert_array_equal(again.lattice.positions_m, LATTICE.positions_m)
+
+
+def test_a_map_whose_name_is_in_capitals(tmp_path):
+    example().write(tmp_path / "MAP.NC")
+    with open_model(tmp_path / "MAP.NC") as radio_map:
+        assert radio_map.devices == ["a", "b"]
+
+
+def test_values_lie_where_the_lattice_says():
+    radio_map = example()
+    value = radio_map.dataset["gain_db"].sel(device="b", x=40, y=0, z=60).item()
+    index = LATTICE.index_of(np.array([[40.0, 0.0, 60.0]]))[0]
+    assert value == radio_map.gain_db[1].ravel()[index] == -(12 + index)
+
+
+def test_units_are_in_the_file(tmp_path):
+    example().write(tmp_path / "map.nc")
+    with xr.open_dataset(tmp_path / "map.nc", engine="h5netcdf") as dataset:
+        assert dataset["gain_db"].attrs["units"] == "dB" and dataset["x"].attrs["units"] == "m"
+
+
+def test_what_is_not_a_radio_map_is_bad_input(tmp_path):
+    with pytest.raises(BadInput, match="does not exist"):
+        RadioMap.read(tmp_path / "no.nc")
+    example().write(tmp_path / "map.nc")
+    data = (tmp_path / "map.nc").read_bytes()
+    (tmp_path / "half.nc").write_bytes(data[: len(data) // 2])
+    with pytest.raises(BadInput, match="not a readable NetCDF-4 file"):
+        RadioMap.read(tmp_path / "half.nc")
+    xr.Dataset({"t": ("x", [1.0])}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    with pytest.raises(BadInput, match="not a radio map"):
+        RadioMap.read(tmp_path / "other.nc")
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda d: d.drop_vars("los"), "lacks los"),
+    (lambda d: d.assign(los=d["los"].isel(z=0)), "los has the dims"),
+    (lambda d: d.assign(los=(d["los"].dims, np.full(d["los"].shape, "yes"))), "los holds .*not numbers"),
+    (lambda d: d.assign(los=d["los"] * 7), "los holds other values"),
+    (lambda d: d.assign(gain_db=d["gain_db"].transpose("z", "device", "y", "x")), "gain_db has the dims"),
+    (lambda d: d.assign(gain_db=(d["gain_db"].dims, np.full(d["los"].shape, "-80"))), "gain_db holds .*not numbers"),
+    (lambda d: d.assign(gain_db=d["gain_db"] - np.inf), "gain_db is infinite"),
+    (lambda d: d.assign(sigma_db=d["gain_db"].isel(device=0)), "sigma_db has the dims"),
+    (lambda d: d.assign(sigma_db=d["gain_db"]), "sigma_db is negative"),
+    (lambda d: d.drop_vars("y"), "coordinate y is missing"),
+    (lambda d: d.isel(x=slice(0, 0)), "coordinate x is missing or empty"),
+    (lambda d: d.assign_coords(x=[0.0, 20.0, np.nan]), "coordinate x must hold finite numbers in ascending"),
+    (lambda d: d.assign_coords(x=[0.0, 20.0, 20.0]), "coordinate x must hold finite numbers in ascending"),
+    (lambda d: d.assign_coords(z=["low", "high"]), "coordinate z must hold finite numbers in ascending"),
+    (lambda d: d.assign_coords(device=["a", "a"]), "two devices have one name"),
+    (lambda d: d.assign_coords(device=["a", "b\x1b[2J"]), "device name .*cannot be printed"),
+    (lambda d: d.assign_coords(device=["a", "b" * 300]), "longer than 200"),
+    (lambda d: d.assign_coords(x=[0.0, 20.0, 1e308]), "coordinate x must lie within"),
+    (lambda d: d.assign_coords(x=[0.0, 1e-300, 20.0]), "coordinate x must lie within .*steps of at least"),
+    (lambda d: d.assign(gain_db=d["gain_db"] + 1000.0), "gain_db goes from .* to 1000 dB"),
+    (lambda d: d.assign(gain_db=d["gain_db"].astype(float) - 1e308), "gain_db goes from"),
+    (lambda d: d.assign(sigma_db=d["gain_db"] * 0 + 1e30), "sigma_db is above"),
+    (lambda d: d.assign_attrs(frequency_hz="high"), "attribute frequency_hz is 'high', not a finite number"),
+    (lambda d: d.assign_attrs(gain_limit_db=np.nan), "attribute gain_limit_db is"),
+    (lambda d: d.assign_attrs(origin_latitude_deg=1e308), "origin_latitude_deg is not within 90"),
+])
+def test_a_part_that_is_not_as_it_must_be_is_named(tmp_path, change, message):
+    dataset = change(example().dataset)
+    for name in dataset.variables:
+        dataset[name].encoding = {}
+    dataset.to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    with pytest.raises(BadInput, match=f"map.nc is not a radio map: .*{message}"):
+        RadioMap.read(tmp_path / "map.nc")
+
+
+def test_one_position_is_a_map_too(tmp_path):
+    one = Lattice.over(0, 10, 0, 10, 20, [50])
+    RadioMap.build(["a"], one, np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1))).write(tmp_path / "map.nc")
+    assert RadioMap.read(tmp_path / "map.nc").lattice.shape == (1, 1, 1)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 30, 40), (2, 700, 900), (1, 3, 500_000), (3, 1, 200_001)])
+def test_parts_cover_every_position_once_in_order_and_are_small(shape):
+    index, seen = np.arange(np.prod(shape)).reshape(shape), []
+    for part in parts_of(shape):
+        seen.append(index[part].ravel())
+        assert 0 < seen[-1].size <= BLOCK_VALUES
+    np.testing.assert_array_equal(np.concatenate(seen), index.ravel())
+
+
+def test_a_stream_is_the_map_that_it_collects_to(tmp_path):
+    """A map larger than a block and than what HDF5 stores in pieces of its own choice."""
+    lattice = Lattice(np.arange(0.0, 1100.0), np.arange(0.0, 1000.0), np.array([50.0]))
+    asked = []
+
+    def make(device, part):
+        asked.append(part.shape)
+        x_m, y_m, _ = part.positions_m.T
+        gain_db = (-50 - (3 if device == "b" else 1) * x_m / 100 - y_m / 100).reshape(part.shape)
+        return {"gain_db": gain_db, "los": gain_db > -55, "sigma_db": gain_db * 0 + 3}
+
+    stream = MapStream(["a", "b"], lattice, {"source": "test"}, ("gain_db", "los", "sigma_db"), make)
+    write_blocks(stream.header, {"gain_db": np.dtype("f4"), "los": np.dtype(bool), "sigma_db": np.dtype("f4")},
+                 stream.blocks(), tmp_path / "stream.nc")
+    assert max(np.prod(shape) for shape in asked) <= BLOCK_VALUES
+    again = RadioMap.read(tmp_path / "stream.nc")
+    xr.testing.assert_identical(again.dataset, RadioMap.collect(stream).dataset)
+    assert again.dataset["gain_db"].sel(device="b", x=200, y=100, z=50) == -57
+
+
+def test_a_model_that_predicts_what_no_link_has_is_refused(tmp_path):
+    stream = MapStream(["a"], LATTICE, {}, ("gain_db", "los"),
+                       lambda _, part: {"gain_db": np.full(part.shape, 1e308), "los": np.ones(part.shape, bool)})
+    with pytest.raises(BadInput, match="gain_db for device 'a' goes from 1e[+]308"):
+        RadioMap.collect(stream)

@@ -1,0 +1,136 @@
+"""The channel that follows paths over a map that may be wrong."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from radiotwin.errors import BadInput
+from radiotwin.links import LinkGeometry
+from radiotwin.propagation.laws.kriging import RegressionKriging
+from radiotwin.propagation.laws.map_error import MapError, estimate_map_error
+from radiotwin.propagation.laws.path_kriging import PathKriging
+from radiotwin.propagation.laws.registry import decode_channel, encode_channel
+from radiotwin.scene.citymap import CityMap
+
+DEVICES_M = np.array([[45.0, 42.0, 1.5], [100.0, 155.0, 1.5], [160.0, 60.0, 1.5]])
+
+
+def houses(move_m=0.0, rise_m=0.0, seed=0):
+    """Nine houses; each side of each is off by a normal error, and so is the height."""
+    rng, boxes = np.random.default_rng(seed), []
+    for east in (10.0, 75.0, 140.0):
+        for north in (10.0, 75.0, 140.0):
+            low, high = np.array([east, north]), np.array([east + 25, north + 25])
+            low, high = low + move_m * rng.normal(size=2), high + move_m * rng.normal(size=2)
+            height = max(22 + rise_m * rng.normal(), 5)
+            boxes.append(trimesh.creation.box(bounds=[[*low, 0], [*high, height]]))
+    mesh = trimesh.util.concatenate(boxes)
+    return CityMap(mesh.vertices, mesh.faces)
+
+
+def links_over(city, receiver_m, device):
+    device_m = DEVICES_M[device]
+    los = city.line_of_sight(device_m, receiver_m)
+    return LinkGeometry(device_m, receiver_m, los, device, city, 2.4e9)
+
+
+def flight(count, seed):
+    rng = np.random.default_rng(seed)
+    receiver_m = np.column_stack([rng.uniform(0, 175, (count, 2)), rng.uniform(25, 50, count)])
+    return receiver_m, rng.integers(0, 3, count)
+
+
+def levels(city, receiver_m, device, seed, noise_db=1.0):
+    """Levels of a world whose paths the engine follows over the true map."""
+    from radiotwin.propagation.paths import path_powers
+
+    powers = path_powers(city, DEVICES_M, receiver_m, device, 2.4e9, "vertical").total
+    distance_m = np.linalg.norm(receiver_m - DEVICES_M[device], axis=1)
+    powers = powers + 1e-13 * (distance_m / 100) ** -3.0
+    return 10 * np.log10(powers) + np.random.default_rng(seed).normal(0, noise_db, len(device))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("move_m", "rise_m"), [(0.0, 0.0), (2.0, 0.0), (0.0, 4.0)])
+def test_the_size_of_a_maps_errors_is_found(move_m, rise_m):
+    """Rationale: the same paths over another map; only how the map was made wrong is not shared."""
+    receiver_m, device = flight(300, 3)
+    level_db = levels(houses(), receiver_m, device, 5)
+    wrong = links_over(houses(move_m, rise_m, seed=11), receiver_m, device)
+    found, _ = estimate_map_error(wrong, level_db, None, 0)
+    for (size_m, low_m, high_m), true_m in ((found.wall_m, move_m), (found.height_m, rise_m)):
+        assert low_m <= size_m <= high_m
+        if not found.is_shifted:  # of nine houses the mean error is large enough to be called a shift
+            assert low_m - 1.0 <= true_m <= high_m + 1.0  # the true errors of nine houses are few draws
+    assert (found.is_seen or found.is_shifted) == bool(move_m or rise_m), "a map is blamed if it is wrong"
+    assert found.is_seen or not rise_m, "heights show at most links"
+
+
+def test_few_links_say_nothing_of_a_map():
+    receiver_m, device = flight(20, 3)
+    links = links_over(houses(), receiver_m, device)
+    assert estimate_map_error(links, np.full(20, -90.0), None, 0)[0] == MapError()
+
+
+def test_error_of_a_map_is_kept_and_strange_ones_are_refused():
+    error = MapError((1.5, 1.0, 2.0), (3.0, 2.0, 4.5), (-2.0, 1.5, 0.5), (-6.0, 1.0))
+    assert MapError.from_state(json.loads(json.dumps(error.state()))) == error
+    for bad in (None, {"wall_m": [1, 2, 3]}, error.state() | {"wall_m": [1, 2]}, error.state() | {"wall_m": [1, 2, "x"]},
+                error.state() | {"height_m": [1e9, 0, 0]}):
+        with pytest.raises(ValueError):
+            MapError.from_state(bad)
+
+
+@pytest.fixture(scope="module")
+def judged():
+    """A model of 200 links over the true map, one over nine other houses, and 300 links to judge on."""
+    receiver_m, device = flight(200, 1)
+    level_db = levels(houses(), receiver_m, device, 2)
+    there_m, to = flight(300, 8)
+    true_db = levels(houses(), there_m, to, 9, noise_db=0.0)
+    found = {}
+    for name, city in (("right", houses()), ("wrong", CityMap(houses().vertices + [30.0, 30.0, 0.0], houses().faces))):
+        links, held = links_over(city, receiver_m, device), links_over(city, there_m, to)
+        model = PathKriging().fit(links, level_db, None, 0)
+        law = RegressionKriging().fit(links, level_db, None, 0)
+        found[name] = model, held, law
+    return found, true_db
+
+
+def rms(error_db):
+    return float(np.sqrt(np.mean(error_db**2)))
+
+
+@pytest.mark.slow
+def test_paths_over_the_true_map_are_relied_on_and_a_map_of_another_place_is_not(judged):
+    models, true_db = judged
+    model, held, law = models["right"]
+    assert not model.map_error.is_seen and model.weight.min() > 0.9
+    assert rms(model.predict(held)[0] - true_db) < 1.5 < rms(law.predict(held)[0] - true_db)
+    model, held, law = models["wrong"]
+    assert model.map_error.is_seen
+    assert rms(model.predict(held)[0] - true_db) < 1.1 * rms(law.predict(held)[0] - true_db)
+    for model, held, _ in models.values():
+        mean_db, sd_db = model.predict(held)
+        assert 0.8 < np.mean(np.abs(true_db - mean_db) < 1.645 * sd_db)
+
+
+@pytest.mark.slow
+def test_what_is_read_predicts_the_same(judged):
+    model, held, _ = judged[0]["wrong"]
+    data = encode_channel(model)
+    again = decode_channel(data, "test")
+    for one, other in zip(model.predict(held), again.predict(held)):
+        np.testing.assert_array_equal(one, other)
+    assert encode_channel(again) == data
+
+
+def test_a_damaged_file_is_refused():
+    model = PathKriging()
+    model.kriging.law = model.kriging.law.from_state({"lines": np.array([[-30.0, -2.0, 2.0]] * 2)}, {"borrowed": None})
+    assert decode_channel(encode_channel(model), "test").weight.tolist() == [1.0, 1.0]
+    model.weight = np.array([2.0, 0.0])
+    with pytest.raises(BadInput, match="not a whole channel model"):
+        decode_channel(encode_channel(model), "test")

@@ -1,0 +1,116 @@
+"""Kriging: interpolates what is smooth, knows where it knows nothing, and does not fill shadows."""
+
+import numpy as np
+import pytest
+
+from radiotwin.links import LinkGeometry
+from radiotwin.propagation.laws import kriging as residual_field
+from radiotwin.propagation.laws.kriging import RegressionKriging
+
+
+def shadowing(links):
+    """A smooth field [dB] over the receiver's position, another for each device."""
+    x, y = links.receiver_m[:, 0], links.receiver_m[:, 1]
+    return 6.0 * np.sin(x / 60.0 + links.device) * np.cos(y / 80.0 - 2.0 * links.device)
+
+
+def test_interpolates_a_smooth_field(world):
+    train, test = world(0, 1500), world(1, 3000)
+    model = RegressionKriging().fit(train.links, train.level_db + shadowing(train.links), None, seed=0)
+    truth_db = test.mean_db + shadowing(test.links)
+    error_db = model.predict(test.links)[0] - truth_db
+    trend_error_db = model.law.predict(test.links)[0] - truth_db
+    assert np.sqrt(np.mean(error_db**2)) < 0.5 * np.sqrt(np.mean(trend_error_db**2))
+
+
+def test_nine_in_ten_fall_within_their_interval(world):
+    """Shadowing drawn from the exponential model, 6 dB and 80 m, on top of the law's own noise."""
+    data = world(2, 2400)
+    rng = np.random.default_rng(3)
+    level_db = data.level_db.copy()
+    for device in range(3):
+        mine = data.links.device == device
+        position_m = data.links.receiver_m[mine]
+        apart_m = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
+        root = np.linalg.cholesky(36.0 * np.exp(-apart_m / 80.0) + 1e-6 * np.eye(mine.sum()))
+        level_db[mine] += root @ rng.standard_normal(mine.sum())
+    train, test = slice(0, 1200), slice(1200, None)
+    model = RegressionKriging().fit(data.links.select(train), level_db[train], None, seed=0)
+    mean_db, sigma_db = model.predict(data.links.select(test))
+    z = (level_db[test] - mean_db) / sigma_db
+    assert np.mean(np.abs(z) < 1.645) == pytest.approx(0.9, abs=0.05)
+    assert 30.0 < model.field.length_m < 200.0
+
+
+def test_far_away_and_for_an_unmeasured_device_it_is_the_law(world):
+    train = world(4, 900)
+    model = RegressionKriging().fit(train.links, train.level_db + shadowing(train.links), None, seed=0)
+    near, n = train.links.select(slice(0, 50)), 50
+    far = LinkGeometry(near.device_m, near.receiver_m + [1e5, 0.0, 0.0], near.los, near.device)
+    other = LinkGeometry(near.device_m, near.receiver_m, near.los, np.full(n, 9))
+    for links in (far, other):
+        assert np.allclose(model.predict(links), model.law.predict(links), atol=1e-6)
+    assert (model.predict(near)[1] < model.law.predict(near)[1]).all()
+
+
+def test_pure_noise_leaves_the_law_nearly_alone(world):
+    train, test = world(5, 900), world(6, 3000)
+    model = RegressionKriging().fit(train.links, train.level_db, None, seed=0)
+    difference_db = model.predict(test.links)[0] - model.law.predict(test.links)[0]
+    assert np.sqrt(np.mean(difference_db**2)) < 0.6
+
+
+def test_a_shadow_that_was_not_detected_stays_dark(world):
+    """A disc of 80 m in which nothing arrives: predicted below the law there, and lower than if left out."""
+    train = world(7, 2400)
+
+    def in_disc(links):
+        return (links.device == 0) & (
+            np.hypot(links.receiver_m[:, 0] - 300, links.receiver_m[:, 1] - 500) < 80
+        )
+
+    dark = in_disc(train.links)
+    train.level_db[dark] = np.nan
+    model = RegressionKriging().fit(train.links, train.level_db, -120.0, seed=0)
+    without = RegressionKriging().fit(train.links.select(~dark), train.level_db[~dark], -120.0, seed=0)
+    probe = train.links.select(dark)
+    law_db = model.law.predict(probe)[0]
+    assert (model.predict(probe)[0] - law_db).mean() < -4.0
+    assert model.predict(probe)[0].mean() < without.predict(probe)[0].mean() - 4.0
+
+
+def test_batches_do_not_show(world):
+    train, many = world(8, 300), world(9, 15_000)
+    model = RegressionKriging().fit(train.links, train.level_db + shadowing(train.links), None, seed=0)
+    whole = np.array(model.predict(many.links))
+    parts = [model.predict(many.links.select(slice(i, i + 777))) for i in range(0, 15_000, 777)]
+    assert np.allclose(whole, np.concatenate(parts, axis=1), atol=1e-9)
+
+
+def test_of_too_many_points_neighbours_become_their_mean(world, monkeypatch):
+    data = world(10, 600)
+    level_db = data.level_db + shadowing(data.links)
+    whole = RegressionKriging().fit(data.links, level_db, None, seed=1)
+    monkeypatch.setattr(residual_field, "MAX_POINTS", 150)
+    few, again = (RegressionKriging().fit(data.links, level_db, None, seed=1) for _ in range(2))
+    (device,) = (number for number in few.field.fields if number == 0)
+    field, mine = few.field.fields[device], data.links.device == 0
+    assert 40 < len(field.residual) <= 150 and field.count.sum() == mine.sum()
+    assert all(np.array_equal(few.state()[0][name], array) for name, array in again.state()[0].items())
+    probe = world(13, 300).links
+    difference_db = few.predict(probe)[0] - whole.predict(probe)[0]
+    assert np.sqrt(np.mean(difference_db**2)) < 2.0
+
+
+def test_repeated_visits_become_one_point(world):
+    data = world(11, 40)
+    links = data.links.select(np.tile(np.arange(40), 5))
+    model = RegressionKriging().fit(links, np.tile(data.level_db, 5), None, seed=0)
+    assert sum(len(field.residual) for field in model.field.fields.values()) == 40
+
+
+def test_one_position_only(world):
+    data = world(12, 40)
+    still = LinkGeometry(data.links.device_m, np.full((40, 3), 50.0), np.arange(40) % 2 == 0, data.links.device)
+    model = RegressionKriging().fit(still, data.level_db, None, seed=0)
+    assert np.isfinite(model.predict(data.links)).all()

@@ -1,0 +1,156 @@
+"""Coefficients against their limits and against exact integrals."""
+
+import numpy as np
+import pytest
+from scipy.special import modfresnelm
+
+from radiotwin.propagation.paths.coefficients import (
+    face_sines,
+    fresnel,
+    reflection,
+    slabs_of,
+    transition,
+    wedge_coefficients,
+)
+from radiotwin.scene.materials import Material, constants, itu_material
+from radiotwin.trace.sionna_scene import import_sionna
+
+CONCRETE = slabs_of([itu_material("concrete", thickness_m=0.1)], 2.4e9)
+CONDUCTOR = slabs_of([itu_material("metal")], 2.4e9)
+WAVE_NUMBER = 2 * np.pi * 2.4e9 / 299_792_458.0
+
+
+def test_concrete_at_one_gigahertz():
+    concrete = slabs_of([itu_material("concrete")], 1e9).permittivity[0]
+    assert concrete.real == 5.24 and concrete.imag == pytest.approx(-17.98 * 0.0462, rel=1e-3)  # P.2040, eq. 9b
+
+
+def test_below_its_range_a_material_has_the_constants_of_its_end():
+    below, end = (slabs_of([itu_material("concrete")], frequency_hz).permittivity[0]
+                  for frequency_hz in (0.9e9, 1e9))
+    assert below.real == end.real and below.imag * 0.9 == pytest.approx(end.imag)  # of one conductivity
+
+
+def test_fresnel_straight_on_and_grazing():
+    te, tm = fresnel(1.0, complex(4, 0))
+    assert te == pytest.approx(-1 / 3) and tm == pytest.approx(1 / 3)
+    assert np.allclose(fresnel(0.0, complex(5, -0.3)), -1)
+    assert abs(fresnel(np.sin(np.arctan(1 / 2)), complex(4, 0))[1]) < 1e-12  # Brewster's angle
+
+
+@pytest.mark.parametrize("x", [0.0, 0.01, 0.5, 3.0, 4.8, 4.9, 10.0, 29.9, 30.1, 500.0])
+def test_transition_function(x):
+    exact = 2j * np.sqrt(x) * np.exp(1j * x) * modfresnelm(np.sqrt(x))[0]
+    assert transition(x) == pytest.approx(exact, abs=2e-5)
+
+
+def slab(permittivity, conductivity_s_per_m=0.0, thickness_m=0.1, frequency_hz=2.4e9, **others):
+    return slabs_of([Material("slab", None, permittivity, conductivity_s_per_m, thickness_m, **others)], frequency_hz)
+
+
+@pytest.mark.parametrize("sine", [1e-3, 0.1, 0.5, 0.9, 1.0])
+def test_a_thick_lossy_slab_is_a_half_space(sine):
+    thick = slab(5.24, 0.09, thickness_m=50.0)
+    assert reflection(sine, thick, 0) == pytest.approx(fresnel(sine, thick.permittivity[0]), rel=1e-6)
+
+
+@pytest.mark.parametrize("sine", [0.01, 0.2, 0.7, 0.99])
+@pytest.mark.parametrize("thickness_m", [0.002, 0.1, 0.37])
+def test_a_slab_is_a_line_that_ends_in_free_space(line_of_slab, sine, thickness_m):
+    ours = reflection(sine, slab(6.31, 0.0117, thickness_m), 0)
+    assert ours == pytest.approx(line_of_slab(sine, 6.31, 0.0117, thickness_m), rel=1e-9)
+
+
+@pytest.mark.parametrize("sine", [0.2, 0.7, 1.0])
+def test_half_a_wave_is_transparent_and_a_quarter_reflects_most(sine):
+    """Born and Wolf, Principles of Optics, section 1.6.4: the slab as a plate of n sin(angle) = root."""
+    permittivity, wavelength_m = 4.0, 299_792_458.0 / 2.4e9
+    wave_in_slab_m = wavelength_m / np.sqrt(permittivity - (1 - sine**2))
+    assert np.allclose(reflection(sine, slab(permittivity, thickness_m=wave_in_slab_m / 2), 0), 0, atol=1e-9)
+    quarter = reflection(sine, slab(permittivity, thickness_m=wave_in_slab_m / 4), 0)
+    for got, one_side in zip(quarter, fresnel(sine, complex(permittivity))):
+        assert got == pytest.approx(2 * one_side / (1 + one_side**2))
+
+
+def test_no_slab_reflects_more_than_all_and_none_of_no_thickness():
+    rng = np.random.default_rng(0)
+    for _ in range(500):
+        any_slab = slab(1 + 10 ** rng.uniform(-2, 2), 10 ** rng.uniform(-4, 7), 10 ** rng.uniform(-3, 1))
+        assert np.abs(reflection(rng.uniform(0, 1), any_slab, 0)).max() <= 1 + 1e-9
+    assert reflection(0.4, slab(5.0, 0.1, thickness_m=0.0), 0) == (0, 0)
+    assert np.allclose(reflection(0.0, CONCRETE, 0), -1)
+
+
+def test_what_is_scattered_is_missing():
+    smooth, rough = (np.array(reflection(0.4, slab(5.0, 0.1, scattering_coefficient=share), 0)) for share in (0, 0.6))
+    assert np.allclose(rough, 0.8 * smooth)
+
+
+@pytest.mark.slow
+@pytest.mark.llvm
+@pytest.mark.parametrize("frequency_hz", [0.9e9, 2.4e9, 28e9])
+@pytest.mark.parametrize("name", ["concrete", "brick", "glass", "marble", "metal", "wood"])
+def test_slabs_are_those_of_the_ray_tracer(name, frequency_hz):
+    """Sionna RT's coefficient in single precision, over angles of 5 to 85 degrees and both polarisations."""
+    import_sionna()
+    import mitsuba
+    from sionna.rt.utils import complex_relative_permittivity, itu_coefficients_single_layer_slab
+
+    for thickness_m in (0.1, 0.2):
+        material = itu_material(name, thickness_m=thickness_m)
+        real, conductivity_s_m, _ = constants(material, frequency_hz)
+        sine = np.sin(np.radians(np.arange(5, 86)))
+        permittivity = complex_relative_permittivity(mitsuba.Float(real), mitsuba.Float(conductivity_s_m),
+                                                     mitsuba.Float(2 * np.pi * frequency_hz))
+        theirs = itu_coefficients_single_layer_slab(mitsuba.Float(sine), permittivity, mitsuba.Float(thickness_m),
+                                                    mitsuba.Float(299_792_458.0 / frequency_hz))[:2]
+        slabs = slabs_of([material], frequency_hz)
+        ours = np.array([reflection(each, slabs, 0) for each in sine]).T
+        for own, other in zip(ours, theirs):
+            difference_db = 20 * np.log10(np.abs(own) / np.hypot(np.array(other.real), np.array(other.imag)))
+            assert np.abs(difference_db).max() < 0.05
+
+
+def wedge(phi, phi_in, sine_edge, distance_m, n, slabs):
+    faces = [reflection(sine, slabs, 0) for sine in face_sines(phi, phi_in, sine_edge, n)]
+    return wedge_coefficients(phi, phi_in, sine_edge, distance_m, WAVE_NUMBER, n, *faces)
+
+
+def field(phi, phi_in, n, slabs, soft):
+    """Direct, reflected and diffracted field of a line source's ray across a wedge, over that of free space."""
+    before_m, after_m = 40.0, 70.0
+    row = 0 if soft else 1
+    total = wedge(phi, phi_in, 1.0, before_m * after_m / (before_m + after_m), n, slabs)[row] \
+        / np.sqrt(before_m * after_m * (before_m + after_m))
+    total *= np.exp(-1j * WAVE_NUMBER * (before_m + after_m))
+    for seen, angle in ((phi < np.pi + phi_in, phi - phi_in), (phi < np.pi - phi_in, phi + phi_in)):
+        if seen:
+            length_m = np.sqrt(before_m ** 2 + after_m ** 2 - 2 * before_m * after_m * np.cos(angle))
+            image = 1.0
+            if angle == phi + phi_in:
+                sine = before_m * np.sin(phi_in) / length_m + after_m * np.sin(phi) / length_m
+                image = reflection(sine, slabs, 0)[row]
+            total += image * np.exp(-1j * WAVE_NUMBER * length_m) / length_m
+    return total * (before_m + after_m)
+
+
+@pytest.mark.parametrize("slabs", [CONDUCTOR, CONCRETE])
+@pytest.mark.parametrize("soft", [True, False])
+@pytest.mark.parametrize("n", [1.5, 1.25, 2.0])
+def test_the_field_has_no_step_at_the_boundaries(slabs, soft, n):
+    phi_in = 0.5
+    for boundary in (np.pi + phi_in, np.pi - phi_in):
+        # Across the boundary, and from its limiting form to the full one.
+        for low, high in ((-1e-7, 1e-7), (0.99e-5, 1.01e-5), (-1.01e-5, -0.99e-5)):
+            before, after = (field(boundary + step, phi_in, n, slabs, soft) for step in (low, high))
+            assert abs(before - after) < 2e-3
+    at_shadow = wedge(np.pi + phi_in + 1e-7, phi_in, 1.0, 25.0, n, slabs)
+    assert np.allclose(np.abs(at_shadow) / np.sqrt(25.0), 0.5, atol=0.06)  # half the free-space field
+
+
+@pytest.mark.parametrize("slabs", [CONDUCTOR, CONCRETE])
+def test_wedge_is_reciprocal(slabs):
+    there = wedge(4.1, 0.7, 0.8, 30.0, 1.5, slabs)
+    back = wedge(0.7, 4.1, 0.8, 30.0, 1.5, slabs)
+    turned = wedge(1.5 * np.pi - 0.7, 1.5 * np.pi - 4.1, 0.8, 30.0, 1.5, slabs)
+    assert np.allclose(there, back) and np.allclose(there, turned)

@@ -1,0 +1,67 @@
+"""Paths over a terrain: off its slopes as off tilted mirrors, over its crests as over wedges, and through it never."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from radiotwin.propagation.paths.powers import COMPONENTS, path_powers
+from radiotwin.scene.citymap import CityMap
+from tests.terrains import incline, ridge, terrain_map
+
+FREQUENCY_HZ = 2.4e9
+WAVELENGTH_M = 299_792_458.0 / FREQUENCY_HZ
+
+
+def friis(distance_m):
+    return (WAVELENGTH_M / (4 * np.pi * distance_m)) ** 2
+
+
+def one_link(city, device_m, receiver_m, **more):
+    powers = path_powers(city, np.array([device_m], dtype=float), np.array([receiver_m], dtype=float),
+                         np.zeros(1, dtype=int), FREQUENCY_HZ, **more)
+    return {name: getattr(powers, name)[0] for name in COMPONENTS}
+
+
+@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.2, 0.0), (-0.15, 0.3)])
+def test_an_inclined_plane_reflects_as_a_tilted_mirror(slope, line_of_slab):
+    """The image of the device across the plane; the coefficient of a slab at the angle to that plane."""
+    height = incline(*slope)
+    normal = np.array([-slope[0], -slope[1], 1.0]) / np.sqrt(1 + slope[0] ** 2 + slope[1] ** 2)
+    device_m = np.array([-40.0, 10.0, height(-40, 10) + 8])
+    receiver_m = np.array([60.0, -20.0, height(60, -20) + 40])
+    above_m = (device_m - [0, 0, height(0, 0)]) @ normal, (receiver_m - [0, 0, height(0, 0)]) @ normal
+    image_m = device_m - 2 * above_m[0] * normal
+    length_m = np.linalg.norm(receiver_m - image_m)
+    of_power = np.abs(line_of_slab((above_m[0] + above_m[1]) / length_m)) ** 2
+    got = one_link(terrain_map(height), device_m, receiver_m, depth=1)
+    assert got["ground"] == pytest.approx(friis(length_m) * of_power.mean(), rel=1e-3)
+    assert got["direct"] == pytest.approx(friis(np.linalg.norm(receiver_m - device_m)), rel=1e-9)
+    assert sum(got.values()) == pytest.approx(got["ground"] + got["direct"], rel=1e-12)
+
+
+def test_no_plane_at_the_datum_reflects_below_a_terrain():
+    """A terrain 100 m above z = 0 that ends at x = 20 m: beyond it there is nothing to reflect."""
+    half = CityMap([[-500, -500, 100], [20, -500, 100], [20, 500, 100], [-500, 500, 100]], [[0, 1, 2], [0, 2, 3]],
+                   terrain=np.ones(2, dtype=bool))
+    assert one_link(half, [30, 0, 110], [60, 0, 110])["ground"] == 0
+    assert one_link(half, [-60, 0, 110], [-30, 0, 110])["ground"] > 0
+
+
+def test_over_a_crest_as_over_a_knife_edge():
+    """ITU-R P.526-15, eq. 31: within 3 dB of a ridge of 55 m with flanks of 70 degrees, deep in its shadow."""
+    city = terrain_map(ridge(55.0, half_width_m=20.0), step_m=5.0)
+    for z_m in (22.0, 32.0):
+        got = one_link(city, [-150, 0, 12], [150, 0, z_m])
+        v = (65 - (12 + z_m) / 2) * np.sqrt(2 / WAVELENGTH_M * (2 / 150))
+        loss_db = 6.9 + 20 * np.log10(np.sqrt((v - 0.1) ** 2 + 1) + v - 0.1)
+        assert got["direct"] == 0
+        assert 10 * np.log10(got["diffracted"] / friis(np.hypot(300, z_m - 12))) == pytest.approx(-loss_db, abs=3)
+
+
+def test_a_wall_on_a_slope_reflects_where_the_ground_lets_it():
+    """A wall behind a ridge cannot be seen over it; on the near side it reflects."""
+    wall = trimesh.creation.box(bounds=[[100, -150, 5], [110, 150, 40]])
+    hidden, seen = (terrain_map(ridge(crest_m), half_m=300.0, building=wall) for crest_m in (60.0, 0.0))
+    ends = [-120, -30, 30], [-120, 30, 30]
+    assert one_link(hidden, *ends, depth=1)["reflected_1"] == 0
+    assert one_link(seen, *ends, depth=1)["reflected_1"] > 0

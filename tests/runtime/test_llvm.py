@@ -1,0 +1,238 @@
+"""The search for libLLVM: on trees of made-up files, and the probe on the libraries of this machine."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from radiotwin.errors import RunFailed
+from radiotwin.runtime import llvm
+
+
+@pytest.fixture
+def tree(tmp_path, monkeypatch):
+    """An empty machine: nothing but the folder `lib` is searched, and no earlier probe is remembered."""
+    folder = tmp_path / "lib"
+    folder.mkdir()
+    monkeypatch.setattr(llvm, "search_folders", lambda: [folder, tmp_path / "missing"])
+    monkeypatch.setattr(llvm, "_loader_files", list)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    llvm.rejection.cache_clear()
+    yield folder
+    llvm.rejection.cache_clear()
+
+
+@pytest.fixture
+def probed(monkeypatch):
+    """A probe that passes versions 18 to 20; gives the names of the files that it was asked of."""
+    names = []
+
+    def probe(path):
+        names.append(path.name)
+        return None if any(str(major) in path.name for major in (18, 19, 20)) else "it fails"
+
+    monkeypatch.setattr(llvm, "probe", probe)
+    return names
+
+
+def write(folder, *names):
+    for name in names:
+        (folder / name).write_text("not a library")
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-14.so.1", (14,)),
+        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
+        ("libLLVM.so.19.1", (19, 1)),
+        ("libLLVM-19.so", (19,)),
+        ("libLLVM.20.1.dylib", (20, 1)),
+        ("libLLVM.dylib", None),
+        ("LLVM-C.dll", None),
+    ],
+)
+def test_version_from_name(tree, name, version):
+    write(tree, name)
+    assert llvm.find() == [llvm.Candidate(tree / name, version)]
+
+
+@pytest.mark.parametrize("name", ["libLLVMCore.so", "libLLVM-17-rust-1.77.0-stable.so", "libLLVM.so.txt"])
+def test_other_files_are_left_out(tree, name):
+    write(tree, name)
+    assert llvm.find() == []
+
+
+def test_newest_first_and_each_library_once(tree):
+    write(tree, "libLLVM-9.so.1", "libLLVM.so.19.1", "libLLVM-18.so")
+    (tree / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
+    (tree / "libLLVM.so").symlink_to("libLLVM.so.19.1")
+    (tree / "libLLVM-20.so").symlink_to("gone.so")
+    assert [candidate.version for candidate in llvm.find()] == [(19, 1), (18,), (9,)]
+
+
+def test_newest_that_works_is_chosen(tree, probed):
+    write(tree, "libLLVM-14.so.1", "libLLVM-18.so.1", "libLLVM.so.19.1", "libLLVM.so.21.0")
+    assert llvm.choose().path == tree / "libLLVM.so.19.1"
+    assert probed == ["libLLVM.so.21.0", "libLLVM.so.19.1"]
+
+
+def test_old_ones_are_never_tried(tree, probed):
+    write(tree, "libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1")
+    assert llvm.choose() is None
+    assert not llvm.available()
+    assert probed == []
+
+
+def test_users_own_is_the_only_choice(tree, probed, monkeypatch, tmp_path):
+    write(tree, "libLLVM-20.so")
+    write(tmp_path, "libLLVM-18.so", "libLLVM-22.so")
+    monkeypatch.setenv(llvm.VARIABLE, str(tmp_path / "libLLVM-18.so"))
+    assert llvm.choose().path == tmp_path / "libLLVM-18.so"
+    monkeypatch.setenv(llvm.VARIABLE, str(tmp_path / "libLLVM-22.so"))
+    assert llvm.choose() is None
+    assert f"{llvm.VARIABLE} names one that does not work" in llvm.advice()
+    assert f"{tmp_path / 'libLLVM-22.so'} (version 22): it fails" in llvm.advice()
+    assert "libLLVM-20.so" not in llvm.advice()
+
+
+def test_pass_is_remembered_until_the_file_changes(tree, probed):
+    write(tree, "libLLVM-19.so")
+    for _ in range(3):
+        llvm.rejection.cache_clear()  # as a new process would
+        assert llvm.available()
+    assert len(probed) == 1
+    os.utime(tree / "libLLVM-19.so", (1, 1))
+    llvm.rejection.cache_clear()
+    assert llvm.available()
+    assert len(probed) == 2
+
+
+def test_failure_is_not_remembered(tree, probed):
+    write(tree, "libLLVM-22.so")
+    for _ in range(2):
+        llvm.rejection.cache_clear()
+        assert not llvm.available()
+    assert len(probed) == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b'{"a": 1}', b"[1, null]"])
+def test_corrupt_memory_is_ignored(tree, probed, tmp_path, content):
+    write(tree, "libLLVM-19.so")
+    memory = tmp_path / "cache" / "radiotwin" / "llvm.json"
+    memory.parent.mkdir(parents=True)
+    memory.write_bytes(content)
+    assert llvm.available()
+    llvm.rejection.cache_clear()
+    assert llvm.available()
+    assert len(probed) == 1  # and it was put right
+
+
+def test_memory_that_cannot_be_written_does_no_harm(tree, probed, tmp_path):
+    write(tree, "libLLVM-19.so")
+    (tmp_path / "cache").write_text("a file where the folder should be")
+    assert llvm.available()
+
+
+def test_unusable_file_is_refused(tree):
+    write(tree, "libLLVM-18.so")
+    (candidate,) = llvm.find()
+    assert str(tree) in llvm.rejection(candidate)  # the loader's own complaint names the file
+    assert llvm.choose() is None
+
+
+def test_probe_that_aborts_ends_only_itself(tree, monkeypatch):
+    monkeypatch.setattr(llvm, "_PROBE", "import os; os.abort()")
+    assert "killed the process (signal 6)" in llvm.probe(tree / "libLLVM-19.so")
+
+
+def test_probe_that_hangs_is_ended(tree, monkeypatch):
+    monkeypatch.setattr(llvm, "_PROBE", "import time; time.sleep(60)")
+    monkeypatch.setattr(llvm, "PROBE_TIMEOUT_S", 0.2)
+    assert "did not end" in llvm.probe(tree / "libLLVM-19.so")
+
+
+def test_prepare_without_any_says_what_was_found_and_what_to_do(tree, probed, monkeypatch):
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    write(tree, "libLLVM-14.so.1", "libLLVM-22.so")
+    with pytest.raises(RunFailed) as failure:
+        llvm.prepare()
+    message = str(failure.value)
+    assert f"{tree / 'libLLVM-14.so.1'} (version 14): too old" in message
+    assert f"{tree / 'libLLVM-22.so'} (version 22): it fails" in message
+    assert llvm.install_line() in message
+    assert llvm.VARIABLE not in os.environ
+
+
+def test_prepare_names_the_chosen_one_and_repeats(tree, probed, monkeypatch):
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    monkeypatch.setenv(llvm.VARIABLE, "")  # so that what prepare() sets is undone after the test
+    write(tree, "libLLVM-18.so", "libLLVM-19.so")
+    for _ in range(2):
+        llvm.prepare()
+        assert os.environ[llvm.VARIABLE] == str(tree / "libLLVM-19.so")
+
+
+@pytest.mark.parametrize(
+    ("system", "conda", "managers", "line"),
+    [
+        ("Linux", False, ["apt-get"], "apt-get install -y libllvm19  # not known there? see https://apt.llvm.org"),
+        ("Linux", False, ["dnf"], "dnf install -y llvm-libs"),
+        ("Linux", False, [], "this system's package manager has it as libLLVM, llvm or llvm-libs"),
+        ("Linux", True, ["apt-get"], "conda install -y -c conda-forge libllvm19"),
+        ("Darwin", False, [], "brew install llvm"),
+        ("Windows", False, [], "winget install LLVM.LLVM"),
+        ("Windows", True, [], "conda install -y -c conda-forge libllvm-c19"),
+    ],
+)
+def test_install_line(monkeypatch, system, conda, managers, line):
+    monkeypatch.setattr(llvm.platform, "system", lambda: system)
+    monkeypatch.setattr(llvm.shutil, "which", lambda name: name if name in managers else None)
+    monkeypatch.setattr(llvm.os, "geteuid", lambda: 0, raising=False)
+    monkeypatch.setenv("CONDA_PREFIX", "/conda" if conda else "")
+    assert llvm.install_line() == line
+
+
+def run_python(program, **environment):
+    return subprocess.run(
+        [sys.executable, "-c", program], check=False, capture_output=True, text=True,
+        env={**os.environ, **environment}, timeout=120,
+    )
+
+
+def test_drjit_imported_too_early_without_a_working_one():
+    program = "import drjit; from radiotwin import llvm; llvm.prepare()"
+    done = run_python(program, DRJIT_LIBLLVM_PATH="/nonexistent/libLLVM.so")
+    assert "RunFailed: tracing needs libLLVM 17 or newer" in done.stderr
+
+
+TOO_OLD = [found for found in llvm.find() if found.version and found.version[0] < llvm.MIN_VERSION]
+
+
+@pytest.mark.parametrize("candidate", TOO_OLD or [None], ids=str)
+def test_minimum_version_is_true(candidate):
+    if candidate is None:
+        pytest.skip("no libLLVM older than the minimum on this machine")
+    assert llvm.probe(candidate.path)
+
+
+@pytest.mark.llvm
+def test_chosen_one_runs_kernels_in_a_fresh_process():
+    program = (
+        "from radiotwin import llvm; llvm.prepare(); llvm.prepare()\n"
+        "import drjit; from drjit.llvm import Float\n"
+        "llvm.prepare(); print(float(drjit.sum(drjit.arange(Float, 101))[0]), drjit.detail.llvm_version()[0])"
+    )
+    total, major = run_python(program).stdout.split()
+    assert float(total) == 5050
+    assert int(major) >= llvm.MIN_VERSION
+
+
+@pytest.mark.llvm
+def test_library_reports_its_version():
+    """Homebrew's and Windows' files carry no number, so the library itself reports it."""
+    chosen = llvm.choose()
+    reported = llvm._version_in_library(chosen.path)
+    assert reported[: len(chosen.version)] == chosen.version

@@ -1,0 +1,169 @@
+"""A map becomes a scene that the rest of the package works with."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import trimesh
+
+from radiotwin.errors import BadInput
+from radiotwin.geo.geodesy import local_crs, to_local
+from radiotwin.scene import Scene
+from radiotwin.scene.build import BuildOptions
+from radiotwin.scene.readers import MapOptions, build_scene_from_map, map_name, map_suffix
+
+TOWN = Path(__file__).with_name("town.osm")
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    return build_scene_from_map(TOWN, tmp_path_factory.mktemp("town") / "scene", options=BuildOptions(devices=3))
+
+
+@pytest.fixture(scope="module")
+def table(report):
+    return pd.read_csv(report.folder / "buildings.csv", keep_default_na=False).set_index("building")
+
+
+def test_names():
+    assert map_suffix("a.b.OSM.pbf") == ".osm.pbf" and map_suffix("a.osm") == ".osm" and map_suffix("a.xml") is None
+    assert map_name("data/old town.osm.pbf") == "old_town" and map_name("area.v2.geojson") == "area.v2"
+
+
+def test_every_height_has_its_source(table, report):
+    tops = {name: (row["top_m"], row["height_from"]) for name, row in table.iterrows()}
+    assert tops["way/101"] == (12, "height") and tops["way/102"] == (12, "building:levels")
+    assert tops["way/103"] == (10, "default") and tops["way/104"] == (10.058, "height")
+    assert tops["way/105"] == (6, "building:levels") and table.loc["way/105", "unusable"] == "height=-5"
+    assert table.loc["way/110", ["bottom_m", "top_m"]].tolist() == [5, 9]
+    facts = dict(report.facts)
+    assert facts["heights from"] == "height tag: 10, building:levels × 3 m: 4, default: 1 (10 m)"
+    assert facts["buildings"] == "15 in 14 blocks"
+
+
+def test_the_map_knows_how_well_it_knows_its_heights(table, report):
+    told = {name: row["height_sd_m"] for name, row in table.iterrows()}
+    assert (told["way/101"], told["way/102"], told["way/105"]) == (1.5, 3.0, 3.0)
+    tops_m = table["top_m"][table["height_from"] != "default"]
+    assert told["way/103"] == pytest.approx(max(np.sqrt(np.mean((tops_m - 10.0) ** 2)), 3.0), abs=0.06)
+    city = Scene.load(report.folder).city
+    for name in ("way/101", "way/103"):
+        x_m, y_m = table.loc[name, ["x_m", "y_m"]]
+        face = city.first_face(np.array([[x_m, y_m, 99.0]]), np.array([[x_m, y_m, 0.0]]))
+        assert city.height_sd_m[face] == pytest.approx(told[name])
+    below = city.first_face(np.array([[-75.2, -8.5, 99.0]]), np.array([[-75.2, -8.5, -1.0]]))
+    assert np.isnan(city.height_sd_m[below]).all()  # the ground has no height
+
+
+def test_defects_are_reported(report):
+    said = "\n".join(problem.message for problem in report.problems)
+    for part in ("'way/116'", "'way/115'", "no area: left out ('way/107')", "0.3 m wide: left out ('way/118')",
+                 "way/105: height=-5", "way/119: straw", "way/113 and way/114: 30 m²", "taken apart ('way/106')"):
+        assert part in said
+    assert not report.tracing_would_fail
+
+
+def test_the_scene_lies_where_the_map_says(report, table):
+    scene = Scene.load(report.folder)
+    assert scene.config.crs == local_crs(scene.config.origin)
+    # way/101 as drawn: 20 x 12 m about latitude 47.49983, longitude 8.69934; the map's own degrees, projected
+    x_m, y_m = to_local(scene.config.origin, np.array([8.6993361]), np.array([47.4998345]))
+    assert scene.city.height_at(x_m, y_m) == pytest.approx([12.0], abs=1e-4)
+    x, y = table.loc["relation/201", ["x_m", "y_m"]]
+    assert scene.city.height_at(x, y) == pytest.approx(18.0, abs=1e-4)
+    assert table.loc["relation/201", "area_m2"] == pytest.approx(50 * 40 - 26 * 20, rel=3e-3)
+    assert scene.city.inside(np.array([[x, y, 9.0]]))[0]
+    assert scene.city.height_at(-75.2, -8.5) == 0.0  # the courtyard
+    bounds = scene.config.extent.bounds
+    assert (table["x_m"].between(*bounds[:2]) & table["y_m"].between(*bounds[2:])).all()
+
+
+def test_meshes_are_watertight_and_face_outwards(report, table):
+    volume_m3 = 0.0
+    for path in (report.folder / "meshes").glob("*.ply"):
+        if path.stem != "ground":
+            mesh = trimesh.load(path, process=False)
+            assert mesh.is_volume, path
+            volume_m3 += mesh.volume
+    prisms_m3 = (table["area_m2"] * (table["top_m"] - table["bottom_m"])).sum()
+    assert volume_m3 == pytest.approx(prisms_m3 - 30 * 7, rel=2e-3)  # 30 m² of way/114 are in way/113
+    assert set(table["shape"]) == {path.stem for path in (report.folder / "meshes").glob("*.ply")} - {"ground"}
+
+
+def test_a_box_within_a_part_that_lies_in_another_part(tmp_path):
+    """The parts of an outline are united: there is a building, and no courtyard."""
+    rings = [[[[x, 47.5 + y] for x, y in ((-a, -a), (a, -a), (a, a), (-a, a), (-a, -a))]] for a in (3e-4, 1.5e-4)]
+    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [
+        {"type": "Feature", "properties": {"height": 9}, "geometry": {"type": "MultiPolygon", "coordinates": rings}}]}))
+    report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out",
+                                  MapOptions(bbox_deg=(47.49995, -5e-5, 47.50005, 5e-5)))
+    assert pd.read_csv(report.folder / "buildings.csv")["area_m2"].tolist() == [pytest.approx(3010, rel=0.01)]
+
+
+def test_a_box_of_degrees(tmp_path):
+    box = 47.4998, 8.699, 47.5002, 8.7001
+    report = build_scene_from_map(TOWN, tmp_path / "part", MapOptions(bbox_deg=box, default_height_m=4.5))
+    scene = Scene.load(tmp_path / "part")
+    table = pd.read_csv(tmp_path / "part" / "buildings.csv")
+    assert set(table["building"]) == {"way/101", "way/102", "way/103", "relation/201"}
+    assert table.set_index("building")["top_m"]["way/103"] == 4.5
+    x_m, y_m = to_local(scene.config.origin, np.array([8.699, 8.7001]), np.array([47.4998, 47.5002]))
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    assert x_min <= x_m[0] and x_max >= x_m[1] and y_min <= y_m[0] and y_max >= y_m[1]
+    assert x_max - x_min < x_m[1] - x_m[0] + 40 and report.extent_m == scene.config.extent.bounds
+
+
+def test_only_a_scene_is_replaced(tmp_path, empty_map):
+    path = empty_map.box(0, 0, 20, 20, height="5").write(tmp_path / "a.osm")
+    for _ in range(2):
+        build_scene_from_map(path, tmp_path / "out")
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    with pytest.raises(BadInput, match="holds notes.txt"):
+        build_scene_from_map(path, tmp_path / "out")
+    with pytest.raises(BadInput, match="choose another output folder"):
+        build_scene_from_map(path, tmp_path)
+
+
+def test_the_table_of_materials_is_used(tmp_path):
+    from radiotwin.scene.readers import with_pairs
+    from radiotwin.scene.readers.material_table import STANDARD
+
+    options = MapOptions(materials=with_pairs(STANDARD, {"straw": "itu_wood", "ground": "wet_ground"}))
+    report = build_scene_from_map(TOWN, tmp_path / "unused", options, check_only=True)
+    assert {use.name: use.shapes for use in report.materials}["wood"] == 2
+    assert "wet_ground" in {use.name for use in report.materials} and not (tmp_path / "unused").exists()
+    assert "straw" not in "\n".join(problem.message for problem in report.problems)
+
+
+@pytest.mark.parametrize(("options", "message"), [
+    ({"bbox_deg": (1, 2, 0, 3)}, "bbox .* is not possible"), ({"bbox_deg": (float("nan"), 0, 1, 1)}, "not possible"),
+    ({"bbox_deg": (0, 0, 1, 1)}, r"no building reaches into the bbox .*the file's lie in 47\.\d+,8\.\d+"),
+    ({"default_height_m": 0.0}, "default height of 0 m"), ({"default_height_m": float("inf")}, "default height")])
+def test_impossible_options(tmp_path, options, message):
+    with pytest.raises(BadInput, match=message):
+        build_scene_from_map(TOWN, tmp_path / "out", MapOptions(**options))
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_far_apart(tmp_path, empty_map):
+    path = empty_map.box(0, 0, 20, 20).box(90_000, 0, 90_020, 20).write(tmp_path / "a.osm")
+    with pytest.raises(BadInput, match="the area is 90 km wide, 50 km are allowed; choose a part with --bbox"):
+        build_scene_from_map(path, tmp_path / "out")
+
+
+def test_a_ring_of_three_points_is_no_building(tmp_path):
+    square = [[8.7, 47.5], [8.7003, 47.5], [8.7003, 47.5002], [8.7, 47.5002], [8.7, 47.5]]
+    features = [{"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+                for ring in (square, [[8.7, 47.5]] * 3, square[:2] + square[:1])]
+    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out")
+    assert dict(report.facts)["buildings"] == "1 in 1 blocks"
+    assert "2 building(s) have no area" in report.problems[0].message
+
+
+def test_nothing_usable_gives_the_reasons(tmp_path, empty_map):
+    path = empty_map.box(0, 0, 0, 20).write(tmp_path / "a.osm")
+    with pytest.raises(BadInput, match="none of its 1 buildings can be used:\n.*have no area"):
+        build_scene_from_map(path, tmp_path / "out")

@@ -1,0 +1,93 @@
+import osmium
+import pytest
+import shapely
+
+from radiotwin.errors import BadInput
+from radiotwin.scene.readers.features import left_out_problems
+from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml, stitch
+
+
+@pytest.mark.parametrize(("chains", "rings"), [
+    ([[1, 2, 3, 1]], 1), ([[1, 2, 3], [1, 4, 3]], 1), ([[1, 2], [3, 2], [3, 4, 1]], 1),
+    ([[1, 2, 3, 1], [5, 6], [6, 7, 5]], 2), ([], 0), ([[1, 2, 1]], 0)])
+def test_ways_make_rings(chains, rings):
+    found = stitch(chains)
+    assert len(found) == rings and all(ring[0] == ring[-1] for ring in found)
+
+
+@pytest.mark.parametrize("chains", [[[1, 2, 3]], [[1, 2, 3], [3, 4]]])
+def test_ways_with_an_open_end(chains):
+    assert stitch(chains) is None
+
+
+def test_the_town(town_osm):
+    found = assemble(read_osm_xml(town_osm))
+    names = {feature.name for feature in found.features}
+    assert names == {f"way/{n}" for n in (*range(101, 115), 118, 119)} | {"relation/201", "relation/202"}
+    areas = {feature.name: feature.area for feature in found.features}
+    assert len(areas["relation/201"].interiors) == 1 and areas["relation/202"].geom_type == "MultiPolygon"
+    messages = "\n".join(problem.message for problem in left_out_problems(found.left_out, None))
+    assert "'way/116'" in messages and "not closed: left out ('way/115')" in messages
+
+
+def test_pbf_holds_the_same_buildings(town_osm, tmp_path):
+    path = tmp_path / "town.osm.pbf"
+    with osmium.SimpleWriter(str(path)) as writer:
+        for element in osmium.FileProcessor(str(town_osm)):
+            if not (element.is_way() and element.id == 129):  # deleted: the XML reader of osmium keeps it
+                writer.add(element)
+    xml, pbf = assemble(read_osm_xml(town_osm)), assemble(read_osm_pbf(path))
+    assert [(f.name, dict(f.tags)) for f in pbf.features] == [(f.name, dict(f.tags)) for f in xml.features]
+    for a, b in zip(xml.features, pbf.features):
+        assert shapely.equals_exact(a.area, b.area, 1e-9)
+    assert {p.message for p in pbf.problems} == {p.message for p in xml.problems}
+
+
+def relation(role, way_tags="", relation_tags='<tag k="type" v="multipolygon"/>'):
+    nodes = "".join(f'<node id="{i}" lat="{i % 2}" lon="{i // 2}"/>' for i in range(4))
+    return (f'<osm>{nodes}<way id="1"><nd ref="0"/><nd ref="1"/><nd ref="3"/><nd ref="2"/><nd ref="0"/>{way_tags}</way>'
+            f'<relation id="1"><member type="way" ref="1" role="{role}"/>{relation_tags}</relation></osm>')
+
+
+def test_old_multipolygons_have_their_tags_at_the_outer_way(tmp_path):
+    path = tmp_path / "a.osm"
+    path.write_text(relation("outer", '<tag k="building" v="yes"/><tag k="height" v="7"/>'))
+    (feature,) = assemble(read_osm_xml(path)).features
+    assert feature.name == "relation/1" and feature.tags["height"] == "7"
+
+
+def test_a_relation_without_its_ways_is_cut(tmp_path):
+    path = tmp_path / "a.osm"
+    path.write_text(relation("outer", "", '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/>'
+                             '<member type="way" ref="5" role="outer"/>'))
+    found = assemble(read_osm_xml(path))
+    assert not found.features and "lack nodes or ways" in found.left_out[0].reason
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("", "line 1, column 1: malformed XML"), ("<osm><node", "malformed XML"), ("<html/>", "begins with <html>"),
+    ('<osm>\n<node id="1" lat="91" lon="0"/></osm>', r"line 2: a node has lat='91'; allowed is -90 to 90"),
+    ('<osm><node id="1" lat="nan" lon="0"/></osm>', "lat='nan'"),
+    ('<osm><node id="1" lon="0"/></osm>', "lat=None"),
+    ('<osm><node id="x" lat="1" lon="0"/></osm>', "id='x' is not a whole number"),
+    ('<osm><way id="1"><nd/></way></osm>', "ref=None is not a whole number"),
+])
+def test_broken_xml_names_line_and_value(tmp_path, text, message):
+    (tmp_path / "a.osm").write_text(text)
+    with pytest.raises(BadInput, match=message) as error:
+        read_osm_xml(tmp_path / "a.osm")
+    assert str(tmp_path / "a.osm") in str(error.value)
+
+
+@pytest.mark.parametrize("data", [b"", b"<osm/>", b"\x00\x00\x00\x0d\x0a\x09OSMHeader\x18\xff\xff\xff\x7f", b"x" * 999])
+def test_broken_pbf(tmp_path, data):
+    (tmp_path / "a.osm.pbf").write_bytes(data)
+    with pytest.raises(BadInput, match="not a readable .osm.pbf file|holds no"):
+        if not assemble(read_osm_pbf(tmp_path / "a.osm.pbf")).features:
+            raise BadInput("holds no")
+
+
+def test_missing_package_names_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "osmium", None)
+    with pytest.raises(BadInput, match=r"pip install 'radiotwin\[gis\]'"):
+        read_osm_pbf(tmp_path / "a.osm.pbf")
