@@ -17,7 +17,7 @@ BOXES = {  # name -> row, column, title, what is below it
     "channel": ("inputs", 2, "ChannelModel", "law, network,\nimage paths"),
     "localize": ("inputs", 3, "localize", "positions of\ndevices"),
     "measurements": ("predict", 0, "Measurements", "measurements\n.csv"),
-    "links": ("predict", 1, "LinkData", "joined with map,\nchecked"),
+    "links": ("predict", 1, "Links", "joined with map,\nchecked"),
     "model": ("predict", 2, "FoldModel", "censored\nregression"),
     "twin": ("predict", 3, "Twin", "predict(links)"),
     "map": ("predict", 4, "RadioMap", "mean, sd of\neach position"),

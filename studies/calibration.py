@@ -5,7 +5,7 @@ those of the two traced cities whose maps are right within a survey's error (`te
 the others of which are left for the studies `hidden` and `null`; and campaigns over open ground.
 
     python -m studies calibration --resume      # rows: the loop on each case
-    python -m studies.calibration               # rows -> radiotwin/closeloop/search/calibration.json
+    python -m studies.calibration           # rows -> radiotwin/closeloop/search/calibration.json
 """
 
 import json

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from radiotwin import Measurements, Scene, close_loop, make_report
 from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.predict.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
-from radiotwin.links import LinkData, prepare_links
+from radiotwin.links import Links, prepare_links
 from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from studies.campus import campus, share_within, with_azimuths
@@ -62,7 +62,7 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
                     for name, mean_db in predicted.items()}}
 
 
-def _rows_of(links: LinkData, measured: Measurements, chosen: np.ndarray) -> np.ndarray:
+def _rows_of(links: Links, measured: Measurements, chosen: np.ndarray) -> np.ndarray:
     """Return rows of prepared links that are those of the measurements; some were left out."""
     def keys(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray) -> list[tuple]:
         return list(zip(*np.round(receiver_m[:, :2].T, 3), device, level_db))

@@ -10,7 +10,7 @@ import pandas as pd
 from radiotwin.closeloop.crossfit import make_folds
 from radiotwin.closeloop.output.residuals import rmse_db
 from radiotwin.effects.catalogue.sector_antenna import SectorPattern, sector_pattern_db
-from radiotwin.links import LinkData, prepare_links
+from radiotwin.links import Links, prepare_links
 from radiotwin.links.checks import SURE, chance_inside
 from radiotwin.propagation.laws.followed_paths import interaction_gains
 from radiotwin.propagation.laws.kriging import ResidualField
@@ -30,7 +30,7 @@ def by_class(values: np.ndarray, los: np.ndarray) -> np.ndarray:
     return np.column_stack([values * los, values * (1 - los)])
 
 
-def quick_terms_of(links: LinkData) -> dict[str, np.ndarray]:
+def quick_terms_of(links: Links) -> dict[str, np.ndarray]:
     """Return columns (n, …) of the terms that no path is followed for, by name."""
     city = links.city
     assert city is not None
@@ -51,7 +51,7 @@ def quick_terms_of(links: LinkData) -> dict[str, np.ndarray]:
             links.los, 0.0, chance_inside(city, links.receiver_m))[:, None]}
 
 
-def terms_of(links: LinkData, seed: int) -> dict[str, np.ndarray]:
+def terms_of(links: Links, seed: int) -> dict[str, np.ndarray]:
     """Return columns (n, …) of each term, by name."""
     city = links.city
     assert city is not None
@@ -123,7 +123,7 @@ def fit_terms(seed: int, settings: dict) -> dict:
     return result
 
 
-def _learnt_from_few(links: LinkData, count: int, seed: int) -> dict[str, list[float]]:
+def _learnt_from_few(links: Links, count: int, seed: int) -> dict[str, list[float]]:
     """Return errors on all readings but a few: of terms, and with their residual by kriging."""
     terms, found = quick_terms_of(links), {}
     order = np.random.default_rng(seed).permutation(len(links))

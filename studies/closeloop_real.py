@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import BadInput, Loop, Measurements, close_loop, make_report, read_measurements
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.twin.localize import calibrate_radii, locate, whole_area
 from radiotwin.twin.model.effect_model import EffectModel
@@ -100,7 +100,7 @@ def permuted(measurements: Measurements, seed: int) -> Measurements:
     return Measurements(table, measurements.devices)
 
 
-def explained(loop: Loop) -> CrossValidatedModel:
+def explained(loop: Loop) -> CrossFit:
     """Return the model with the named effects, without interpolation of the rest."""
     return loop.selection.explained or loop.after
 
@@ -122,7 +122,7 @@ def turned_rmse_db(loop: Loop) -> float:
     return explained(loop).extended(turned, [model.fit() for model in turned]).rmse_db()
 
 
-def locate_held_out(loop: Loop, model: CrossValidatedModel) -> dict[str, dict]:
+def locate_held_out(loop: Loop, model: CrossFit) -> dict[str, dict]:
     """Locate devices of each fold by what was learnt from the others, with calibrated 90 % radii.
 
     Returns:

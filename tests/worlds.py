@@ -9,7 +9,7 @@ import pytest
 
 from radiotwin.closeloop.predict.baselines import grow_trees
 from radiotwin.closeloop.predict.predictor import CombinedPrediction
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import fly_survey
@@ -106,7 +106,7 @@ def narrow_street():
 
 @pytest.fixture
 def make_links():
-    """Make the links of every receiver position (n, 3) to every device (k, 3): LinkData of n k links."""
+    """Make the links of every receiver position (n, 3) to every device (k, 3): Links of n k links."""
     def make(device_m, receiver_m, **given):
         device_m, receiver_m = np.atleast_2d(device_m).astype(float), np.atleast_2d(receiver_m).astype(float)
         each, count = len(device_m), len(receiver_m) * len(device_m)
@@ -115,7 +115,7 @@ def make_links():
         names = [[f"{letter}{i}" for i in range(total)] for letter, total in
                  (("d", each), ("r", values["receiver"].max() + 1), ("f", values["flight"].max() + 1))]
         limit_db = -np.inf if values["limit_db"] is None else values["limit_db"]
-        return LinkData(values["level_db"], np.full(count, float(limit_db)), np.repeat(receiver_m, each, axis=0), device_m,
+        return Links(values["level_db"], np.full(count, float(limit_db)), np.repeat(receiver_m, each, axis=0), device_m,
                         np.tile(np.arange(each), len(receiver_m)), values["receiver"], values["flight"],
                         values["time_s"], values["heading_deg"], *names, values.get("frequency_hz", 2.4e9),
                         values.get("city"), True, frozenset(range(each)))

@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from radiotwin.effects import EffectParams, Estimate, GainEffect, Parameter, Term
 from radiotwin.effects.base import LevelAt, ResidualView
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 
 class WetRadome(GainEffect):
@@ -27,7 +27,7 @@ class WetRadome(GainEffect):
         end_s: float = Field(description="End of the rain [s].")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         return None if np.isfinite(links.time_s).any() else "there is no time_s"
 
     @override
@@ -39,7 +39,7 @@ class WetRadome(GainEffect):
         return [episodes[int(np.argmax(gains))]]
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         rains = (links.time_s >= params.start_s) & (links.time_s <= params.end_s)
         return Term.of_columns(-rains[:, None].astype(float), prior_sd_db=5.0)
 
@@ -48,7 +48,7 @@ class WetRadome(GainEffect):
         return None if coefficients[0] > 0 else "rain would have to amplify"
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         return {"loss_db": Parameter.normal(estimate.coefficients[0], estimate.coefficients_sd[0],
                                             "dB")}

@@ -25,7 +25,7 @@ from radiotwin.errors import BadInput
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.held_out import deal_groups
 from radiotwin.inference.student import mean_if_detected
-from radiotwin.links import LinkData, with_evidence
+from radiotwin.links import Links, with_evidence
 from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.evidence import fitting_width_m
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
@@ -65,7 +65,7 @@ class Folds:
         return int(self.index.max()) + 1
 
 
-def make_folds(links: LinkData, seed: int, by: str = "auto") -> Folds:
+def make_folds(links: Links, seed: int, by: str = "auto") -> Folds:
     """Return which links are held out together.
 
     Args:
@@ -96,7 +96,7 @@ def make_folds(links: LinkData, seed: int, by: str = "auto") -> Folds:
     return Folds(by, deal_groups(_blocks(links), MAX_FOLDS, rng))
 
 
-def _blocks(links: LinkData) -> np.ndarray:
+def _blocks(links: Links) -> np.ndarray:
     """Return labels (n,) of squares of ground of the end that moves, or of stretches of time.
 
     Where `BLOCK_M` is too wide for `MIN_BLOCKS`, squares are smaller. Clusters of positions that no
@@ -113,7 +113,7 @@ def _blocks(links: LinkData) -> np.ndarray:
     return stretch
 
 
-def _quadrants(links: LinkData) -> np.ndarray:
+def _quadrants(links: Links) -> np.ndarray:
     """Return labels (n,) of the four parts of the area on either side of its middle link.
 
     Each is a piece of ground that no other link is near to: what is learnt has to extrapolate.
@@ -131,7 +131,7 @@ def _require_several(index: np.ndarray, by: str) -> np.ndarray:
     return index
 
 
-def _flights_are_alike(links: LinkData) -> bool:
+def _flights_are_alike(links: Links) -> bool:
     if len(np.unique(links.flight)) < MIN_FLIGHTS:
         return False
     seen = np.bincount(links.flight[np.isfinite(links.level_db)])
@@ -157,7 +157,7 @@ class Base(ABC):
     max_radius_m: ClassVar[float] = np.inf
 
     @abstractmethod
-    def fit(self, links: LinkData) -> Twin:
+    def fit(self, links: Links) -> Twin:
         """Fit to links.
 
         Raises:
@@ -178,7 +178,7 @@ class LogDistanceBase(Base):
         self._scene, self._seed = scene, seed
 
     @override
-    def fit(self, links: LinkData) -> Twin:
+    def fit(self, links: Links) -> Twin:
         if np.isfinite(links.device_m).all():
             return fit_known(links, LogDistance, self._seed)
         assert self._scene is not None  # without one, links of unlocated devices are left out
@@ -194,10 +194,10 @@ class TwinBase(Base):
     def __init__(self, scene: Scene | None, seed: int) -> None:
         self.scene, self._seed = scene, seed
         # The base that follows paths asks for the same fits again.
-        self._fitted: WeakKeyDictionary[LinkData, Twin] = WeakKeyDictionary()
+        self._fitted: WeakKeyDictionary[Links, Twin] = WeakKeyDictionary()
 
     @override
-    def fit(self, links: LinkData) -> Twin:
+    def fit(self, links: Links) -> Twin:
         if links not in self._fitted:
             if self.scene is None:
                 self._fitted[links] = fit_known(links, SegmentedLogDistance, self._seed)
@@ -223,7 +223,7 @@ class RaytraceBase(Base):
         self._relocation = relocation_from(law.scene, MAX_RADIUS_M)
 
     @override
-    def fit(self, links: LinkData) -> Twin:
+    def fit(self, links: Links) -> Twin:
         return fit_paths(links, self._scene, self._law.fit(links), self._relocation)
 
 
@@ -240,7 +240,7 @@ def make_bases(scene: Scene | None, seed: int) -> dict[str, Base]:
 
 
 @dataclass(eq=False)
-class CrossValidatedModel:
+class CrossFit:
     """A base with effects, of all links and of each fold's others.
 
     Attributes:
@@ -265,17 +265,17 @@ class CrossValidatedModel:
         return [self.whole, *self.folds]
 
     @property
-    def links(self) -> LinkData:
+    def links(self) -> Links:
         """The n links, with the devices where the base has them."""
         return self.whole.links
 
-    def extended(self, models: list[FoldModel], fits: list[FitResult]) -> CrossValidatedModel:
+    def extended(self, models: list[FoldModel], fits: list[FitResult]) -> CrossFit:
         """Return the same base with other effects: the whole, then the folds."""
-        return CrossValidatedModel(models[0], models[1:], fits, self.index, self.twin)
+        return CrossFit(models[0], models[1:], fits, self.index, self.twin)
 
-    def with_shadowing(self, shadowing: list[CorrelatedShadowing]) -> CrossValidatedModel:
+    def with_shadowing(self, shadowing: list[CorrelatedShadowing]) -> CrossFit:
         """Return the same with interpolated shadowing: the whole's, then the folds'."""
-        return CrossValidatedModel(self.whole, self.folds, self.fits, self.index, self.twin,
+        return CrossFit(self.whole, self.folds, self.fits, self.index, self.twin,
                                    shadowing)
 
     def held_out(self, of: Callable[[FoldModel, FitResult], np.ndarray]) -> np.ndarray:
@@ -385,7 +385,7 @@ def _on_the_same_links(whole: FoldModel, fold: FoldModel, of_whole: list[int],
             if as_many or shared[row, column] > 1e-9]
 
 
-def without_quality(model: CrossValidatedModel) -> CrossValidatedModel:
+def without_quality(model: CrossFit) -> CrossFit:
     """Return a model whose links do not know their own quality, as no map does.
 
     Each has the median of its fold's training links instead; nothing is fitted again.
@@ -408,13 +408,13 @@ def without_quality(model: CrossValidatedModel) -> CrossValidatedModel:
     return model.extended(models, model.fits).with_shadowing(model.shadowing)
 
 
-def training_parts(links: LinkData, folds: Folds) -> list[LinkData]:
+def training_parts(links: Links, folds: Folds) -> list[Links]:
     """Return the links outside each fold; the same objects serve every base."""
     return [links.select(folds.index != number) for number in range(folds.count)]
 
 
-def cross_validate(links: LinkData, base: Base, folds: Folds,
-                   parts: list[LinkData]) -> CrossValidatedModel:
+def cross_validate(links: Links, base: Base, folds: Folds,
+                   parts: list[Links]) -> CrossFit:
     """Fit a base to all links, and to those outside each fold.
 
     Args:
@@ -441,10 +441,10 @@ def cross_validate(links: LinkData, base: Base, folds: Folds,
         models.append(FoldModel.build(links, fitted.channel, dof, device_m=base.device_m(fitted),
                                       train=folds.index != number))
     fits = [model.fit() for model in (whole, *models)]
-    return CrossValidatedModel(whole, models, fits, folds.index, twin)
+    return CrossFit(whole, models, fits, folds.index, twin)
 
 
-def _with_evidence(links: LinkData, whole: FoldModel) -> LinkData:
+def _with_evidence(links: Links, whole: FoldModel) -> Links:
     """Return links with pieces of evidence that fit the base's residual, if they have none yet."""
     if links.evidence is not None:
         return links

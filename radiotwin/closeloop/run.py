@@ -13,7 +13,7 @@ import numpy as np
 
 from radiotwin.closeloop.crossfit import (
     BASES,
-    CrossValidatedModel,
+    CrossFit,
     Folds,
     LogDistanceBase,
     cross_validate,
@@ -37,7 +37,7 @@ from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue
 from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
-from radiotwin.links import LinkData, prepare_links, residual_variables
+from radiotwin.links import Links, prepare_links, residual_variables
 from radiotwin.links.checks import refuse_misplaced_anchors
 from radiotwin.links.correlation import moving_end_m, pair_of_ends
 from radiotwin.links.limits import limits_to_explain
@@ -52,7 +52,7 @@ MAX_LINKS = 120_000  # up to which all are used
 SAMPLE_LINKS = 60_000  # of more: takes minutes
 
 
-def thin_piles(links: LinkData) -> LinkData:
+def thin_piles(links: Links) -> Links:
     """Return links of which no place has far more than the others have, with a note.
 
     A receiver that hovers reads one and the same error many times. What a place (of one pair of
@@ -78,7 +78,7 @@ def thin_piles(links: LinkData) -> LinkData:
     return replace(links.select(kept), notes=[*links.notes, note])
 
 
-def thin_links(links: LinkData, seed: int) -> LinkData:
+def thin_links(links: Links, seed: int) -> Links:
     """Return the links, or a sample of very many, with a note that says so.
 
     The links of each flight, device and receiver are taken in the order of their times, and of as
@@ -119,9 +119,9 @@ class Loop(Summarised):
     """
 
     base: str
-    links: LinkData
+    links: Links
     folds: Folds
-    before: CrossValidatedModel
+    before: CrossFit
     selection: SelectionResult
     dependences_before: list[ResidualDependence]
     dependences_after: list[ResidualDependence]
@@ -130,12 +130,12 @@ class Loop(Summarised):
     origin: Origin | None = None
 
     @property
-    def after(self) -> CrossValidatedModel:
+    def after(self) -> CrossFit:
         """Base and effects."""
         return self.selection.model
 
     @cached_property
-    def for_twin(self) -> CrossValidatedModel:
+    def for_twin(self) -> CrossFit:
         """The same without curves that no map has; with the rest, if it goes with just that."""
         dropped = [each.effect for each in self.after.whole.effects
                    if not (each.effect.is_cause or each.effect.is_declared
@@ -296,7 +296,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
                 seed, _noise_floor_db(all_links, criteria), measurements.origin)
 
 
-def best_base(models: dict[str, CrossValidatedModel]) -> str:
+def best_base(models: dict[str, CrossFit]) -> str:
     """Return the base with the least held-out error of the links that all can predict.
 
     One that cannot locate the devices that are hard to predict does not win by that. Of several
@@ -310,13 +310,13 @@ def best_base(models: dict[str, CrossValidatedModel]) -> str:
     return min(models, key=lambda name: models[name].rmse_db(in_common))
 
 
-def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependence]:
+def _dependences(model: CrossFit, seed: int) -> list[ResidualDependence]:
     mean_db = model.held_out_mean_db
     residual_db = np.where(model.unforeseen, np.nan, model.links.level_db - mean_db)
     return residual_dependences(model.links, residual_db, model.held_out_reading[1], mean_db, seed)
 
 
-def _noise_floor_db(links: LinkData, criteria: SelectionCriteria) -> float:
+def _noise_floor_db(links: Links, criteria: SelectionCriteria) -> float:
     """Return the standard deviation of one measurement [dB], from repeats at one position."""
     place = np.round(np.column_stack([links.receiver_m, links.device, links.receiver]), 1)
     group = np.unique(place, axis=0, return_inverse=True)[1].ravel()

@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkData, LinkGeometry
+from radiotwin.links import LinkGeometry, Links
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import channel_named
 from radiotwin.propagation.laws.image_paths import ImagePaths
@@ -203,7 +203,7 @@ class TwinSource(GainSource):
             return found.mean_db, found.sd_db
         twin = self._twin
         device_m = np.vstack([np.nan_to_num(twin.device_m), each.position_m])
-        links = LinkData.synthetic(
+        links = Links.synthetic(
             device_m, np.full(len(receiver_m), len(twin.devices)), receiver_m,
             device_names=[*(device.device for device in twin.devices), each.name],
             limit_db=twin.limit_db, frequency_hz=self._scene.config.radio.frequency_hz,

@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
 
 MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
@@ -22,9 +22,9 @@ class LinkCache:
     """Values derived from links, kept for as long as those links are in use."""
 
     def __init__(self) -> None:
-        self._known: WeakKeyDictionary[LinkData, dict] = WeakKeyDictionary()
+        self._known: WeakKeyDictionary[Links, dict] = WeakKeyDictionary()
 
-    def get(self, links: LinkData, key: Hashable, derive: Callable[[], Any]) -> Any:
+    def get(self, links: Links, key: Hashable, derive: Callable[[], Any]) -> Any:
         """Return the value of `derive`, called once for these links and this key."""
         known = self._known.setdefault(links, {})
         if key not in known:
@@ -39,7 +39,7 @@ class LinkCache:
         """Decide nothing: what is remembered could be derived again."""
 
 
-def city_of(links: LinkData, effect: str) -> CityMap:
+def city_of(links: Links, effect: str) -> CityMap:
     """Return the 3D map that an effect needs.
 
     Raises:
@@ -51,7 +51,7 @@ def city_of(links: LinkData, effect: str) -> CityMap:
     return links.city
 
 
-def ends_above(links: LinkData, place_m: Sequence[float],
+def ends_above(links: Links, place_m: Sequence[float],
                rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends (n, 3) of links, heights above the ground below one place [m].
 
@@ -67,7 +67,7 @@ def ends_above(links: LinkData, place_m: Sequence[float],
     return ends_m[0] - base_m, ends_m[1] - base_m
 
 
-def ends_above_ground(links: LinkData, rows: np.ndarray | slice = slice(None)
+def ends_above_ground(links: Links, rows: np.ndarray | slice = slice(None)
                       ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ends (n, 3) of links, each with its height above the ground below it [m].
 

@@ -31,7 +31,7 @@ from radiotwin.effects.params import (
     quantities,
 )
 from radiotwin.inference.student import Losses
-from radiotwin.links import LinkData, design_effect, evidence_blocks
+from radiotwin.links import Links, design_effect, evidence_blocks
 
 if TYPE_CHECKING:
     from radiotwin.scene.citymap import CityMap
@@ -134,7 +134,7 @@ class Effect(ABC):
     uses: ClassVar[tuple[str, ...]] = ()
     needs_map: ClassVar[bool] = False
 
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         """Return why the data do not allow this effect to be looked for; None where they do.
 
         By default, because it needs a map and there is none.
@@ -157,7 +157,7 @@ class Effect(ABC):
         return self.propose(view)
 
     @abstractmethod
-    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
         """Return what it adds to the mean level of n links.
 
         Args:
@@ -188,7 +188,7 @@ class Effect(ABC):
         """Return whether a map, which has neither receivers nor times, is drawn with it."""
         return not self.of_receiver
 
-    def reach(self, links: LinkData, params: Any) -> np.ndarray | None:
+    def reach(self, links: Links, params: Any) -> np.ndarray | None:
         """Return which (n,) links similar parameters may act on; None for any."""
         return None
 
@@ -217,11 +217,11 @@ class Effect(ABC):
         """
         return None
 
-    def contradicted(self, params: Any, links: LinkData) -> str | None:
+    def contradicted(self, params: Any, links: Links) -> str | None:
         """Return what in the map of n links speaks against fitted parameters; None for nothing."""
         return None
 
-    def parameters(self, links: LinkData, params: Any, estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, params: Any, estimate: Estimate) -> dict[str, Parameter]:
         """Return what was found, by name; by default every parameter made with `quantity`."""
         return {name: Parameter.normal(getattr(params, name), sd, each["unit"],
                                        Allowed(each["low"], each["high"]))
@@ -241,11 +241,11 @@ class GainEffect(Effect):
 
     stage = "gain"
 
-    def gain_db(self, links: LinkData, params: Any) -> np.ndarray:
+    def gain_db(self, links: Links, params: Any) -> np.ndarray:
         """Return what it adds to each link (n,) [dB]; a loss is negative."""
         raise NotImplementedError(f"{type(self).__name__} defines neither gain_db nor term")
 
-    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
         """Return `gain_db` as a term without coefficients."""
         return Term.of_offset(self.gain_db(links, params))
 
@@ -253,7 +253,7 @@ class GainEffect(Effect):
 class _ResponseEffect(Effect):
     """An effect that maps one level to another; override `inputs`, or `term` that carries them."""
 
-    def inputs(self, links: LinkData, params: Any) -> np.ndarray:
+    def inputs(self, links: Links, params: Any) -> np.ndarray:
         """Return what `response` needs of each link (n, …)."""
         raise NotImplementedError(f"{type(self).__name__} defines neither inputs nor term")
 
@@ -271,7 +271,7 @@ class _ResponseEffect(Effect):
             (n,) [dB], and its slope in `level_db` (n,), above zero.
         """
 
-    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
         """Return a term that adds nothing and carries the inputs."""
         return Term.of_inputs(self.inputs(links, params))
 
@@ -294,7 +294,7 @@ class _BlankingEffect(Effect):
 
     of_receiver = True
 
-    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
         """Return a term that adds nothing."""
         return Term.of_offset(np.zeros(len(links)))
 
@@ -305,7 +305,7 @@ class DetectionEffect(_BlankingEffect):
     stage = "detection"
 
     @abstractmethod
-    def losses(self, links: LinkData, params: Any) -> Losses:
+    def losses(self, links: Links, params: Any) -> Losses:
         """Return what becomes of n links; each value (n,), probabilities below 1."""
 
 
@@ -315,14 +315,14 @@ class LimitEffect(_BlankingEffect):
     stage = "limit"
 
     @abstractmethod
-    def limits_db(self, links: LinkData, params: Any) -> np.ndarray:
+    def limits_db(self, links: Links, params: Any) -> np.ndarray:
         """Return the level (n,) below which links are blank; -inf where the declared one holds."""
 
 
 class LevelAt(Protocol):
     """Levels (n,) [dB] that the channel predicts for other links, such as with moved devices."""
 
-    def __call__(self, links: LinkData, exact: bool = False) -> np.ndarray:
+    def __call__(self, links: Links, exact: bool = False) -> np.ndarray:
         """Return them quickly, or exactly (following paths, where the channel does)."""
 
 
@@ -340,7 +340,7 @@ class ResidualView:
         found: name and parameters of the effects so far.
     """
 
-    links: LinkData
+    links: Links
     residual_db: np.ndarray
     scale_db: np.ndarray
     mean_db: np.ndarray

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from radiotwin.effects.arrays import ends_above
 from radiotwin.effects.params import Length, Metres
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
 
 SAMPLE_M = 5.0  # between points on a link, while it is back-projected
@@ -165,13 +165,13 @@ def _share_below(start_z_m: np.ndarray, rise_m: np.ndarray, enter: np.ndarray, l
     return np.where(level & (start_z_m >= height_m), 0.0, below)
 
 
-def devices_through(box: Box, links: LinkData) -> np.ndarray:
+def devices_through(box: Box, links: Links) -> np.ndarray:
     """Return how many of the links of each device (k,) pass a box."""
     inside = cross(box, *ends_above(links, box[:2])).inside_m > 0
     return np.bincount(links.device[inside], minlength=len(links.device_m))
 
 
-def is_beside_unknown(through: np.ndarray, links: LinkData) -> bool:
+def is_beside_unknown(through: np.ndarray, links: Links) -> bool:
     """Return whether nearly all links through a box are of devices of estimated positions.
 
     Args:
@@ -181,7 +181,7 @@ def is_beside_unknown(through: np.ndarray, links: LinkData) -> bool:
     return bool(through[sorted(links.anchors)].sum() < MIN_SHARE * through.sum())
 
 
-def is_seen_from_one_place(through: np.ndarray, links: LinkData) -> bool:
+def is_seen_from_one_place(through: np.ndarray, links: Links) -> bool:
     """Return whether nearly all links through a box are of devices that stand together.
 
     Along their lines a large box far away hides what a small one nearby does. Arguments as of

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from radiotwin.effects.arrays import robust_sd
 from radiotwin.effects.base import ResidualView
-from radiotwin.links import LinkData, correlation_length_m
+from radiotwin.links import Links, correlation_length_m
 from radiotwin.links.correlation import devices_move, step_m
 
 NEIGHBOURS = 24  # nearest links that are looked at, of which some are of other flights
@@ -117,7 +117,7 @@ def share_alike(label: np.ndarray, value_db: np.ndarray, weight: np.ndarray, min
         if means else 0.0
 
 
-def flight_mask(links: LinkData, receiver: int | None, flight: str | None) -> np.ndarray:
+def flight_mask(links: Links, receiver: int | None, flight: str | None) -> np.ndarray:
     """Return (n,) bool, links of a receiver on a flight of that name; None: of all."""
     mine = np.ones(len(links), dtype=bool)
     if receiver is not None:

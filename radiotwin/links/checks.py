@@ -18,7 +18,7 @@ import pandas as pd
 from radiotwin.errors import BadInput
 from radiotwin.geo.frames import is_same_frame, place
 from radiotwin.io.texts import percent
-from radiotwin.links.link_data import LinkData
+from radiotwin.links.links import Links
 from radiotwin.links.measurements import MAX_APART_M, Measurements
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
@@ -258,7 +258,7 @@ def receiver_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
             if odd.any()] + height_notes(receiver_m, scene)
 
 
-def refuse_misplaced_anchors(links: LinkData, scene: Scene) -> None:
+def refuse_misplaced_anchors(links: Links, scene: Scene) -> None:
     """Check that anchors are where a device can be.
 
     Raises:

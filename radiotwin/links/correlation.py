@@ -28,7 +28,7 @@ from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from radiotwin.links.link_data import LinkData
+from radiotwin.links.links import Links
 
 MAX_LINKS = 20_000  # a sample of more has pairs enough
 NEIGHBOURS = 8  # nearest, of each link: the short distances
@@ -87,7 +87,7 @@ class Trend:
     basis: np.ndarray
 
     @classmethod
-    def of(cls, links: LinkData, rows: np.ndarray, series: np.ndarray) -> Trend:
+    def of(cls, links: Links, rows: np.ndarray, series: np.ndarray) -> Trend:
         """Return the trend of some rows (m,) of links (n,), with the series (n,) of each link."""
         own = series[rows]
         columns = (own[:, None] == np.unique(own)).astype(float)
@@ -252,21 +252,21 @@ def _apart_m(position_m: np.ndarray, first: np.ndarray, second: np.ndarray) -> n
     return np.linalg.norm(position_m[first] - position_m[second], axis=1)
 
 
-def devices_move(links: LinkData) -> bool:
+def devices_move(links: Links) -> bool:
     """Return whether devices are positions of one that moves: most are read once by a receiver."""
     series = pd.DataFrame({"device": links.device, "receiver": links.receiver,
                            "flight": links.flight})
     return len(series.drop_duplicates()) > len(links) / MIN_SERIES
 
 
-def moving_end_m(links: LinkData) -> np.ndarray:
+def moving_end_m(links: Links) -> np.ndarray:
     """Return the positions (n, 3) of the end that moves [m]; 0 where unknown."""
     if devices_move(links):
         return np.nan_to_num(links.device_m[links.device])
     return links.receiver_m
 
 
-def pair_of_ends(links: LinkData) -> np.ndarray:
+def pair_of_ends(links: Links) -> np.ndarray:
     """Return a label (n,) of each link's device and receiver; where devices move, of the latter."""
     if devices_move(links):
         return links.receiver
@@ -279,7 +279,7 @@ def extent_m(position_m: np.ndarray) -> float:
     return float(np.hypot(*(high - low)))
 
 
-def step_m(links: LinkData) -> float:
+def step_m(links: Links) -> float:
     """Return the usual distance from a place to the nearest other one of its pair of ends [m]."""
     place, offset_m = _apart(links, pair_of_ends(links))
     places = pd.DataFrame(np.round(place / MIN_STEP_M)).drop_duplicates().to_numpy() * MIN_STEP_M
@@ -291,7 +291,7 @@ def step_m(links: LinkData) -> float:
     return float(np.median(nearest)) if len(nearest) else 0.0
 
 
-def correlation_length_m(links: LinkData, z: np.ndarray) -> float:
+def correlation_length_m(links: Links, z: np.ndarray) -> float:
     """Return the distance over which the correlation of a residual falls to 1/e [m].
 
     At least the usual step between places, which is also what a residual without any correlation
@@ -307,7 +307,7 @@ def correlation_length_m(links: LinkData, z: np.ndarray) -> float:
 
 
 @lru_cache(maxsize=REMEMBERED)
-def _variogram(links: LinkData, seen: bytes) -> tuple[float, np.ndarray, Variogram | None]:
+def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram | None]:
     """Return the least length [m], rows (m,) of the links that were seen, and what they allow.
 
     Every effect and every step asks for the same links, of which this is the slow part.
@@ -331,7 +331,7 @@ def _variogram(links: LinkData, seen: bytes) -> tuple[float, np.ndarray, Variogr
         np.geomspace(least_m, most_m, LENGTHS))
 
 
-def _apart(links: LinkData, label: np.ndarray) -> tuple[np.ndarray, float]:
+def _apart(links: Links, label: np.ndarray) -> tuple[np.ndarray, float]:
     """Return places (n, 7) [m] and the distance between series [m].
 
     A place is both ends' positions, and far from all places of another label (n,).

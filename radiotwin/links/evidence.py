@@ -11,7 +11,7 @@ from radiotwin.links.correlation import (
     pair_of_ends,
     step_m,
 )
-from radiotwin.links.link_data import LinkData
+from radiotwin.links.links import Links
 
 LENGTHS = 1.0  # side of a piece over the correlation length
 # Side of a place over it: a square of the area over which exp(-d/L) adds up to 1, 2 pi L².
@@ -22,7 +22,7 @@ NARROWER = 0.8  # from one width that is tried to the next
 LITTLE = 30  # places: fewer say little
 
 
-def evidence_blocks(links: LinkData) -> np.ndarray:
+def evidence_blocks(links: Links) -> np.ndarray:
     """Return the piece of evidence that each link belongs to.
 
     Links of one device and receiver that are close to each other on the ground and in one flight
@@ -38,7 +38,7 @@ def evidence_blocks(links: LinkData) -> np.ndarray:
     return _evidence(links)[:, 0]
 
 
-def places(links: LinkData) -> np.ndarray:
+def places(links: Links) -> np.ndarray:
     """Return the place that each link belongs to: squares of ground that both its ends are in.
 
     What stands beside a way shadows every flight that comes along it again, whatever the receiver,
@@ -53,14 +53,14 @@ def places(links: LinkData) -> np.ndarray:
     return _evidence(links)[:, 1]
 
 
-def _evidence(links: LinkData) -> np.ndarray:
+def _evidence(links: Links) -> np.ndarray:
     if links.evidence is not None:
         return links.evidence
     width_m = fitting_width_m(links, UNKNOWN_M)
     return _pieces(links, width_m, width_m)
 
 
-def with_evidence(links: LinkData, z: np.ndarray) -> LinkData:
+def with_evidence(links: Links, z: np.ndarray) -> Links:
     """Return links whose pieces of evidence fit a residual, with notes on them.
 
     Done once, by the residual of the base: then all that is scored later counts the same pieces.
@@ -79,7 +79,7 @@ def with_evidence(links: LinkData, z: np.ndarray) -> LinkData:
     return replace(links, evidence=pieces, notes=[*links.notes, *notes])
 
 
-def fitting_width_m(links: LinkData, wanted_m: float, places: int = MIN_PLACES) -> float:
+def fitting_width_m(links: Links, wanted_m: float, places: int = MIN_PLACES) -> float:
     """Return the side of squares that the ground is cut into [m].
 
     As wanted, or less where the end that moves would then be in fewer than so many squares; at
@@ -97,7 +97,7 @@ def _occupied(position_m: np.ndarray, width_m: float) -> int:
     return len(np.unique(np.floor(position_m[:, :2] / width_m), axis=0))
 
 
-def _pieces(links: LinkData, width_m: float, place_m: float) -> np.ndarray:
+def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
     """Return labels (n, 2): squares of one pair of ends and flight, and larger ones of all."""
     pieces, squares = (np.column_stack([np.floor(end[:, :2] / side_m).astype(np.int64) for end in
                                         (links.receiver_m,

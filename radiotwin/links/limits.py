@@ -18,7 +18,7 @@ from scipy.special import log_ndtr, logsumexp, ndtr, stdtr
 
 from radiotwin.io.texts import percent
 from radiotwin.links.evidence import design_effect, evidence_blocks
-from radiotwin.links.link_data import LinkData
+from radiotwin.links.links import Links
 
 SLOPE_DB, SLOPE_SD_DB = -30.0, 10.0  # prior of the fall per decade: path-loss exponent 2 to 4
 END_SD_DB = 8.0  # prior of what one device, or one receiver, differs from the others
@@ -204,7 +204,7 @@ def _nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray, scale_
     return nats, (blanks * np.log(share) + readings * np.log1p(-share)) / as_one
 
 
-def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndarray, list[str]]:
+def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray, list[str]]:
     """Estimate the limit of detection of each receiver, and judge a declared one.
 
     Args:
@@ -245,7 +245,7 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
     return own_db[links.receiver], notes
 
 
-def _says_nothing(links: LinkData, declared_db: float) -> str | None:
+def _says_nothing(links: Links, declared_db: float) -> str | None:
     """Return why a declared limit is not looked at, a sentence; None where it may be right.
 
     Signals of all levels arrive, so where some are too weak others are just strong enough. A limit
@@ -262,14 +262,14 @@ def _says_nothing(links: LinkData, declared_db: float) -> str | None:
             f"{blanks:,} links are blank")
 
 
-def _declared(links: LinkData, declared_db: float) -> str:
+def _declared(links: Links, declared_db: float) -> str:
     """Name a declared limit by its value and by where it is declared."""
     of = "sensitivity_dbm less tx_power_dbm" if links.is_gain else "sensitivity_dbm"
     return (f"the declared limit of detection, {declared_db:g} {links.level_unit} ({of} of "
             "scene.toml; the default, if nobody set it),")
 
 
-def _usual_db(links: LinkData, rows: list[np.ndarray], found: list[LimitEstimate | None],
+def _usual_db(links: Links, rows: list[np.ndarray], found: list[LimitEstimate | None],
               together: LimitEstimate | None, declared_db: float) -> float | None:
     """Return the limit of receivers whose own links do not show it [dB]; None: nothing is known.
 
@@ -308,7 +308,7 @@ def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) ->
     return found.is_sure and sure and not reaches
 
 
-def _estimates(links: LinkData, rows: list[np.ndarray], declared_db: float,
+def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
                ) -> tuple[list[LimitEstimate | None], LimitEstimate | None]:
     """Return the estimate of each receiver's links, and that of all links together."""
     blank = np.isnan(links.level_db)
@@ -339,7 +339,7 @@ def _lowest_db(level_db: np.ndarray) -> float:
     return float(read_db[int(ODD_SHARE * len(read_db))]) if len(read_db) else np.inf
 
 
-def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
+def _notes(links: Links, rows: list[np.ndarray], own_db: np.ndarray,
            found: list[LimitEstimate | None], declared_db: float, lost: list[int]) -> list[str]:
     """Return what is odd about the limits of receivers (r,), a sentence each."""
     unit, notes = links.level_unit, []
@@ -370,7 +370,7 @@ def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
     return notes
 
 
-def _used_instead(links: LinkData, own_db: np.ndarray, found: list[LimitEstimate | None],
+def _used_instead(links: Links, own_db: np.ndarray, found: list[LimitEstimate | None],
                   receivers: list[int]) -> str:
     used = "; ".join(_used(links.receiver_names[r], own_db[r], found[r], links.level_unit)
                      for r in receivers[:MAX_NAMED])
@@ -394,7 +394,7 @@ def lower_median(values: np.ndarray | list[float]) -> float:
     return float(np.sort(values)[(len(values) - 1) // 2])
 
 
-def limits_to_explain(links: LinkData) -> LinkData:
+def limits_to_explain(links: Links) -> Links:
     """Return links with the limits of faultless receivers, so that effects must explain blanks.
 
     A receiver that is clearly less sensitive than most has the usual limit, and one whose links are

@@ -25,7 +25,7 @@ from radiotwin.links.checks import (
     useless_receivers,
 )
 from radiotwin.links.limits import estimate_limits
-from radiotwin.links.link_data import RESTART_NOTE, LinkData
+from radiotwin.links.links import RESTART_NOTE, Links
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 
@@ -34,7 +34,7 @@ MAX_OTHER_FREQUENCY = 0.1  # share; levels by frequency differ by 1 dB and less 
 ASSUMED_HEIGHT_M = 1.5  # of an end whose height is blank: a hand-held phone's
 
 
-def join_links(measurements: Measurements, scene: Scene) -> LinkData:
+def join_links(measurements: Measurements, scene: Scene) -> Links:
     """Join all measurements with a scene as they are: nothing is left out.
 
     Only the limit of detection that the scene declares is compared with the readings.
@@ -63,7 +63,7 @@ def join_links(measurements: Measurements, scene: Scene) -> LinkData:
 
 
 def prepare_links(measurements: Measurements, scene: Scene | None,
-                  to_locate: bool = False) -> LinkData:
+                  to_locate: bool = False) -> Links:
     """Join measurements with a scene, leave out what cannot be used, and note what was left out.
 
     Args:
@@ -166,7 +166,7 @@ def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.
 
 def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
                level_db: np.ndarray, receiver_m: np.ndarray, device_m: np.ndarray,
-               device: np.ndarray, kept_devices: np.ndarray, notes: list[str]) -> LinkData:
+               device: np.ndarray, kept_devices: np.ndarray, notes: list[str]) -> Links:
     """Join rows that are kept already; `kept_devices` (k,) are rows of the table of devices."""
     receiver, receiver_names = pd.factorize(table["receiver"], sort=True)
     flight, flight_names = pd.factorize(table["flight"])
@@ -182,7 +182,7 @@ def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | N
     notes += _other_frequencies(_column(measurements.devices, "frequency_hz")[kept_devices],
                                 frequency_hz)
     anchors = frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist())
-    links = LinkData(
+    links = Links(
         level_db, np.full(len(level_db), -np.inf), receiver_m, device_m, device, receiver,
         flight, _column(table, "time_s"), heading_deg % 360,
         list(measurements.devices["device"].iloc[kept_devices]), list(receiver_names),

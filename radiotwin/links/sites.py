@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import t as student
 
 from radiotwin.links.correlation import devices_move
-from radiotwin.links.link_data import LinkData
+from radiotwin.links.links import Links
 
 SAME_SITE_M = 1.0  # apart at most: sectors of one mast; declared positions are good to that
 SAME_DIRECTION_DEG = 5.0  # azimuths within it are of one antenna, or of two side by side
@@ -37,7 +37,7 @@ MIN_SD_DB = 0.1
 QUANTILE = 0.95  # upper end of a 90 % interval
 
 
-def site_of(links: LinkData, device: int) -> list[int]:
+def site_of(links: Links, device: int) -> list[int]:
     """Return the device and the anchors that share its mast, in order.
 
     Args:
@@ -49,7 +49,7 @@ def site_of(links: LinkData, device: int) -> list[int]:
             if other == device or other in links.anchors]
 
 
-def antenna_of(links: LinkData, device: int) -> list[int]:
+def antenna_of(links: Links, device: int) -> list[int]:
     """Return the device and those of its mast whose declared azimuth is the same, in order.
 
     They are carriers through one antenna, or through antennas side by side. Arguments as of
@@ -63,7 +63,7 @@ def antenna_of(links: LinkData, device: int) -> list[int]:
     return sorted(found)
 
 
-def relatives_of(links: LinkData, device: int, heard: set[int]) -> list[int]:
+def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
     """Return whose signals reach a receiver on nearly the same ways as those of a device.
 
     The others of its antenna that were heard, or where there are none of its mast.
@@ -102,7 +102,7 @@ class ReceiverDifference:
     places: int
 
 
-def receiver_differences(links: LinkData) -> list[ReceiverDifference]:
+def receiver_differences(links: Links) -> list[ReceiverDifference]:
     """Compare every two receivers that read the same devices at the same places.
 
     Args:
@@ -120,7 +120,7 @@ def receiver_differences(links: LinkData) -> list[ReceiverDifference]:
     return [each for each in found if each is not None]
 
 
-def _difference(links: LinkData, first: int, second: int) -> ReceiverDifference | None:
+def _difference(links: Links, first: int, second: int) -> ReceiverDifference | None:
     pairs = _pairs(links, first, second)
     if len(pairs) < MIN_PAIRS:
         return None
@@ -141,7 +141,7 @@ def _difference(links: LinkData, first: int, second: int) -> ReceiverDifference 
                               len(pairs), len(places))
 
 
-def _pairs(links: LinkData, first: int, second: int) -> pd.DataFrame:
+def _pairs(links: Links, first: int, second: int) -> pd.DataFrame:
     """Return each reading of the first with the nearest of the second to the same device."""
     read = np.isfinite(links.level_db)
     parts = []

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from radiotwin.links.link_data import LinkData
+from radiotwin.links.links import Links
 
 CELL_M = 60.0  # side of the cells of ground that positions are sorted into
 MAX_LABELS = 40  # devices or receivers that get a column each; more are told by their positions
@@ -19,7 +19,7 @@ OF_GEOMETRY, OF_BORESIGHT = 14, 2  # columns
 NO_EDGE = -10.0  # stands for a diffraction parameter without a map: far from any edge
 
 
-def residual_variables(links: LinkData, mean_db: np.ndarray) -> dict[str, np.ndarray]:
+def residual_variables(links: Links, mean_db: np.ndarray) -> dict[str, np.ndarray]:
     """Return every variable that a residual may depend on, by name.
 
     Args:
@@ -32,7 +32,7 @@ def residual_variables(links: LinkData, mean_db: np.ndarray) -> dict[str, np.nda
     return {name: variable(links, mean_db) for name, variable in VARIABLES.items()}
 
 
-def residual_variable(name: str, links: LinkData, mean_db: np.ndarray) -> np.ndarray:
+def residual_variable(name: str, links: Links, mean_db: np.ndarray) -> np.ndarray:
     """Return one of `residual_variables`, without the time that others take."""
     return VARIABLES[name](links, mean_db)
 
@@ -43,7 +43,7 @@ def _cells(position_m: np.ndarray) -> np.ndarray:
     return np.unique(squares, axis=0, return_inverse=True)[1].ravel()
 
 
-VARIABLES: dict[str, Callable[[LinkData, np.ndarray], np.ndarray]] = {
+VARIABLES: dict[str, Callable[[Links, np.ndarray], np.ndarray]] = {
     "distance_m": lambda links, _: links.distance_m,
     "elevation_deg": lambda links, _: links.elevation_deg,
     "azimuth_deg": lambda links, _: links.azimuth_deg,
@@ -78,7 +78,7 @@ def feature_count(devices: int, declared: bool) -> int:
     return OF_GEOMETRY + OF_BORESIGHT * declared + labels
 
 
-def link_features(links: LinkData, receivers: bool = True) -> np.ndarray:
+def link_features(links: Links, receivers: bool = True) -> np.ndarray:
     """Return position, geometry and angles, and which device and receiver it is, as numbers.
 
     Neither time nor columns that the receiver reports beside the level: a map has none.

@@ -10,7 +10,7 @@ import numpy as np
 
 import radiotwin
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkData, LinkGeometry, link_geometry
+from radiotwin.links import LinkGeometry, Links, link_geometry
 from radiotwin.links.prepare import ASSUMED_HEIGHT_M
 from radiotwin.propagation.laws import ChannelModel, check_fit_data, fit_once
 from radiotwin.propagation.laws.base import MIN_DETECTED
@@ -27,7 +27,7 @@ from radiotwin.twin.localize import (
 from radiotwin.twin.twin import Twin
 
 
-def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: int,
+def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int,
               start: Twin | None = None, settings: LocalizeSettings | None = None) -> Twin:
     """Learn a channel from the anchors' links, then locate the unknown devices with it.
 
@@ -64,7 +64,7 @@ def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: 
     return Twin(fitted, devices, level_of(links), links.usual_limit_db, provenance(links, scene))
 
 
-def fit_known(links: LinkData, channel: type[ChannelModel], seed: int) -> Twin:
+def fit_known(links: Links, channel: type[ChannelModel], seed: int) -> Twin:
     """Learn a channel from links whose devices all have declared positions; no scene is needed.
 
     Raises:
@@ -92,7 +92,7 @@ def reliable_m(devices: list[TwinDevice], max_radius_m: float = np.inf) -> np.nd
     return np.where(located[:, None], positions_m, np.nan)
 
 
-def _fit_channel(links: LinkData, device_m: np.ndarray, channel: type[ChannelModel],
+def _fit_channel(links: Links, device_m: np.ndarray, channel: type[ChannelModel],
                  seed: int) -> ChannelModel:
     """Fit to the links of all devices whose position in `device_m` (k, 3) is known."""
     if not links.anchors:
@@ -108,7 +108,7 @@ def _fit_channel(links: LinkData, device_m: np.ndarray, channel: type[ChannelMod
     return fit_once(channel, geometry, level_db, limit_db, seed)
 
 
-def _known_links(links: LinkData, device_m: np.ndarray
+def _known_links(links: Links, device_m: np.ndarray
                  ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
     """Return the m links of devices with a position in `device_m` (k, 3), levels and limits."""
     known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
@@ -117,7 +117,7 @@ def _known_links(links: LinkData, device_m: np.ndarray
         links.limit_db[known]
 
 
-def _published(links: LinkData, device_m: np.ndarray, scene: Scene,
+def _published(links: Links, device_m: np.ndarray, scene: Scene,
                law: type[PublishedLaw]) -> PublishedLaw:
     """Return a law as it was published; warn of the transmit power, where levels are powers.
 
@@ -137,7 +137,7 @@ def _published(links: LinkData, device_m: np.ndarray, scene: Scene,
     return fitted
 
 
-def _locate(links: LinkData, scene: Scene, channel: ChannelModel, unknown: np.ndarray, seed: int,
+def _locate(links: Links, scene: Scene, channel: ChannelModel, unknown: np.ndarray, seed: int,
             start: Twin | None, settings: LocalizeSettings | None) -> list[TwinDevice]:
     start_m = None
     if start is not None:
@@ -167,12 +167,12 @@ def _device(name: str, found: DeviceEstimate) -> TwinDevice:
                       float(found.credible_radius_m), found.second_mode)
 
 
-def level_of(links: LinkData) -> str:
+def level_of(links: Links) -> str:
     """Return the name of what links hold, as of `Twin.level`."""
     return "gain_db" if links.is_gain else "rssi_dbm"
 
 
-def provenance(links: LinkData, scene: Scene | None) -> dict[str, Any]:
+def provenance(links: Links, scene: Scene | None) -> dict[str, Any]:
     """Return what a twin says of what it was made of."""
     own: dict[str, Any] = {}
     if scene is not None:

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import f
 
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import drop_uninformative
 from radiotwin.propagation.laws.image_paths import ImagePaths
@@ -50,7 +50,7 @@ MAX_COPIES = 4  # anchors that are located as if they were unknown
 PRIOR_DEVICES = 2  # that the radii of the likelihood are worth, beside what those show
 
 
-def fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | None,
+def fit_along_paths(links: Links, scene: Scene, seed: int, start: Twin | None,
                     executor: Executor | None = None) -> Twin:
     """Return a twin that follows paths, with what they do not tell learnt.
 
@@ -90,7 +90,7 @@ def fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | None
     return replace(twin, fitted=EffectModel.of(by_paths, fit))
 
 
-def fit_paths(links: LinkData, scene: Scene, law: Twin, relocation: Relocation) -> Twin:
+def fit_paths(links: Links, scene: Scene, law: Twin, relocation: Relocation) -> Twin:
     """Follow paths over the map, with unknown devices where they explain the levels best.
 
     Args:
@@ -127,7 +127,7 @@ def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None
                       executor=executor or Executor())
 
 
-def best_dof(links: LinkData, channel: ChannelModel, device_m: np.ndarray) -> float:
+def best_dof(links: Links, channel: ChannelModel, device_m: np.ndarray) -> float:
     """Return the degrees of freedom of the errors that explain the links best.
 
     Args:
@@ -140,14 +140,14 @@ def best_dof(links: LinkData, channel: ChannelModel, device_m: np.ndarray) -> fl
     return DOFS[int(np.argmin(objectives))]
 
 
-def _image_paths(links: LinkData, law: Twin, device_m: np.ndarray) -> ImagePaths:
+def _image_paths(links: Links, law: Twin, device_m: np.ndarray) -> ImagePaths:
     """Return the channel, its diffuse power fitted to links of devices that have a position."""
     channel = ImagePaths(law.channel)
     located = links.located(device_m)
     return channel.fit_diffuse(located.geometry, located.level_db, located.limit_db)
 
 
-def fit_over_wrong_map(links: LinkData, scene: Scene, seed: int, start: Twin | None,
+def fit_over_wrong_map(links: Links, scene: Scene, seed: int, start: Twin | None,
                        executor: Executor | None = None) -> Twin:
     """Return a twin that allows for errors of its map.
 
@@ -188,7 +188,7 @@ def fit_over_wrong_map(links: LinkData, scene: Scene, seed: int, start: Twin | N
     return Twin(channel, devices, by_paths.level, links.usual_limit_db, provenance(links, scene))
 
 
-def _shift(links: LinkData, seed: int) -> Shift:
+def _shift(links: Links, seed: int) -> Shift:
     """Return the shift of the map, from the anchors' links."""
     known = links.located(links.device_m)
     if not len(known):
@@ -197,7 +197,7 @@ def _shift(links: LinkData, seed: int) -> Shift:
     return estimate_shift(*informative, seed)
 
 
-def _moved(links: LinkData, shift_m: Shift) -> LinkData:
+def _moved(links: Links, shift_m: Shift) -> Links:
     """Return links whose ends are all moved by a shift."""
     if shift_m == NO_SHIFT:
         return links
@@ -205,7 +205,7 @@ def _moved(links: LinkData, shift_m: Shift) -> LinkData:
     return links.with_devices(links.device_m + step_m).with_receivers(links.receiver_m + step_m)
 
 
-def _with_copies(links: LinkData) -> LinkData:
+def _with_copies(links: Links) -> Links:
     """Return the links, and those of some anchors once more, as of unknown devices at the end."""
     count = len(links.device_names)
     unknown = count - len(links.anchors)
@@ -224,7 +224,7 @@ def _with_copies(links: LinkData) -> LinkData:
                    device_names=[*links.device_names, *names], known_los=None)
 
 
-def _calibrated(devices: list[TwinDevice], links: LinkData) -> list[TwinDevice]:
+def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:
     """Return the devices of links with radii as wide as the copies' errors show that they must be.
 
     Errors within a 90 % radius r of a normal distribution have the mean square r² / ln 10.
@@ -240,7 +240,7 @@ def _calibrated(devices: list[TwinDevice], links: LinkData) -> list[TwinDevice]:
             for each in devices[:count]]
 
 
-def _found(links: LinkData, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
+def _found(links: Links, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
     """Return the errors of a map that is not shifted any more, from devices that are not lost."""
     known = links.located(reliable_m(devices, LOST_M))
     informative = drop_uninformative(known.geometry, known.level_db, known.limit_db)
@@ -248,7 +248,7 @@ def _found(links: LinkData, devices: list[TwinDevice], shift_m: Shift, seed: int
     return replace(error, shift_m=shift_m), diffuse
 
 
-def _channel(links: LinkData, devices: list[TwinDevice], found: Found, seed: int) -> PathKriging:
+def _channel(links: Links, devices: list[TwinDevice], found: Found, seed: int) -> PathKriging:
     """Fit the channel to all devices that are located; kriging alone to those that are lost."""
     lost = tuple(np.flatnonzero(~np.isfinite(reliable_m(devices, LOST_M)).all(axis=1)).tolist())
     known = links.located(reliable_m(devices))
@@ -258,7 +258,7 @@ def _channel(links: LinkData, devices: list[TwinDevice], found: Found, seed: int
                 PathKriging.from_state)
 
 
-def _radius_by_map_m(links: LinkData, devices: list[TwinDevice], channel: ImagePaths,
+def _radius_by_map_m(links: Links, devices: list[TwinDevice], channel: ImagePaths,
                      cities: list[CityMap], bounds: tuple[float, float, float, float]
                      ) -> np.ndarray:
     """Return the radius (k,) [m] that 90 % of the errors by the map stay within.

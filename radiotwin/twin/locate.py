@@ -10,7 +10,7 @@ from radiotwin.errors import BadInput
 from radiotwin.geo.geodesy import to_geographic, to_local
 from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import Origin
-from radiotwin.links import LinkData, prepare_links
+from radiotwin.links import Links, prepare_links
 from radiotwin.links.alignment import in_known_frame
 from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
@@ -108,7 +108,7 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
     return table, notes
 
 
-def _widening(model: EffectModel, links: LinkData, found: list[PositionEstimate]) -> float:
+def _widening(model: EffectModel, links: Links, found: list[PositionEstimate]) -> float:
     """Return how much larger residuals are than they were at home; 1 where they are much alike."""
     if np.isnan(model.typical_misfit) or not found:
         return 1.0

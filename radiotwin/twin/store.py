@@ -18,7 +18,7 @@ from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_folder, require_writable
 from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.io.inputs import parse_json, read_bytes, read_text, require_within
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB
 from radiotwin.propagation.laws.image_paths import ImagePaths, stored_diffuse
@@ -315,7 +315,7 @@ def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: lis
     """Refuse effects with another number of coefficients than they need, on a link or two."""
     n = max(len(devices), len(receivers), 2)
     row, nothing = np.arange(n), np.zeros(n)
-    links = LinkData(
+    links = Links(
         np.full(n, -80.0), np.full(n, -np.inf),
         np.column_stack([100.0 + row, nothing, np.full(n, 30.0)]),
         np.zeros((len(devices), 3)), row % len(devices), row % max(len(receivers), 1),

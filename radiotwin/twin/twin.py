@@ -21,8 +21,8 @@ from radiotwin.errors import BadInput
 from radiotwin.geo.frames import is_same_frame, place
 from radiotwin.inference.gaussian import detection_probability
 from radiotwin.io.forms import Origin
-from radiotwin.links import LinkData
-from radiotwin.links.link_data import Prediction
+from radiotwin.links import Links
+from radiotwin.links.links import Prediction
 from radiotwin.maps.form import MapStream
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import ChannelModel
@@ -89,7 +89,7 @@ class Twin(Summarised):
         devices: in the order of the measurements' `devices.csv`.
         level: `gain_db`, or `rssi_dbm` where transmit power is unknown.
         limit_db: level below which receivers do not detect [dB]: the median of theirs, see
-            `LinkData.usual_limit_db`; None where it was not known.
+            `Links.usual_limit_db`; None where it was not known.
         provenance: measurements, scene, seed and version that made it.
         fitted: levels, effects and errors fitted upon the channel; None where `close-loop` did not
             look and the channel does not need levels.
@@ -141,7 +141,7 @@ class Twin(Summarised):
             names.append(SHADOWING)
         return self.channel.name + (f" with {', '.join(names)}" if names else "")
 
-    def links(self, receiver_m: np.ndarray, device: np.ndarray, scene: Scene) -> LinkData:
+    def links(self, receiver_m: np.ndarray, device: np.ndarray, scene: Scene) -> Links:
         """Return links that nobody measured: receiver, flight and time unset.
 
         Args:
@@ -150,13 +150,13 @@ class Twin(Summarised):
             scene: the 3D map and the radio.
         """
         anchors = frozenset(i for i, each in enumerate(self.devices) if each.role == "anchor")
-        return LinkData.synthetic(
+        return Links.synthetic(
             np.nan_to_num(self.device_m), device, receiver_m, limit_db=self.limit_db,
             device_names=[each.device for each in self.devices],
             frequency_hz=scene.config.radio.frequency_hz, city=scene.city,
             is_gain=self.level == "gain_db", anchors=anchors)
 
-    def predict(self, links: LinkData) -> Prediction:
+    def predict(self, links: Links) -> Prediction:
         """Return the levels that are expected of links.
 
         Args:
@@ -171,7 +171,7 @@ class Twin(Summarised):
             links.select(slice(start, start + size)) for start in range(0, len(links), size)]
         return Prediction.concatenate([self._predict(chunk) for chunk in chunks])
 
-    def _predict(self, links: LinkData) -> Prediction:
+    def _predict(self, links: Links) -> Prediction:
         if self.fitted is not None:
             return self.fitted.predict(links)
         mean_db, sd_db = self.channel.predict(links.geometry)

@@ -7,7 +7,7 @@ import pytest
 from sklearn.ensemble import HistGradientBoostingRegressor
 from threadpoolctl import ThreadpoolController
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.output.result_file import compare_with_baselines
 from radiotwin.closeloop.predict.baselines import (
     BOOSTING,
@@ -128,7 +128,7 @@ def test_published_laws_say_nothing_of_devices_that_are_nowhere(links):
     folds = [FoldModel.build(links, LogDistance(LogDistanceLine(-35.0, -2.6, 2.0)), 5.0, device_m=device_m,
                              train=links.flight != flight) for flight in range(6)]
     fits = [each.fit() for each in folds]
-    model = CrossValidatedModel(folds[0], folds, [fits[0], *fits], links.flight, None)
+    model = CrossFit(folds[0], folds, [fits[0], *fits], links.flight, None)
     found, _ = held_out_baselines(model, [Part(each.links) for each in folds], SelectionCriteria(), 0)
     known = links.device != 3
     for name, mean_db in found.items():

@@ -8,7 +8,7 @@ import pytest
 
 import radiotwin as rt
 from radiotwin.closeloop.crossfit import (
-    CrossValidatedModel,
+    CrossFit,
     cross_validate,
     make_bases,
     make_folds,
@@ -181,5 +181,5 @@ def test_of_two_faults_each_is_unforeseen_where_its_flight_was_held_out():
     effect, index = FaultyFlight(), np.arange(100) // 50
     first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
     folds = [model_of(second), model_of(first)]  # each learnt from the other half
-    model = CrossValidatedModel(model_of(first, second), folds, [], index, None)
+    model = CrossFit(model_of(first, second), folds, [], index, None)
     np.testing.assert_array_equal(model.unforeseen, first.acts | second.acts)

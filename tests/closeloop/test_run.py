@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.output.result_file import make_report
 from radiotwin.closeloop.run import best_base, close_loop
 from radiotwin.errors import BadInput
@@ -200,7 +200,7 @@ def test_when_a_receiver_changed_a_flight_that_is_held_out_does_not_tell(open_gr
 class Predicts(SimpleNamespace):
     """A base of which only held-out predictions are known."""
 
-    rmse_db = CrossValidatedModel.rmse_db
+    rmse_db = CrossFit.rmse_db
 
 
 def test_a_base_does_not_win_by_links_that_it_cannot_predict():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.search.selection import fit_candidate, score_candidate
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.effects.catalogue.noise_floor import NoiseFloor
@@ -111,7 +111,7 @@ def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
     channel = KnownLevels(LogDistanceLine(-20.0, -3.0, 3.0))
     whole, *folds = (FoldModel.build(links.with_los(los), channel, 5.0, channel_db=channel.predict(links.geometry)[0]
                                      + 25.0 * los, train=index != number) for number in range(-1, 5))
-    model = CrossValidatedModel(whole, folds, [each.fit() for each in (whole, *folds)], index, None)
+    model = CrossFit(whole, folds, [each.fit() for each in (whole, *folds)], index, None)
     criteria = SelectionCriteria()
     candidate = fit_candidate(model, NoiseFloor(), 0, criteria)
     score, extended = score_candidate(model, candidate, evidence_blocks(links), 20, 0, 0, criteria, Executor())

@@ -12,7 +12,7 @@ from radiotwin.effects.catalogue.declared_sectors import (
     own_sd_db,
     unheard_sd_db,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.sites import antenna_of, relatives_of
 from radiotwin.twin.model.correlated_shadowing import Relatives, RelativesState
 
@@ -28,7 +28,7 @@ def links_of(rng, points=150, declared=True):
     device = np.repeat(np.arange(9), points)
     receiver_m = np.column_stack([rng.uniform(0, 500, (len(device), 2)), np.full(len(device), 1.5)])
     device_m = np.vstack([MASTS_M, [[250.0, 50, 10]]])[MAST]
-    links = LinkData.synthetic(device_m, device, receiver_m, device_names=[f"d{i}" for i in range(9)], limit_db=None,
+    links = Links.synthetic(device_m, device, receiver_m, device_names=[f"d{i}" for i in range(9)], limit_db=None,
                                frequency_hz=3.6e9, city=None, is_gain=True, anchors=frozenset(range(9)))
     links = replace(links, receiver=np.zeros(len(links), dtype=int))
     return replace(links, boresight_deg=AZIMUTHS_DEG) if declared else links

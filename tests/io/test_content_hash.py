@@ -10,7 +10,7 @@ import pytest
 from radiotwin.effects.catalogue.gain_drift import ReceiverDrift
 from radiotwin.effects.catalogue.tilted_dipole import TiltedDipole
 from radiotwin.io.content_hash import Unhashable, content_hash
-from radiotwin.links.link_data import LinkGeometry
+from radiotwin.links.links import LinkGeometry
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import itu_material
 from radiotwin.twin.localize import LocalizeSettings

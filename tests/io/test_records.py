@@ -6,14 +6,14 @@ import pytest
 from pydantic import Field
 
 from radiotwin.errors import BadInput
-from radiotwin.io.forms import Number, Record, Whole, check_size, read_record, validated
+from radiotwin.io.forms import Real, Record, Whole, check_size, read_record, validated
 
 
 class Part(Record):
     """A schema with one of each."""
 
     name: str
-    value: Number | None = None
+    value: Real | None = None
     count: Whole = 0
     parts: list["Part"] = Field(default_factory=list)
 

@@ -66,7 +66,7 @@ def signalled(self, *item):
         os.kill(os.getpid(), signal.SIGINT)
     return set_item(self, *item)
 enum._EnumDict.__setitem__ = signalled
-from radiotwin import signals
+from radiotwin.io import signals
 from radiotwin.runtime.exits import exit_status
 from radiotwin.trace.sionna_scene import import_sionna
 signals.leave(exit_status(import_sionna, "all is kept"))

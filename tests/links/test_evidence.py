@@ -8,14 +8,14 @@ import pytest
 from radiotwin.closeloop.crossfit import make_folds
 from radiotwin.closeloop.run import thin_piles
 from radiotwin.links import (
-    LinkData,
+    Links,
     correlation_length_m,
     evidence_blocks,
     places,
     residual_variables,
     with_evidence,
 )
-from radiotwin.links.link_data import clocks_restart
+from radiotwin.links.links import clocks_restart
 
 
 def flown(seed, length_m, noise_sd=0.5, flights=6, devices=3, slots=60, step_m=10.0, side_m=600.0, restart=False):
@@ -34,7 +34,7 @@ def flown(seed, length_m, noise_sd=0.5, flights=6, devices=3, slots=60, step_m=1
     time_s = np.repeat(np.tile(np.arange(slots), flights), devices) + (0 if restart else 200.0) * flight
     device_m = np.column_stack([rng.uniform(0, side_m, (devices, 2)), np.full(devices, 1.5)])
     receiver_m = np.repeat(np.column_stack([place, np.full(len(place), 50.0)]), devices, axis=0)
-    return LinkData(z, None, receiver_m, device_m, np.tile(np.arange(devices), len(place)), np.zeros(n, int), flight,
+    return Links(z, None, receiver_m, device_m, np.tile(np.arange(devices), len(place)), np.zeros(n, int), flight,
                     time_s.astype(float), np.full(n, np.nan), [f"d{i}" for i in range(devices)], ["r0"],
                     [f"f{i}" for i in range(flights)], 2.4e9, None, True, frozenset(range(devices)))
 

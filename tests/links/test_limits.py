@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.limits import estimate_limits, limits_to_explain
 
 DEVICES, REACH_M, STEP_M, SHADOWING_M = 5, 1500.0, 10.0, 50.0
@@ -40,7 +40,7 @@ def fly(seed, limits_db=(-110.0, -110.0), n=4000, soft_db=0.0, lost=0.0, step_db
     if step_db:
         level_db = np.round(level_db / step_db) * step_db
     count, unknown = len(level_db), np.full(len(level_db), np.nan)
-    return LinkData(level_db, np.full(count, -np.inf), receiver_m, device_m, device, receiver, np.zeros(count, int),
+    return Links(level_db, np.full(count, -np.inf), receiver_m, device_m, device, receiver, np.zeros(count, int),
                     np.arange(count, dtype=float), unknown, [f"d{i}" for i in range(DEVICES)],
                     [f"r{i}" for i in range(len(limits_db))], ["f"], 2.4e9, None, True, frozenset(range(DEVICES)))
 

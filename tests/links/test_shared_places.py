@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.sites import receiver_differences
 
 OFFSET_DB, SQUARE_M = -4.0, 100.0
@@ -33,7 +33,7 @@ def walked(seed, offset_db=OFFSET_DB, limit_db=-np.inf, devices=4):
     receiver_m, device, receiver, level_db = (np.concatenate(part) for part in zip(*rows))
     level_db = np.where(level_db < limit_db, np.nan, level_db)
     n, unknown = len(level_db), np.full(len(level_db), np.nan)
-    return LinkData(level_db, np.full(n, limit_db), receiver_m, device_m, device, receiver, np.zeros(n, int), unknown,
+    return Links(level_db, np.full(n, limit_db), receiver_m, device_m, device, receiver, np.zeros(n, int), unknown,
                     unknown, [f"d{i}" for i in range(devices)], ["A", "B"], ["walk"], 3.6e9, None, False,
                     frozenset(range(devices)))
 

@@ -203,7 +203,7 @@ def run_python(program, **environment):
 
 
 def test_drjit_imported_too_early_without_a_working_one():
-    program = "import drjit; from radiotwin import llvm; llvm.prepare()"
+    program = "import drjit; from radiotwin.runtime import llvm; llvm.prepare()"
     done = run_python(program, DRJIT_LIBLLVM_PATH="/nonexistent/libLLVM.so")
     assert "RunFailed: tracing needs libLLVM 17 or newer" in done.stderr
 
@@ -221,7 +221,7 @@ def test_minimum_version_is_true(candidate):
 @pytest.mark.llvm
 def test_chosen_one_runs_kernels_in_a_fresh_process():
     program = (
-        "from radiotwin import llvm; llvm.prepare(); llvm.prepare()\n"
+        "from radiotwin.runtime import llvm; llvm.prepare(); llvm.prepare()\n"
         "import drjit; from drjit.llvm import Float\n"
         "llvm.prepare(); print(float(drjit.sum(drjit.arange(Float, 101))[0]), drjit.detail.llvm_version()[0])"
     )

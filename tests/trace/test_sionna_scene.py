@@ -68,7 +68,7 @@ def test_the_plugin_does_mark(plugin, tmp_path):
     """Without the change of `import_sionna`, Mitsuba loads it from the working directory."""
     (tmp_path / "plugins").mkdir()
     shutil.copy(plugin, tmp_path / "plugins" / "evil.so")
-    program = ("import sys; from radiotwin import llvm; llvm.prepare(); import mitsuba as mi\n"
+    program = ("import sys; from radiotwin.runtime import llvm; llvm.prepare(); import mitsuba as mi\n"
                "mi.set_variant('llvm_ad_mono_polarized')\n{}\ntry: mi.load_dict({{'type': 'evil'}})\nexcept Exception: pass")
     known = os.environ | {"PYTHONPATH": str(ROOT), "RADIOTWIN_TEST_MARK": str(tmp_path / "mark")}
     subprocess.run([sys.executable, "-P", "-c", program.format("")], cwd=tmp_path, env=known, check=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from radiotwin import __version__
-from radiotwin.closeloop.crossfit import CrossValidatedModel, without_quality
+from radiotwin.closeloop.crossfit import CrossFit, without_quality
 from radiotwin.closeloop.output.result_schema import ReportRecord
 from radiotwin.closeloop.predict.blending import held_out_coverage
 from radiotwin.closeloop.run import Loop
@@ -22,7 +22,7 @@ from radiotwin.effects.params import Parameter
 from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import read_record, validated
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.sites import ReceiverDifference, receiver_differences
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 
@@ -133,7 +133,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "criteria": loop.criteria.to_json(), "notes": links.notes})
 
 
-def scores(model: CrossValidatedModel, rows: np.ndarray | None = None) -> dict[str, float]:
+def scores(model: CrossFit, rows: np.ndarray | None = None) -> dict[str, float]:
     """Return held-out errors of the links of a mask (n,), or of all.
 
     Returns:
@@ -256,14 +256,14 @@ def _step(step: Step) -> dict[str, Any]:
             "probabilities": [{"name": name, "probability": each} for name, each in ordered]}
 
 
-def _difference(found: ReceiverDifference, links: LinkData) -> dict[str, Any]:
+def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:
     value = Parameter(found.difference_db, found.low_db, found.high_db, "dB")
     return {"first": links.receiver_names[found.first],
             "second": links.receiver_names[found.second], "difference_db": value.record(),
             "pairs": found.pairs, "places": found.places}
 
 
-def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> dict[str, Any]:
+def _shadowing(score: CandidateScore, model: CrossFit, rank: int) -> dict[str, Any]:
     field, relatives = model.shadowing[0].field, model.shadowing[0].relatives
     sd_db = model.shadowing[0].relative_sd * float(model.fits[0].scale_db.mean())
     numbers = {"length_m": (field.length_m, "m"), "share": (field.share, "of the variance"),
@@ -278,7 +278,7 @@ def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> 
             "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}} | NOT_KNOWN
 
 
-def _groups(links: LinkData) -> dict[str, dict[str, np.ndarray]]:
+def _groups(links: Links) -> dict[str, dict[str, np.ndarray]]:
     groups = {"los": {"los": links.los, "nlos": ~links.los}}
     for name, index, labels in (("device", links.device, links.device_names),
                                 ("receiver", links.receiver, links.receiver_names),

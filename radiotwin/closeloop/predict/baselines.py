@@ -9,11 +9,11 @@ from functools import cache, cached_property
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import mean_if_detected
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.variables import feature_count, link_features
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.forest import Forest
@@ -42,7 +42,7 @@ class Part:
         known: (n, p) `features` where they are known already.
     """
 
-    links: LinkData
+    links: Links
     known: np.ndarray | None = None
 
     @cached_property
@@ -125,7 +125,7 @@ def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: i
                 lambda arrays, _: arrays["mean_db"])
 
 
-def law_db(kind: type[ChannelModel], links: LinkData, train: np.ndarray, test: np.ndarray,
+def law_db(kind: type[ChannelModel], links: Links, train: np.ndarray, test: np.ndarray,
            like: RegressionKriging | None = None) -> np.ndarray:
     """Return what a channel model that was fitted to some links predicts of others [dB].
 
@@ -141,7 +141,7 @@ def law_db(kind: type[ChannelModel], links: LinkData, train: np.ndarray, test: n
     return _if_detected(fitted_law(kind, links, train, like), links, test)
 
 
-def fitted_law(kind: type[ChannelModel], links: LinkData, train: np.ndarray,
+def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,
                like: RegressionKriging | None = None) -> ChannelModel:
     """Return a channel model of some links, as of `law_db`."""
     geometry, level_db = links.geometry.select(train), links.level_db[train]
@@ -152,18 +152,18 @@ def fitted_law(kind: type[ChannelModel], links: LinkData, train: np.ndarray,
         return fit_once(kind, geometry, level_db, links.limit_db[train], 0)
 
 
-def _if_detected(law: ChannelModel, links: LinkData, test: np.ndarray) -> np.ndarray:
+def _if_detected(law: ChannelModel, links: Links, test: np.ndarray) -> np.ndarray:
     mean_db, sd_db = law.predict(links.geometry.select(test))
     return mean_if_detected(mean_db, sd_db, links.limit_db[test])
 
 
-def laws_for(links: LinkData, criteria: SelectionCriteria) -> list[type[ChannelModel]]:
+def laws_for(links: Links, criteria: SelectionCriteria) -> list[type[ChannelModel]]:
     """Return `LAWS`, without kriging where links are too many for it."""
     return [kind for kind in LAWS
             if kind is not RegressionKriging or len(links) <= criteria.max_links_for_kriging]
 
 
-def held_out_baselines(model: CrossValidatedModel, parts: list[Part], criteria: SelectionCriteria,
+def held_out_baselines(model: CrossFit, parts: list[Part], criteria: SelectionCriteria,
                        seed: int,
                        ) -> tuple[dict[str, np.ndarray], list[RegressionKriging]]:
     """Return the held-out prediction of other models.
@@ -196,7 +196,7 @@ def held_out_baselines(model: CrossValidatedModel, parts: list[Part], criteria: 
     return result, kriging
 
 
-def published_laws(links: LinkData) -> list[PublishedLaw]:
+def published_laws(links: Links) -> list[PublishedLaw]:
     """Return laws of recommendations, fitted to nothing.
 
     Of those that hold at the frequency and for most of the heights and distances. Levels must be

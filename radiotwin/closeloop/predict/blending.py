@@ -6,7 +6,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.stats import t as student
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.predict.baselines import LAWS, Part, fitted_law
 from radiotwin.closeloop.predict.predictor import HALF_M, CombinedPrediction, grown_forests
 from radiotwin.twin.model.blend import FORESTS, NAMED, REST, TREES_ALONE, Blend, sd_factor
@@ -17,7 +17,7 @@ MIN_SD_RATIO = 0.05
 SAME_M = 0.1  # measured places closer together are one
 
 
-def make_blend(model: CrossValidatedModel, prediction: CombinedPrediction,
+def make_blend(model: CrossFit, prediction: CombinedPrediction,
                seed: int) -> Blend | None:
     """Return what predicts beside named effects.
 
@@ -55,7 +55,7 @@ def needs_rest(prediction: CombinedPrediction) -> bool:
         prediction.weights[:, prediction.names.index(REST)].max() >= MIN_WEIGHT)
 
 
-def held_out_coverage(model: CrossValidatedModel, prediction: CombinedPrediction) -> float:
+def held_out_coverage(model: CrossFit, prediction: CombinedPrediction) -> float:
     """Return the share of held-out readings in the central 90 % intervals of a twin's prediction.
 
     How wide those of a fold are is learnt from the other folds. Arguments as of `make_blend`.
@@ -84,11 +84,11 @@ def _members(prediction: CombinedPrediction) -> dict[str, np.ndarray]:
             if pair.max() >= MIN_WEIGHT}
 
 
-def _is_physics_alone(model: CrossValidatedModel, prediction: CombinedPrediction) -> bool:
+def _is_physics_alone(model: CrossFit, prediction: CombinedPrediction) -> bool:
     return set(_members(prediction)) == {NAMED} or not receivers_move(model.links)
 
 
-def _sd_ratio(model: CrossValidatedModel, prediction: CombinedPrediction,
+def _sd_ratio(model: CrossFit, prediction: CombinedPrediction,
               but: int = -1) -> tuple[float, float]:
     """Return the error's sd over that of named effects, near and far.
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.predict.baselines import (
     BOOSTING,
     EXTRA_TREES,
@@ -37,7 +37,7 @@ from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.held_out import combine, convex_weights
 from radiotwin.inference.student import mean_if_detected
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.propagation.laws.forest import Forest
 from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import LogDistance
@@ -138,7 +138,7 @@ class _Learnt:
         return np.column_stack([physics, *laws])
 
 
-def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: SelectionCriteria,
+def combined_prediction(model: CrossFit, with_rest: bool, criteria: SelectionCriteria,
                         seed: int) -> CombinedPrediction:
     """Return the held-out prediction by all that was learnt.
 
@@ -194,7 +194,7 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
     return CombinedPrediction(mean_db, names, weights, members, share, baselines, away)
 
 
-def _quadrant(links: LinkData) -> np.ndarray:
+def _quadrant(links: Links) -> np.ndarray:
     """Return the quadrant (n,) of the area that the end that moves is in.
 
     With one left out, as much is extrapolated as by a map of more than was measured.
@@ -204,7 +204,7 @@ def _quadrant(links: LinkData) -> np.ndarray:
     return above @ np.array([1, 2])
 
 
-def shares_of(links: LinkData, train: np.ndarray, test: np.ndarray) -> np.ndarray:
+def shares_of(links: Links, train: np.ndarray, test: np.ndarray) -> np.ndarray:
     """Return how far some links are from all measured ones, in 0..1, see `far_share`.
 
     By the end that moves, from where it was measured with the same other end.

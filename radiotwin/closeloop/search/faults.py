@@ -27,7 +27,7 @@ from scipy.stats import t
 
 from radiotwin.closeloop.crossfit import (
     Base,
-    CrossValidatedModel,
+    CrossFit,
     Folds,
     cross_validate,
     make_folds,
@@ -49,7 +49,7 @@ from radiotwin.closeloop.verdict.intervals import effect_size_db, why_not_borne_
 from radiotwin.effects.base import DetectionEffect, Effect
 from radiotwin.effects.catalogue.gain_drift import DeviceDrift, ReceiverDrift
 from radiotwin.inference.censored_regression import FitResult
-from radiotwin.links import LinkData, evidence_blocks
+from radiotwin.links import Links, evidence_blocks
 from radiotwin.links.correlation import devices_move
 from radiotwin.twin.model.fold_model import AppliedEffect, FoldModel
 
@@ -57,7 +57,7 @@ MIN_SHARED = 0.5  # of a fault's links, on which what is held against it, or the
 MIN_DEVICES = 4  # of known position, to hold some of them out
 
 
-def select_change_points(result: SelectionResult, links: LinkData, base: Base, folds: Folds,
+def select_change_points(result: SelectionResult, links: Links, base: Base, folds: Folds,
                          seed: int, on_progress: Callable[[str], None]) -> None:
     """Add changes in time to a model whose folds are flights, one by one, until none passes.
 
@@ -74,7 +74,7 @@ def select_change_points(result: SelectionResult, links: LinkData, base: Base, f
             _select_one_kind(result, effect, links, base, seed, on_progress)
 
 
-def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrift, links: LinkData,
+def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrift, links: Links,
                      base: Base, seed: int, on_progress: Callable[[str], None]) -> None:
     """Add changes of receivers, or of devices."""
     criteria = result.criteria
@@ -110,7 +110,7 @@ def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrif
         result.keep(score, with_candidate(result.model, there, result.executor))
 
 
-def located_links(model: CrossValidatedModel, links: LinkData, base: Base) -> LinkData:
+def located_links(model: CrossFit, links: Links, base: Base) -> Links:
     """Return the links with the devices that the base has located as anchors there."""
     device_m = base.device_m(model.twin)
     known = np.isfinite(device_m).all(axis=1)
@@ -119,7 +119,7 @@ def located_links(model: CrossValidatedModel, links: LinkData, base: Base) -> Li
     return replace(links.with_devices(device_m), anchors=anchors, evidence=model.links.evidence)
 
 
-def _stands_out(model: CrossValidatedModel, candidate: Candidate | CandidateScore,
+def _stands_out(model: CrossFit, candidate: Candidate | CandidateScore,
                 criteria: SelectionCriteria) -> bool:
     """Return whether a change is larger than flights of all receivers, or all devices, differ.
 
@@ -158,7 +158,7 @@ def _stands_out(model: CrossValidatedModel, candidate: Candidate | CandidateScor
     return bool(p_value <= criteria.max_p_value)
 
 
-def with_effect(model: CrossValidatedModel, effect: Effect, params: Any) -> CrossValidatedModel:
+def with_effect(model: CrossFit, effect: Effect, params: Any) -> CrossFit:
     """Return a model with one more effect in the whole and every fold, its parameters given."""
     models = [each.with_effects([*each.effects, each.apply(effect, params)])
               for each in model.models]
@@ -166,7 +166,7 @@ def with_effect(model: CrossValidatedModel, effect: Effect, params: Any) -> Cros
     return model.extended(models, fits)
 
 
-def select_faults(result: SelectionResult, effects: list[Effect], links: LinkData, base: Base,
+def select_faults(result: SelectionResult, effects: list[Effect], links: Links, base: Base,
                   seed: int, on_progress: Callable[[str], None]) -> None:
     """Add the effects that act at certain times, one after the other, until none passes.
 
@@ -180,7 +180,7 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
     """
     timed = [effect for effect in effects
              if effect.within_flights and not effect.unavailable(result.model.links)]
-    model: CrossValidatedModel | None = None
+    model: CrossFit | None = None
     while timed and not result.is_full:
         step, refused = len(result.model.whole.effects), []
         hypotheses = result.hypotheses(seed)
@@ -298,8 +298,8 @@ def _without(model: FoldModel, place: int | None) -> FoldModel:
                                if number != place])
 
 
-def _within_flights(result: SelectionResult, links: LinkData, base: Base,
-                    seed: int) -> CrossValidatedModel:
+def _within_flights(result: SelectionResult, links: Links, base: Base,
+                    seed: int) -> CrossFit:
     """Return the model as it is, fitted to folds that leave part of each flight."""
     links = located_links(result.model, links, base)
     folds = _folds(links, seed)
@@ -309,12 +309,12 @@ def _within_flights(result: SelectionResult, links: LinkData, base: Base,
     return model
 
 
-def _folds(links: LinkData, seed: int) -> Folds:
+def _folds(links: Links, seed: int) -> Folds:
     by_device = len(links.anchors & set(links.device.tolist())) >= MIN_DEVICES
     return make_folds(links, seed, "device" if by_device and not devices_move(links) else "block")
 
 
-def _adopted(model: CrossValidatedModel, candidate: Candidate) -> CrossValidatedModel:
+def _adopted(model: CrossFit, candidate: Candidate) -> CrossFit:
     """Return a model with the effect; a fold has it as far as its own training links show it."""
     effect, like = candidate.effect, candidate.whole.effects[-1].params
     models, fits = [candidate.whole], [candidate.fit]

@@ -22,7 +22,7 @@ from radiotwin.effects.catalogue.unexplained_trend import curve_columns
 from radiotwin.effects.params import NEAR_SHARE
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.twin.model.correlated_shadowing import receivers_move
 from radiotwin.twin.model.fold_model import FoldModel
 
@@ -56,7 +56,7 @@ class Hypotheses:
     """
 
     evidence: CorrelatedEvidence
-    links: LinkData
+    links: Links
     scale_db: np.ndarray
     nuisance: Columns
     base_z: np.ndarray
@@ -252,7 +252,7 @@ def _says_something(model: FoldModel, fit: FitResult) -> np.ndarray:
     return np.isfinite(training.level_db) | (training.residual_db(fit) < 0)
 
 
-def _nuisance(links: LinkData, mean_db: np.ndarray) -> Columns:
+def _nuisance(links: Links, mean_db: np.ndarray) -> Columns:
     """Return what every base may be wrong in, of n links [dB].
 
     Args:

@@ -20,7 +20,7 @@ from importlib.resources import files
 import numpy as np
 from scipy.special import expit
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.search.hypotheses import Hypotheses
 from radiotwin.closeloop.search.scoring import CandidateScore
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
@@ -55,7 +55,7 @@ class Step:
         return max([0.0, *self.unnamed_nats.values()])
 
 
-def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypotheses: Hypotheses,
+def judge(scores: Sequence[CandidateScore], model: CrossFit, hypotheses: Hypotheses,
           criteria: SelectionCriteria) -> tuple[list[CandidateScore], Step]:
     """Return a step's scores with their probabilities, and what the step says.
 
@@ -106,7 +106,7 @@ def features(nats: tuple[float, float, float], rmse_fall: float, rest_over_noise
             float(np.log(max(rest_over_noise, LEAST_RATIO))), float(is_another_kind))
 
 
-def probability_of_all(scores: Sequence[CandidateScore], other: float, before: CrossValidatedModel,
+def probability_of_all(scores: Sequence[CandidateScore], other: float, before: CrossFit,
                        rest_over_noise: float) -> float:
     """Return the probability that several effects are there, from what they explain together.
 

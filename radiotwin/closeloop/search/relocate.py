@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from radiotwin.closeloop.crossfit import Base, CrossValidatedModel
+from radiotwin.closeloop.crossfit import Base, CrossFit
 from radiotwin.effects.arrays import subsample
 from radiotwin.inference.censored_regression import FitResult
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.twin.localize import position_log_likelihood
 from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.model.effect_model import EffectModel
@@ -29,8 +29,8 @@ MIN_MOVE_M = 2.0  # along paths, which put a device to about a metre
 MAX_LOSS_NATS = 0.01  # a link, of those that could be predicted before, where more can be now
 
 
-def relocate_devices(model: CrossValidatedModel, links: LinkData, base: Base
-                     ) -> CrossValidatedModel:
+def relocate_devices(model: CrossFit, links: Links, base: Base
+                     ) -> CrossFit:
     """Return the model with unknown devices moved to where its effects make their links likeliest.
 
     Each fold moves them by its own training links, then its levels are fitted again. Where paths
@@ -98,7 +98,7 @@ def _with_positions(devices: list[TwinDevice], device_m: np.ndarray) -> list[Twi
             for each, (x_m, y_m, _) in zip(devices, device_m, strict=True)]
 
 
-def _located_anew(model: FoldModel, links: LinkData, mine: np.ndarray,
+def _located_anew(model: FoldModel, links: Links, mine: np.ndarray,
                   base: Base) -> tuple[FoldModel, list[TwinDevice]]:
     """Return one model with its devices where its base, over the corrected map, has them.
 
@@ -135,7 +135,7 @@ def _relocated(model: FoldModel, fit: FitResult, unknown: list[int]) -> FoldMode
     return moved.with_effects([moved.apply(each.effect, each.params) for each in model.effects])
 
 
-def _likeliest(model: EffectModel, own: LinkData, start_m: np.ndarray) -> np.ndarray:
+def _likeliest(model: EffectModel, own: Links, start_m: np.ndarray) -> np.ndarray:
     """Return the likeliest position (2,) of a device on circles around the best so far [m]."""
     angles = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
     circle = np.column_stack([np.sin(angles), np.cos(angles)])

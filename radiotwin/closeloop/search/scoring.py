@@ -10,14 +10,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.search.hypotheses import Hypotheses, is_judged_by_levels
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.effects.base import Effect
 from radiotwin.effects.params import EffectParams
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.held_out import cross_fit_p_value, sign_flip_p_value
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.runtime.execution import Executor
 from radiotwin.twin.model.fitting import add_effect, along_paths, prepare_additions
 from radiotwin.twin.model.fold_model import FittedEffect, FoldModel
@@ -27,7 +27,7 @@ from radiotwin.twin.model.fold_model import FittedEffect, FoldModel
 MIN_MOVED, MIN_SHARE = 0.05, 0.1
 
 
-def ends_of(fitted: FittedEffect, links: LinkData) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def ends_of(fitted: FittedEffect, links: Links) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the devices and of the receivers that parameters belong to.
 
     Where each end has a coefficient, and few are off, that is the one that is off most.
@@ -131,7 +131,7 @@ class Candidate:
     evidence: float = np.nan
 
 
-def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
+def fit_candidate(model: CrossFit, effect: Effect, step: int,
                   criteria: SelectionCriteria, hypotheses: Hypotheses | None = None,
                   ) -> Candidate | CandidateScore:
     """Fit a candidate to all links; return a score with the reason if that refuses it already.
@@ -168,9 +168,9 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     return Candidate(effect, *whole, gain, hypotheses.of_named(*whole))
 
 
-def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.ndarray, tried: int,
+def score_candidate(model: CrossFit, candidate: Candidate, block: np.ndarray, tried: int,
                     step: int, seed: int, criteria: SelectionCriteria, executor: Executor,
-                    ) -> tuple[CandidateScore, CrossValidatedModel | None]:
+                    ) -> tuple[CandidateScore, CrossFit | None]:
     """Fit a candidate to each fold's training links, and score it on the others.
 
     Args:
@@ -198,8 +198,8 @@ def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.
     return score, None if score.reason else extended
 
 
-def with_candidate(model: CrossValidatedModel, candidate: Candidate,
-                   executor: Executor) -> CrossValidatedModel:
+def with_candidate(model: CrossFit, candidate: Candidate,
+                   executor: Executor) -> CrossFit:
     """Return a model with a candidate; a fold has it as its own training links show it."""
     effect, like = candidate.effect, candidate.whole.effects[-1].params
     models, fits = [candidate.whole], [candidate.fit]
@@ -211,10 +211,10 @@ def with_candidate(model: CrossValidatedModel, candidate: Candidate,
     return model.extended(models, fits)
 
 
-def fit_and_score(model: CrossValidatedModel, effect: Effect, block: np.ndarray, tried: int,
+def fit_and_score(model: CrossFit, effect: Effect, block: np.ndarray, tried: int,
                   step: int, seed: int, criteria: SelectionCriteria, executor: Executor,
                   hypotheses: Hypotheses | None = None,
-                  ) -> tuple[CandidateScore, CrossValidatedModel | None]:
+                  ) -> tuple[CandidateScore, CrossFit | None]:
     """Return `score_candidate` of `fit_candidate`; of one that is refused, no model."""
     candidate = fit_candidate(model, effect, step, criteria, hypotheses)
     if isinstance(candidate, CandidateScore):
@@ -222,7 +222,7 @@ def fit_and_score(model: CrossValidatedModel, effect: Effect, block: np.ndarray,
     return score_candidate(model, candidate, block, tried, step, seed, criteria, executor)
 
 
-def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score: CandidateScore,
+def score_model(model: CrossFit, extended: CrossFit, score: CandidateScore,
                 block: np.ndarray | None, tried: int, seed: int, criteria: SelectionCriteria,
                 nlos_only: bool = False) -> CandidateScore:
     """Return what held-out links say of an extended model; with the reason where it is refused.

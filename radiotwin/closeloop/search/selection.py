@@ -24,7 +24,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.search.hypotheses import Hypotheses
 from radiotwin.closeloop.search.posterior import Step, judge, probability_of_all
 from radiotwin.closeloop.search.scoring import (
@@ -61,10 +61,10 @@ class Passed:
 
     effect: Effect
     score: CandidateScore
-    model: CrossValidatedModel
+    model: CrossFit
 
 
-def probable_together(passed: Sequence[Passed], before: CrossValidatedModel, step: Step,
+def probable_together(passed: Sequence[Passed], before: CrossFit, step: Step,
                       block: np.ndarray, tried: int, seed: int, criteria: SelectionCriteria,
                       executor: Executor, on_progress: Callable[[str], None]) -> list[Passed]:
     """Return effects that are probable together, in order; none where there are none.
@@ -119,7 +119,7 @@ def probable_together(passed: Sequence[Passed], before: CrossValidatedModel, ste
             for each in best]
 
 
-def with_moved_limits(model: CrossValidatedModel) -> CrossValidatedModel:
+def with_moved_limits(model: CrossFit) -> CrossFit:
     """Return a model in which limits are moved by the offsets of receivers that were kept last.
 
     Args:
@@ -161,13 +161,13 @@ class SelectionResult:
         executor: where candidates are fitted.
     """
 
-    model: CrossValidatedModel
+    model: CrossFit
     criteria: SelectionCriteria = field(default_factory=SelectionCriteria)
     scores: list[CandidateScore] = field(default_factory=list)
     rivals: list[list[str]] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
-    explained: CrossValidatedModel | None = None
-    looked_at: tuple[CrossValidatedModel, Hypotheses] | None = None
+    explained: CrossFit | None = None
+    looked_at: tuple[CrossFit, Hypotheses] | None = None
     executor: Executor = field(default_factory=Executor)
 
     @property
@@ -182,7 +182,7 @@ class SelectionResult:
             self.looked_at = self.model, found
         return self.looked_at[1]
 
-    def keep(self, score: CandidateScore, model: CrossValidatedModel) -> None:
+    def keep(self, score: CandidateScore, model: CrossFit) -> None:
         """Take over a model with one more effect; it may have been scored in other folds."""
         self.model = model
         self.scores.append(replace(score, kept=True, rmse_db=model.rmse_db()))
@@ -324,7 +324,7 @@ def _judged(result: SelectionResult, passed: list[Passed], hypotheses: Hypothese
     return found
 
 
-def _all_borne_out(model: CrossValidatedModel, last: int) -> bool:
+def _all_borne_out(model: CrossFit, last: int) -> bool:
     """Return whether each of a model's last effects is larger than nothing at all."""
     count = len(model.whole.effects)
     return not any(why_not_borne_out(effect_size_db(model, number))
@@ -387,8 +387,8 @@ def _keep_best(result: SelectionResult, passed: list[Passed], supported: list[Pa
     result.model = with_moved_limits(_exactly(steps[-1][1]))
 
 
-def _if_likelier(result: SelectionResult, several: list[tuple[CandidateScore, CrossValidatedModel]],
-                 best: CandidateScore) -> list[tuple[CandidateScore, CrossValidatedModel]]:
+def _if_likelier(result: SelectionResult, several: list[tuple[CandidateScore, CrossFit]],
+                 best: CandidateScore) -> list[tuple[CandidateScore, CrossFit]]:
     """Return several of a kind with the probability that all are there, if it exceeds the best's.
 
     Of the first, what is among the scores is replaced.
@@ -403,7 +403,7 @@ def _if_likelier(result: SelectionResult, several: list[tuple[CandidateScore, Cr
     return found
 
 
-def _beyond(passed: Passed, candidate: Candidate, model: CrossValidatedModel,
+def _beyond(passed: Passed, candidate: Candidate, model: CrossFit,
             criteria: SelectionCriteria) -> bool:
     """Return whether an effect that passed gains so much that another need not be scored.
 
@@ -422,7 +422,7 @@ def _alike(nats: float, other: CandidateScore, criteria: SelectionCriteria) -> b
     return nats - other.held_out_nats < criteria.indistinguishable_nats
 
 
-def _on_one_mast(model: CrossValidatedModel) -> int:
+def _on_one_mast(model: CrossFit) -> int:
     """Return how many devices the last effect acts on, if they are all on one mast; else 0."""
     applied, links = model.whole.effects[-1], model.links
     devices = np.unique(links.device[applied.acts])
@@ -432,7 +432,7 @@ def _on_one_mast(model: CrossValidatedModel) -> int:
 
 def _several(result: SelectionResult, rival: Passed, block: np.ndarray,
              hypotheses: Hypotheses | None, seed: int, min_nats: float, most: int,
-             ) -> list[tuple[CandidateScore, CrossValidatedModel]] | None:
+             ) -> list[tuple[CandidateScore, CrossFit]] | None:
     """Add an effect of which a step finds one again and again, until all have more than `min_nats`.
 
     Such as groves or towers, each seen from few devices, against an offset for each device; or
@@ -455,7 +455,7 @@ def _several(result: SelectionResult, rival: Passed, block: np.ndarray,
     return None
 
 
-def _exactly(model: CrossValidatedModel) -> CrossValidatedModel:
+def _exactly(model: CrossFit) -> CrossFit:
     """Ask each model's channel for exact levels, where these explain its training links better."""
     exact = [with_exact_levels(each, fit)
              for each, fit in zip(model.models, model.fits, strict=True)]

@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import t
 
-from radiotwin.closeloop.crossfit import CrossValidatedModel, same_effects
+from radiotwin.closeloop.crossfit import CrossFit, same_effects
 from radiotwin.effects.params import Estimate, Parameter
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.sandwich import MAX_WIDTH
@@ -39,7 +39,7 @@ MIN_CLUSTERS = 3  # effective ones, of which a spread can be told
 DOF = 4.0  # degrees of freedom of the errors, by which outliers count less
 
 
-def effect_parameters(model: CrossValidatedModel) -> list[dict[str, Parameter]]:
+def effect_parameters(model: CrossFit) -> list[dict[str, Parameter]]:
     """Return the parameters of each effect with intervals that hold out of the data they are from.
 
     Args:
@@ -140,7 +140,7 @@ def _checked(parameter: Parameter, found: int, folds: int) -> Parameter:
     return replace(parameter, low=low, high=high, determined=determined)
 
 
-def effect_size_db(model: CrossValidatedModel, number: int) -> Parameter:
+def effect_size_db(model: CrossFit, number: int) -> Parameter:
     """Return the size of an effect: the RMS of what it changes in the readings that it acts on.
 
     Args:
@@ -180,7 +180,7 @@ def why_not_borne_out(size_db: Parameter) -> str:
             f"{size_db.value:.1f} dB ({size_db.low:.1f} to {size_db.high:.1f})")
 
 
-def _held_out(model: CrossValidatedModel, number: int
+def _held_out(model: CrossFit, number: int
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the terms of the regression in `effect_size_db` for each link (n,), by its fold.
 

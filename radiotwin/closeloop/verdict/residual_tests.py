@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from radiotwin.inference.dependence import Series, holm, levels_of, permutation_p_value
-from radiotwin.links import LinkData, residual_variables
+from radiotwin.links import Links, residual_variables
 from radiotwin.runtime.pieces import kept
 
 MAX_LINKS = 20_000  # more are thinned to whole series
@@ -28,7 +28,7 @@ class ResidualDependence:
     effect_db: float
 
 
-def residual_dependences(links: LinkData, residual_db: np.ndarray, scale_db: np.ndarray,
+def residual_dependences(links: Links, residual_db: np.ndarray, scale_db: np.ndarray,
                          mean_db: np.ndarray, seed: int) -> list[ResidualDependence]:
     """Test every variable that the data have.
 
@@ -52,7 +52,7 @@ def _read(_: dict[str, np.ndarray], content: Any) -> list[ResidualDependence]:
                                float(each["effect_db"])) for each in content]
 
 
-def _tested(links: LinkData, residual_db: np.ndarray, scale_db: np.ndarray, mean_db: np.ndarray,
+def _tested(links: Links, residual_db: np.ndarray, scale_db: np.ndarray, mean_db: np.ndarray,
             seed: int) -> list[ResidualDependence]:
     rng = np.random.default_rng(seed)
     rows = np.flatnonzero(np.isfinite(residual_db))

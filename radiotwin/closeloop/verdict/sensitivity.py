@@ -46,7 +46,7 @@ from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle, only_b
 from radiotwin.effects.catalogue.sector_antenna import SectorAntenna, SectorPattern
 from radiotwin.effects.losses import max_loss_db
 from radiotwin.effects.params import quantities
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 MAX_MEMBERS = 5  # devices, receivers or flights of which the median is taken
 MAX_PLACES = 3  # and of boxes in the way, whose search takes longer
@@ -149,7 +149,7 @@ def _gone(view: ResidualView) -> Iterator[Pattern]:
                       rise_db / mean_db)
 
 
-def _timed(links: LinkData, mine: np.ndarray, end: str,
+def _timed(links: Links, mine: np.ndarray, end: str,
            drift: type[GainEffect]) -> Iterator[Pattern]:
     """Yield a drift of links (n,) of one end and, of a receiver, an episode."""
     timed = np.isfinite(links.time_s)
@@ -166,7 +166,7 @@ def _timed(links: LinkData, mine: np.ndarray, end: str,
                       -1.0 * (mine & during))
 
 
-def _flights(links: LinkData) -> Iterator[Pattern]:
+def _flights(links: Links) -> Iterator[Pattern]:
     """Yield a constant of flights between others, as a first or last one may be a step in time."""
     flights = _members(links.track)
     between = [mine for mine in flights if not is_first_or_last(
@@ -176,7 +176,7 @@ def _flights(links: LinkData) -> Iterator[Pattern]:
                                           "neither its first nor its last", -1.0 * mine)
 
 
-def _crossed(links: LinkData, high_m: float) -> Iterator[np.ndarray]:
+def _crossed(links: Links, high_m: float) -> Iterator[np.ndarray]:
     """Yield lengths (n,) of links with line of sight in boxes that such a link passes [m]."""
     rows = np.flatnonzero(links.los)
     a_m, b_m = ends_above_ground(links, rows)
@@ -302,7 +302,7 @@ def needed_nats(name: str, probability: float, rest_over_noise: float,
     return float(brentq(lack, 0.0, MAX_NATS)) if lack(MAX_NATS) > 0 else np.inf
 
 
-def _bounds(effect: type[GainEffect], links: LinkData) -> tuple[float, float]:
+def _bounds(effect: type[GainEffect], links: Links) -> tuple[float, float]:
     """Return the least and the largest size that an effect may have, as of `implausible`."""
     known = bool(np.isfinite(links.frequency_hz))
     if effect in (gain_offsets.DeviceGainOffset, gain_offsets.ReceiverGainOffset):

@@ -24,7 +24,7 @@ from radiotwin.effects.params import (
     quantities,
     quantity,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 MIN_LINKS = 100  # of a receiver, detected and with a heading
 MIN_NATS = 4.0  # that a body must gain to be proposed
@@ -67,7 +67,7 @@ class BodyShadowing(GainEffect):
             min_length=1, description="Body of each receiver, by index.")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         return TiltedDipole().unavailable(links)  # which needs headings, too
 
     @override
@@ -86,7 +86,7 @@ class BodyShadowing(GainEffect):
         return [*self.propose(view), params]
 
     @override
-    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+    def gain_db(self, links: Links, params: Params) -> np.ndarray:
         gain_db = np.zeros(len(links))
         for receiver, body in params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
@@ -99,7 +99,7 @@ class BodyShadowing(GainEffect):
                              lambda receivers: self.Params(receivers=receivers))
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         reported: dict[str, Parameter] = {}
         bodies_sd = np.reshape(estimate.params_sd, (len(params.receivers), -1))
@@ -112,7 +112,7 @@ class BodyShadowing(GainEffect):
         return reported
 
 
-def _arrivals(links: LinkData) -> np.ndarray:
+def _arrivals(links: Links) -> np.ndarray:
     """Return unit vectors (n, 3) towards the devices, along right, nose and top of the receiver."""
     length_m = np.maximum(np.linalg.norm(links.offset_m, axis=1), 1e-9)
     return np.einsum("nij,nj->ni", links.receiver_axes, -links.offset_m / length_m[:, None])

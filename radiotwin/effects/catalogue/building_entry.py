@@ -20,7 +20,7 @@ from typing_extensions import override
 from radiotwin.effects.arrays import LinkCache, city_of
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, quantity
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.checks import chance_inside
 
 MIN_LINKS = 30  # with one end inside
@@ -91,7 +91,7 @@ class BuildingEntry(GainEffect):
         self._entering = LinkCache()
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
             return missing
         if not MIN_HZ <= links.frequency_hz <= MAX_HZ:
@@ -109,7 +109,7 @@ class BuildingEntry(GainEffect):
                             scatter_sd_db=START_SD_DB) for building in CLASSES]
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         chance = self._chance(links)
         median_db = entry_loss_db(params.frequency_hz, links.elevation_deg, params.building)
         low_db, high_db = (entry_loss_db(params.frequency_hz, 0.0, params.building, probability)
@@ -131,7 +131,7 @@ class BuildingEntry(GainEffect):
         return None
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         scatter = Parameter.normal(params.scatter_sd_db, estimate.params_sd[0], "dB")
         return {"entry_loss_db": Parameter.normal(self._loss_db(params, estimate.coefficients),
@@ -143,7 +143,7 @@ class BuildingEntry(GainEffect):
         """Return the fitted loss of a horizontal path [dB]."""
         return float(entry_loss_db(params.frequency_hz, 0.0, params.building) + coefficients[0])
 
-    def _chance(self, links: LinkData) -> np.ndarray:
+    def _chance(self, links: Links) -> np.ndarray:
         """Return the probability (n,) that one end is inside a building and the other outside."""
         def derive() -> np.ndarray:
             city = city_of(links, self.name)

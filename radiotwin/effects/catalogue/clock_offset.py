@@ -23,7 +23,7 @@ from radiotwin.effects.params import (
     Seconds,
     Variation,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 MIN_LINKS = 60  # with a time, of a receiver that is looked at
 MAX_RECEIVERS = 60  # that are shifted in time, or it takes too long
@@ -56,7 +56,7 @@ class ReceiverClockOffset(GainEffect):
         exact: bool = Field(False, description="Whether paths are followed to those positions.")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
         moving = _speeds_m_s(links)
@@ -86,7 +86,7 @@ class ReceiverClockOffset(GainEffect):
         return [best[1]] if best[1] else []
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         offset_db = np.zeros(len(links))
         rows = np.flatnonzero(links.receiver == params.receiver)
         mine = links.select(rows)
@@ -107,7 +107,7 @@ class ReceiverClockOffset(GainEffect):
             follows_paths=params.exact)
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         name = f"positions_late_by_s[{links.receiver_names[params.receiver]}]"
         max_s = MAX_M / params.speed_m_s
@@ -115,7 +115,7 @@ class ReceiverClockOffset(GainEffect):
                                        Allowed(-max_s, max_s))}
 
 
-def _speeds_m_s(links: LinkData) -> dict[int, float]:
+def _speeds_m_s(links: Links) -> dict[int, float]:
     """Return the mean speed while moving of each receiver that moves and has enough links [m/s]."""
     moving = {}
     for receiver in frequent_labels(links.receiver[np.isfinite(links.time_s)], MIN_LINKS):
@@ -130,7 +130,7 @@ def _speeds_m_s(links: LinkData) -> dict[int, float]:
     return moving
 
 
-def _at_other_time(links: LinkData, receiver: int, offset_s: float) -> LinkData:
+def _at_other_time(links: Links, receiver: int, offset_s: float) -> Links:
     """Return links of one receiver, moved to where its tracks have it `offset_s` later.
 
     Links without a time stay.

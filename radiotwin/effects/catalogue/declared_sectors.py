@@ -46,7 +46,7 @@ from radiotwin.effects.params import (
     quantities,
     quantity,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.sites import antenna_of, site_of
 
 GROUP_SD_DB = 3.0  # between masts, and between directions of a mast
@@ -58,7 +58,7 @@ OFFSETS = ("azimuth_offset_deg", "tilt_offset_deg")  # numbers that all devices 
 TURNS_DEG = (0.0, -45.0, 45.0, -90.0, 90.0, -135.0, 135.0, 180.0)  # that are tried first
 
 
-def level_groups(links: LinkData, devices: list[int]) -> list[list[int]]:
+def level_groups(links: Links, devices: list[int]) -> list[list[int]]:
     """Return those of some devices that are on one mast, and those that look one way from it.
 
     Groups are of at least two devices; one that is both, a mast of one direction, is in it twice.
@@ -145,7 +145,7 @@ class DeclaredSectors(SectorAntenna):
             return self
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
             return missing
         if len(_declared(links)) < MIN_DEVICES:
@@ -181,7 +181,7 @@ class DeclaredSectors(SectorAntenna):
                 "azimuth_deg counts clockwise from north")
 
     @override
-    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
         own = super().term(links, params, level_at)
         shared = _shared(params)
         sd_db = np.zeros(len(links))
@@ -218,7 +218,7 @@ class DeclaredSectors(SectorAntenna):
         return Variation(values, steps, low, high, changed)
 
     @override
-    def parameters(self, links: LinkData, params: Any,
+    def parameters(self, links: Links, params: Any,
                    estimate: Estimate) -> dict[str, Parameter]:
         values = self.variation(params).values
         reported = {name: Parameter.normal(value, sd, field["unit"], allowed_of(name, field))
@@ -259,13 +259,13 @@ def _numbers() -> dict[str, dict]:
         name: field for name, field in shape.items() if name not in ("azimuth_deg", "tilt_deg")}
 
 
-def _declared(links: LinkData) -> list[int]:
+def _declared(links: Links) -> list[int]:
     """Return the devices of declared azimuth and position, also those without a reading."""
     return [device for device in np.flatnonzero(np.isfinite(links.boresight_deg)).tolist()
             if device in links.anchors]
 
 
-def _turned(links: LinkData, devices: list[int], shape: SectorPattern,
+def _turned(links: Links, devices: list[int], shape: SectorPattern,
             offset_deg: float) -> dict[int, SectorPattern]:
     """Return device -> a pattern, turned to what is declared for it, and further.
 

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from radiotwin.effects.base import LimitEffect, ResidualView
 from radiotwin.effects.params import Decibels, EffectParams, Estimate, Parameter, ReceiverIndex
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.limits import MIN_NATS, contradict_limit, receiver_limit
 
 MIN_RISE_DB = 2.0  # above the usual limit
@@ -36,7 +36,7 @@ class DetectionLimit(LimitEffect):
             default_factory=dict, description="Standard deviation of each [dB].")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         return None if np.isnan(links.level_db).any() else "no link is blank"
 
     @override
@@ -55,13 +55,13 @@ class DetectionLimit(LimitEffect):
         return [self.Params(receivers=found, sd_db=sd_db)] if found else []
 
     @override
-    def limits_db(self, links: LinkData, params: Params) -> np.ndarray:
+    def limits_db(self, links: Links, params: Params) -> np.ndarray:
         by_receiver_db = np.full(len(links.receiver_names), -np.inf)
         by_receiver_db[list(params.receivers)] = list(params.receivers.values())
         return by_receiver_db[links.receiver]
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         unit = links.level_unit
         return {f"limit[{links.receiver_names[receiver]}]": Parameter.normal(

@@ -32,7 +32,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Seconds,
 )
-from radiotwin.links import LinkData, evidence_blocks
+from radiotwin.links import Links, evidence_blocks
 from radiotwin.links.sites import site_of
 
 MIN_LINKS = 60  # with a time, of a receiver or a flight
@@ -95,7 +95,7 @@ class Episode(GainEffect):
             None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, no bound.")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
         if len(np.unique(links.flight)) < 2:
@@ -129,7 +129,7 @@ class Episode(GainEffect):
         return [params.model_copy(update={key: value for key, value in window._asdict().items()
                                           if key not in ("nats", "form")})]
 
-    def _proposed(self, links: LinkData, value_db: np.ndarray, weight: np.ndarray,
+    def _proposed(self, links: Links, value_db: np.ndarray, weight: np.ndarray,
                   known: np.ndarray, receiver: int | None, flight: str | None,
                   ) -> tuple[float, Params] | None:
         rows = _timed_rows(links, receiver, flight)
@@ -147,7 +147,7 @@ class Episode(GainEffect):
         return (window.nats, params) if stands_out else None
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         loss = np.where(_inside(links, params), -1.0, 0.0)
         if params.form == "attenuation":
             return Term.of_columns((loss * links.distance_m / 1000)[:, None], PRIOR_SD_DB_KM)
@@ -167,7 +167,7 @@ class Episode(GainEffect):
         return None
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         who = "all" if params.receiver is None else links.receiver_names[params.receiver]
         member = f"[{who}]" if params.flight is None else f"[{who}, flight {params.flight}]"
@@ -190,19 +190,19 @@ def _is_same(window: _Window, params: Any) -> bool:
     return both_s >= 0 and both_s >= MIN_OVERLAP * either_s
 
 
-def _inside(links: LinkData, params: Any) -> np.ndarray:
+def _inside(links: Links, params: Any) -> np.ndarray:
     """Return (n,) bool, links that an episode acts on."""
     with np.errstate(invalid="ignore"):
         between = (links.time_s >= params.start_s) & (links.time_s <= params.end_s)
     return between & flight_mask(links, params.receiver, params.flight)
 
 
-def _timed_rows(links: LinkData, receiver: int | None, flight: str | None) -> np.ndarray:
+def _timed_rows(links: Links, receiver: int | None, flight: str | None) -> np.ndarray:
     """Return the rows of a receiver on a flight (None: of all) that have a time."""
     return np.flatnonzero(flight_mask(links, receiver, flight) & np.isfinite(links.time_s))
 
 
-def _strongest(links: LinkData, every_db: np.ndarray, weights: np.ndarray,
+def _strongest(links: Links, every_db: np.ndarray, weights: np.ndarray,
                rows: np.ndarray) -> _Window | None:
     """Return the window in which a loss, or an attenuation, explains most.
 
@@ -278,7 +278,7 @@ def _last_s(cell: np.ndarray, time_s: np.ndarray, cells: int) -> np.ndarray:
     return last_s
 
 
-def _agrees(links: LinkData, value_db: np.ndarray, weight: np.ndarray, known: np.ndarray,
+def _agrees(links: Links, value_db: np.ndarray, weight: np.ndarray, known: np.ndarray,
             rows: np.ndarray, inside: np.ndarray) -> bool:
     """Return whether most devices, and most receivers, show the change.
 
@@ -303,14 +303,14 @@ def _agrees(links: LinkData, value_db: np.ndarray, weight: np.ndarray, known: np
                if np.bincount(label[mine]).max() >= MIN_MEMBER_LINKS)
 
 
-def _is_low(links: LinkData, rows: np.ndarray) -> bool:
+def _is_low(links: Links, rows: np.ndarray) -> bool:
     """Return whether receivers are below most roofs."""
     place_m = links.receiver_m[rows]
     ground_m = 0.0 if links.city is None else links.city.ground_height_m(*place_m[:, :2].T)
     return bool(np.median(place_m[:, 2] - ground_m) < LOW_M)
 
 
-def _is_another(links: LinkData, params: Any, inside: np.ndarray) -> bool:
+def _is_another(links: Links, params: Any, inside: np.ndarray) -> bool:
     """Return whether it is a step in time of one receiver, or all of one of its flights."""
     if params.receiver is None:
         return False
@@ -324,7 +324,7 @@ def _is_another(links: LinkData, params: Any, inside: np.ndarray) -> bool:
     return len(covered) == 1 and whole[0]
 
 
-def _is_alone(links: LinkData, value_db: np.ndarray, weight: np.ndarray, rows: np.ndarray,
+def _is_alone(links: Links, value_db: np.ndarray, weight: np.ndarray, rows: np.ndarray,
               inside: np.ndarray, nats: float) -> bool:
     """Return whether no other window differs as much.
 

@@ -14,7 +14,7 @@ from typing_extensions import override
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.losses import max_gas_db_km, max_rain_db_km, specific_db_m
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 PRIOR_SD_DB_KM = 30.0  # wide: heavy rain at 60 GHz is 15 dB/km
 SCALE_HEIGHTS_M = (5000.0, 150.0, 50.0)  # to begin with: the atmosphere, haze, vegetation
@@ -47,7 +47,7 @@ class ExcessAttenuation(GainEffect):
                 for height_m in SCALE_HEIGHTS_M]
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         height_m = params.scale_height_m
         low = np.minimum(links.device_m[links.device, 2], links.receiver_m[:, 2])
         rise = np.maximum(np.abs(links.offset_m[:, 2]), 1e-3) / height_m
@@ -81,7 +81,7 @@ class ExcessAttenuation(GainEffect):
         return None
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         return {"specific_attenuation_db_km": Parameter.normal(
                     estimate.coefficients[0], estimate.coefficients_sd[0], "dB/km",

@@ -35,7 +35,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     quantity,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 MIN_LINKS = 30  # of a receiver on a flight, at places where other flights were
 MIN_FLIGHTS = 3  # of a receiver: of two whose levels differ, either may be the faulty one
@@ -98,7 +98,7 @@ class FaultyFlight(GainEffect):
             description="Standard deviation beside that of other flights [dB].")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         pairs = np.unique(np.column_stack([links.receiver, links.flight]), axis=0)
         most = np.unique(pairs[:, 0], return_counts=True)[1].max()
         if most < 2 or (most < MIN_FLIGHTS and len(pairs) < MIN_ALL_FLIGHTS):
@@ -129,7 +129,7 @@ class FaultyFlight(GainEffect):
         return [params] if there.sum() >= MIN_LINKS else []
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         rows = np.flatnonzero(flight_mask(links, params.receiver, params.flight))
         columns, noise_db = np.zeros((len(links), 2)), np.zeros(len(links))
         columns[rows, 0] = 1.0
@@ -141,7 +141,7 @@ class FaultyFlight(GainEffect):
                        random_effect_sd_db=noise_db)
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         member = f"[{links.receiver_names[params.receiver]}, flight {params.flight}]"
         offset_db, slope = estimate.coefficients
@@ -174,7 +174,7 @@ def _flights(view: ResidualView) -> list[_Flight]:
 
 
 def _levels_db(value_db: np.ndarray, weight: np.ndarray, rows: list[np.ndarray],
-               receiver: np.ndarray, links: LinkData) -> np.ndarray:
+               receiver: np.ndarray, links: Links) -> np.ndarray:
     """Return levels (f,) of flights over those of the same receiver; NaN if devices disagree."""
     known = [mine[weight[mine] > 0] for mine in rows]
     level_db = np.array([mean_by_precision(value_db[mine], weight[mine])
@@ -203,14 +203,14 @@ def _robust_sd(values: np.ndarray) -> float:
     return robust_sd(known) if len(known) >= MIN_LINKS else np.nan
 
 
-def _from_reading_to_reading_db(residual_db: np.ndarray, links: LinkData) -> np.ndarray:
+def _from_reading_to_reading_db(residual_db: np.ndarray, links: Links) -> np.ndarray:
     """Return how far readings are from the one before of the same device, over sqrt(2) [dB]."""
     order = np.lexsort((links.time_s, links.device))
     same = np.diff(links.device[order]) == 0
     return np.diff(residual_db[order])[same] / np.sqrt(2)
 
 
-def _disagreement(flight: _Flight, flights: list[_Flight], links: LinkData) -> tuple[float, float]:
+def _disagreement(flight: _Flight, flights: list[_Flight], links: Links) -> tuple[float, float]:
     """Return the p-value of a flight's disagreement, and the scatter that it adds [dB]."""
     others = [each for each in flights if each is not flight]
     noisy = [_excess(own, np.array([each.log_scatters[kind] for each in others]), prior_sd)
@@ -238,7 +238,7 @@ def _excess(own: float, usual: np.ndarray, prior_sd: float) -> tuple[float, floa
     return float(t.sf(excess / sd, freedom + PRIOR_FREEDOM)), float(added_db)
 
 
-def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: LinkData) -> float:
+def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: Links) -> float:
     """Return the p-value of a flight's level against others'; 1 if it is small or unknown."""
     known = [each for each in others if np.isfinite(each.levels_db[kind])]
     level_db = np.array([each.levels_db[kind] for each in known])
@@ -258,7 +258,7 @@ def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: Li
     return float(2 * t.sf(abs(own_db) / np.sqrt(sum_of_squares / freedom), freedom))
 
 
-def is_first_or_last(receiver: int, flight: int, links: LinkData) -> bool:
+def is_first_or_last(receiver: int, flight: int, links: Links) -> bool:
     """Return whether a level that is off may as well be a step in time, before or after it."""
     times = {number: time_s[0] for (each, number), (time_s, _) in links.tracks.items()
              if each == receiver}

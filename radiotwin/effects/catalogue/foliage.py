@@ -28,7 +28,7 @@ from radiotwin.effects.boxes import (
 )
 from radiotwin.effects.losses import max_loss_db
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 MIN_NATS = 6.0  # that a cell must gain to be proposed
 MAX_CELLS = 3  # that are proposed, with each of `SIDES_M`
@@ -83,7 +83,7 @@ class Foliage(GainEffect):
                 if gain > MIN_NATS for side_m in SIDES_M]
 
     @override
-    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+    def gain_db(self, links: Links, params: Params) -> np.ndarray:
         crossing = cross(params.box, *ends_above(links, params.box[:2]))
         specific_db_m, max_db = params.law
         return -max_db * (1 - np.exp(-crossing.inside_m * specific_db_m / max_db))
@@ -104,12 +104,12 @@ class Foliage(GainEffect):
                 "law": VegetationLoss(*np.exp(numbers[6:]).tolist())}))
 
     @override
-    def contradicted(self, params: Params, links: LinkData) -> str | None:
+    def contradicted(self, params: Params, links: Links) -> str | None:
         through = devices_through(params.box, links)
         return BESIDE_UNKNOWN if is_beside_unknown(through, links) else None
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         variation = self.variation(params)
         low, high = variation.low.tolist(), variation.high.tolist()

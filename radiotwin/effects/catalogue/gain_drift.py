@@ -25,7 +25,7 @@ from radiotwin.effects.params import (
     Seconds,
     Variation,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 MIN_LINKS = 60  # of a receiver or device, with a time
 MIN_FLIGHTS = 3  # that a device was heard on: within a flight, time and position change together
@@ -85,7 +85,7 @@ class _GainDrift(GainEffect):
         again = "warm_up_each_flight" if self._between_flights else None
         return tuple(form for form in self.forms if form != again)
 
-    def index(self, links: LinkData) -> np.ndarray:
+    def index(self, links: Links) -> np.ndarray:
         """Return the index (n,) of the receiver or device of each link."""
         return getattr(links, self.end)
 
@@ -93,12 +93,12 @@ class _GainDrift(GainEffect):
         """Return the drifts by index of the receiver or device."""
         return getattr(params, f"{self.end}s")
 
-    def _members(self, links: LinkData) -> list[int]:
+    def _members(self, links: Links) -> list[int]:
         """Return the receivers or devices that may drift."""
         return frequent_labels(self.index(links)[np.isfinite(links.time_s)], MIN_LINKS)
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
         if links.time_restarts and "warm_up_each_flight" not in self._forms:
@@ -135,7 +135,7 @@ class _GainDrift(GainEffect):
         return [params for _, params in sorted(found, key=lambda each: -each[0])[:MAX_PROPOSALS]]
 
     @override
-    def term(self, links: LinkData, params: _DriftParams, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: _DriftParams, level_at: LevelAt) -> Term:
         columns, time_s = [], links.time_s
         if not self.of_receiver and params.span_s:  # a map has no time: it is of the latest state
             time_s = np.where(np.isnan(time_s), params.span_s[1], time_s)
@@ -163,7 +163,7 @@ class _GainDrift(GainEffect):
                          changed)
 
     @override
-    def parameters(self, links: LinkData, params: _DriftParams,
+    def parameters(self, links: Links, params: _DriftParams,
                    estimate: Estimate) -> dict[str, Parameter]:
         result, names = {}, getattr(links, f"{self.end}_names")
         log_sd = iter(estimate.params_sd)
@@ -211,12 +211,12 @@ class DeviceDrift(_GainDrift):
             min_length=1, description="Drift of each device, by index.")
 
     @override
-    def _members(self, links: LinkData) -> list[int]:
+    def _members(self, links: Links) -> list[int]:
         flights = np.unique(np.column_stack([links.device, links.flight]), axis=0)[:, 0]
         return sorted(set(super()._members(links)) & set(frequent_labels(flights, MIN_FLIGHTS)))
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         members = self._members(links)
         if len(members) > MAX_DEVICES:
             return f"{len(members)} devices are too many to examine each; at most {MAX_DEVICES}"
@@ -224,7 +224,7 @@ class DeviceDrift(_GainDrift):
             None if members else f"no device has {MIN_LINKS} links on {MIN_FLIGHTS} flights")
 
 
-def _shape(drift: Drift, links: LinkData, time_s: np.ndarray,
+def _shape(drift: Drift, links: Links, time_s: np.ndarray,
            span_s: tuple[float, float] | None) -> np.ndarray:
     """Return the change (n,) at times (n,), with an amplitude of 1."""
     form, number = drift
@@ -238,7 +238,7 @@ def _shape(drift: Drift, links: LinkData, time_s: np.ndarray,
     return (time_s - number) / max(high - low, 1.0)
 
 
-def _gap_s(links: LinkData, mine: np.ndarray, when_s: float) -> tuple[float, float]:
+def _gap_s(links: Links, mine: np.ndarray, when_s: float) -> tuple[float, float]:
     """Return the times of the readings before and after a step: it was somewhere between."""
     time_s = links.time_s[mine & np.isfinite(links.time_s) & np.isfinite(links.level_db)]
     before, after = time_s[time_s < when_s], time_s[time_s >= when_s]
@@ -246,7 +246,7 @@ def _gap_s(links: LinkData, mine: np.ndarray, when_s: float) -> tuple[float, flo
             float(after.min()) if len(after) else when_s)
 
 
-def _candidates(links: LinkData, residual_db: np.ndarray, weight: np.ndarray,
+def _candidates(links: Links, residual_db: np.ndarray, weight: np.ndarray,
                 between_flights: bool) -> Iterator[tuple[float, str, float]]:
     """Yield (nats, form, number) of each form that the times of one member's links allow.
 

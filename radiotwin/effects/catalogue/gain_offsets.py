@@ -21,7 +21,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Unique,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 PRIOR_SD_DB = 10.0  # wide: an error of a cable, a connector or a declared power
 MIN_LINKS = 30  # of a member; fewer do not outweigh shadowing
@@ -44,14 +44,14 @@ class _GainOffset(GainEffect):
                                      ge=0, le=1000,
                                      description="Standard deviation of the offsets [dB].")
 
-    def _names(self, links: LinkData) -> list[str]:
+    def _names(self, links: Links) -> list[str]:
         return getattr(links, f"{self.end}_names")
 
-    def _index(self, links: LinkData) -> np.ndarray:
+    def _index(self, links: Links) -> np.ndarray:
         return getattr(links, self.end)
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         members = frequent_labels(self._index(links), MIN_LINKS)
         if len(members) < 2:
             return f"needs two {self.end}s with {MIN_LINKS} links each, to compare them"
@@ -71,7 +71,7 @@ class _GainOffset(GainEffect):
         return [self.Params(members=members, offsets_sd_db=float(np.std(offsets_db)))]
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         index = self._index(links)
         unknown = ~np.isin(index, params.members)
         return replace(Term.of_columns(one_hot(index, params.members), PRIOR_SD_DB),
@@ -86,7 +86,7 @@ class _GainOffset(GainEffect):
         return None
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         # Relative to the median member: a common offset is the channel's intercept.
         order = np.argsort(estimate.coefficients)

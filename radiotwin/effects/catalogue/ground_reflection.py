@@ -25,7 +25,7 @@ from radiotwin.effects.params import (
     Parameter,
     Variation,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import permittivity
 
@@ -68,7 +68,7 @@ class GroundReflection(GainEffect):
         self._bounces = LinkCache()
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if not np.isfinite(links.frequency_hz):
             return "the frequency is not known; give frequency_hz in devices.csv"
         if links.los.sum() < MIN_LINKS:
@@ -99,7 +99,7 @@ class GroundReflection(GainEffect):
         return [params for _, params in best[:MAX_PROPOSALS]]
 
     @override
-    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+    def gain_db(self, links: Links, params: Params) -> np.ndarray:
         offset_db = np.zeros(len(links))
         clear, device_m, receiver_m = self._bounces.get(links, None, lambda: _bounces(links))
         rows = np.flatnonzero(clear)
@@ -120,7 +120,7 @@ class GroundReflection(GainEffect):
                 update=dict(zip(names, numbers.tolist(), strict=True))))
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         units = {"strength": "of medium dry ground", "roughness_m": "m", "ground_m": "m"}
         of = self.variation(params)
@@ -130,7 +130,7 @@ class GroundReflection(GainEffect):
                                                        of.high, strict=True)}
 
 
-def _bounces(links: LinkData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _bounces(links: Links) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return whether (n,) links have both rays, and their ends (n, 3) above a plane z = 0 [m]."""
     device_m = links.device_m[links.device]
     if links.city is not None and links.city.terrain is not None:
@@ -190,7 +190,7 @@ def _slope_normals(city: CityMap, points_m: np.ndarray) -> np.ndarray:
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
 
-def _has_bounce(links: LinkData) -> np.ndarray:
+def _has_bounce(links: Links) -> np.ndarray:
     """Return whether (n,) links have both the direct ray and the one off flat ground."""
     clear = links.los.copy()
     if links.city is not None:

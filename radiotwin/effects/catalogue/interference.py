@@ -23,7 +23,7 @@ from radiotwin.effects.params import (
     Parameter,
     Variation,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 HEIGHT_M = 1.5  # of the emitter
 REFERENCE_M = 100.0  # distance of its level
@@ -57,7 +57,7 @@ class Interference(ReceiverEffect):
             "Whether its power falls by the channel, as it was found over a 3D map."))
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         positions = np.unique((links.receiver_m[:, :2] / SAME_POSITION_M).round(), axis=0)
         if len(positions) < MIN_POSITIONS:
             return (f"receivers were at {len(positions)} positions; {MIN_POSITIONS} are needed to "
@@ -97,7 +97,7 @@ class Interference(ReceiverEffect):
         return [*self.propose(view), params]
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         fall_db = _fall_db(links, params.place_m, level_at if params.through_channel else None)
         return Term.of_inputs(np.exp((params.level_db + fall_db) * NEPERS))
 
@@ -127,7 +127,7 @@ class Interference(ReceiverEffect):
         return None
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         level = ("over_a_device_db", "dB") if params.through_channel else (
             f"level_at_{REFERENCE_M:.0f}_m", links.level_unit)
@@ -138,7 +138,7 @@ class Interference(ReceiverEffect):
                     names, of.values.tolist(), estimate.params_sd, units, of.low, of.high)}
 
 
-def _fall_db(links: LinkData, position_m: Sequence[float] | np.ndarray,
+def _fall_db(links: Links, position_m: Sequence[float] | np.ndarray,
              level_at: LevelAt | None) -> np.ndarray:
     """Return the level (n,) of an emitter of 0 dB: by the channel, or else by free space.
 

@@ -34,7 +34,7 @@ from radiotwin.effects.params import (
     Variation,
 )
 from radiotwin.inference.student import Losses, log_density
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 DOF = 4.0  # of the errors within a state
 TAILS = (1.2, 1.6, 2.2, 3.0, 4.0, 8.0)  # degrees of freedom of the single t, tried
@@ -116,7 +116,7 @@ def find_drops(view: ResidualView, receiver: int, rows: np.ndarray, design_effec
     return Drops(states.share, states.drop_db, nats)
 
 
-def _instants(links: LinkData, rows: np.ndarray) -> np.ndarray:
+def _instants(links: Links, rows: np.ndarray) -> np.ndarray:
     """Return the number (n,) of the instant of each link, in the order of time."""
     time_s = links.time_s[rows]
     key = np.where(np.isfinite(time_s), time_s, rows)
@@ -165,7 +165,7 @@ def _single_state(rest_db: np.ndarray) -> np.ndarray:
     return best
 
 
-def _comes_and_goes(links: LinkData, rows: np.ndarray, instant: np.ndarray,
+def _comes_and_goes(links: Links, rows: np.ndarray, instant: np.ndarray,
                     low: np.ndarray) -> bool:
     """Return whether the low instants (i,) are several stretches of time, none of them most."""
     flight = np.zeros(len(low), dtype=int)
@@ -211,7 +211,7 @@ class LockLoss(DetectionEffect):
         return proposed
 
     @override
-    def losses(self, links: LinkData, params: Params) -> Losses:
+    def losses(self, links: Links, params: Params) -> Losses:
         blank, drop, drop_db = np.zeros((3, len(links.receiver_names)))
         for receiver, probability in params.receivers.items():
             (drop if receiver in params.drops_db else blank)[receiver] = probability
@@ -239,7 +239,7 @@ class LockLoss(DetectionEffect):
             np.maximum(start - change, least), np.minimum(start + change, most), changed)
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         sd = estimate.params_sd
         if not len(sd):  # too many to be varied

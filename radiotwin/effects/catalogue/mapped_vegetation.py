@@ -16,7 +16,7 @@ from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.catalogue.foliage import UNKNOWN_MAX_LOSS_DB
 from radiotwin.effects.losses import max_loss_db
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.scene.vegetation import KINDS
 
 MIN_THROUGH_M, MIN_LINKS = 3.0, 60  # way in vegetation that counts, and links that have one
@@ -46,7 +46,7 @@ class MappedVegetation(GainEffect):
         self._through = LinkCache()
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
             return missing
         if not len(city_of(links, self.name).vegetation):
@@ -66,7 +66,7 @@ class MappedVegetation(GainEffect):
                 for specific in SPECIFIC_DB_M]
 
     @override
-    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+    def gain_db(self, links: Links, params: Params) -> np.ndarray:
         most_db = params.greatest_loss_db
         through_m = self._through_m(links, params.kind)
         return most_db * np.expm1(-through_m * params.specific_attenuation_db_m / most_db)
@@ -78,18 +78,18 @@ class MappedVegetation(GainEffect):
         return None
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         return {f"specific_attenuation_db_m[{params.kind}]": Parameter.normal(
             params.specific_attenuation_db_m, estimate.params_sd[0], "dB/m",
             Allowed(low=0.0, high=5.0))}
 
-    def _kinds(self, links: LinkData) -> list[str]:
+    def _kinds(self, links: Links) -> list[str]:
         """Return the kinds that enough links pass."""
         return [kind for kind in KINDS
                 if (self._through_m(links, kind) >= MIN_THROUGH_M).sum() >= MIN_LINKS]
 
-    def _through_m(self, links: LinkData, kind: str) -> np.ndarray:
+    def _through_m(self, links: Links, kind: str) -> np.ndarray:
         def measure() -> np.ndarray:
             city = city_of(links, self.name)
             vegetation = city.vegetation.of_kind(kind)

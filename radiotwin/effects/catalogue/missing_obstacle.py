@@ -47,7 +47,7 @@ from radiotwin.effects.params import (
     Parameter,
     Variation,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.scene.citymap import CONCRETE, CityMap
 
 MIN_NATS = 6.0  # that a cell must gain to be proposed
@@ -97,7 +97,7 @@ class MissingObstacle(GainEffect):
         self._shadows, self._known = LinkCache(), LinkCache()
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if not np.isfinite(links.frequency_hz):
             return "the frequency is not known; give frequency_hz in devices.csv"
         return None
@@ -159,7 +159,7 @@ class MissingObstacle(GainEffect):
                      if built_share(links, tried[0], found) <= MAX_BUILT), None)
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         offset_db = np.zeros(len(links))
         if params.exact:
             city = city_of(links, self.name)
@@ -173,7 +173,7 @@ class MissingObstacle(GainEffect):
         return Term.of_offset(self._offsets_db(links, params.box, (params.scattered_db,),
                                                params.by_class, level_at)[0])
 
-    def _offsets_db(self, links: LinkData, box: Box, scattered_db: tuple[float, ...],
+    def _offsets_db(self, links: Links, box: Box, scattered_db: tuple[float, ...],
                     by_class: bool, level_at: LevelAt) -> np.ndarray:
         """Return what a box adds to links (n,), by each of k powers in its shadow (k, n) [dB]."""
         offset_db, rows = np.zeros((len(scattered_db), len(links))), np.flatnonzero(links.los)
@@ -189,7 +189,7 @@ class MissingObstacle(GainEffect):
                                           scattered, speed_of_light / links.frequency_hz)
         return offset_db
 
-    def _past_db(self, links: LinkData, box: Box, level_at: LevelAt) -> np.ndarray:
+    def _past_db(self, links: Links, box: Box, level_at: LevelAt) -> np.ndarray:
         """Return what a box adds to links (n,) past which their known paths go [dB]."""
         from radiotwin.propagation.laws.followed_paths import KnownPaths, UprightBox
 
@@ -217,16 +217,16 @@ class MissingObstacle(GainEffect):
         offset_db[rows] = 10 * np.log10(np.clip(share, 10 ** (-MAX_LOSS_DB / 10), 1.0))
         return offset_db
 
-    def _near(self, links: LinkData, box: Box, within_m: float = NEAR_M) -> np.ndarray:
+    def _near(self, links: Links, box: Box, within_m: float = NEAR_M) -> np.ndarray:
         """Return whether (n,) links may have other levels along paths because of a box."""
         return near_box(box, links.device_m[links.device], links.receiver_m, within_m)
 
     @override
-    def reach(self, links: LinkData, params: Params) -> np.ndarray | None:
+    def reach(self, links: Links, params: Params) -> np.ndarray | None:
         along_paths = params.exact or params.known_paths
         return self._near(links, params.box) if along_paths else None
 
-    def _shadow_db(self, links: LinkData, level_at: LevelAt, by_class: bool) -> np.ndarray:
+    def _shadow_db(self, links: Links, level_at: LevelAt, by_class: bool) -> np.ndarray:
         """Return what links (n,) lose if something hides the other end [dB]; see `Params`."""
         def derive() -> np.ndarray:
             hidden = links.with_los(np.zeros(len(links), bool))
@@ -268,7 +268,7 @@ class MissingObstacle(GainEffect):
         return 0.5 * (params.box.height_m / HEIGHT_SCALE_M) ** 2
 
     @override
-    def contradicted(self, params: Params, links: LinkData) -> str | None:
+    def contradicted(self, params: Params, links: Links) -> str | None:
         through = devices_through(params.box, links)
         if is_beside_unknown(through, links):
             return BESIDE_UNKNOWN
@@ -286,7 +286,7 @@ class MissingObstacle(GainEffect):
         return _with_box(city, params.box)
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         variation = self.variation(params)
         reach = variation.values + QUANTILE_90 * estimate.sides_sd * np.array([[-1.0], [1.0]])
@@ -302,7 +302,7 @@ class MissingObstacle(GainEffect):
         return params.model_copy(update={"box": params.box.like(other.box)})
 
 
-def _ways(links: LinkData, ways: tuple[T, ...]) -> tuple[T, ...]:
+def _ways(links: Links, ways: tuple[T, ...]) -> tuple[T, ...]:
     """Return the ways in which power reaches a shadow; without a map there is one, past the box."""
     return ways if links.city is not None else ways[:1]
 
@@ -323,7 +323,7 @@ def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
     return np.maximum(10 * np.log10(np.minimum(power, 1.0)), -MAX_LOSS_DB)
 
 
-def built_share(links: LinkData, box: Box, found: Iterable[Box] = ()) -> float:
+def built_share(links: Links, box: Box, found: Iterable[Box] = ()) -> float:
     """Return the share of the ground of a box, and just around it, that is built.
 
     In the map of links, if they have one, or because boxes were found there.

@@ -23,7 +23,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Variation,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 MIN_LINKS = 40  # of a receiver, to estimate its floor
 MIN_RECEIVERS = 3  # with a floor, so that their median is the usual one
@@ -91,7 +91,7 @@ class NoiseFloor(ReceiverEffect):
         return float(view.gain_nats(rows, change_db).sum())
 
     @override
-    def inputs(self, links: LinkData, params: Params) -> np.ndarray:
+    def inputs(self, links: Links, params: Params) -> np.ndarray:
         floors_db = list(params.receivers.values())
         # A receiver without an estimate has the usual floor, unless some have one alone.
         usual = len(floors_db) >= MIN_RECEIVERS and not params.alone
@@ -125,7 +125,7 @@ class NoiseFloor(ReceiverEffect):
                 f"would be {BELOW_DB:.0f} dB below it then: it is no floor")
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         unit = links.level_unit
         return {f"floor[{links.receiver_names[receiver]}]": Parameter.normal(floor_db, sd_db, unit)

@@ -15,7 +15,7 @@ from typing_extensions import override
 from radiotwin.effects.arrays import NEPERS, add_power, city_of
 from radiotwin.effects.base import PathEffect, ResidualView
 from radiotwin.effects.params import Allowed, Decibels, EffectParams, Estimate, Parameter, Variation
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.propagation.laws.followed_paths import paths_of
 
 STRENGTHS_DB = (0.0, -4.0, -8.0)  # to begin with, relative to theory
@@ -39,7 +39,7 @@ class _Paths(PathEffect):
         level_db: Decibels = Field(description="Level that a gain of 0 dB is measured as [dB].")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
             return missing
         if len(links) > MAX_LINKS:
@@ -59,7 +59,7 @@ class _Paths(PathEffect):
                 for strength_db in STRENGTHS_DB]
 
     @override
-    def inputs(self, links: LinkData, params: Params) -> np.ndarray:
+    def inputs(self, links: Links, params: Params) -> np.ndarray:
         city_of(links, self.name)
         return paths_of(links, self.kinds)
 
@@ -77,7 +77,7 @@ class _Paths(PathEffect):
             lambda numbers: params.model_copy(update={"strength_db": float(numbers[0])}))
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         return {"strength_db": Parameter.normal(params.strength_db - params.level_db,
                                                 estimate.params_sd[0], "dB",

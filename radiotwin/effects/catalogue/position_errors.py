@@ -21,7 +21,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Variation,
 )
-from radiotwin.links import LinkData, site_of
+from radiotwin.links import Links, site_of
 
 MIN_LINKS = 60  # of an end that is moved about
 MAX_ENDS = 60  # that are moved about, or it takes too long
@@ -57,7 +57,7 @@ class DevicePositionError(GainEffect):
         exact: bool = Field(False, description="Whether paths are followed to the new position.")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         devices = _movable_anchors(links)
         if not devices:
             return f"no anchor has {MIN_LINKS} links"
@@ -88,7 +88,7 @@ class DevicePositionError(GainEffect):
         return [best[1]] if best[1] else []
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         offset_db = np.zeros(len(links))
         rows = np.flatnonzero(np.isin(links.device, site_of(links, params.device)))
         mine = links.select(rows)
@@ -113,7 +113,7 @@ class DevicePositionError(GainEffect):
             follows_paths=params.exact)
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         declared_m = links.device_m[params.device, :2]
         return {f"{axis}_m[{links.device_names[device]}]": Parameter.normal(
@@ -142,7 +142,7 @@ class ReceiverPositionError(GainEffect):
         exact: bool = Field(False, description="Whether paths are followed to the new positions.")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         receivers = frequent_labels(links.receiver, MIN_LINKS)
         if len(receivers) > MAX_ENDS:
             return f"{len(receivers)} receivers are too many to move each about; at most {MAX_ENDS}"
@@ -168,7 +168,7 @@ class ReceiverPositionError(GainEffect):
         return [best[1]] if best[1] else []
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         offset_db = np.zeros(len(links))
         rows = np.flatnonzero(links.receiver == params.receiver)
         mine = links.select(rows)
@@ -193,7 +193,7 @@ class ReceiverPositionError(GainEffect):
             follows_paths=params.exact)
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         name = links.receiver_names[params.receiver]
         return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(
@@ -209,13 +209,13 @@ def _too_near(move_m: tuple[float, ...]) -> str | None:
     return None
 
 
-def _movable_anchors(links: LinkData) -> list[int]:
+def _movable_anchors(links: Links) -> list[int]:
     """Return anchors with enough links; other devices were located where these links fit best."""
     return [device for device in frequent_labels(links.device, MIN_LINKS)
             if device in links.anchors]
 
 
-def _with_moved(links: LinkData, device: int, move_m: tuple[float, float]) -> LinkData:
+def _with_moved(links: Links, device: int, move_m: tuple[float, float]) -> Links:
     """Return the links with a device and all on its mast moved east and north."""
     device_m = links.device_m.copy()
     device_m[site_of(links, device), :2] += move_m

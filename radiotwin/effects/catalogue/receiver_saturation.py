@@ -21,7 +21,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Variation,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 
 MIN_STRONG = 20  # links above the saturation level
 MIN_LINKS = 5 * MIN_STRONG  # of a receiver
@@ -77,7 +77,7 @@ class ReceiverSaturation(ReceiverEffect):
         return [self.Params(receivers=found)] if found else []
 
     @override
-    def inputs(self, links: LinkData, params: Params) -> np.ndarray:
+    def inputs(self, links: Links, params: Params) -> np.ndarray:
         by_receiver = np.full((len(links.receiver_names), 2), np.inf)
         for receiver, compression in params.receivers.items():
             by_receiver[receiver] = compression
@@ -108,7 +108,7 @@ class ReceiverSaturation(ReceiverEffect):
                          list(np.arange(2 * n).reshape(n, 2)))
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         unit = links.level_unit
         return {f"saturation_level[{links.receiver_names[receiver]}]":

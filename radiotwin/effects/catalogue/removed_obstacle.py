@@ -26,7 +26,7 @@ from radiotwin.effects.boxes import (
 )
 from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
 
 MAX_PROPOSALS = 4  # of buildings whose removal is tried exactly
@@ -86,7 +86,7 @@ class RemovedObstacle(GainEffect):
         return []
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         offset_db, with_it = np.zeros(len(links)), city_of(links, self.name)
         if params.exact:
             city, box = _without(with_it, params.building)
@@ -111,7 +111,7 @@ class RemovedObstacle(GainEffect):
         return _without(city, nearest)[0] if apart_m[nearest] < SAME_M else city
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         return {name: Parameter(value, value, value, "m")
                 for name, value in zip(("x_m", "y_m", "height_m"), params.centre_m, strict=True)}
@@ -126,17 +126,17 @@ def _gain_nats(view: ResidualView, building: int, other: CityMap) -> float:
     return float(view.gain_nats(rows, change_db).sum())
 
 
-def _near(links: LinkData, box: Box) -> np.ndarray:
+def _near(links: Links, box: Box) -> np.ndarray:
     """Return the rows of links that pass near a box."""
     return np.flatnonzero(near_box(box, links.device_m[links.device], links.receiver_m, NEAR_M))
 
 
-def _rise_db(links: LinkData, level_at: LevelAt) -> np.ndarray:
+def _rise_db(links: Links, level_at: LevelAt) -> np.ndarray:
     """Return what links (n,) gain if nothing were in their straight line [dB]."""
     return level_at(links.with_los(np.ones(len(links), bool)), True) - level_at(links, True)
 
 
-def only_blocker(links: LinkData) -> np.ndarray:
+def only_blocker(links: Links) -> np.ndarray:
     """Return (n,) the building that alone blocks each link; -1 where none or more than one does.
 
     Terrain is no building.

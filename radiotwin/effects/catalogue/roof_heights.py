@@ -37,7 +37,7 @@ from radiotwin.effects.boxes import (
 )
 from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Length, Metres, Parameter
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.scene.citymap import DOWN, CityMap
 
 SAMPLES = 24  # points of a link over the box around a building
@@ -194,7 +194,7 @@ class RoofHeights(GainEffect):
         roofs: tuple[Roof, ...] = Field(description="Roofs, and how much higher they are.")
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
             return missing
         return None if np.isfinite(links.frequency_hz) else "the frequency is not known"
@@ -209,7 +209,7 @@ class RoofHeights(GainEffect):
         return [self.Params(roofs=roofs)] if roofs else []
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         city, offset_db = city_of(links, self.name), np.zeros(len(links))
         count = len(buildings(city)[1])
         raised_m = np.zeros(count)
@@ -236,7 +236,7 @@ class RoofHeights(GainEffect):
         return Term.of_offset(offset_db)
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         return {f"true_minus_mapped_height_m[{roof.x_m:.0f}, {roof.y_m:.0f}]":
                 Parameter.normal(roof.true_offset_m, roof.offset_sd_m, "m")
@@ -363,7 +363,7 @@ def _without(city: CityMap, which: tuple[int, ...]) -> CityMap:
     return city.without(np.isin(buildings(city)[0], which))
 
 
-def _contrast_db(links: LinkData, level_at: LevelAt) -> np.ndarray:
+def _contrast_db(links: Links, level_at: LevelAt) -> np.ndarray:
     """Return what each link (n,) has more with line of sight than without, by the law [dB]."""
     with_it, without = (level_at(links.with_los(np.full(len(links), each)))
                         for each in (True, False))

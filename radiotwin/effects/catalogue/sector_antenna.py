@@ -27,7 +27,7 @@ from radiotwin.effects.params import (
     Variation,
     quantity,
 )
-from radiotwin.links import LinkData, site_of
+from radiotwin.links import Links, site_of
 from radiotwin.propagation.laws.followed_paths import free_space, rays_of, through_antenna_db
 
 MIN_LINKS = 100  # of a device whose antenna is looked for
@@ -105,7 +105,7 @@ class SectorAntenna(GainEffect):
         self._rays = LinkCache()
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if not _eligible_devices(links):
             return f"no device of known position has {MIN_LINKS} links"
         return None
@@ -130,7 +130,7 @@ class SectorAntenna(GainEffect):
                 for chosen in ([mast, {best}] if len(mast) > 1 else [{best}])]
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         offset_db = np.zeros(len(links))
         for device, pattern in params.devices.items():
             rows = np.flatnonzero(links.device == device)
@@ -147,7 +147,7 @@ class SectorAntenna(GainEffect):
                              lambda devices: params.model_copy(update={"devices": devices}))
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         reported: dict[str, Parameter] = {}
         patterns_sd = np.reshape(estimate.params_sd, (len(params.devices), -1))
@@ -160,7 +160,7 @@ class SectorAntenna(GainEffect):
         return reported
 
 
-def _eligible_devices(links: LinkData) -> list[int]:
+def _eligible_devices(links: Links) -> list[int]:
     """Return devices with enough links and a declared position.
 
     One that was located wrongly from these very measurements may look as if it had an antenna.
@@ -184,7 +184,7 @@ class Rays(NamedTuple):
     free: np.ndarray
 
     @classmethod
-    def of(cls, links: LinkData, rows: np.ndarray, straight: bool) -> "Rays":
+    def of(cls, links: Links, rows: np.ndarray, straight: bool) -> "Rays":
         """Return those of some links, which are followed over the map unless they are straight."""
         links = links.select(rows)
         if straight or links.city is None:

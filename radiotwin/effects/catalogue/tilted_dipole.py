@@ -25,7 +25,7 @@ from radiotwin.effects.params import (
     Variation,
     quantity,
 )
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.propagation.laws.followed_paths import free_space, rays_of, through_antenna_db
 
 MIN_LINKS = 100  # of a receiver with line of sight, to propose its dipole
@@ -86,7 +86,7 @@ class TiltedDipole(GainEffect):
         self._arrivals = LinkCache()
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if np.isnan(links.heading_deg).all():
             return "there is no heading_deg, so directions in the receiver's body frame are unknown"
         heading = np.radians(links.heading_deg)
@@ -106,7 +106,7 @@ class TiltedDipole(GainEffect):
         return [self.Params(receivers=found)] if found else []
 
     @override
-    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+    def gain_db(self, links: Links, params: Params) -> np.ndarray:
         offset_db = np.zeros(len(links))
         for receiver, dipole in params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
@@ -121,7 +121,7 @@ class TiltedDipole(GainEffect):
                              lambda receivers: self.Params(receivers=receivers))
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         reported: dict[str, Parameter] = {}
         dipoles_sd = np.reshape(estimate.params_sd, (len(params.receivers), -1))
@@ -156,7 +156,7 @@ class _Arrivals(NamedTuple):
     Attributes:
         ray: (n, sectors, 3) unit vectors towards where they come from, in the world.
         power: (n, sectors) power gain.
-        axes: (n, 3, 3) of the receiver, see `LinkData.receiver_axes`.
+        axes: (n, 3, 3) of the receiver, see `Links.receiver_axes`.
         free: (n,) power gain in free space; 0 without a map, where the straight line is all.
     """
 
@@ -166,7 +166,7 @@ class _Arrivals(NamedTuple):
     free: np.ndarray
 
     @classmethod
-    def of(cls, links: LinkData, rows: np.ndarray) -> "_Arrivals":
+    def of(cls, links: Links, rows: np.ndarray) -> "_Arrivals":
         """Return those of some links, which are followed over the map."""
         links = links.select(rows)
         if links.city is None:

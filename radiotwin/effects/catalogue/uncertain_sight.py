@@ -14,7 +14,7 @@ from typing_extensions import override
 from radiotwin.effects.arrays import LinkCache, city_of
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.scene.perturbation import perturbed_map
 
 # Between the accuracies of buildings as blocks with roofs (2 m) and of surveyed ones (0.5 m): LoD2
@@ -47,7 +47,7 @@ class UncertainSight(GainEffect):
         self._chances = LinkCache()
 
     @override
-    def unavailable(self, links: LinkData) -> str | None:
+    def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
             return missing
         chance = self._chance(links)
@@ -62,14 +62,14 @@ class UncertainSight(GainEffect):
         return [self.Params(contrast_db=contrast_db) for contrast_db in CONTRASTS_DB]
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         chance, los = self._chance(links), links.los
         columns = np.column_stack([np.where(los, chance - 1.0, 0.0), np.where(los, 0.0, chance)])
         return replace(Term.of_columns(columns, PRIOR_SD_DB),
                        random_effect_sd_db=params.contrast_db * np.sqrt(chance * (1.0 - chance)))
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         contrast = Parameter.normal(params.contrast_db, estimate.params_sd[0], "dB",
                                     Allowed(low=0.0))
@@ -78,7 +78,7 @@ class UncertainSight(GainEffect):
             name: Parameter.normal(value_db, sd_db, "dB") for name, value_db, sd_db in
             zip(names, estimate.coefficients, estimate.coefficients_sd, strict=True)}
 
-    def _chance(self, links: LinkData) -> np.ndarray:
+    def _chance(self, links: Links) -> np.ndarray:
         """Return how probable the line of sight of each link (n,) is."""
         def derive() -> np.ndarray:
             city = city_of(links, self.name)

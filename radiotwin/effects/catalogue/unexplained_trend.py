@@ -15,7 +15,7 @@ from typing_extensions import override
 from radiotwin.effects.arrays import LinkCache
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, Unique
-from radiotwin.links import LinkData, residual_variable
+from radiotwin.links import Links, residual_variable
 
 KNOTS = 8
 PRIOR_SD_DB = 5.0  # of the value at a knot
@@ -80,7 +80,7 @@ class UnexplainedTrend(GainEffect):
         return self.variable in ON_MAPS and params.receivers == [None]
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
         basis = _hats(self._value(links, level_at), np.array(params.knots),
                       self.variable in CIRCULAR)
         columns = [basis if member is None else basis * (links.receiver == member)[:, None]
@@ -88,7 +88,7 @@ class UnexplainedTrend(GainEffect):
         return Term.of_columns(np.hstack(columns), PRIOR_SD_DB)
 
     @override
-    def parameters(self, links: LinkData, params: Params,
+    def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         curves = np.reshape(estimate.coefficients, (len(params.receivers), -1))
         result = {}
@@ -100,7 +100,7 @@ class UnexplainedTrend(GainEffect):
                                                              "dB")
         return result
 
-    def _value(self, links: LinkData, level_at: LevelAt) -> np.ndarray:
+    def _value(self, links: Links, level_at: LevelAt) -> np.ndarray:
         """Return the variable (n,)."""
         return self._values.get(
             links, (level_at,), lambda: residual_variable(self.variable, links, level_at(links)))

@@ -18,7 +18,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import Limit, limits_of
-from radiotwin.links import LinkData, LinkGeometry
+from radiotwin.links import LinkGeometry, Links
 
 MIN_DETECTED = 20  # detected links that a line and its standard deviation are learnt from
 LEVEL_SD_DB = 20.0  # prior standard deviation of a refitted level: weak
@@ -86,7 +86,7 @@ class ChannelModel(ABC):
         """A quicker model of small changes, such as moved ends; by default the model itself."""
         return self
 
-    def level_at(self, links: LinkData, exact: bool = False) -> np.ndarray:
+    def level_at(self, links: Links, exact: bool = False) -> np.ndarray:
         """Return the mean level (n,) [dB] of measured links, such as with moved devices.
 
         Args:

@@ -16,7 +16,7 @@ from numba import njit
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkData, LinkGeometry
+from radiotwin.links import LinkGeometry, Links
 from radiotwin.propagation.paths.powers import paths_with_points
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.pieces import KeptParts, Piece
@@ -70,12 +70,12 @@ def interaction_gains(geometry: LinkGeometry) -> np.ndarray:
     return power
 
 
-def paths_of(links: LinkData, kinds: tuple[str, ...]) -> np.ndarray:
+def paths_of(links: Links, kinds: tuple[str, ...]) -> np.ndarray:
     """Return `path_gains` (n,) of measured links."""
     return path_gains(links.geometry, kinds)
 
 
-def rays_of(links: LinkData, end: str) -> np.ndarray:
+def rays_of(links: Links, end: str) -> np.ndarray:
     """Return power times direction of the paths at one end of links.
 
     Args:

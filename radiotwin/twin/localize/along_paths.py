@@ -21,7 +21,7 @@ from scipy.special import stdtrit
 
 from radiotwin.effects.base import ResidualView
 from radiotwin.inference.censored_regression import CensoredRegression, FitResult
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.execution import Executor, Job, Resources
@@ -97,7 +97,7 @@ class Relocation:
     powers: WeakKeyDictionary[CityMap, Followed] = field(default_factory=WeakKeyDictionary)
     executor: Executor = field(default_factory=Executor)
 
-    def relocate(self, links: LinkData, devices: list[TwinDevice],
+    def relocate(self, links: Links, devices: list[TwinDevice],
                  channel: ImagePaths) -> list[TwinDevice]:
         """Return the devices, unknown ones where paths put them.
 
@@ -176,7 +176,7 @@ class Relocation:
             "position", inputs, partial(search.from_law, device, before), write, read)
         return found
 
-    def _rows(self, links: LinkData, device: int) -> np.ndarray:
+    def _rows(self, links: Links, device: int) -> np.ndarray:
         """Return some links of a device: the same ones in each part of them."""
         rows = np.flatnonzero(links.device == device)
         hashes = _hashes(links.receiver_m[rows])
@@ -217,17 +217,17 @@ class _Likelihood:
     rows: np.ndarray
     device: int
 
-    def at(self, position_m: np.ndarray) -> LinkData:
+    def at(self, position_m: np.ndarray) -> Links:
         """Return the links with the device at a position (2,)."""
         device_m = self.model.links.device_m.copy()
         device_m[self.device, :2] = position_m
         return self.model.links.select(self.rows).with_devices(device_m)
 
-    def problem(self, links: LinkData, mean_db: np.ndarray) -> CensoredRegression:
+    def problem(self, links: Links, mean_db: np.ndarray) -> CensoredRegression:
         """Return the regression on the links, of which the channel predicts (n,)."""
         return FoldModel.build(links, self.model.channel, DOF, channel_db=mean_db).regression()
 
-    def nll(self, links: LinkData, mean_db: np.ndarray) -> float:
+    def nll(self, links: Links, mean_db: np.ndarray) -> float:
         """Return the negative log-likelihood [nats]."""
         return float(self.problem(links, mean_db).nll(self.result).sum())
 
@@ -331,7 +331,7 @@ class _Search:
         links = self.by_law.at(position_m)
         return self.by_law.nll(links, self.by_law.model.level_at(links))
 
-    def _paths_db(self, links: LinkData) -> np.ndarray:
+    def _paths_db(self, links: Links) -> np.ndarray:
         position_m = tuple(map(float, links.device_m[self.by_paths.device]))
         assert links.city is not None
         power = self.relocation.follow(links.city, position_m, links.receiver_m,

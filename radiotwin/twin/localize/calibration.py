@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from radiotwin.effects.arrays import subsample
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.twin.localize.without_map import (
     CREDIBLE,
     MIN_LINKS,
@@ -49,7 +49,7 @@ class RadiusCalibration:
     typical_misfit: float = np.nan
 
 
-def calibrate_radii(models: list[EffectModel], held_out: list[LinkData], area_m: Area,
+def calibrate_radii(models: list[EffectModel], held_out: list[Links], area_m: Area,
                     seed: int) -> RadiusCalibration:
     """Locate devices of known position, each from links that its model has not seen.
 
@@ -87,7 +87,7 @@ def calibrate_radii(models: list[EffectModel], held_out: list[LinkData], area_m:
     return RadiusCalibration(power, radius_factor(ratios(power)), float(np.median(misfits)))
 
 
-def _enough_links(links: LinkData) -> np.ndarray:
+def _enough_links(links: Links) -> np.ndarray:
     """Return devices with links enough to be located, of which at least one was heard."""
     count, heard = (np.bincount(links.device[rows], minlength=len(links.device_names))
                     for rows in (slice(None), np.isfinite(links.level_db)))
@@ -109,7 +109,7 @@ def radius_factor(ratios: np.ndarray) -> float:
     return max(float(np.sqrt(square / (PRIOR_TRIALS + len(ratios)))), 1.0)
 
 
-def misfit(model: EffectModel, own: LinkData, place: PositionEstimate) -> float:
+def misfit(model: EffectModel, own: Links, place: PositionEstimate) -> float:
     """Return the mean square of residuals over their scale, of the links of a located device.
 
     The device's own level, as far as it may have one, counts as no misfit.

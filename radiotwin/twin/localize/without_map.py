@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.twin.model.effect_model import EffectModel
 
 COARSE_CELLS, MAX_FINE_CELLS, MAX_SPLIT = 1500, 640, 4
@@ -68,7 +68,7 @@ class PositionPosterior:
     links: int
 
     @classmethod
-    def of(cls, model: EffectModel, own: LinkData, area_m: Area, power: float
+    def of(cls, model: EffectModel, own: Links, area_m: Area, power: float
            ) -> PositionPosterior:
         """Return that of the links of one device; the cells hold the likelihood to a power."""
         coarse_m, width_m = _grid(area_m)
@@ -88,7 +88,7 @@ class PositionPosterior:
                                 float(self.cells_m[best, 1]), float(radius_m), self.links)
 
 
-def locate(model: EffectModel, links: LinkData, area_m: Area,
+def locate(model: EffectModel, links: Links, area_m: Area,
            on_progress: Callable[[], None] = lambda: None) -> Iterator[PositionEstimate]:
     """Locate the devices of some links, whatever position the links have them at but for height.
 
@@ -110,14 +110,14 @@ def locate(model: EffectModel, links: LinkData, area_m: Area,
         on_progress()
 
 
-def whole_area(model: EffectModel, links: LinkData) -> Area:
+def whole_area(model: EffectModel, links: Links) -> Area:
     """Return the area around all ends that are known."""
     known = np.vstack([links.receiver_m[:, :2], model.device_m[:, :2]])
     (west, south), (east, north) = known.min(axis=0) - MARGIN_M, known.max(axis=0) + MARGIN_M
     return west, east, south, north
 
 
-def position_log_likelihood(model: EffectModel, own: LinkData,
+def position_log_likelihood(model: EffectModel, own: Links,
                             positions_m: np.ndarray) -> np.ndarray:
     """Return the log-likelihood (c,) of the links of one device, if it were elsewhere.
 
@@ -131,7 +131,7 @@ def position_log_likelihood(model: EffectModel, own: LinkData,
                            for first in range(0, len(positions_m), cells)])
 
 
-def _log_likelihood_at(model: EffectModel, own: LinkData, positions_m: np.ndarray) -> np.ndarray:
+def _log_likelihood_at(model: EffectModel, own: Links, positions_m: np.ndarray) -> np.ndarray:
     """Return the same for few enough positions, all at once."""
     n, cells, sd_db = len(own), len(positions_m), model.device_sd_db
     height_m = np.full(cells, own.device_m[own.device[0], 2])

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from radiotwin.inference.held_out import combine
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.measurements import MAX_ANGLE_DEG
 from radiotwin.links.variables import feature_count, link_features
 from radiotwin.propagation.laws.base import (
@@ -76,7 +76,7 @@ class Blend:
     laws: dict[str, ChannelModel]
     boresights_deg: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
-    def far_share(self, links: LinkData) -> np.ndarray:
+    def far_share(self, links: Links) -> np.ndarray:
         """Return how far the receivers of links are from where their device was measured (n,)."""
         away_m = np.full(len(links), np.inf)
         for device in np.unique(links.device):
@@ -86,7 +86,7 @@ class Blend:
                 away_m[mine] = cKDTree(known_m).query(links.receiver_m[mine])[0]
         return far_share(away_m, self.half_m)
 
-    def apply(self, links: LinkData, mean_db: np.ndarray, scale_db: np.ndarray,
+    def apply(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray,
               rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and error scale (n,) of the combination [dB], before any limit of detection.
 
@@ -110,7 +110,7 @@ class Blend:
                              np.transpose([self.weights[name] for name in names]))
         return blended_db, scale_db * sd_factor(share, self.sd_ratio)
 
-    def _declared(self, links: LinkData) -> LinkData:
+    def _declared(self, links: Links) -> Links:
         """Return links with the azimuths that were declared where this was fitted, no others."""
         boresight_deg = np.full(len(links.device_names), np.nan)
         boresight_deg[self.boresights_deg[:, 0].astype(int)] = self.boresights_deg[:, 1]

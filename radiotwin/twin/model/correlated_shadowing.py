@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from radiotwin.inference.censored_regression import FitResult
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.links.sites import antenna_of, relatives_of
 from radiotwin.propagation.laws.kriging import MIN_POINTS, ResidualField
 from radiotwin.runtime.pieces import kept
@@ -91,7 +91,7 @@ class Relatives:
     passed_on: dict[int, float]
 
     @classmethod
-    def fit(cls, links: LinkData, z: np.ndarray, field: ResidualField | None,
+    def fit(cls, links: Links, z: np.ndarray, field: ResidualField | None,
             seed: int) -> Relatives | None:
         """Return what links with residuals (n,) say of their relatives; None if none has any.
 
@@ -127,18 +127,18 @@ class Relatives:
             passed_on |= dict.fromkeys(alike, share)
         return cls(field, relative_sd, passed_on)
 
-    def mean(self, links: LinkData) -> np.ndarray:
+    def mean(self, links: Links) -> np.ndarray:
         """Return what they say of links (n,) [error scales]; 0 where they say nothing."""
         return self._share(links) * self.relative_sd * self.field.mean(
             links.device, links.receiver_m, links.receiver)
 
-    def at(self, links: LinkData) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
         """Return `mean`, and the share (n,) left of the error scale."""
         mean, sd = self.field.predict(links.device, links.receiver_m, links.receiver)
         share = self._share(links)
         return share * self.relative_sd * mean, np.sqrt(1 - share**2 * (1 - sd**2))
 
-    def _share(self, links: LinkData) -> np.ndarray:
+    def _share(self, links: Links) -> np.ndarray:
         """Return `passed_on` of the device of each link (n,); 0 of one without relatives."""
         share = np.zeros(len(links))
         for device, passed_on in self.passed_on.items():
@@ -220,7 +220,7 @@ class CorrelatedShadowing:
                  else fitted_field("shadowing", ResidualField(), *points, seed, kind))
         return cls(field, relative_sd, move, relatives=relatives)
 
-    def at(self, links: LinkData) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
         """Return what it adds (n,) [error scales], and the share (n,) left of the error scale."""
         mean, sd = self.field.predict(*_points(links, self.receivers_move))
         mean = self.relative_sd * mean
@@ -251,7 +251,7 @@ class CorrelatedShadowing:
                    relatives)
 
 
-def _points(links: LinkData,
+def _points(links: Links,
             receivers_move: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return series, position and kind of links.
 
@@ -268,6 +268,6 @@ def standardised_residual(model: FoldModel, result: FitResult) -> np.ndarray:
     return np.clip(residual_db / model.training.predict(result).scale_db, -MAX_Z, MAX_Z)
 
 
-def receivers_move(links: LinkData) -> bool:
+def receivers_move(links: Links) -> bool:
     """Return whether receivers have been at more positions than there are devices."""
     return len(np.unique(links.receiver_m[:, :2].round(), axis=0)) >= len(links.device_names)

@@ -9,8 +9,8 @@ import numpy as np
 from radiotwin.errors import BadInput
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.student import detection_probability
-from radiotwin.links import LinkData
-from radiotwin.links.link_data import Prediction
+from radiotwin.links import Links
+from radiotwin.links.links import Prediction
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.twin.model.blend import Blend
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
@@ -127,7 +127,7 @@ class EffectModel:
         return replace(self, effects=tuple(each for each in self.effects
                                            if each.effect.is_cause and not each.effect.in_paths))
 
-    def on_links(self, links: LinkData) -> tuple[FoldModel, FitResult]:
+    def on_links(self, links: Links) -> tuple[FoldModel, FitResult]:
         """Return the model of any links (n,), and the fit that goes with it.
 
         Where the links have no receivers (a map's have none) those are faultless: effects of
@@ -148,7 +148,7 @@ class EffectModel:
                                "needed for these links; run `radiotwin fit` again")
         return model, FitResult(np.concatenate(coefficients), self.scale_db, np.nan)
 
-    def predict(self, links: LinkData) -> Prediction:
+    def predict(self, links: Links) -> Prediction:
         """Return the levels that are expected of links, see `Prediction`."""
         model, result = self.on_links(links)
         mean_db, scale_db, unheard_db = model.predict_parts(result)

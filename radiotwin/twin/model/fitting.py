@@ -19,7 +19,7 @@ from radiotwin.effects.base import Effect
 from radiotwin.effects.params import NEAR_SHARE, Variation
 from radiotwin.inference import censored_regression
 from radiotwin.inference.censored_regression import FitResult
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.propagation.laws.base import ANY_LEVEL_SD_DB
 from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept
@@ -106,11 +106,11 @@ def _refine_members(model: FoldModel, result: FitResult, last: AppliedEffect,
     numbers = variation.values.copy()
     arriving_db = model.regression().arriving(result.coefficients)[0] - last.term.offset_db
 
-    def changed(links: LinkData, numbers: np.ndarray) -> AppliedEffect:
+    def changed(links: Links, numbers: np.ndarray) -> AppliedEffect:
         params = variation.params(np.clip(numbers, variation.low, variation.high))
         return AppliedEffect(last.effect, params, last.effect.term(links, params, model.level_at))
 
-    def acted_db(links: LinkData, numbers: np.ndarray) -> np.ndarray:
+    def acted_db(links: Links, numbers: np.ndarray) -> np.ndarray:
         there = changed(links, numbers)
         if last.effect.stage != "receiver":
             return there.term.offset_db
@@ -136,7 +136,7 @@ def _refine_members(model: FoldModel, result: FitResult, last: AppliedEffect,
                         prior_sd_db=np.full(1, ANY_LEVEL_SD_DB))
 
         def objective(values: np.ndarray, member: np.ndarray = member, rows: np.ndarray = rows,
-                      links: LinkData = links, others: list[AppliedEffect] = others,
+                      links: Links = links, others: list[AppliedEffect] = others,
                       alone: censored_regression.CensoredRegression = alone) -> float:
             nonlocal latest
             tried = numbers.copy()

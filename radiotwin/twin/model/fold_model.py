@@ -23,7 +23,7 @@ from radiotwin.inference.censored_regression import (
     Response,
 )
 from radiotwin.inference.student import NO_LOSSES, Losses
-from radiotwin.links import LinkData
+from radiotwin.links import Links
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.scene.citymap import CityMap
 
@@ -71,7 +71,7 @@ class FoldModel:
         effects: found so far.
     """
 
-    links: LinkData
+    links: Links
     train: np.ndarray
     usable: np.ndarray
     channel: ChannelModel
@@ -84,7 +84,7 @@ class FoldModel:
     effects: list[AppliedEffect] = field(default_factory=list)
 
     @classmethod
-    def build(cls, links: LinkData, channel: ChannelModel, dof: float, *,
+    def build(cls, links: Links, channel: ChannelModel, dof: float, *,
               device_m: np.ndarray | None = None, train: np.ndarray | None = None,
               channel_db: np.ndarray | None = None) -> FoldModel:
         """Return a model without effects.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from radiotwin.links.link_data import LinkGeometry
+from radiotwin.links.links import LinkGeometry
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.segmented_nn import SegmentedNN, forward
 

@@ -168,7 +168,7 @@ def link_geometry(device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarr
 
 
 @dataclass(frozen=True, eq=False)
-class LinkData:
+class Links:
     """n links, as arrays; made by `radiotwin.links.prepare_links` from measurements.
 
     Attributes:
@@ -251,7 +251,7 @@ class LinkData:
     @classmethod
     def synthetic(cls, device_m: np.ndarray, device: np.ndarray, receiver_m: np.ndarray, *,
                   device_names: Sequence[str], limit_db: float | None, frequency_hz: float,
-                  city: CityMap | None, is_gain: bool, anchors: frozenset[int]) -> LinkData:
+                  city: CityMap | None, is_gain: bool, anchors: frozenset[int]) -> Links:
         """Return links that nobody measured: receiver, flight, time and heading are unset.
 
         Args:
@@ -385,35 +385,35 @@ class LinkData:
             greatest[rows] = nu.max(axis=1)
         return greatest
 
-    def select(self, rows: np.ndarray | slice) -> LinkData:
+    def select(self, rows: np.ndarray | slice) -> Links:
         """Return the links of a mask, a slice or an index array."""
         values = {name: getattr(self, name) for name in _OF_EACH_LINK}
         values["known_los"] = self.los
         return replace(self, **{name: value[rows] for name, value in values.items()
                                 if value is not None})
 
-    def with_devices(self, device_m: np.ndarray) -> LinkData:
+    def with_devices(self, device_m: np.ndarray) -> Links:
         """Return the same links with the devices at (k, 3) [m]."""
         return replace(self, device_m=device_m, known_los=None)
 
-    def located(self, device_m: np.ndarray) -> LinkData:
+    def located(self, device_m: np.ndarray) -> Links:
         """Return the links of devices that have a position in (k, 3) [m], there; NaN: none."""
         rows = np.isfinite(device_m).all(axis=1)[self.device]
         return self.with_devices(np.nan_to_num(device_m)).select(rows)
 
-    def with_receivers(self, receiver_m: np.ndarray) -> LinkData:
+    def with_receivers(self, receiver_m: np.ndarray) -> Links:
         """Return the same links with the receivers at (n, 3) [m]."""
         return replace(self, receiver_m=receiver_m, known_los=None)
 
-    def with_los(self, los: np.ndarray) -> LinkData:
+    def with_los(self, los: np.ndarray) -> Links:
         """Return the same links with lines of sight (n,) other than the map's."""
         return replace(self, known_los=los)
 
-    def with_city(self, city: CityMap | None) -> LinkData:
+    def with_city(self, city: CityMap | None) -> Links:
         """Return the same links over another map."""
         return replace(self, city=city, known_los=None)
 
-    def renumber_receivers(self, names: Sequence[str]) -> LinkData:
+    def renumber_receivers(self, names: Sequence[str]) -> Links:
         """Return the same links, counting receivers by `names`, which hold all of theirs."""
         place = {name: i for i, name in reversed(list(enumerate(names)))}
         number = np.array([place[name] for name in self.receiver_names])
