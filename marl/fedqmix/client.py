@@ -222,7 +222,7 @@ class Client:
         if self._measured is not None and not (scene.folder / "truth.nc").exists():
             return None
         truth = read_truth(scene, self._party.truth)
-        scene.check_map(truth)
+        truth.require_of(scene)
         noise_db = 0.0 if "sigma_db" in truth.dataset else run.noise_db
         return Reality(scene, truth, run.assignment, noise_db, run.seed)
 

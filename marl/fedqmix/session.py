@@ -192,6 +192,6 @@ def _checked(party: Party, run: RunSettings, learner: LearnerSettings) -> tuple[
         truth = segmented_truth(scene)  # which map it is does not matter here
     else:
         truth = read_truth(scene, party.truth)
-        scene.check_map(truth)
+        truth.require_of(scene)
     check_sizes(run, learner, make_mission(scene, truth, Known.truth(scene), run.assignment))
     return len(scene.config.uavs), len(scene.config.devices)

@@ -11,6 +11,7 @@ import xarray as xr
 
 from radiotwin.display.axes import GAIN_COLOURS, level_range_db, plain
 from radiotwin.display.summary import Summary, count, some, span
+from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
 from radiotwin.maps.difference import MapDifference
 from radiotwin.maps.file import load_dataset, open_dataset, write_parts
@@ -131,6 +132,25 @@ class RadioMap(OverDevices):
                     self.blocks(), path)
 
     write = save  # the name of version 0.1
+
+    def require_of(self, scene: Scene) -> None:
+        """Raise BadInput unless the map was made for a scene as it is now, with all its devices.
+
+        Args:
+            scene: whose hash is held against the map's attribute `scene_hash`.
+        """
+        known = set(self.devices)
+        missing = [device.device for device in scene.config.devices if device.device not in known]
+        if missing or not self.is_over_lattice_of(scene) \
+                or self.dataset.attrs.get("scene_hash") != scene.content_hash():
+            what = (f"it lacks device {missing[0]!r}" if missing else
+                    "geometry, radio, devices or lattice differ")
+            raise BadInput(f"the radio map was not made for the scene as it is now in "
+                           f"{scene.folder} ({what}); run `radiotwin trace` again")
+
+    def is_over_lattice_of(self, scene: Scene) -> bool:
+        """Return whether the map is over a scene's lattice."""
+        return self.lattice.equals(scene.lattice)
 
     def plot(self, device: str | None = None, altitude_m: float | None = None,
              ax: "Axes | None" = None, *, scene: Scene | None = None,

@@ -163,7 +163,7 @@ def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, Radio
     maps: dict[str, RadioMap | MapStream] = {}
     if truth is not None and truth != "segmented":
         given = stack.enter_context(RadioMap.open(truth))
-        if run.scene is not None and not run.scene.over_lattice(given):
+        if run.scene is not None and not given.is_over_lattice_of(run.scene):
             raise BadInput(f"{truth} is not over the lattice of {run.scene.folder}, so it cannot "
                            "be compared with the run; give a map of that scene")
         maps[TRUTH] = given
@@ -172,7 +172,7 @@ def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, Radio
     elif run.scene is not None and (path := _first_map(run.scene.folder)):
         found = stack.enter_context(RadioMap.open(path))
         try:
-            run.scene.check_map(found)
+            found.require_of(run.scene)
             maps[TRUTH] = found
         except BadInput as error:
             run.notes.append(f"{path} is not shown: {error}.")
@@ -188,7 +188,7 @@ def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, Radio
             continue
         found = stack.enter_context(
             RadioMap.open(require_within(path.parent, path, str(path.parent))))
-        if run.scene is not None and not run.scene.over_lattice(found):
+        if run.scene is not None and not found.is_over_lattice_of(run.scene):
             run.notes.append(
                 f"{path} is not shown: it is not over the lattice of {run.scene.folder}.")
         else:

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from radiotwin.display import PlotFrame
-    from radiotwin.maps.radiomap import RadioMap
 
 _BLOCK_BYTES = 2**20
 
@@ -281,25 +280,6 @@ class Scene(Summarised):
                     f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, {z_m:g}) m is "
                     f"{'below the ground' if below else 'inside a building'}; move it or raise "
                     "altitude_m")
-
-    def check_map(self, radio_map: "RadioMap") -> None:
-        """Raise BadInput unless a map was made for this scene as it is now, with all its devices.
-
-        Args:
-            radio_map: Map with the attribute `scene_hash`.
-        """
-        known = set(radio_map.devices)
-        missing = [device.device for device in self.config.devices if device.device not in known]
-        if missing or not self.over_lattice(radio_map) \
-                or radio_map.dataset.attrs.get("scene_hash") != self.content_hash():
-            what = (f"it lacks device {missing[0]!r}" if missing else
-                    "geometry, radio, devices or lattice differ")
-            raise BadInput(f"the radio map was not made for the scene as it is now in "
-                           f"{self.folder} ({what}); run `radiotwin trace` again")
-
-    def over_lattice(self, radio_map: "RadioMap") -> bool:
-        """Return whether a map is over this scene's lattice."""
-        return radio_map.lattice.equals(self.lattice)
 
     def content_hash(self) -> str:
         """Return the SHA-256 of all inputs of a gain map.

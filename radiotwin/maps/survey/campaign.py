@@ -283,5 +283,5 @@ def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: 
     slots = flights * sum(uav.battery // slot_cost + 1 for uav in scene.config.uavs)
     ROWS.check(slots * len(scene.config.devices), f"{path}: {flights} flights, as far as the "
                "batteries of its UAVs go")
-    scene.check_map(truth)
+    truth.require_of(scene)
     require_possible(scene, truth)
