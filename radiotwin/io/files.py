@@ -245,10 +245,10 @@ def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
     handle: int | None = None
     try:
         with _reported(path), deferred():
+            # Another thread or process may sweep the new folder before it is locked.
             while True:
                 name = tempfile.mkdtemp(prefix=".radiotwin-", suffix=suffix, dir=path.parent)
-                handle = None if fcntl is None else os.open(name, os.O_RDONLY)
-                if handle is None or _locked(handle, name):
+                if fcntl is None or (handle := _lock(name)) is not None:
                     break
         yield Path(name)
     finally:
@@ -259,17 +259,19 @@ def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
                 os.close(handle)
 
 
-def _locked(handle: int, name: str) -> bool:
-    """Lock a new folder; False if another process has swept it before."""
+def _lock(name: str) -> int | None:
+    """Open and lock a folder; None if it is there no more."""
+    try:
+        handle = os.open(name, os.O_RDONLY)
+    except FileNotFoundError:
+        return None
     with suppress(OSError):  # a file system without locks
         fcntl.flock(handle, fcntl.LOCK_EX)
-    try:
+    with suppress(FileNotFoundError):
         if os.path.samestat(os.fstat(handle), os.stat(name)):
-            return True
-    except FileNotFoundError:
-        pass
+            return handle
     os.close(handle)
-    return False
+    return None
 
 
 @cache  # once a folder and process: a store of batches writes thousands of files to one

@@ -5,8 +5,10 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -230,6 +232,22 @@ def test_a_file_that_another_process_removes_meanwhile_is_written(tmp_path):
     finally:
         done.set()
         other.join()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="temporaries are locked and swept on POSIX only")
+def test_a_temporary_that_another_process_sweeps_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+    make, made = tempfile.mkdtemp, []
+
+    def make_and_sweep_the_first(**options):
+        made.append(make(**options))
+        if len(made) == 1:
+            files._remove_stale(Path(made[0]), aside=False)
+        return made[-1]
+
+    monkeypatch.setattr("tempfile.mkdtemp", make_and_sweep_the_first)
+    with atomic_path(tmp_path / "part.bin") as temporary:
+        temporary.write_bytes(b"x")
+    assert len(made) == 2 and [path.name for path in tmp_path.iterdir()] == ["part.bin"]
 
 
 def test_a_folder_that_was_only_tried_is_removed_and_a_written_one_stays(tmp_path):
