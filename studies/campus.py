@@ -169,7 +169,7 @@ def _bias_db(loop: Loop) -> float:
 def coverage(loop: Loop) -> float:
     """Return the share of held-out readings within their central 90 % interval."""
     mean_db, scale_db = loop.after.held_out_reading
-    return share_within(loop.links.level_db - mean_db, scale_db, loop.after.whole.dof)
+    return share_within(loop.links.level_db - mean_db, scale_db, loop.after.whole.model.dof)
 
 
 def share_within(error_db: np.ndarray, scale_db: np.ndarray, dof: float) -> float:

@@ -260,7 +260,7 @@ def draw_from_base(world: int, base: str, seed: int) -> Measurements:
     model = FoldModel.build(links, twin.channel, DOF, device_m=kind.device_m(twin))
     fit = model.fit()
     errors = np.random.default_rng(seed).standard_t(DOF, len(links))
-    level_db = model.predict(fit).mean_db + fit.scale_db[model.group] * errors
+    level_db = fit.readings().mean_db + fit.scale_db[model.group] * errors
     level_db = np.round(level_db / STEP_DB) * STEP_DB
     table = hidden.measurements.table.copy()
     table["gain_db"] = np.where(level_db >= model.limit_db, level_db, np.nan)

@@ -18,6 +18,7 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.twin.localize import calibrate_radii, locate, whole_area
 from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.model.fold_model import Fit
 from studies.closeloop import counted, summary
 from studies.runner import Study
 from studies.tables import markdown, number
@@ -107,19 +108,19 @@ def explained(loop: Loop) -> CrossFit:
 
 def turned_rmse_db(loop: Loop) -> float:
     """Return its held-out error with all sector antennas turned by 180°, the rest refitted [dB]."""
-    turned = []
-    for model in explained(loop).models:
+    def turned(fit: Fit) -> Fit:
         effects = []
-        for each in model.effects:
+        for each in fit.effects:
             if isinstance(each.effect, SectorAntenna):
                 devices = {device: pattern.model_copy(
                     update={"azimuth_deg": pattern.azimuth_deg + 180.0})
                     for device, pattern in each.params.devices.items()}
-                each = model.apply(each.effect, each.params.model_copy(
+                each = fit.model.apply(each.effect, each.params.model_copy(
                     update={"devices": devices}))
             effects.append(each)
-        turned.append(model.with_effects(effects))
-    return explained(loop).extended(turned, [model.fit() for model in turned]).rmse_db()
+        return fit.model.with_effects(effects).fit()
+
+    return explained(loop).map(turned).rmse_db()
 
 
 def locate_held_out(loop: Loop, model: CrossFit) -> dict[str, dict]:
@@ -128,7 +129,7 @@ def locate_held_out(loop: Loop, model: CrossFit) -> dict[str, dict]:
     Returns:
         By flight (a fold each), of at most 150 devices, and of all.
     """
-    models = [EffectModel.of(fold, fit) for fold, fit in zip(model.folds, model.fits[1:])]
+    models = [EffectModel.of(fold) for fold in model.folds]
     folds = [loop.links.select(model.index == index) for index in range(len(models))]
     area_m, rng, rows = whole_area(models[0], loop.links), np.random.default_rng(0), []
     for index, (learnt, fold) in enumerate(zip(models, folds)):

@@ -27,7 +27,7 @@ from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.correlated_evidence import BOUNDS
 from radiotwin.links import prepare_links
 from radiotwin.twin.model.fitting import add_effect
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.fold_model import Fit
 from studies.runner import Study
 from studies.tables import markdown
 from tests import worlds
@@ -77,11 +77,11 @@ def compare(seed: int, settings: dict) -> dict:
     links = prepare_links(kept, None)
     folds = make_folds(links, seed)
     model = cross_validate(links, LogDistanceBase(None, seed), folds, training_parts(links, folds))
-    hypotheses = Hypotheses.of(model.whole, model.fits[0], seed)
-    found = add_effect(model.whole, EFFECTS[kind](), model.fits[0])
+    hypotheses = Hypotheses.of(model.whole, seed)
+    found = add_effect(model.whole, EFFECTS[kind]())
     if found is None:
         return {"links": len(links), "laplace_nats": None, "nested_nats": None, "sd_nats": None}
-    without, with_it = _without(hypotheses), _with(hypotheses, *found)
+    without, with_it = _without(hypotheses), _with(hypotheses, found)
     results = []
     for log_likelihood, low, high in (without, with_it):
         box = np.array([low, high]).T
@@ -95,7 +95,7 @@ def compare(seed: int, settings: dict) -> dict:
         results.append((sampler.results.logz[-1], sampler.results.logzerr[-1]))
     (base, base_sd), (named, named_sd) = results
     return {"links": len(links), "numbers": len(with_it[1]) - 2,
-            "laplace_nats": hypotheses.of_named(*found), "nested_nats": float(named - base),
+            "laplace_nats": hypotheses.of_named(found), "nested_nats": float(named - base),
             "sd_nats": float(np.hypot(base_sd, named_sd))}
 
 
@@ -107,9 +107,9 @@ def _without(hypotheses: Hypotheses) -> Sampled:
     return _of(hypotheses, lambda numbers: nothing, np.zeros(0), np.zeros(0))
 
 
-def _with(hypotheses: Hypotheses, whole: FoldModel, fit: FitResult) -> Sampled:
+def _with(hypotheses: Hypotheses, fit: Fit) -> Sampled:
     """Return the likelihood over the last effect's numbers, within their bounds."""
-    applied, own = whole.effects[-1], whole.coefficient_slices[-1]
+    applied, own = fit.effects[-1], fit.model.coefficient_slices[-1]
     varied = applied.effect.variation(applied.params)
     assert varied is not None
     coefficients = fit.coefficients.copy()
@@ -118,8 +118,8 @@ def _with(hypotheses: Hypotheses, whole: FoldModel, fit: FitResult) -> Sampled:
     plain = FitResult(coefficients, fit.scale_db, np.nan)
 
     def at(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        other = whole.apply(applied.effect, varied.params(numbers))
-        problem = whole.with_effects([other]).training
+        other = fit.model.apply(applied.effect, varied.params(numbers))
+        problem = fit.model.with_effects([other]).training
         z = (problem.level_db - problem.predict(plain).mean_db) / hypotheses.scale_db
         return z, other.term.columns / hypotheses.scale_db[:, None], other.term.prior_sd_db
 

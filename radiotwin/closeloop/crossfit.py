@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -22,7 +22,6 @@ from scipy.optimize import linear_sum_assignment
 from typing_extensions import override
 
 from radiotwin.errors import BadInput
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.held_out import deal_groups
 from radiotwin.inference.student import mean_if_detected
 from radiotwin.links import Links, with_evidence
@@ -33,7 +32,7 @@ from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_known, fit_links, reliable_m
 from radiotwin.twin.fit_paths import LOST_M, best_dof, fit_paths, relocation_from
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
-from radiotwin.twin.model.fold_model import AppliedEffect, FoldModel
+from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel
 from radiotwin.twin.twin import Twin
 
 WAYS = ("flight", "block", "quadrant", "device")
@@ -246,44 +245,46 @@ class CrossFit:
     Attributes:
         whole: learnt from all links.
         folds: learnt from all but one fold each.
-        fits: the whole's fit, then the folds'.
         index: (n,) fold of each link.
         twin: the base as it was fitted to all links.
         shadowing: the whole's, then the folds', of what all effects leave over; empty = none.
     """
 
-    whole: FoldModel
-    folds: list[FoldModel]
-    fits: list[FitResult]
+    whole: Fit
+    folds: tuple[Fit, ...]
     index: np.ndarray
     twin: Twin
     shadowing: list[CorrelatedShadowing] = field(default_factory=list)
 
     @property
-    def models(self) -> list[FoldModel]:
+    def each(self) -> tuple[Fit, ...]:
         """The whole, then the folds."""
-        return [self.whole, *self.folds]
+        return (self.whole, *self.folds)
 
     @property
     def links(self) -> Links:
         """The n links, with the devices where the base has them."""
         return self.whole.links
 
-    def extended(self, models: list[FoldModel], fits: list[FitResult]) -> CrossFit:
-        """Return the same base with other effects: the whole, then the folds."""
-        return CrossFit(models[0], models[1:], fits, self.index, self.twin)
+    def extended(self, whole: Fit, folds: Iterable[Fit]) -> CrossFit:
+        """Return the same base with other effects, without interpolated shadowing."""
+        return CrossFit(whole, tuple(folds), self.index, self.twin)
+
+    def map(self, function: Callable[[Fit], Fit]) -> CrossFit:
+        """Return what a function makes of the whole, then of the folds, as `extended` does."""
+        whole, *folds = (function(each) for each in self.each)
+        return self.extended(whole, folds)
 
     def with_shadowing(self, shadowing: list[CorrelatedShadowing]) -> CrossFit:
         """Return the same with interpolated shadowing: the whole's, then the folds'."""
-        return CrossFit(self.whole, self.folds, self.fits, self.index, self.twin,
-                                   shadowing)
+        return replace(self, shadowing=shadowing)
 
-    def held_out(self, of: Callable[[FoldModel, FitResult], np.ndarray]) -> np.ndarray:
+    def held_out(self, of: Callable[[Fit], np.ndarray]) -> np.ndarray:
         """Return a value (n,) of each link, from the fold that has not seen it."""
         result = np.full(len(self.index), np.nan)
-        for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
+        for number, fold in enumerate(self.folds):
             own = self.index == number
-            result[own] = of(model, fit)[own]
+            result[own] = of(fold)[own]
         return result
 
     @cached_property
@@ -301,26 +302,26 @@ class CrossFit:
     @cached_property
     def _held_out_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         mean_db, scale_db, unheard_db = np.full((3, len(self.index)), np.nan)
-        for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
+        for number, fold in enumerate(self.folds):
             own = self.index == number
             mean_db[own], scale_db[own], unheard_db[own] = (
-                each[own] for each in model.predict_parts(fit))
+                each[own] for each in fold.reading_parts())
         return mean_db, scale_db, unheard_db
 
     @cached_property
     def held_out_nll(self) -> np.ndarray:
         """(n,) negative log-likelihood [nats]; NaN where there is none."""
         reading = self.held_out_reading
-        return self.held_out(lambda model, fit: np.where(
-            model.usable, model.regression().nll_at(*reading), np.nan))
+        return self.held_out(lambda fold: np.where(
+            fold.usable, fold.model.regression().nll_at(*reading), np.nan))
 
     @cached_property
     def held_out_mean_db(self) -> np.ndarray:
         """(n,) predicted level of a link that is detected [dB]; NaN where there is none."""
         reading = self.held_out_reading
-        return self.held_out(lambda model, fit: np.where(
-            model.usable, mean_if_detected(*reading, model.limit_db, model.dof,
-                                           model.losses), np.nan))
+        return self.held_out(lambda fold: np.where(
+            fold.usable, mean_if_detected(*reading, fold.model.limit_db, fold.model.dof,
+                                          fold.model.losses), np.nan))
 
     @cached_property
     def unforeseen(self) -> np.ndarray:
@@ -352,7 +353,7 @@ class CrossFit:
         return shift, left
 
 
-def same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
+def same_effects(whole: Fit, fold: Fit) -> list[int | None]:
     """Return the place in a fold of each effect of the whole; None for what it has not found.
 
     Of several of a kind those are the same that act on the same links: one faulty flight is not
@@ -367,7 +368,7 @@ def same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
     return places
 
 
-def _on_the_same_links(whole: FoldModel, fold: FoldModel, of_whole: list[int],
+def _on_the_same_links(whole: Fit, fold: Fit, of_whole: list[int],
                        of_fold: list[int]) -> list[tuple[int, int]]:
     """Return pairs of places of one kind of effect whose links overlap most, all in all."""
     as_many = len(of_whole) == len(of_fold)
@@ -393,7 +394,7 @@ def without_quality(model: CrossFit) -> CrossFit:
     if model.links.quality is None:
         return model
 
-    def blind(each: FoldModel) -> FoldModel:
+    def blind(each: Fit) -> Fit:
         quality = each.links.quality
         assert quality is not None
         known = quality[each.train & np.isfinite(quality)]
@@ -401,11 +402,10 @@ def without_quality(model: CrossFit) -> CrossFit:
         links = replace(each.links, quality=np.full(len(quality), usual))
         effects = [applied if "quality" not in applied.effect.uses
                    else AppliedEffect(applied.effect, applied.params, applied.effect.term(
-                       links, applied.params, each.level_at)) for applied in each.effects]
-        return replace(each, links=links, effects=effects)
+                       links, applied.params, each.model.level_at)) for applied in each.effects]
+        return replace(each, model=replace(each.model, links=links, effects=effects))
 
-    models = [blind(each) for each in model.models]
-    return model.extended(models, model.fits).with_shadowing(model.shadowing)
+    return model.map(blind).with_shadowing(model.shadowing)
 
 
 def training_parts(links: Links, folds: Folds) -> list[Links]:
@@ -440,15 +440,14 @@ def cross_validate(links: Links, base: Base, folds: Folds,
             fitted = base.fit(part)
         models.append(FoldModel.build(links, fitted.channel, dof, device_m=base.device_m(fitted),
                                       train=folds.index != number))
-    fits = [model.fit() for model in (whole, *models)]
-    return CrossFit(whole, models, fits, folds.index, twin)
+    return CrossFit(whole.fit(), tuple(each.fit() for each in models), folds.index, twin)
 
 
 def _with_evidence(links: Links, whole: FoldModel) -> Links:
     """Return links with pieces of evidence that fit the base's residual, if they have none yet."""
     if links.evidence is not None:
         return links
-    view, z = whole.view(whole.fit()), np.full(len(links), np.nan)
+    view, z = whole.fit().view, np.full(len(links), np.nan)
     z[whole.train] = view.residual_db / view.scale_db
     located = with_evidence(whole.links, z)
     return replace(links, evidence=located.evidence, notes=located.notes)

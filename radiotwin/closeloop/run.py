@@ -142,10 +142,9 @@ class Loop(Summarised):
                            or each.effect.is_on_maps(each.params))]
         if not dropped:
             return self.after
-        models = [model.with_effects([each for each in model.effects
-                                      if not any(each.effect is other for other in dropped)])
-                  for model in self.after.models]
-        return self.after.extended(models, [model.fit() for model in models])
+        return self.after.map(lambda fit: fit.model.with_effects(
+            [each for each in fit.effects
+             if not any(each.effect is other for other in dropped)]).fit())
 
     @property
     def criteria(self) -> SelectionCriteria:
@@ -199,8 +198,8 @@ class Loop(Summarised):
         if left is None:
             return []
         model, hypotheses = left
-        return detectable(model.whole.view(model.fits[0]), hypotheses, self.criteria,
-                          model.whole.effect_names)
+        return detectable(model.whole.view, hypotheses, self.criteria,
+                          model.whole.model.effect_names)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:

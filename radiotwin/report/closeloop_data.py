@@ -6,7 +6,7 @@ Average residuals over bins of a variable.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from radiotwin.effects.params import Parameter
 from radiotwin.links import evidence_blocks, residual_variables
 from radiotwin.report.labels import variable_label
 from radiotwin.scene.citymap import CityMap
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.fold_model import Fit
 
 MAX_MEMBERS = 6  # devices or receivers with a panel of their own
 MIN_SHARE = 0.02  # of the largest standard deviation of a contribution; below it, no panel
@@ -205,7 +205,7 @@ def collect(loop: Loop) -> LoopData:
         interpolated_db)
 
 
-def _links(model: FoldModel, predicted_db: np.ndarray) -> LinkArrays:
+def _links(model: Fit, predicted_db: np.ndarray) -> LinkArrays:
     links, device_m = model.links, model.links.device_m.copy()
     device_m[links.device[~model.usable]] = np.nan
     return LinkArrays(
@@ -219,16 +219,14 @@ def _links(model: FoldModel, predicted_db: np.ndarray) -> LinkArrays:
 
 def _effects(loop: Loop, links: LinkArrays) -> list[EffectData]:
     """Predict all links with and without each effect, by the model fitted to all links."""
-    whole, fit = loop.after.whole, loop.after.fits[0]
+    whole = loop.after.whole
     if not whole.effects:
         return []
-    with_db = np.where(whole.usable, whole.predict(fit).mean_db, np.nan)
+    with_db = np.where(whole.usable, whole.readings().mean_db, np.nan)
     effects = []
-    for own, applied, parameters in zip(whole.coefficient_slices, whole.effects, loop.parameters,
-                                        strict=True):
-        others = [other for other in whole.effects if other is not applied]
-        rest = replace(fit, coefficients=np.delete(fit.coefficients, own))
-        without_db = whole.with_effects(others).predict(rest).mean_db
+    for number, (applied, parameters) in enumerate(zip(whole.effects, loop.parameters,
+                                                       strict=True)):
+        without_db = whole.without(number).readings().mean_db
         effect = applied.effect
         effects.append(EffectData(
             effect.name, effect.figure, effect.stage, effect.nlos_only, effect.of_receiver,

@@ -87,7 +87,7 @@ def fit_along_paths(links: Links, scene: Scene, seed: int, start: Twin | None,
         warnings.warn(f"{unknown} devices are unknown, and paths are followed to locate "
                       f"{MAX_DEVICES} at most: they are where a law of distance and line of sight "
                       "has them", stacklevel=4)
-    return replace(twin, fitted=EffectModel.of(by_paths, fit))
+    return replace(twin, fitted=EffectModel.of(fit))
 
 
 def fit_paths(links: Links, scene: Scene, law: Twin, relocation: Relocation) -> Twin:

@@ -59,8 +59,5 @@ def fitted(table, effect, seed=0, devices_m=MASTS_M):
     links = prepare_links(measurements, None)
     folds = make_folds(links, seed)
     before = cross_validate(links, make_bases(None, seed)["log-distance"], folds, training_parts(links, folds))
-    whole = add_effect(before.whole, effect, before.fits[0])
-    found = [add_effect(fold, effect, fit, whole[0].effects[-1].params) or (fold, fit)
-             for fold, fit in zip(before.folds, before.fits[1:])]
-    models, fits = zip(whole, *found)
-    return before.extended(list(models), list(fits))
+    whole = add_effect(before.whole, effect)
+    return before.extended(whole, [add_effect(fold, effect, whole.effects[-1].params) or fold for fold in before.folds])

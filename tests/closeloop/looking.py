@@ -12,4 +12,4 @@ def looked_at(open_ground, seed, change=lambda world: None):
     links = prepare_links(open_ground.measured(world), None)
     folds = make_folds(links, 0)
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-    return model, Hypotheses.of(model.whole, model.fits[0], 0)
+    return model, Hypotheses.of(model.whole, 0)

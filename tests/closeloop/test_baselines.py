@@ -126,9 +126,8 @@ def test_published_laws_say_nothing_of_devices_that_are_nowhere(links):
     device_m = links.device_m.copy()
     device_m[3] = np.nan
     folds = [FoldModel.build(links, LogDistance(LogDistanceLine(-35.0, -2.6, 2.0)), 5.0, device_m=device_m,
-                             train=links.flight != flight) for flight in range(6)]
-    fits = [each.fit() for each in folds]
-    model = CrossFit(folds[0], folds, [fits[0], *fits], links.flight, None)
+                             train=links.flight != flight).fit() for flight in range(6)]
+    model = CrossFit(folds[0], tuple(folds), links.flight, None)
     found, _ = held_out_baselines(model, [Part(each.links) for each in folds], SelectionCriteria(), 0)
     known = links.device != 3
     for name, mean_db in found.items():

@@ -33,7 +33,7 @@ def blended():
         model.held_out_mean_db, ["named", *FORESTS, "segmented_log_distance", "regression_kriging"], weights,
         np.zeros((len(links), 5)), np.linspace(0, 1, len(links)))
     blend = make_blend(model, prediction, 0)
-    fitted = replace(EffectModel.of(model.whole, model.fits[0]), blend=blend)
+    fitted = replace(EffectModel.of(model.whole), blend=blend)
     return SimpleNamespace(links=links, model=model, prediction=prediction, twin=replace(model.twin, fitted=fitted))
 
 

@@ -31,20 +31,20 @@ def test_devices_that_the_loop_found_elsewhere_are_not_located_against_their_dec
     _, held_out, *_ = asked(model, monkeypatch)
     assert all(each.anchors == model.links.anchors for each in held_out)
     effect = DevicePositionError()
-    moved = model.whole.apply(effect, effect.Params(device=1, move_m=(20.0, 5.0)))
-    whole = model.whole.with_effects([*model.whole.effects, moved])
-    _, held_out, *_ = asked(model.extended([whole, *model.folds], model.fits), monkeypatch)
+    moved = model.whole.model.apply(effect, effect.Params(device=1, move_m=(20.0, 5.0)))
+    whole = replace(model.whole, model=model.whole.model.with_effects([*model.whole.effects, moved]))
+    _, held_out, *_ = asked(model.extended(whole, model.folds), monkeypatch)
     assert all(each.anchors == model.links.anchors - {1} for each in held_out)
 
 
 def test_what_only_describes_the_rest_does_not_locate(model, monkeypatch):
     trend = UnexplainedTrend("distance_m")
-    folds, fits = [], []
-    for fold, fit in zip(model.folds, model.fits[1:], strict=True):
-        applied = fold.apply(trend, trend.propose(fold.view(fit))[0])
-        folds.append(fold.with_effects([*fold.effects, applied]))
-        fits.append(replace(fit, coefficients=np.r_[fit.coefficients, np.zeros(applied.term.columns.shape[1])]))
-    models, *_ = asked(model.extended([model.whole, *folds], [model.fits[0], *fits]), monkeypatch)
+    folds = []
+    for fold in model.folds:
+        applied = fold.model.apply(trend, trend.propose(fold.view)[0])
+        folds.append(replace(fold, model=fold.model.with_effects([*fold.effects, applied]), coefficients=np.r_[
+            fold.coefficients, np.zeros(applied.term.columns.shape[1])]))
+    models, *_ = asked(model.extended(model.whole, folds), monkeypatch)
     assert all([own.effect.name for own in each.effects] == ["receiver_gain_offset"] for each in models)
 
 

@@ -71,7 +71,7 @@ def taken(measurements):
     others = take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
     assert len(others) == sum(not effect.is_declared for effect in BUILT_IN)
     whole, parameters = result.model.whole, {}
-    for each, estimate in zip(whole.effects, estimates(linearise(whole, result.model.fits[0])), strict=True):
+    for each, estimate in zip(whole.effects, estimates(linearise(whole)), strict=True):
         parameters |= each.effect.parameters(links, each.params, estimate)
     return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.scores,
                            params=whole.effects[0].params if whole.effects else None, parameters=parameters,
@@ -269,18 +269,18 @@ def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
     folds = make_folds(links, 0, "device")
     result = SelectionResult(cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds)))
     take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
-    fields = [CorrelatedShadowing.fit(each, fit, 0) for each, fit in zip(result.model.models, result.model.fits)]
+    fields = [CorrelatedShadowing.fit(each, 0) for each in result.model.each]
     model = result.model.with_shadowing(fields)
     mean_db, scale_db = model.held_out_reading
     spread_db, unheard_db = model.held_out_scales
     assert np.median(unheard_db) > 3.0 and np.median(spread_db) < 4.0
-    for number, (fold, fit, field) in enumerate(zip(model.folds, model.fits[1:], fields[1:])):
+    for number, (fold, field) in enumerate(zip(model.folds, fields[1:])):
         own = model.index == number
         assert fold.links.device[own].min() == fold.links.device[own].max()
-        twin = replace(EffectModel.of(fold, fit), shadowing=field).predict(links.select(own))
+        twin = replace(EffectModel.of(fold), shadowing=field).predict(links.select(own))
         np.testing.assert_allclose(mean_db[own], twin.mean_db, atol=1e-6)
         left = field.at(links.select(own))[1]
-        t_sd = np.sqrt(model.whole.dof / (model.whole.dof - 2))
+        t_sd = np.sqrt(model.whole.model.dof / (model.whole.model.dof - 2))
         np.testing.assert_allclose(twin.sd_db, np.hypot(spread_db[own] * left * t_sd, unheard_db[own]), rtol=1e-6)
         assert (scale_db[own] > unheard_db[own]).all()
 

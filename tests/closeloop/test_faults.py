@@ -159,7 +159,7 @@ def test_a_fault_that_its_own_search_would_not_find_beside_the_others_is_taken_b
                              end_within_s=(END_S, END_S + 1), form="loss", frequency_hz=2.4e9)
     result = SelectionResult(model)
     result.keep(CandidateScore("episode", step=0), with_effect(model, Episode(), episode))
-    assert model.fits[0].objective - result.model.fits[0].objective > result.criteria.min_training_gain_nats
+    assert model.whole.objective - result.model.whole.objective > result.criteria.min_training_gain_nats
     drop_idle_faults(result)
     assert len(result.model.whole.effects) == result.scores[0].kept == (not always)
 
@@ -180,6 +180,6 @@ def test_only_the_fault_that_is_taken_back_leaves_a_fold():
 def test_of_two_faults_each_is_unforeseen_where_its_flight_was_held_out():
     effect, index = FaultyFlight(), np.arange(100) // 50
     first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
-    folds = [model_of(second), model_of(first)]  # each learnt from the other half
-    model = CrossFit(model_of(first, second), folds, [], index, None)
+    folds = model_of(second), model_of(first)  # each learnt from the other half
+    model = CrossFit(model_of(first, second), folds, index, None)
     np.testing.assert_array_equal(model.unforeseen, first.acts | second.acts)

@@ -95,10 +95,9 @@ def test_folds_follow_no_paths_of_their_own_for_intervals(monkeypatch):
     moved_m[1, :2] += (30.0, -20.0)
     effect = DevicePositionError()
     model = fitted(drive(1), effect, devices_m=moved_m)
-    exact = [each.with_effects([each.apply(effect, effect.exact(each.effects[0].params))]) for each in model.models]
-    model = model.extended(exact, [each.fit() for each in exact])
-    own = [np.concatenate(estimates(linearise(fold, fit))[0].sides_sd)
-           for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
+    model = model.map(lambda fit: fit.model.with_effects(
+        [fit.model.apply(effect, effect.exact(fit.effects[0].params))]).fit())
+    own = [np.concatenate(estimates(linearise(fold))[0].sides_sd) for fold in model.folds]
 
     moves_m, term = [], DevicePositionError.term
     monkeypatch.setattr(DevicePositionError, "term", lambda self, links, params, level_at: (
@@ -108,9 +107,9 @@ def test_folds_follow_no_paths_of_their_own_for_intervals(monkeypatch):
     around = np.array(model.whole.effects[0].params.move_m)
     assert 4 <= len(moves_m) <= 8 and (np.array(moves_m) == around).any(axis=1).all()
 
-    whole = linearise(model.whole, model.fits[0])
-    shared = [np.concatenate(estimates(linearise(fold, fit, intervals._as_followed(whole, fold)))[0].sides_sd)
-              for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
+    whole = linearise(model.whole)
+    shared = [np.concatenate(estimates(linearise(fold, intervals._as_followed(whole, fold)))[0].sides_sd)
+              for fold in model.folds]
     np.testing.assert_allclose(shared, own, rtol=0.4)
 
 
@@ -162,8 +161,8 @@ def test_the_size_of_an_effect_is_its_decibels_and_that_of_none_includes_zero():
 
 def test_the_size_of_what_one_fold_does_not_find_is_still_told():
     model = fitted(with_offsets(drive(5)), ReceiverGainOffset())
-    without = model.folds[0].with_effects([])
-    lacking = replace(model, folds=[without, *model.folds[1:]], fits=[model.fits[0], without.fit(), *model.fits[2:]])
+    without = model.folds[0].model.with_effects([]).fit()
+    lacking = replace(model, folds=(without, *model.folds[1:]))
     assert effect_size_db(lacking, 0).low > 0
     assert effect_parameters(lacking)[0].keys() == effect_parameters(model)[0].keys()
 

@@ -28,5 +28,5 @@ def test_one_fault_has_one_name(open_ground, off_db, limit_moves, named):
     result = SelectionResult(cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds)))
     forward_selection(result, [ReceiverGainOffset(), DetectionLimit()], 0, lambda _: None)
     assert [each.effect.name for each in result.model.whole.effects] == named
-    used_db = [float(np.median(result.model.whole.limit_db[links.receiver == receiver])) for receiver in (0, 1)]
+    used_db = [float(np.median(result.model.whole.model.limit_db[links.receiver == receiver])) for receiver in (0, 1)]
     assert used_db == pytest.approx([LIMIT_DB, LIMIT_DB + 6.0 * limit_moves], abs=1.0)

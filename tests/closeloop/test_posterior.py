@@ -26,8 +26,8 @@ def test_evidence_for_an_offset_that_is_there_and_none_for_one_that_is_not(open_
 
     for change, low, high in ((louder, 15.0, np.inf), (lambda world: None, -np.inf, 0.0)):
         model, hypotheses = looked_at(open_ground, 2, change)
-        found = add_effect(model.whole, ReceiverGainOffset(), model.fits[0])
-        assert low < hypotheses.of_named(*found) < high
+        found = add_effect(model.whole, ReceiverGainOffset())
+        assert low < hypotheses.of_named(found) < high
 
 
 def test_an_end_that_is_off_does_not_pay_for_those_that_are_not(open_ground, monkeypatch):
@@ -35,13 +35,13 @@ def test_an_end_that_is_off_does_not_pay_for_those_that_are_not(open_ground, mon
         world.gain_db[world.device == 1] -= 5.0
 
     model, hypotheses = looked_at(open_ground, 2, weaker)
-    found = add_effect(model.whole, DeviceGainOffset(), model.fits[0])
-    few_nats = hypotheses.of_named(*found)
+    found = add_effect(model.whole, DeviceGainOffset())
+    few_nats = hypotheses.of_named(found)
     monkeypatch.setattr(DeviceGainOffset, "sparse", False)
-    assert few_nats > hypotheses.of_named(*found) + 2.0
+    assert few_nats > hypotheses.of_named(found) + 2.0
     monkeypatch.undo()
     model, hypotheses = looked_at(open_ground, 2)
-    assert hypotheses.of_named(*add_effect(model.whole, DeviceGainOffset(), model.fits[0])) < 0
+    assert hypotheses.of_named(add_effect(model.whole, DeviceGainOffset())) < 0
 
 
 def test_no_further_cause_is_no_evidence_wherever_the_variances_are(open_ground):
@@ -67,16 +67,15 @@ def moved(world):
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 5))])
 def test_evidence_is_that_of_all_numbers_an_effect_may_have(open_ground, monkeypatch, effect, change, seed):
     model, hypotheses = looked_at(open_ground, seed, change)
-    found, fit = add_effect(model.whole, effect, model.fits[0])
-    by_laplace = hypotheses.of_named(found, fit)
+    found = add_effect(model.whole, effect)
+    by_laplace = hypotheses.of_named(found)
     monkeypatch.setattr("radiotwin.closeloop.search.hypotheses._slopes",
-                        lambda model, fit: Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0)))
+                        lambda fit: Columns(np.zeros((int(fit.train.sum()), 0)), np.zeros(0)))
     applied = found.effects[-1]
     varied = effect.variation(applied.params)
 
     def nats(numbers):
-        other = found.with_effects([found.apply(effect, varied.params(numbers))])
-        return hypotheses.of_named(other, other.fit(fit))
+        return hypotheses.of_named(found.with_effects([found.model.apply(effect, varied.params(numbers))]))
 
     # Of a uniform prior: the sum over a grid around the best, wide enough to hold what is likely.
     best, reach = nats(varied.values), []

@@ -24,16 +24,15 @@ def misplaced(seed, device=1):
         unknown = replace(each.links, anchors=each.links.anchors - {device})
         device_m = unknown.device_m.copy()
         device_m[device, :2] += WRONG_M
-        built = FoldModel.build(unknown, each.channel, each.dof, device_m=device_m, train=each.train)
-        return built.with_effects([built.apply(effect.effect, effect.params) for effect in each.effects])
-    models = [moved(each) for each in model.models]
-    return model.extended(models, [each.fit() for each in models])
+        built = FoldModel.build(unknown, each.channel, each.model.dof, device_m=device_m, train=each.train)
+        return built.with_effects([built.apply(effect.effect, effect.params) for effect in each.effects]).fit()
+    return model.map(moved)
 
 
 def test_a_device_moves_to_where_it_is_in_every_fold():
     before = misplaced(3)
     after = relocate_devices(before, before.links, make_bases(None, 0)["twin"])
-    for each in after.models:
+    for each in after.each:
         assert np.hypot(*(each.links.device_m[1, :2] - MASTS_M[1, :2])) < 0.5 * np.hypot(*WRONG_M)
     assert after.rmse_db() < before.rmse_db()
     assert (after.links.device_m[[0, 2]] == before.links.device_m[[0, 2]]).all()
@@ -69,15 +68,15 @@ class Following:
 def test_along_paths_folds_are_located_anew_only_where_a_device_moves(monkeypatch, moved_m, asked):
     """By what the whole says; NaN: the device is lost over the corrected map."""
     model = misplaced(3)
-    assert len(model.models) == 7
-    model = model.extended([replace(each, channel=Following(each.channel)) for each in model.models], model.fits)
+    assert len(model.each) == 7
+    model = model.map(lambda fit: replace(fit, model=replace(fit.model, channel=Following(fit.channel))))
     located = []
 
     def anew(each, links, mine, base):
         located.append(mine.sum())
         device_m = each.links.device_m.copy()
         device_m[1, 0] += moved_m
-        return FoldModel.build(each.links, each.channel, each.dof, device_m=device_m, train=mine), model.twin.devices
+        return FoldModel.build(each.links, each.channel, each.model.dof, device_m=device_m, train=mine), model.twin.devices
 
     monkeypatch.setattr(FoldModel, "corrected_map", property(lambda each: "another map"))
     monkeypatch.setattr(relocate, "_located_anew", anew)

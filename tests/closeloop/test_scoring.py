@@ -39,8 +39,7 @@ def moved(make_links):
     distance_m = np.linalg.norm(receiver_m[:, None] - (DEVICES_M + MOVED_M), axis=2).ravel()
     links = make_links(DEVICES_M, receiver_m, level_db=-40 - 22 * np.log10(distance_m) + rng.normal(0, 0.5, 600))
     channel = SlowLaw(LogDistanceLine(-40.0, -2.2, 0.5))
-    whole = FoldModel.build(links, channel, 5.0)
-    return SimpleNamespace(whole=whole, fits=[whole.fit()], links=links), channel
+    return SimpleNamespace(whole=FoldModel.build(links, channel, 5.0).fit(), links=links), channel
 
 
 class Sentenced(DevicePositionError):
@@ -76,7 +75,8 @@ class OfUsable(DevicePositionError):
 
 def test_links_of_devices_that_are_nowhere_do_not_speak_against_anything(moved):
     model, _ = moved
-    lost = SimpleNamespace(whole=replace(model.whole, usable=model.links.device == 0), fits=model.fits, links=model.links)
+    lost = SimpleNamespace(links=model.links, whole=replace(model.whole, model=replace(
+        model.whole.model, usable=model.links.device == 0)))
     effect = OfUsable()
     assert isinstance(fit_candidate(lost, effect, 0, SelectionCriteria(), None), Candidate)
     assert effect.asked == {0}
@@ -100,11 +100,11 @@ class OverMap(MissingObstacle):
 def test_a_building_that_was_found_is_in_the_map_that_the_next_is_held_against(moved):
     model, _ = moved
     house = trimesh.creation.box(bounds=[[400, 400, 0], [410, 410, 10]])
-    whole = replace(model.whole, links=model.whole.links.with_city(CityMap(house.vertices, house.faces)))
+    whole = replace(model.whole.model, links=model.whole.links.with_city(CityMap(house.vertices, house.faces)))
     for found, height_m in (([], 0.0), ([Box(40.0, 60.0, 20.0, 20.0, 25.0, 0.0)], 25.0)):
         effect = OverMap()
         applied = [whole.apply(MissingObstacle(), MissingObstacle.Params(box=box)) for box in found]
-        base = whole.with_effects(applied)
-        over = SimpleNamespace(whole=base, fits=[base.fit()], links=base.links)
+        base = whole.with_effects(applied).fit()
+        over = SimpleNamespace(whole=base, links=base.links)
         refused = fit_candidate(over, effect, 0, SelectionCriteria(), None)
         assert refused.reason == "it is noted" and effect.heights_m == [pytest.approx(height_m)]

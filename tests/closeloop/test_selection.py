@@ -38,7 +38,7 @@ def test_a_candidate_that_no_held_out_link_can_judge_is_refused(open_ground):
     links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
     folds = make_folds(links, 0)
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-    extended = CrossFit(model.whole, model.folds, model.fits, model.index, model.twin)
+    extended = model.extended(model.whole, model.folds)
     extended.held_out_nll = np.full(len(links), np.nan)
     score = score_model(model, extended, CandidateScore("device_gain_offset"), None, 1, 0, SelectionCriteria())
     assert "no held-out link" in score.reason
@@ -52,10 +52,10 @@ def test_folds_that_a_candidate_does_not_act_on_do_not_vote(open_ground, gains, 
     folds = make_folds(links, 0)
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
     index = np.arange(len(links)) % 6
-    six = CrossFit(model.whole, model.folds[:1] * 6, model.fits[:1] * 7, index, model.twin)
-    per_link = np.array(gains)[index] / np.bincount(index)[index] * model.whole.view(model.fits[0]).design_effect
+    six = CrossFit(model.whole, model.folds[:1] * 6, index, model.twin)
+    per_link = np.array(gains)[index] / np.bincount(index)[index] * model.whole.view.design_effect
     six.held_out_nll = model.held_out_nll
-    extended = CrossFit(six.whole, six.folds, six.fits, index, six.twin)
+    extended = six.extended(six.whole, six.folds)
     extended.held_out_nll = model.held_out_nll - per_link
     score = score_model(six, extended, CandidateScore("lock_loss"), None, 1, 0, SelectionCriteria())
     assert ("folds" in score.reason) == (not passes)
@@ -69,11 +69,11 @@ def test_links_with_line_of_sight_are_asked_if_it_moves_them(open_ground, in_sig
     folds = make_folds(links, 0)
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
     index, gains = np.arange(len(links)) % 6, np.where(los, in_sight, 40) + np.arange(6)[np.arange(len(links)) % 6] / 10
-    whole = replace(model.whole, links=links.with_los(los))
-    six = CrossFit(whole, model.folds[:1] * 6, model.fits[:1] * 7, index, model.twin)
-    per_link = gains / len(links) * 12 * model.whole.view(model.fits[0]).design_effect
+    whole = replace(model.whole, model=replace(model.whole.model, links=links.with_los(los)))
+    six = CrossFit(whole, model.folds[:1] * 6, index, model.twin)
+    per_link = gains / len(links) * 12 * model.whole.view.design_effect
     six.held_out_nll = model.held_out_nll
-    extended = CrossFit(six.whole, six.folds, six.fits, index, six.twin)
+    extended = six.extended(six.whole, six.folds)
     extended.held_out_nll = model.held_out_nll - per_link
     score = score_model(six, extended, CandidateScore("interference"), None, 1, 0, SelectionCriteria())
     assert ("line of sight" in score.reason) == (not passes)
@@ -127,7 +127,7 @@ def test_what_may_be_nothing_at_all_is_not_named(open_ground, monkeypatch):
 def keep_best(monkeypatch):
     """Function that keeps the best of some candidates; `several` is what is found of one kind."""
     def run(result, candidates, step, several=None, improbable=()):
-        for name, stand_in in (("_exactly", lambda model: model), ("with_moved_limits", lambda model: model),
+        for name, stand_in in (("_settled", lambda model: model),
                                ("_on_one_mast", lambda _: 0), ("_several", lambda *_: several)):
             monkeypatch.setattr(selection, name, stand_in)
         supported = [*candidates, *improbable]
@@ -192,14 +192,13 @@ def test_what_gains_nothing_is_no_part_of_the_base_either(open_ground):
     links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
     folds = make_folds(links, 0)
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-    same = CrossFit(model.whole, model.folds, model.fits, model.index, model.twin)
+    same = model.extended(model.whole, model.folds)
     score = score_model(model, same, CandidateScore("roof_heights"), None, 1, 0, SelectionCriteria().of_no_claim)
     assert score.nll_gain == 0 and not score.passed and "gains nothing" in score.reason
 
 
 def test_of_two_effects_of_one_name_the_one_that_is_probable_beside_another_is_kept(monkeypatch):
-    monkeypatch.setattr(selection, "_exactly", lambda model: model)
-    monkeypatch.setattr(selection, "with_moved_limits", lambda model: model)
+    monkeypatch.setattr(selection, "_settled", lambda model: model)
     sector, dipole = (CandidateScore("antenna_pattern", variant=variant, passed=True) for variant in ("", "dipole"))
     result = SelectionResult(MODEL, scores=[sector, dipole])
     other = CandidateScore("foliage", passed=True)

@@ -26,7 +26,7 @@ def seen(open_ground):
     """`seen(seed, change)`: view of a world's residual, and the hypotheses about it."""
     def make(seed, change=lambda world: None):
         model, hypotheses = looked_at(open_ground, seed, change)
-        return model.whole.view(model.fits[0]), hypotheses
+        return model.whole.view, hypotheses
     return make
 
 

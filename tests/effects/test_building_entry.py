@@ -81,10 +81,9 @@ def test_loss_and_scatter_are_found(make_links):
         level_db[:300] -= rng.normal(12, 6, 300)
         links = make_links([[0.0, 0, 1.5]], receiver_m, city=CityMap(box.vertices, box.faces), level_db=level_db)
         law = LogDistance().fit(links.select(np.arange(600) >= 300).geometry, level_db[300:], None)
-        model = FoldModel.build(links, law, 8.0)
-        added, fit = add_effect(model, BuildingEntry(), model.fit())
+        added = add_effect(FoldModel.build(links, law, 8.0).fit(), BuildingEntry())
         params = added.effects[-1].params
-        found.append((BuildingEntry._loss_db(params, fit.coefficients[added.coefficient_slices[-1]]),
+        found.append((BuildingEntry._loss_db(params, added.coefficients_of(-1)),
                       params.scatter_sd_db))
     loss_db, scatter_db = np.mean(found, axis=0)
     assert loss_db == pytest.approx(12.0, abs=2.5) and scatter_db == pytest.approx(6.0, abs=2.0)

@@ -10,11 +10,10 @@ from radiotwin.effects.catalogue.lock_loss import LockLoss
 from radiotwin.effects.catalogue.path_strength import WallReflection
 from radiotwin.effects.catalogue.roof_heights import RoofHeights
 from radiotwin.inference.censored_line import LogDistanceLine
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.effect_model import EffectModel, device_sd_db
-from radiotwin.twin.model.fold_model import FittedEffect, FoldModel
+from radiotwin.twin.model.fold_model import Fit, FittedEffect, FoldModel
 
 
 def test_positions_are_sought_without_what_follows_paths_or_many_maps():
@@ -42,7 +41,7 @@ def test_a_class_that_nothing_was_learnt_of_has_the_scale_of_the_other(make_link
     fit = fold.fit()
     assert fit.scale_db[0] == fit.scale_db[1] == pytest.approx(2.3, abs=0.6)  # of Student's t with 5 degrees
     alone = FoldModel.build(links.select(learnt), channel, 5.0)
-    assert np.isfinite(EffectModel.of(alone, alone.fit()).predict(links).mean_db).all()
+    assert np.isfinite(EffectModel.of(alone.fit()).predict(links).mean_db).all()
 
 
 @pytest.mark.parametrize("devices", [3, 6])
@@ -56,5 +55,5 @@ def test_what_devices_have_in_common_is_not_underestimated_for_few_of_them(make_
         level_db = -40 - 20 * np.log10(links.distance_m) + rng.normal(0, 1, devices)[links.device] + rng.normal(0, 1, len(links))
         channel = LogDistance(LogDistanceLine(-40.0, -2.0, 1.0))
         model = FoldModel.build(replace(links, level_db=level_db), channel, 5.0)
-        found.append(device_sd_db(model, FitResult(np.zeros(model.level_columns.shape[1]), np.array([1.0]), 0.0)) ** 2)
+        found.append(device_sd_db(Fit(np.zeros(model.level_columns.shape[1]), np.array([1.0]), 0.0, model)) ** 2)
     assert np.mean(found) == pytest.approx(1.0, abs=0.2)

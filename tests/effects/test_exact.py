@@ -125,14 +125,14 @@ def two_answers_model(make_links, seed):
 def found_along_paths(model):
     """The candidate as the loop fits it: quickly, and then with levels of its own paths."""
     before = model.fit()
-    return along_paths(*add_effect(model, DevicePositionError(), before), before)
+    return along_paths(add_effect(before, DevicePositionError()), before)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_position_whose_exact_optimum_lies_beside_the_quick_one_is_found(make_links, seed):
     """At the quick optimum the exact levels fit worse, so they were not looked at there."""
     model = two_answers_model(make_links, seed)
-    found, _ = found_along_paths(model)
+    found = found_along_paths(model)
     params = found.effects[-1].params
     assert params.exact and params.device == 0
     assert params.move_m == pytest.approx(MOVE_M, abs=2.0)
@@ -142,8 +142,8 @@ def test_paths_of_more_links_than_can_be_followed_are_not(make_links, monkeypatc
     """The anchor has 700 links: with fewer allowed its position is that of the quick levels."""
     monkeypatch.setattr(fitting, "MAX_FOLLOWED_LINKS", 699)
     model = two_answers_model(make_links, 0)
-    found, _ = found_along_paths(model)
+    found = found_along_paths(model)
     params = found.effects[-1].params
     assert not params.exact and params.device == 0
     monkeypatch.setattr(fitting, "MAX_FOLLOWED_LINKS", 700)
-    assert found_along_paths(model)[0].effects[-1].params.exact
+    assert found_along_paths(model).effects[-1].params.exact

@@ -46,26 +46,25 @@ def world(make_links):
 
 def model_of(links):
     twin = make_bases(None, 0)["log-distance"].fit(links)
-    model = FoldModel.build(links, twin.channel, 8.0)
-    return model, model.fit()
+    return FoldModel.build(links, twin.channel, 8.0).fit()
 
 
 def test_its_specific_attenuation_is_found(world):
     found = []
     for seed in range(5):
-        model, fit = model_of(world(seed))
-        added, better = add_effect(model, MappedVegetation(), fit)
+        fit = model_of(world(seed))
+        better = add_effect(fit, MappedVegetation())
         assert fit.objective - better.objective > 100
-        found.append(added.effects[-1].params.specific_attenuation_db_m)
-        assert added.effects[-1].params.greatest_loss_db == pytest.approx(MOST_DB)
+        found.append(better.effects[-1].params.specific_attenuation_db_m)
+        assert better.effects[-1].params.greatest_loss_db == pytest.approx(MOST_DB)
     # The law was fitted before, and has taken part of the loss for distance.
     assert 0.7 * SPECIFIC_DB_M < np.mean(found) < 1.05 * SPECIFIC_DB_M and np.std(found) < 0.2 * SPECIFIC_DB_M
 
 
 def test_a_wood_that_costs_nothing_is_not_plausible(world):
-    model, fit = model_of(world(0, loss=False))
-    added, better = add_effect(model, MappedVegetation(), fit)
-    params = added.effects[-1].params
+    fit = model_of(world(0, loss=False))
+    better = add_effect(fit, MappedVegetation())
+    params = better.effects[-1].params
     gain = fit.objective - better.objective
     assert gain < 5 or MappedVegetation().implausible(params, np.zeros(0)) is not None
 

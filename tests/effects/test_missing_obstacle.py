@@ -178,14 +178,13 @@ def test_along_paths_a_box_is_found_that_quick_levels_turned(make_links, seed):
     channel = ImagePaths().fit(links.geometry, level_db, None)
     model = FoldModel.build(replace(links, level_db=level_db), channel, 5.0)
     def fitted(box):
-        found = model.with_effects([model.apply(effect, effect.Params(box=box, exact=True))])
-        return found, found.fit()
+        return model.with_effects([model.apply(effect, effect.Params(box=box, exact=True))]).fit()
 
     without, start = model.fit(), fitted(Box(62.0, 7.0, 18.0, 18.0, 26.0, 52.0))
-    found, fit = along_paths(*start, without)
-    gain, most = without.objective - fit.objective, without.objective - fitted(true)[1].objective
+    found = along_paths(start, without)
+    gain, most = without.objective - found.objective, without.objective - fitted(true).objective
     assert found.effects[-1].params.exact
-    assert gain > 0.8 * most > 0.8 * 1000 and without.objective - start[1].objective < 0.65 * most
+    assert gain > 0.8 * most > 0.8 * 1000 and without.objective - start.objective < 0.65 * most
 
 
 def test_a_box_that_no_link_comes_near_stays_where_it_is(make_links):
@@ -195,8 +194,8 @@ def test_a_box_that_no_link_comes_near_stays_where_it_is(make_links):
                        level_db=np.linspace(-80, -70, len(receiver_m)))
     model = FoldModel.build(links, ImagePaths().fit(links.geometry, links.level_db, None), 5.0)
     far = MissingObstacle.Params(box=Box(-300.0, 0.0, 20.0, 20.0, 30.0, 0.0), known_paths=True)
-    there = model.with_effects([model.apply(MissingObstacle(), far)])
-    assert refine(there, there.fit())[0] is there
+    there = model.with_effects([model.apply(MissingObstacle(), far)]).fit()
+    assert refine(there) is there
 
 
 def test_where_a_building_was_found_no_other_is_proposed(make_links, view):

@@ -15,7 +15,7 @@ from radiotwin.effects.params import QUANTILE_90
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.fitting import add_effect
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.fold_model import Fit, FoldModel
 
 CORNERS_M = [(-80.0, -20.0), (-15.0, -15.0), (50.0, -25.0), (-40.0, 60.0)]  # south-western, of blocks of 30 by 30 m
 MAPPED_M = (20.0, 18.0, 22.0, 15.0)
@@ -56,9 +56,8 @@ def world(make_links):
 
 
 def fitted(links):
-    model = FoldModel.build(links, make_bases(None, 0)["twin"].fit(links).channel, 8.0)
-    fit = model.fit()
-    return model, fit, add_effect(model, RoofHeights(), fit)
+    fit = FoldModel.build(links, make_bases(None, 0)["twin"].fit(links).channel, 8.0).fit()
+    return fit, add_effect(fit, RoofHeights())
 
 
 def offsets(roofs):
@@ -74,15 +73,15 @@ def offsets(roofs):
 @pytest.mark.parametrize("seed", range(3))
 def test_roofs_that_are_off_are_found_and_explain_the_links(world, seed):
     true_m = np.array([5.5, -5.5, 5.5, 0.0])
-    model, fit, (added, better) = fitted(world(np.add(MAPPED_M, true_m), seed))
+    fit, better = fitted(world(np.add(MAPPED_M, true_m), seed))
     assert fit.objective - better.objective > 50
-    off_m, sd_m = offsets(added.effects[-1].params.roofs)
+    off_m, sd_m = offsets(better.effects[-1].params.roofs)
     assert off_m[:3] == pytest.approx(true_m[:3], abs=1.2)
     assert not abs(off_m[3]) > 1.2
-    sure = surely_off(added.effects[-1].params.roofs)
+    sure = surely_off(better.effects[-1].params.roofs)
     assert {round(roof.height_m) for roof in sure} <= {20, 18, 22} and len(sure) >= 2
     assert sd_m[:3].min() > 1.5  # other worlds have other edges than this one
-    named = added.effects[-1].effect.parameters(added.links, added.effects[-1].params, None)
+    named = better.effects[-1].effect.parameters(better.links, better.effects[-1].params, None)
     assert list(named) == [f"true_minus_mapped_height_m[{roof.x_m:.0f}, {roof.y_m:.0f}]" for roof in sure]
     off_by_place = {(round(x + 15), round(y + 15)): off_m for (x, y), off_m in zip(CORNERS_M, true_m, strict=True)}
     for roof, parameter in zip(sure, named.values(), strict=True):
@@ -108,8 +107,8 @@ def test_what_all_roofs_have_in_common_is_the_models_and_no_roofs():
 
 def test_of_a_roof_higher_than_any_that_was_tried_little_is_known(world):
     links = world(np.add(MAPPED_M, [11.0, 0.0, 0.0, 0.0]), 3)
-    model, fit, _ = fitted(links)
-    (params,) = RoofHeights().propose(model.view(fit))
+    fit, _ = fitted(links)
+    (params,) = RoofHeights().propose(fit.view)
     (roof,) = (roof for roof in params.roofs if roof.height_m == pytest.approx(20.0))
     low_m, high_m = (roof.true_offset_m + each * QUANTILE_90 * roof.offset_sd_m for each in (-1, 1))
     assert roof.offset_m < 8.1 and low_m < 11.0 < high_m
@@ -120,31 +119,31 @@ def test_a_roof_is_as_far_off_as_its_map_may_be(world, sd_m, least_m, most_m):
     links = world(np.add(MAPPED_M, [11.0, 0.0, 0.0, 0.0]), 3)
     told = links.with_city(CityMap(links.city.vertices, links.city.faces,
                                    height_sd_m=np.full(len(links.city.faces), sd_m)))
-    model, fit, _ = fitted(links)
-    view = FoldModel.build(told, model.channel, 8.0).view(fit)
+    fit, _ = fitted(links)
+    view = Fit(fit.coefficients, fit.scale_db, fit.objective, FoldModel.build(told, fit.channel, 8.0)).view
     off_m = [offsets(params.roofs)[0][0] for params in RoofHeights().propose(view)]
     assert least_m <= (np.nan_to_num(off_m[0]) if off_m else 0.0) <= most_m
 
 
 def test_a_map_that_is_right_stays(world):
     links = world(MAPPED_M, 1)
-    model, fit, _ = fitted(links)
-    for params in RoofHeights().propose(model.view(fit)):
+    fit, _ = fitted(links)
+    for params in RoofHeights().propose(fit.view):
         assert not [roof for roof in surely_off(params.roofs) if abs(roof.offset_m) > 1.0]
 
 
 def test_of_a_block_that_is_gone_nothing_is_said(world):
     twin = make_bases(None, 0)["twin"].fit(world(MAPPED_M, 2))
     model = FoldModel.build(world((0.0, *MAPPED_M[1:]), 2), twin.channel, 8.0)
-    for params in RoofHeights().propose(model.view(model.fit())):
+    for params in RoofHeights().propose(model.fit().view):
         assert np.isnan(offsets(params.roofs)[0][0])
 
 
 def test_only_links_over_a_roof_change_and_by_no_more_than_both_classes_differ(world):
     links = world(MAPPED_M)
-    model, _, _ = fitted(links)
+    fit, _ = fitted(links)
     params = RoofHeights.Params(roofs=(Roof(_number((-80.0, -20.0)), -65.0, -5.0, 20.0, 5.0, 1.0),))
-    change_db = RoofHeights().term(links, params, model.level_at).offset_db
+    change_db = RoofHeights().term(links, params, fit.model.level_at).offset_db
     a_m, b_m = links.device_m[links.device], links.receiver_m
     newly = blocked(a_m, b_m, (25.0, *MAPPED_M[1:])) & ~blocked(a_m, b_m, MAPPED_M)
     far = (np.maximum(a_m[:, 0], b_m[:, 0]) < -82) | (np.minimum(a_m[:, 0], b_m[:, 0]) > -48)
@@ -165,7 +164,7 @@ def test_it_needs_a_map_a_frequency_and_the_map_that_it_was_found_on(world, make
     assert RoofHeights().unavailable(links) is None
     alone = make_links(np.array([[0.0, 0.0, 2.0]]), np.random.default_rng(0).uniform(20, 90, (50, 3)))
     assert "no 3D map" in RoofHeights().unavailable(alone)
-    model, _, _ = fitted(links)
+    fit, _ = fitted(links)
     params = RoofHeights.Params(roofs=(Roof(99, 0.0, 0.0, 10.0, 2.0, 1.0),))
     with pytest.raises(BadInput, match="building 99, but the map has"):
-        RoofHeights().term(links, params, model.level_at)
+        RoofHeights().term(links, params, fit.model.level_at)

@@ -52,26 +52,25 @@ def test_the_chance_is_that_of_a_wall_that_is_off(make_links, monkeypatch):
 
 def fitted(links):
     twin = make_bases(None, 0)["twin"].fit(links)
-    model = FoldModel.build(links, twin.channel, 8.0)
-    fit = model.fit()
-    return model, fit, add_effect(model, UncertainSight(), fit)
+    fit = FoldModel.build(links, twin.channel, 8.0).fit()
+    return fit, add_effect(fit, UncertainSight())
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_where_walls_are_off_links_beside_them_are_likelier_with_larger_errors(world, seed):
     links = world(seed, city((-8.5, 11.5)))
-    model, fit, (added, better) = fitted(links)
+    fit, better = fitted(links)
     assert fit.objective - better.objective > 15
-    chance = added.effects[-1].effect._chance(links)
-    scale_db, sure = added.predict(better).scale_db, (chance == 0) | (chance == 1)
+    chance = better.effects[-1].effect._chance(links)
+    scale_db, sure = better.readings().scale_db, (chance == 0) | (chance == 1)
     assert scale_db[~sure].min() > 1.2 * scale_db[sure].max()
-    assert added.effects[-1].params.contrast_db == pytest.approx(BEHIND_DB, rel=0.6)
+    assert better.effects[-1].params.contrast_db == pytest.approx(BEHIND_DB, rel=0.6)
 
 
 def test_where_the_map_is_right_it_changes_next_to_nothing(world):
     links = world(0)
-    model, fit, (added, better) = fitted(links)
-    before, after = model.predict(fit), added.predict(better)
+    fit, better = fitted(links)
+    before, after = fit.readings(), better.readings()
     assert np.abs(after.mean_db - before.mean_db).max() < 3.0
     assert np.median(np.abs(after.scale_db / before.scale_db - 1)) < 0.05
 

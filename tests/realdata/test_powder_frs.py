@@ -52,8 +52,8 @@ def test_transmitters_of_days_that_are_held_out_are_located_better(loop):
     """The same transmitters before and after, so that chance in which ones are asked for does not count."""
     def errors_m(model) -> np.ndarray:
         off_m = []
-        for number, (fold, fit) in enumerate(zip(model.folds, model.fits[1:])):
-            day, learnt = loop.links.select(model.index == number), EffectModel.of(fold, fit)
+        for number, fold in enumerate(model.folds):
+            day, learnt = loop.links.select(model.index == number), EffectModel.of(fold)
             devices = np.random.default_rng(0).permutation(np.unique(day.device))[:DEVICES_A_DAY]
             asked = day.select(np.isin(day.device, devices))
             off_m += [np.hypot(*(loop.links.device_m[each.device, :2] - (each.x_m, each.y_m)))

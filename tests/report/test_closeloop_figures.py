@@ -6,7 +6,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.output.result_file import make_report
 from radiotwin.closeloop.run import Loop, close_loop
 from radiotwin.closeloop.search.selection import SelectionResult
@@ -79,8 +78,8 @@ def with_model(loop, model):
 
 def with_effect(model, effect, params):
     """Return a model with an effect of given parameters."""
-    whole = model.whole.with_effects([model.whole.apply(effect(), effect.Params(**params))])
-    return CrossFit(whole, model.folds, [whole.fit(), *model.fits[1:]], model.index, model.twin)
+    plain = model.whole.model
+    return model.extended(plain.with_effects([plain.apply(effect(), effect.Params(**params))]).fit(), model.folds)
 
 
 def drawn(loop, scene=None):

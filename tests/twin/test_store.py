@@ -92,8 +92,8 @@ def test_a_corrected_twin_of_version_0_1_predicts_the_same():
     np.testing.assert_allclose(found.sd_db, before["sd_db"], atol=1e-6, rtol=0)
     # As they are read by the receivers that it knows, before shadowing.
     links = prepare_links(read_measurements(VERSION_1 / "links" / "measurements.csv"), None)
-    model, result = twin.fitted.on_links(links)
-    reading = model.regression().predict(result)
+    fit = twin.fitted.on_links(links)
+    reading = fit.readings()
     np.testing.assert_allclose(reading.mean_db, before["read_db"], atol=1e-6, rtol=0)
     np.testing.assert_allclose(reading.scale_db, before["read_scale_db"], atol=ATOL_DB, rtol=0)
 
@@ -144,9 +144,9 @@ def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, old_scene, tmp
         values = [found.mean_db, found.sd_db]
     else:
         links = prepare_links(read_measurements(VERSION_1 / "links" / "measurements.csv"), None)
-        model, result = twin.fitted.on_links(links)
-        reading = model.regression().predict(result)
-        values = [reading.mean_db, reading.scale_db, model.regression().nll(result)]
+        fit = twin.fitted.on_links(links)
+        reading = fit.readings()
+        values = [reading.mean_db, reading.scale_db, fit.model.regression().nll(fit)]
     limit_db = 0.1 if part["name"] == "diffraction" else ATOL_DB  # 0.1 did not follow paths over two edges
     np.testing.assert_allclose(values, before[f"{part['over']}_{number}"], atol=limit_db, rtol=0)
 

@@ -29,8 +29,8 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     model = loop.for_twin
     shadowing = model.shadowing[0] if model.shadowing else None
     if shadowing is None and needs_rest(loop.prediction):
-        shadowing = CorrelatedShadowing.fit(model.whole, model.fits[0], loop.seed)
-    fitted = replace(EffectModel.of(model.whole, model.fits[0]),
+        shadowing = CorrelatedShadowing.fit(model.whole, loop.seed)
+    fitted = replace(EffectModel.of(model.whole),
                      **vars(_calibration(loop, scene)), shadowing=shadowing,
                      blend=make_blend(model, loop.prediction, loop.seed))
     provenance: dict[str, Any] = {"links": len(model.links),
@@ -48,8 +48,7 @@ def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
     model, links = loop.for_twin, loop.links
     if model.whole.channel.follows_paths:  # which locates nothing: `check_can_locate`
         return RadiusCalibration()
-    models = [EffectModel.of(fold, fit).for_positions()
-              for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
+    models = [EffectModel.of(fold).for_positions() for fold in model.folds]
     # A device that the loop found elsewhere is not where it was declared.
     moved = {device for each in model.whole.effects if isinstance(each.effect, DevicePositionError)
              for device in model.links.device[each.acts].tolist()}

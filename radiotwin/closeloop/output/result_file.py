@@ -265,7 +265,7 @@ def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:
 
 def _shadowing(score: CandidateScore, model: CrossFit, rank: int) -> dict[str, Any]:
     field, relatives = model.shadowing[0].field, model.shadowing[0].relatives
-    sd_db = model.shadowing[0].relative_sd * float(model.fits[0].scale_db.mean())
+    sd_db = model.shadowing[0].relative_sd * float(model.whole.scale_db.mean())
     numbers = {"length_m": (field.length_m, "m"), "share": (field.share, "of the variance"),
                "receiver_share": (field.kind_share, "of the variance"), "sigma_db": (sd_db, "dB")}
     if relatives is not None:

@@ -28,13 +28,13 @@ def make_blend(model: CrossFit, prediction: CombinedPrediction,
         prediction: whose weights are taken.
         seed: of the trees.
     """
-    whole, fit = model.whole, model.fits[0]
+    whole = model.whole
     weights = _members(prediction)
     if _is_physics_alone(model, prediction):
         return None
     total = np.sum(list(weights.values()), axis=0)
     grown = set(weights) & set(FORESTS + TREES_ALONE)
-    forests = grown_forests(whole, fit, Part(whole.links), seed, names=grown) if grown else {}
+    forests = grown_forests(whole, Part(whole.links), seed, names=grown) if grown else {}
     laws = {kind.name: fitted_law(kind, whole.links, whole.train)
             for kind in LAWS if kind.name in weights}
     places = np.column_stack([np.round(whole.links.receiver_m / SAME_M) * SAME_M,
@@ -63,7 +63,7 @@ def held_out_coverage(model: CrossFit, prediction: CombinedPrediction) -> float:
     Returns:
         in 0..1; NaN where no reading is predicted.
     """
-    half = student.ppf(0.95, model.whole.dof)
+    half = student.ppf(0.95, model.whole.model.dof)
     if _is_physics_alone(model, prediction):
         mean_db, scale_db = model.held_out_reading
     else:
@@ -108,7 +108,8 @@ def _sd_ratio(model: CrossFit, prediction: CombinedPrediction,
     if not len(here):
         return 1.0, 1.0
     away = prediction.away[prediction.away[:, 2] != but, :2]
-    ratios = [_fitted_ratio(links, model.whole.dof) for links in (here, np.vstack([here, away]))]
+    ratios = [_fitted_ratio(links, model.whole.model.dof)
+              for links in (here, np.vstack([here, away]))]
     near, far = np.max(ratios, axis=0)
     return float(near), float(far)
 

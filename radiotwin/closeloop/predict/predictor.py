@@ -34,7 +34,6 @@ from radiotwin.closeloop.predict.baselines import (
     laws_for,
 )
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.held_out import combine, convex_weights
 from radiotwin.inference.student import mean_if_detected
 from radiotwin.links import Links
@@ -48,7 +47,7 @@ from radiotwin.twin.model.correlated_shadowing import (
     receivers_move,
     standardised_residual,
 )
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.fold_model import Fit
 
 HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
 PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
@@ -85,8 +84,7 @@ class CombinedPrediction:
 class _Learnt:
     """A model of some links, with all that is learnt beside it, and which members count."""
 
-    model: FoldModel
-    fit: FitResult
+    fit: Fit
     rest: CorrelatedShadowing | None
     kriging: RegressionKriging | None
     part: Part
@@ -106,12 +104,12 @@ class _Learnt:
             (r, k) measured minus predicted by each member [dB], (r,) far shares, (r,) error scales
             of named effects [dB], and (r,) rows of the links.
         """
-        rows = np.flatnonzero(self.model.train)
+        rows = np.flatnonzero(self.fit.train)
         if len(rows) > MAX_AWAY_LINKS:
             rng = np.random.default_rng(seed)
             rows = np.sort(rng.choice(rows, MAX_AWAY_LINKS, replace=False))
-        part, quadrant = self.part.select(rows), _quadrant(self.model.links)[rows]
-        whole = self.model.restrict(rows, self.model.effects)
+        part, quadrant = self.part.select(rows), _quadrant(self.fit.links)[rows]
+        whole = self.fit.model.restrict(rows, self.fit.effects)
         errors, shares, scales = [np.zeros((0, len(self.names)))], [np.zeros(0)], [np.zeros(0)]
         tested = [np.zeros(0, dtype=int)]
         for each in range(4):
@@ -119,21 +117,20 @@ class _Learnt:
             test = np.flatnonzero(out & np.isfinite(part.links.level_db))
             if not len(test) or np.isfinite(part.links.level_db[~out]).sum() < MIN_LEARNT:
                 continue
-            model = replace(whole, train=~out)
-            fit = model.fit(self.fit)
-            rest = self.rest and self.rest.refit(model, fit)
-            inner = _Learnt(model, fit, rest, self.kriging, part, self.names)
+            fit = replace(whole, train=~out).fit(self.fit)
+            rest = self.rest and self.rest.refit(fit)
+            inner = _Learnt(fit, rest, self.kriging, part, self.names)
             errors.append(part.links.level_db[test, None] - inner.members_db(test, seed))
             shares.append(shares_of(part.links, ~out, test))
-            scales.append(model.predict_parts(fit)[1][test])
+            scales.append(fit.reading_parts()[1][test])
             tested.append(rows[test])
         return (np.concatenate(errors), np.concatenate(shares), np.concatenate(scales),
                 np.concatenate(tested))
 
     def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
         """Return predictions (m, k) of rows (m,), by few trees and known correlations [dB]."""
-        physics = physics_db(self.model, self.fit, self.rest, self.part, test, seed, AWAY_TREES)
-        laws = [law_db(kind, self.part.links, self.model.train, test, self.kriging)
+        physics = physics_db(self.fit, self.rest, self.part, test, seed, AWAY_TREES)
+        laws = [law_db(kind, self.part.links, self.fit.train, test, self.kriging)
                 for kind in LAWS if kind.name in self.names]
         return np.column_stack([physics, *laws])
 
@@ -160,13 +157,13 @@ def combined_prediction(model: CrossFit, with_rest: bool, criteria: SelectionCri
 
     def of_fold(number: int) -> tuple[_Learnt, np.ndarray, np.ndarray, np.ndarray]:
         """Return what is learnt outside a fold; its rows (m,), their members and far shares."""
-        fold, fit, part, rest = model.folds[number], model.fits[number + 1], parts[number], None
+        fold, part, rest = model.folds[number], parts[number], None
         if REST in names:
             rest = model.shadowing[number + 1] if model.shadowing else CorrelatedShadowing.fit(
-                fold, fit, seed)
-        learnt = _Learnt(fold, fit, rest, kriging[number] if kriging else None, part, names)
+                fold, seed)
+        learnt = _Learnt(fold, rest, kriging[number] if kriging else None, part, names)
         test = np.flatnonzero((model.index == number) & fold.usable)
-        members = np.column_stack([physics_db(fold, fit, rest, part, test, seed),
+        members = np.column_stack([physics_db(fold, rest, part, test, seed),
                                    *(baselines[name][test] for name in laws)])
         return learnt, test, members, shares_of(part.links, fold.train, test)
 
@@ -236,7 +233,7 @@ def _weights(error_db: np.ndarray, share: np.ndarray, names: list[str]) -> np.nd
     return convex_weights(error_db[known], share[known], PULL)
 
 
-def grown_forests(model: FoldModel, fit: FitResult, part: Part, seed: int, trees: int = TREES,
+def grown_forests(fit: Fit, part: Part, seed: int, trees: int = TREES,
                   names: Collection[str] = (*FORESTS, *TREES_ALONE)) -> dict[str, Forest]:
     """Grow trees on training links: on the standardised residual (`FORESTS`), and on the levels.
 
@@ -244,29 +241,27 @@ def grown_forests(model: FoldModel, fit: FitResult, part: Part, seed: int, trees
     theirs: its effects have names, and a map has none.
 
     Args:
-        model: n links, of which some are learnt from.
-        fit: to these.
+        fit: to some of n links.
         part: the links, with the features of trees.
         seed: of the trees.
         trees: number of them.
         names: those that are asked for.
     """
-    rows = np.flatnonzero(model.train)
-    z = standardised_residual(model, fit)
-    mean_db, scale_db, _ = model.predict_parts(fit)
+    rows = np.flatnonzero(fit.train)
+    z = standardised_residual(fit)
+    mean_db, scale_db, _ = fit.reading_parts()
     level_db = mean_db[rows] + z * scale_db[rows]
     return {name: grow_trees(kind, part.common[rows], target, seed, trees)
             for both, target in ((FORESTS, z), (TREES_ALONE, level_db))
             for name, kind in zip(both, (EXTRA_TREES, BOOSTING), strict=True) if name in names}
 
 
-def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | None, part: Part,
-               test: np.ndarray, seed: int, trees: int = TREES) -> np.ndarray:
+def physics_db(fit: Fit, rest: CorrelatedShadowing | None, part: Part, test: np.ndarray,
+               seed: int, trees: int = TREES) -> np.ndarray:
     """Return levels by named effects and trees, alone and together, and with the rest [dB].
 
     Args:
-        model: n links, of which some are learnt from.
-        fit: to these.
+        fit: to some of n links.
         rest: interpolated, of these; None: not asked for.
         part: the links, with the features of trees.
         test: (m,) rows.
@@ -277,16 +272,16 @@ def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | Non
         (m, 5), or (m, 6) with the rest, level of a link that is detected.
     """
     limit_db, mean_db, scale_db, unheard_db = (each[test] for each in (
-        model.limit_db, *model.predict_parts(fit)))
-    losses = model.losses.select(test)
+        fit.model.limit_db, *fit.reading_parts()))
+    losses = fit.model.losses.select(test)
     added: list[tuple] = [(0.0, 1.0)]
-    for name, forest in grown_forests(model, fit, part, seed, trees).items():
+    for name, forest in grown_forests(fit, part, seed, trees).items():
         predicted = forest.predict(part.common[test])
         alone = name in TREES_ALONE
         added.append(((predicted - mean_db) / scale_db if alone else predicted, 1.0))
     if rest is not None:
-        added.append(rest.at(model.links.select(test)))
+        added.append(rest.at(fit.links.select(test)))
     return np.column_stack([
         mean_if_detected(mean_db + shift * scale_db, np.hypot(scale_db * left, unheard_db),
-                         limit_db, model.dof, losses)
+                         limit_db, fit.model.dof, losses)
         for shift, left in added])

@@ -48,10 +48,9 @@ from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.intervals import effect_size_db, why_not_borne_out
 from radiotwin.effects.base import DetectionEffect, Effect
 from radiotwin.effects.catalogue.gain_drift import DeviceDrift, ReceiverDrift
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import Links, evidence_blocks
 from radiotwin.links.correlation import devices_move
-from radiotwin.twin.model.fold_model import AppliedEffect, FoldModel
+from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel
 
 MIN_SHARED = 0.5  # of a fault's links, on which what is held against it, or the same, acts
 MIN_DEVICES = 4  # of known position, to hold some of them out
@@ -104,8 +103,7 @@ def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrif
             return
         model = extended
         params = candidate.whole.effects[-1].params
-        whole = with_effect(result.model, effect, params)
-        there = replace(candidate, whole=whole.whole, fit=whole.fits[0])
+        there = replace(candidate, whole=with_effect(result.model, effect, params).whole)
         # When it was, a flight that is held out does not tell.
         result.keep(score, with_candidate(result.model, there, result.executor))
 
@@ -131,7 +129,7 @@ def _stands_out(model: CrossFit, candidate: Candidate | CandidateScore,
     effect, params = candidate.effect, candidate.whole.effects[-1].params
     assert isinstance(effect, ReceiverDrift | DeviceDrift)
     ((changed, drift),) = effect.drifts(params).items()
-    view = model.whole.view(model.fits[0])
+    view = model.whole.view
     links = view.links
     seen = np.isfinite(links.level_db) & np.isfinite(links.time_s)
     end = effect.index(links)
@@ -160,10 +158,7 @@ def _stands_out(model: CrossFit, candidate: Candidate | CandidateScore,
 
 def with_effect(model: CrossFit, effect: Effect, params: Any) -> CrossFit:
     """Return a model with one more effect in the whole and every fold, its parameters given."""
-    models = [each.with_effects([*each.effects, each.apply(effect, params)])
-              for each in model.models]
-    fits = [each.fit(fit) for each, fit in zip(models, model.fits, strict=True)]
-    return model.extended(models, fits)
+    return model.map(lambda fit: fit.with_effects([*fit.effects, fit.model.apply(effect, params)]))
 
 
 def select_faults(result: SelectionResult, effects: list[Effect], links: Links, base: Base,
@@ -265,29 +260,29 @@ def drop_idle_faults(result: SelectionResult) -> None:
                                                             ReceiverDrift | DeviceDrift)
         if not timed:
             continue
-        alone = whole.with_effects([each for each in whole.effects if each is not applied])
-        fit = alone.fit()
-        gain = fit.objective - result.model.fits[0].objective
-        if gain >= result.criteria.min_training_gain_nats and _is_found(applied, alone, fit):
+        alone = whole.model.with_effects([each for each in whole.effects
+                                          if each is not applied]).fit()
+        gain = alone.objective - whole.objective
+        if gain >= result.criteria.min_training_gain_nats and _is_found(applied, alone):
             continue
-        folds = [_without(each, same_effects(whole, each)[number]) for each in result.model.folds]
-        fits = [fit, *(each.fit() for each in folds)]
-        result.model = result.model.extended([alone, *folds], fits)
+        folds = [_without(each.model, same_effects(whole, each)[number]).fit()
+                 for each in result.model.folds]
+        result.model = result.model.extended(alone, folds)
         kept = [i for i, score in enumerate(result.scores) if score.kept][number]
         result.scores[kept] = replace(result.scores[kept], kept=False,
                                       reason="what was found later explains it")
         del result.rivals[number]
 
 
-def _is_found(applied: AppliedEffect, model: FoldModel, fit: FitResult) -> bool:
-    """Return whether the search of a fault finds it in what a model without it leaves.
+def _is_found(applied: AppliedEffect, without: Fit) -> bool:
+    """Return whether the search of a fault finds it in what a fit without it leaves.
 
     Steps in time have no search of their own.
     """
     effect = applied.effect
     if not effect.within_flights:
         return True
-    again = [model.apply(effect, params).acts for params in effect.propose(model.view(fit))]
+    again = [without.model.apply(effect, params).acts for params in effect.propose(without.view)]
     return any((applied.acts & acts).sum() >= MIN_SHARED * (applied.acts | acts).sum()
                for acts in again)
 
@@ -317,12 +312,8 @@ def _folds(links: Links, seed: int) -> Folds:
 def _adopted(model: CrossFit, candidate: Candidate) -> CrossFit:
     """Return a model with the effect; a fold has it as far as its own training links show it."""
     effect, like = candidate.effect, candidate.whole.effects[-1].params
-    models, fits = [candidate.whole], [candidate.fit]
-    for each, fit in zip(model.folds, model.fits[1:], strict=True):
-        own: list[Any] = effect.propose_like(each.view(fit), like)
-        if own:
-            each = each.with_effects([*each.effects, each.apply(effect, own[0])])
-            fit = each.fit(fit)
-        models.append(each)
-        fits.append(fit)
-    return model.extended(models, fits)
+    def adopted(fold: Fit) -> Fit:
+        own: list[Any] = effect.propose_like(fold.view, like)
+        return fold.with_effects([*fold.effects, fold.model.apply(effect, own[0])]) if own else fold
+
+    return model.extended(candidate.whole, [adopted(fold) for fold in model.folds])

@@ -20,11 +20,10 @@ from radiotwin.effects.arrays import one_hot
 from radiotwin.effects.base import Effect
 from radiotwin.effects.catalogue.unexplained_trend import curve_columns
 from radiotwin.effects.params import NEAR_SHARE
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
 from radiotwin.links import Links
 from radiotwin.twin.model.correlated_shadowing import receivers_move
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.fold_model import Fit
 
 MAX_Z = 3.0  # an outlier counts as this many scales from its neighbours
 NEIGHBOURS = 9
@@ -65,18 +64,18 @@ class Hypotheses:
     near: np.ndarray
 
     @classmethod
-    def of(cls, model: FoldModel, fit: FitResult, seed: int) -> Hypotheses:
+    def of(cls, fit: Fit, seed: int) -> Hypotheses:
         """Return the hypotheses about what a model lacks.
 
         Args:
-            model: with what was found so far.
-            fit: to its training links.
+            fit: with what was found so far.
             seed: of the draw of links, where there are many.
         """
-        links, predicted = model.links.select(model.train), model.training.predict(fit)
+        training = fit.model.training
+        links, predicted = fit.links.select(fit.train), training.predict(fit)
         nuisance = _nuisance(links, predicted.mean_db)
         nuisance = Columns(nuisance.values / predicted.scale_db[:, None], nuisance.prior_sd)
-        residual_db = np.where(_says_something(model, fit), model.training.residual_db(fit), np.nan)
+        residual_db = np.where(_says_something(fit), training.residual_db(fit), np.nan)
         moving = receivers_move(links)
         series = links.device if moving else links.receiver
         position_m = links.receiver_m if moving else links.device_m[links.device]
@@ -114,7 +113,7 @@ class Hypotheses:
         pattern = self.evidence.rotated(pattern_db / self.scale_db)
         return self.evidence.information(pattern, columns, self.nuisance.prior_sd, theta)
 
-    def of_named(self, model: FoldModel, fit: FitResult) -> float:
+    def of_named(self, fit: Fit) -> float:
         """Return the evidence for the last effect of a model [nats].
 
         Coefficients are integrated over their priors, and so are the numbers that were searched
@@ -123,27 +122,26 @@ class Hypotheses:
         determine costs nothing, and what fits best without the rest is fitted again beside it.
 
         Args:
-            model: this one's with one more effect.
-            fit: of it.
+            fit: of this one's model with one more effect.
 
         Returns:
             NaN for an effect that residuals do not show.
         """
-        applied = model.effects[-1]
-        term, own = applied.term.select(model.train), model.coefficient_slices[-1]
+        applied, own = fit.effects[-1], fit.coefficients_of(-1)
+        term = applied.term.select(fit.train)
         if term.random_effect_sd_db is not None and applied.effect.within_flights:
             return np.nan  # it makes errors larger, which levels alone do not show
-        z = _tamed(model.training.residual_db(fit) / self.scale_db, self.near)
+        z = _tamed(fit.model.training.residual_db(fit) / self.scale_db, self.near)
         # What its columns brought, and what levels gave way for it, is integrated over again.
-        shown_db = term.columns @ fit.coefficients[own]
-        levels = model.level_columns[model.train]
+        shown_db = term.columns @ own
+        levels = fit.model.level_columns[fit.train]
         p = levels.shape[1]
         shown_db += levels @ (fit.coefficients[:p] - self.coefficients[:p])
         z += shown_db / self.scale_db
         columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
         if applied.effect.sparse:
-            return self._of_few(z, columns, fit.coefficients[own])
-        slopes = _slopes(model, fit)
+            return self._of_few(z, columns, own)
+        slopes = _slopes(fit)
         return self.gain_nats(z, columns.beside(
             Columns(slopes.values / self.scale_db[:, None], slopes.prior_sd)))
 
@@ -201,9 +199,9 @@ class Hypotheses:
                 yield variable + (f", {name}" if name else ""), np.hstack(blocks)
 
 
-def _slopes(model: FoldModel, fit: FitResult) -> Columns:
+def _slopes(fit: Fit) -> Columns:
     """Return what each number of the last effect changes (n, q) [dB], and how far it may (q,)."""
-    applied = model.effects[-1]
+    model, applied = fit.model, fit.effects[-1]
     variation = applied.effect.variation(applied.params)
     if variation is None:
         return Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0))
@@ -246,9 +244,9 @@ def _tamed(z: np.ndarray, near: np.ndarray) -> np.ndarray:
     return common + np.clip(z - common, -MAX_Z, MAX_Z)
 
 
-def _says_something(model: FoldModel, fit: FitResult) -> np.ndarray:
+def _says_something(fit: Fit) -> np.ndarray:
     """Return (m,) training links that were detected, or should have been."""
-    training = model.training
+    training = fit.model.training
     return np.isfinite(training.level_db) | (training.residual_db(fit) < 0)
 
 

@@ -67,7 +67,7 @@ def judge(scores: Sequence[CandidateScore], model: CrossFit, hypotheses: Hypothe
     """
     rest_db, noise_db = hypotheses.sizes_db
     step = Step(len(model.whole.effects), hypotheses.unnamed_nats, rest_db, noise_db, {})
-    there = model.whole.effect_names
+    there = model.whole.model.effect_names
     judged = []
     for score in scores:
         if score.gain_by_fold.size:
@@ -118,7 +118,7 @@ def probability_of_all(scores: Sequence[CandidateScore], other: float, before: C
     """
     evidence, held_out = (sum(each.nats for each in scores),
                           sum(each.held_out_nats for each in scores))
-    kinds = {each.name for each in scores} | before.whole.effect_names
+    kinds = {each.name for each in scores} | before.whole.model.effect_names
     values = features((evidence, held_out, held_out - other),
                       sum(each.rmse_fall for each in scores),
                       rest_over_noise, len(kinds) > 1)

@@ -13,12 +13,11 @@ import numpy as np
 
 from radiotwin.closeloop.crossfit import Base, CrossFit
 from radiotwin.effects.arrays import subsample
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import Links
 from radiotwin.twin.localize import position_log_likelihood
 from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.model.effect_model import EffectModel
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.fold_model import Fit, FoldModel
 
 RADII_M = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)  # of circles around a position, that are tried
 DIRECTIONS = 12
@@ -51,10 +50,9 @@ def relocate_devices(model: CrossFit, links: Links, base: Base
         return model
     twin = model.twin
     if not model.whole.channel.follows_paths:
-        moved = [_relocated(each, fit, unknown)
-                 for each, fit in zip(model.models, model.fits, strict=True)]
+        moved = [_relocated(each, unknown) for each in model.each]
         twin = replace(twin, devices=_with_positions(twin.devices, moved[0].links.device_m))
-    elif model.whole.corrected_map is not links.city:
+    elif model.whole.model.corrected_map is not links.city:
         located = [_located_anew(model.whole, links, np.ones(len(links), bool), base)]
         if not _is_moved(model.whole, located[0][0]):
             return model  # which takes folds minutes, too
@@ -64,11 +62,12 @@ def relocate_devices(model: CrossFit, links: Links, base: Base
         twin = replace(twin, devices=located[0][1])
     else:
         return model
-    found = replace(model.extended(moved, [each.fit() for each in moved]), twin=twin)
+    whole, *folds = (each.fit() for each in moved)
+    found = replace(model.extended(whole, folds), twin=twin)
     return found if is_better(model.held_out_nll, found.held_out_nll) else model
 
 
-def _is_moved(before: FoldModel, after: FoldModel) -> bool:
+def _is_moved(before: Fit, after: FoldModel) -> bool:
     """Return whether any device with links moves noticeably, is found or is lost."""
     apart_m = np.linalg.norm(after.links.device_m - before.links.device_m, axis=1)
     moved = apart_m[before.links.device] > MIN_MOVE_M
@@ -98,16 +97,17 @@ def _with_positions(devices: list[TwinDevice], device_m: np.ndarray) -> list[Twi
             for each, (x_m, y_m, _) in zip(devices, device_m, strict=True)]
 
 
-def _located_anew(model: FoldModel, links: Links, mine: np.ndarray,
+def _located_anew(fit: Fit, links: Links, mine: np.ndarray,
                   base: Base) -> tuple[FoldModel, list[TwinDevice]]:
     """Return one model with its devices where its base, over the corrected map, has them.
 
     Args:
-        model: with effects.
+        fit: with effects.
         links: n links as the base was given them.
         mine: (n,) bool, those that it learns from.
         base: locates.
     """
+    model = fit.model
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the base has warned already
         twin = base.fit(links.with_city(model.corrected_map).select(mine))
@@ -117,9 +117,9 @@ def _located_anew(model: FoldModel, links: Links, mine: np.ndarray,
         twin.devices
 
 
-def _relocated(model: FoldModel, fit: FitResult, unknown: list[int]) -> FoldModel:
+def _relocated(fit: Fit, unknown: list[int]) -> FoldModel:
     """Return one model with its devices moved, by its training links."""
-    learnt = EffectModel.of(model, fit)
+    learnt, model = EffectModel.of(fit), fit.model
     device_m = model.links.device_m.copy()
     for device in unknown:
         rows = np.flatnonzero(model.train & (model.links.device == device))

@@ -15,12 +15,11 @@ from radiotwin.closeloop.search.hypotheses import Hypotheses, is_judged_by_level
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.effects.base import Effect
 from radiotwin.effects.params import EffectParams
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.held_out import cross_fit_p_value, sign_flip_p_value
 from radiotwin.links import Links
 from radiotwin.runtime.execution import Executor
 from radiotwin.twin.model.fitting import add_effect, along_paths, prepare_additions
-from radiotwin.twin.model.fold_model import FittedEffect, FoldModel
+from radiotwin.twin.model.fold_model import Fit, FittedEffect
 
 # Of the fold where a candidate moves likelihoods most (and of all folds, for links with line of
 # sight), and of the fold where it gains or loses most.
@@ -125,8 +124,7 @@ class Candidate:
     """
 
     effect: Effect
-    whole: FoldModel
-    fit: FitResult
+    whole: Fit
     gain: float
     evidence: float = np.nan
 
@@ -144,28 +142,28 @@ def fit_candidate(model: CrossFit, effect: Effect, step: int,
         hypotheses: about what the model lacks; None: not to be looked at.
     """
     refused = CandidateScore(effect.name, step=step, variant=effect.variant)
-    whole = add_effect(model.whole, effect, model.fits[0])
+    whole = add_effect(model.whole, effect)
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
-    links, city = model.whole.links.select(model.whole.usable), model.whole.corrected_map
+    links, city = model.links.select(model.whole.usable), model.whole.model.corrected_map
     if city is not links.city:  # what was found is part of what is known
         links = links.with_city(city)
-    why = effect.contradicted(whole[0].effects[-1].params, links)
+    why = effect.contradicted(whole.effects[-1].params, links)
     if why:
         return replace(refused, reason=why)
-    whole = along_paths(*whole, model.fits[0])
-    coefficients = whole[1].coefficients[whole[0].coefficient_slices[-1]]
-    params = whole[0].effects[-1].params
-    why = effect.implausible(params, coefficients) or effect.contradicted(params, links)
+    whole = along_paths(whole, model.whole)
+    params = whole.effects[-1].params
+    why = effect.implausible(params, whole.coefficients_of(-1)) \
+        or effect.contradicted(params, links)
     if why:
         return replace(refused, reason=why)
-    gain = model.fits[0].objective - whole[1].objective
+    gain = model.whole.objective - whole.objective
     if gain < criteria.min_training_gain_nats:
         return replace(refused, reason=f"gains less than {criteria.min_training_gain_nats:.0f} "
                        "nats even on the links that it is fitted to")
     if hypotheses is None or not is_judged_by_levels(effect):
-        return Candidate(effect, *whole, gain)
-    return Candidate(effect, *whole, gain, hypotheses.of_named(*whole))
+        return Candidate(effect, whole, gain)
+    return Candidate(effect, whole, gain, hypotheses.of_named(whole))
 
 
 def score_candidate(model: CrossFit, candidate: Candidate, block: np.ndarray, tried: int,
@@ -187,7 +185,7 @@ def score_candidate(model: CrossFit, candidate: Candidate, block: np.ndarray, tr
         the score, and the model with it; None where it does not pass.
     """
     fitted = FittedEffect(candidate.effect, candidate.whole.effects[-1].params,
-                          candidate.fit.coefficients[candidate.whole.coefficient_slices[-1]])
+                          candidate.whole.coefficients_of(-1))
     devices, receivers = ends_of(fitted, model.links)
     extended = with_candidate(model, candidate, executor)
     score = CandidateScore(candidate.effect.name, step=step, evidence_nats=candidate.evidence,
@@ -202,13 +200,9 @@ def with_candidate(model: CrossFit, candidate: Candidate,
                    executor: Executor) -> CrossFit:
     """Return a model with a candidate; a fold has it as its own training links show it."""
     effect, like = candidate.effect, candidate.whole.effects[-1].params
-    models, fits = [candidate.whole], [candidate.fit]
-    prepare_additions(model.folds, model.fits[1:], [effect], executor, like)
-    for each, fit in zip(model.folds, model.fits[1:], strict=True):
-        extended_fold, extended_fit = add_effect(each, effect, fit, like) or (each, fit)
-        models.append(extended_fold)
-        fits.append(extended_fit)
-    return model.extended(models, fits)
+    prepare_additions(model.folds, [effect], executor, like)
+    return model.extended(candidate.whole, [add_effect(fold, effect, like) or fold
+                                            for fold in model.folds])
 
 
 def fit_and_score(model: CrossFit, effect: Effect, block: np.ndarray, tried: int,
@@ -234,7 +228,7 @@ def score_model(model: CrossFit, extended: CrossFit, score: CandidateScore,
     usable = known & ~model.unforeseen
     if not usable.any():
         return replace(score, reason="no held-out link can be judged with it")
-    design_effect = model.whole.view(model.fits[0]).design_effect
+    design_effect = model.whole.view.design_effect
 
     def by_fold(rows: np.ndarray) -> np.ndarray:
         own = np.bincount(model.index[rows], weights=gain[rows], minlength=len(model.folds))

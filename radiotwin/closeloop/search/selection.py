@@ -91,7 +91,7 @@ def probable_together(passed: Sequence[Passed], before: CrossFit, step: Step,
         model, number = found[-1].model, step.number + len(found)
         if number >= criteria.max_effects:
             return []
-        hypotheses = Hypotheses.of(model.whole, model.fits[0], seed)
+        hypotheses = Hypotheses.of(model.whole, seed)
         longer = []
         for effect in effects:
             score, extended = fit_and_score(model, effect, block, tried, number, seed, criteria,
@@ -125,12 +125,12 @@ def with_moved_limits(model: CrossFit) -> CrossFit:
     Args:
         model: of n links; any other last effect leaves it as it is.
     """
-    whole, fit = model.whole, model.fits[0]
+    whole = model.whole
     offsets = whole.effects[-1]
     if not isinstance(offsets.effect, ReceiverGainOffset):
         return model
-    limits = DetectionLimit().propose(whole.view(fit))
-    own_db = fit.coefficients[whole.coefficient_slices[-1]]
+    limits = DetectionLimit().propose(whole.view)
+    own_db = whole.coefficients_of(-1)
     off_db = dict(zip(offsets.params.members, own_db - np.median(own_db), strict=True))
     limit_db = model.links.limit_db.copy()
     for receiver, found_db in (limits[0].receivers if limits else {}).items():
@@ -139,9 +139,8 @@ def with_moved_limits(model: CrossFit) -> CrossFit:
             limit_db[mine] = found_db
     if np.array_equal(limit_db, model.links.limit_db):
         return model
-    models = [replace(each, links=replace(each.links, limit_db=limit_db)) for each in model.models]
-    fits = [each.fit(old) for each, old in zip(models, model.fits, strict=True)]
-    return model.extended(models, fits)
+    return model.map(lambda fit: replace(
+        fit.model, links=replace(fit.links, limit_db=limit_db)).fit(fit))
 
 
 @dataclass(eq=False)
@@ -178,7 +177,7 @@ class SelectionResult:
     def hypotheses(self, seed: int) -> Hypotheses:
         """Return the hypotheses about what the model lacks, made once for each model."""
         if self.looked_at is None or self.looked_at[0] is not self.model:
-            found = Hypotheses.of(self.model.whole, self.model.fits[0], seed)
+            found = Hypotheses.of(self.model.whole, seed)
             self.looked_at = self.model, found
         return self.looked_at[1]
 
@@ -259,7 +258,7 @@ def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarr
     here = [each.effect for each in result.model.whole.effects]
     tried = [effect for effect in available
              if effect.repeatable or not any(each is effect for each in here)]
-    prepare_additions([result.model.whole], result.model.fits[:1], tried, result.executor)
+    prepare_additions([result.model.whole], tried, result.executor)
     for effect in tried:
         on_progress(f"step {step + 1}: {effect.name}")
         candidate = fit_candidate(result.model, effect, step, result.criteria, hypotheses)
@@ -341,7 +340,7 @@ def _keep_together(result: SelectionResult, found: list[Passed], step: int) -> N
             break
     result.scores += [replace(each.score, kept=True) for each in found[1:]]
     result.rivals += [[] for _ in found]
-    result.model = with_moved_limits(_exactly(found[-1].model))
+    result.model = _settled(found[-1].model)
 
 
 def _keep_best(result: SelectionResult, passed: list[Passed], supported: list[Passed],
@@ -384,7 +383,7 @@ def _keep_best(result: SelectionResult, passed: list[Passed], supported: list[Pa
     result.scores += [replace(score, kept=True) for score, _ in steps[1:]]
     result.rivals += [rivals, *([] for _ in steps[1:])]
     on_progress(f"step {step + 1}: {best.name}, exactly")
-    result.model = with_moved_limits(_exactly(steps[-1][1]))
+    result.model = _settled(steps[-1][1])
 
 
 def _if_likelier(result: SelectionResult, several: list[tuple[CandidateScore, CrossFit]],
@@ -411,7 +410,7 @@ def _beyond(passed: Passed, candidate: Candidate, model: CrossFit,
     kind of which there may be several gets its chance, and so does one with more evidence.
     """
     lead = passed.score.nll_gain - candidate.gain
-    design_effect = model.whole.view(model.fits[0]).design_effect
+    design_effect = model.whole.view.design_effect
     clear = lead > criteria.indistinguishable_nats * design_effect
     more = candidate.evidence > passed.score.evidence_nats
     return clear and not more and (passed.effect.repeatable or not candidate.effect.repeatable)
@@ -442,7 +441,7 @@ def _several(result: SelectionResult, rival: Passed, block: np.ndarray,
     score, extended = steps[0]
     while len(extended.whole.effects) < result.criteria.max_effects and len(steps) < most:
         if hypotheses is not None:
-            hypotheses = Hypotheses.of(extended.whole, extended.fits[0], seed)
+            hypotheses = Hypotheses.of(extended.whole, seed)
         score, more = fit_and_score(extended, rival.effect, block, 1, score.step + 1, seed,
                                     result.criteria, result.executor, hypotheses)
         if more is None:
@@ -455,19 +454,16 @@ def _several(result: SelectionResult, rival: Passed, block: np.ndarray,
     return None
 
 
-def _exactly(model: CrossFit) -> CrossFit:
-    """Ask each model's channel for exact levels, where these explain its training links better."""
-    exact = [with_exact_levels(each, fit)
-             for each, fit in zip(model.models, model.fits, strict=True)]
-    return model.extended([each for each, _ in exact], [fit for _, fit in exact])
+def _settled(model: CrossFit) -> CrossFit:
+    """Return a model with exact levels where these explain its training links better."""
+    return with_moved_limits(model.map(with_exact_levels))
 
 
 def add_shadowing(result: SelectionResult, seed: int) -> None:
     """Interpolate the rest over the ground; keep that if it predicts held-out links better."""
     model = result.model
     step = len(model.whole.effects)
-    fields = [CorrelatedShadowing.fit(each, fit, seed)
-              for each, fit in zip(model.models, model.fits, strict=True)]
+    fields = [CorrelatedShadowing.fit(each, seed) for each in model.each]
     # Where what it learnt does not return on held-out flights, its mean may be right and its
     # certainty is not.
     for tried in (fields, [replace(each, certain=False) for each in fields]):

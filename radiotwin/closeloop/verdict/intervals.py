@@ -24,10 +24,9 @@ from scipy.stats import t
 
 from radiotwin.closeloop.crossfit import CrossFit, same_effects
 from radiotwin.effects.params import Estimate, Parameter
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.sandwich import MAX_WIDTH
 from radiotwin.links import evidence_blocks
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.fold_model import Fit
 from radiotwin.twin.model.uncertainty import Linearised, Secant, estimates, linearise
 
 QUANTILE = 0.95  # upper end of a 90 % interval
@@ -45,10 +44,9 @@ def effect_parameters(model: CrossFit) -> list[dict[str, Parameter]]:
     Args:
         model: of all links, and of those outside each fold.
     """
-    whole = linearise(model.whole, model.fits[0])
+    whole = linearise(model.whole)
     of_whole = estimates(whole)
-    of_folds = [estimates(linearise(fold, fit, _as_followed(whole, fold)))
-                for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
+    of_folds = [estimates(linearise(fold, _as_followed(whole, fold))) for fold in model.folds]
     found = []
     for number, (applied, estimate) in enumerate(zip(model.whole.effects, of_whole, strict=True)):
         reported = applied.effect.parameters(model.links, applied.params, estimate)
@@ -59,26 +57,26 @@ def effect_parameters(model: CrossFit) -> list[dict[str, Parameter]]:
     return found
 
 
-def _as_followed(whole: Linearised, fold: FoldModel) -> dict[int, list[Secant]]:
+def _as_followed(whole: Linearised, fold: Fit) -> dict[int, list[Secant]]:
     """Return secants for a fold, by the place of the effect, of paths that the whole followed.
 
     Following them anew around each fold's values takes minutes, and of a fold's own uncertainty
     no more is asked than whether it knows a number at all.
     """
     known = {}
-    for number, place in enumerate(same_effects(whole.model, fold)):
+    for number, place in enumerate(same_effects(whole.fit, fold)):
         own = whole.variations[number]
         if place is None or own is None or not own.follows_paths:
             continue
         applied = fold.effects[place]
         other = applied.effect.variation(applied.params)
         if other is not None and other.follows_paths and len(other.values) == len(own.values):
-            known[place] = [each.moved(whole.model.train, fold.train)
+            known[place] = [each.moved(whole.fit.train, fold.train)
                             for each in whole.secants[number]]
     return known
 
 
-def _of_fold(fold: FoldModel, own: list[Estimate], whole: FoldModel,
+def _of_fold(fold: Fit, own: list[Estimate], whole: Fit,
              number: int) -> dict[str, Parameter]:
     """Return an effect's parameters in one fold; empty where it was not found."""
     place = same_effects(whole, fold)[number]
@@ -190,27 +188,19 @@ def _held_out(model: CrossFit, number: int
     """
     change_db, lacking_db, scale_db = np.full((3, len(model.index)), np.nan)
     acts = np.zeros(len(model.index), dtype=bool)
-    for fold, (each, fit) in enumerate(zip(model.folds, model.fits[1:], strict=True)):
+    for fold, each in enumerate(model.folds):
         own = (model.index == fold) & each.usable
         place = same_effects(model.whole, each)[number]
         if place is None:  # nothing in the other folds looks like it: no link here bears it out
             continue
-        with_it = each.predict(fit)
-        rest, taken_away = _without(each, fit, place)
-        without_db = rest.predict(rest.fit(taken_away)).mean_db
+        with_it, taken_away = each.readings(), each.without(place)
+        without_db = taken_away.model.fit(taken_away).readings().mean_db
         change_db[own] = (with_it.mean_db - without_db)[own]
         lacking_db[own] = (each.links.level_db - without_db)[own]
         scale_db[own] = with_it.scale_db[own]
-        moved_db = with_it.mean_db - rest.predict(taken_away).mean_db
+        moved_db = with_it.mean_db - taken_away.readings().mean_db
         acts[own] = np.abs(moved_db[own]) > MIN_CHANGE_DB
     return change_db, lacking_db, scale_db, acts
-
-
-def _without(model: FoldModel, fit: FitResult, place: int) -> tuple[FoldModel, FitResult]:
-    """Return a model from which an effect is taken away and nothing else is changed."""
-    coefficients = np.delete(fit.coefficients, model.coefficient_slices[place])
-    rest = model.with_effects([*model.effects[:place], *model.effects[place + 1:]])
-    return rest, replace(fit, coefficients=coefficients)
 
 
 def _reach(pull: np.ndarray, share: np.ndarray, label: np.ndarray) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from radiotwin.effects.base import ResidualView
-from radiotwin.inference.censored_regression import CensoredRegression, FitResult
+from radiotwin.inference.censored_regression import CensoredRegression
 from radiotwin.links import Links
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.runtime.console import progress
@@ -29,7 +29,7 @@ from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept_with_name
 from radiotwin.runtime.processes import in_threads
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.localize.estimate import TwinDevice, read_device
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.fold_model import Fit, FoldModel
 
 Followed = dict[tuple[float, ...], dict[int, float]]
 """Position -> hash of the other end's position -> power."""
@@ -113,9 +113,8 @@ class Relocation:
         if unknown > MAX_DEVICES:
             return list(devices)
         device_m = np.array([(each.x_m, each.y_m, each.z_m) for each in devices])
-        models = [FoldModel.build(links, each, DOF, device_m=device_m)
-                  for each in (channel.law, channel)]
-        fits = [model.fit() for model in models]
+        fits = [FoldModel.build(links, each, DOF, device_m=device_m).fit()
+                for each in (channel.law, channel)]
         searches: dict[int, _Question] = {}
         for number, device in enumerate(devices):
             if device.role != "unknown":
@@ -123,8 +122,7 @@ class Relocation:
             rows = self._rows(links, number)
             heard = np.isfinite(links.level_db[rows]).sum()
             if device.credible_radius_m <= self.max_radius_m and heard >= MIN_HEARD:
-                by_law, by_paths = (_Likelihood(model, fit, rows, number)
-                                    for model, fit in zip(models, fits, strict=True))
+                by_law, by_paths = (_Likelihood(fit, rows, number) for fit in fits)
                 before = self.positions.setdefault(device.device, [])
                 searches[number] = _Search(by_law, by_paths, self), device, before
         self._search_ahead(list(searches.values()))
@@ -158,7 +156,7 @@ class Relocation:
     def _search(self, search: _Search, device: TwinDevice,
                 before: list[tuple[float, float]]) -> TwinDevice:
         """Return a device where paths put it, and remember what was followed for that."""
-        city = search.by_law.model.links.city
+        city = search.by_law.fit.links.city
         assert city is not None
         followed = self.powers.setdefault(city, {})
         known = {position_m: len(powers) for position_m, powers in followed.items()}
@@ -207,29 +205,28 @@ class _Likelihood:
     """Likelihood of some links of a device, wherever it is.
 
     Attributes:
-        model, result: of all links.
+        fit: of all links.
         rows: links of the device that take part.
         device: its row.
     """
 
-    model: FoldModel
-    result: FitResult
+    fit: Fit
     rows: np.ndarray
     device: int
 
     def at(self, position_m: np.ndarray) -> Links:
         """Return the links with the device at a position (2,)."""
-        device_m = self.model.links.device_m.copy()
+        device_m = self.fit.links.device_m.copy()
         device_m[self.device, :2] = position_m
-        return self.model.links.select(self.rows).with_devices(device_m)
+        return self.fit.links.select(self.rows).with_devices(device_m)
 
     def problem(self, links: Links, mean_db: np.ndarray) -> CensoredRegression:
         """Return the regression on the links, of which the channel predicts (n,)."""
-        return FoldModel.build(links, self.model.channel, DOF, channel_db=mean_db).regression()
+        return FoldModel.build(links, self.fit.channel, DOF, channel_db=mean_db).regression()
 
     def nll(self, links: Links, mean_db: np.ndarray) -> float:
         """Return the negative log-likelihood [nats]."""
-        return float(self.problem(links, mean_db).nll(self.result).sum())
+        return float(self.problem(links, mean_db).nll(self.fit).sum())
 
 
 @dataclass(eq=False)
@@ -322,21 +319,21 @@ class _Search:
         x_m, y_m = positions_m.T
         inside = (x_m >= west) & (x_m <= east) & (y_m >= south) & (y_m <= north)
         positions_m = positions_m[inside]
-        links = self.by_law.model.links
+        links = self.by_law.fit.links
         assert links.city is not None
         height_m = np.full(len(positions_m), links.device_m[self.by_law.device, 2])
         return positions_m[~links.city.inside(np.column_stack([positions_m, height_m]))]
 
     def _law_nll(self, position_m: np.ndarray) -> float:
         links = self.by_law.at(position_m)
-        return self.by_law.nll(links, self.by_law.model.level_at(links))
+        return self.by_law.nll(links, self.by_law.fit.model.level_at(links))
 
     def _paths_db(self, links: Links) -> np.ndarray:
         position_m = tuple(map(float, links.device_m[self.by_paths.device]))
         assert links.city is not None
         power = self.relocation.follow(links.city, position_m, links.receiver_m,
                                        links.frequency_hz)
-        channel = self.by_paths.model.channel
+        channel = self.by_paths.fit.channel
         assert isinstance(channel, ImagePaths)
         return channel.level_db(power, links.geometry)
 
@@ -355,9 +352,9 @@ class _Search:
         """Return the links with the device where it was found."""
         likelihood, links = self.by_paths, self.by_paths.at(np.array(best))
         problem = likelihood.problem(links, self._paths_db(links))
-        reading = problem.predict(likelihood.result)
-        return ResidualView(links, problem.residual_db(likelihood.result), reading.scale_db,
-                            reading.mean_db, likelihood.model.level_at)
+        reading = problem.predict(likelihood.fit)
+        return ResidualView(links, problem.residual_db(likelihood.fit), reading.scale_db,
+                            reading.mean_db, likelihood.fit.model.level_at)
 
     def _radius_m(self, best: tuple[float, float], links_as_one: float) -> float:
         """Return the radius of a circle that holds 90 % of the probability of what was tried [m].
@@ -387,7 +384,7 @@ class _Searches:
         search, device, before = self.searches[number]
         alone = replace(search.relocation, powers=WeakKeyDictionary())
         found = replace(search, relocation=alone, tried={}).from_law(device, before)
-        city = search.by_law.model.links.city
+        city = search.by_law.fit.links.city
         assert city is not None
         return followed_since({}, alone.powers.get(city, {})), asdict(found)
 

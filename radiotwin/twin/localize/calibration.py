@@ -120,9 +120,9 @@ def misfit(model: EffectModel, own: Links, place: PositionEstimate) -> float:
                     device_m=np.vstack([model.device_m, device_m]), known_los=None,
                     anchors=frozenset(), first_s=model.first_s,
                     device_names=[f"device {i}" for i in range(known + 1)])
-    applied, result = model.on_links(there)
-    problem = applied.regression()
-    residual_db, scale_db = problem.residual_db(result), problem.predict(result).scale_db
+    fit = model.on_links(there)
+    problem = fit.model.regression()
+    residual_db, scale_db = problem.residual_db(fit), problem.predict(fit).scale_db
     seen = np.isfinite(own.level_db)
     if model.device_sd_db > 0 and seen.any():
         precision = (1 / scale_db[seen]**2).sum() + 1 / model.device_sd_db**2

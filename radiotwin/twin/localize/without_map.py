@@ -142,13 +142,13 @@ def _log_likelihood_at(model: EffectModel, own: Links, positions_m: np.ndarray) 
         own.select(np.tile(np.arange(n), cells)), device=known + np.repeat(np.arange(cells), n),
         device_m=np.vstack([model.device_m, candidates_m]), known_los=None, anchors=frozenset(),
         device_names=[f"device {i}" for i in range(known + cells)], first_s=model.first_s)
-    applied, result = model.on_links(every)
-    problem = applied.regression()
+    fit = model.on_links(every)
+    problem = fit.model.regression()
     nodes, weights = np.polynomial.hermite_e.hermegauss(NODES if sd_db > 0 else 1)
     values = []
     for node, weight in zip(nodes, weights / weights.sum(), strict=True):
         moved = replace(problem, gain_db=problem.gain_db + node * sd_db)
-        values.append(np.log(weight) - moved.nll(result).reshape(cells, n).sum(axis=1))
+        values.append(np.log(weight) - moved.nll(fit).reshape(cells, n).sum(axis=1))
     return np.logaddexp.reduce(values, axis=0)
 
 

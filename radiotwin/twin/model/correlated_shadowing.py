@@ -18,12 +18,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import Links
 from radiotwin.links.sites import antenna_of, relatives_of
 from radiotwin.propagation.laws.kriging import MIN_POINTS, ResidualField
 from radiotwin.runtime.pieces import kept
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.fold_model import Fit
 
 MIN_SD = 1e-6  # of a residual that is nothing
 LEAST_SHARED_SD = 0.1  # of what relatives say, in error scales: less is nearly nothing
@@ -193,21 +192,21 @@ class CorrelatedShadowing:
     relatives: Relatives | None = None
 
     @classmethod
-    def fit(cls, model: FoldModel, result: FitResult, seed: int) -> CorrelatedShadowing:
+    def fit(cls, fit: Fit, seed: int) -> CorrelatedShadowing:
         """Learn from the training links of a model what its channel and effects leave over."""
-        return cls._learnt(model, result, seed)
+        return cls._learnt(fit, seed)
 
-    def refit(self, model: FoldModel, result: FitResult) -> CorrelatedShadowing:
+    def refit(self, fit: Fit) -> CorrelatedShadowing:
         """Return the same correlation with the residual of a model's training links."""
-        return replace(self._learnt(model, result, 0, self), certain=self.certain)
+        return replace(self._learnt(fit, 0, self), certain=self.certain)
 
     @classmethod
-    def _learnt(cls, model: FoldModel, result: FitResult, seed: int,
+    def _learnt(cls, fit: Fit, seed: int,
                 like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
         """Learn, with the correlations of another where one is given."""
-        z = standardised_residual(model, result)
-        links, relatives = model.links.select(model.train), None
-        move = like.receivers_move if like else receivers_move(model.links)
+        z = standardised_residual(fit)
+        links, relatives = fit.links.select(fit.train), None
+        move = like.receivers_move if like else receivers_move(fit.links)
         if move:
             field = like.relatives.field if like and like.relatives else None
             relatives = Relatives.fit(links, z, field, seed)
@@ -262,10 +261,10 @@ def _points(links: Links,
     return links.receiver, links.device_m[links.device], None
 
 
-def standardised_residual(model: FoldModel, result: FitResult) -> np.ndarray:
+def standardised_residual(fit: Fit) -> np.ndarray:
     """Return the residuals of a model's training links (n,) [error scales]; outliers clipped."""
-    residual_db = model.training.residual_db(result)
-    return np.clip(residual_db / model.training.predict(result).scale_db, -MAX_Z, MAX_Z)
+    training = fit.model.training
+    return np.clip(training.residual_db(fit) / training.predict(fit).scale_db, -MAX_Z, MAX_Z)
 
 
 def receivers_move(links: Links) -> bool:

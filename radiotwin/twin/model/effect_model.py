@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.student import detection_probability
 from radiotwin.links import Links
 from radiotwin.links.links import Prediction
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.twin.model.blend import Blend
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
-from radiotwin.twin.model.fold_model import FittedEffect, FoldModel
+from radiotwin.twin.model.fold_model import Fit, FittedEffect, FoldModel
 
 MIN_LINKS = 3  # of a device whose mean residual is known
 MIN_SLOPE = 0.5  # of a receiver's response that passes a device's own level on
@@ -36,29 +35,28 @@ class Unheard:
     sd_db: float
 
     @classmethod
-    def of(cls, model: FoldModel, result: FitResult, device_sd_db: float) -> Unheard | None:
-        """Return that of a model's devices without a training link; None if each has one.
+    def of(cls, fit: Fit, device_sd_db: float) -> Unheard | None:
+        """Return that of devices without a training link; None if each has one.
 
         Args:
-            model: fitted.
-            result: its fit.
+            fit: of a model.
             device_sd_db: as of `EffectModel` [dB].
         """
-        own_db, declared = np.zeros(len(model.links)), set[int]()
-        for each, slice_ in zip(model.effects, model.coefficient_slices, strict=True):
+        links, own_db, declared = fit.links, np.zeros(len(fit.links)), set[int]()
+        for number, each in enumerate(fit.effects):
             if each.effect.is_declared:
                 declared |= set(getattr(each.params, "devices", ()))
             elif each.effect.of_device:
-                own_db += each.term.offset_db + each.term.columns @ result.coefficients[slice_]
-        device = model.links.device[model.train]
+                own_db += each.term.offset_db + each.term.columns @ fit.coefficients_of(number)
+        device = links.device[fit.train]
         heard = np.unique(device)
-        devices = sorted(set(range(len(model.links.device_m))) - set(heard.tolist()) - declared)
+        devices = sorted(set(range(len(links.device_m))) - set(heard.tolist()) - declared)
         if not devices or not len(heard):
             return None
         # Each device counts the same, however many readings it has.
         weight = 1.0 / np.bincount(device)[device] / len(heard)
-        mean_db = float(weight @ own_db[model.train])
-        spread_db = np.sqrt(weight @ (own_db[model.train] - mean_db) ** 2)
+        mean_db = float(weight @ own_db[fit.train])
+        spread_db = np.sqrt(weight @ (own_db[fit.train] - mean_db) ** 2)
         return cls(tuple(devices), mean_db, float(np.hypot(spread_db, device_sd_db)))
 
 
@@ -103,18 +101,13 @@ class EffectModel:
     unheard: Unheard | None = None
 
     @classmethod
-    def of(cls, model: FoldModel, result: FitResult) -> EffectModel:
-        """Return what was learnt from the training links of a model.
-
-        Args:
-            model: channel and effects on the training links.
-            result: fit of the model.
-        """
-        sd_db = device_sd_db(model, result)
-        return cls(model.channel, tuple(model.fitted_effects(result)),
-                   result.coefficients[:model.level_columns.shape[1]], result.scale_db, model.dof,
+    def of(cls, fit: Fit) -> EffectModel:
+        """Return what was learnt from the training links of a model."""
+        model, sd_db = fit.model, device_sd_db(fit)
+        return cls(model.channel, fit.fitted_effects,
+                   fit.coefficients[:model.level_columns.shape[1]], fit.scale_db, model.dof,
                    model.links.device_m, tuple(model.links.receiver_names), model.links.first_s,
-                   sd_db, unheard=Unheard.of(model, result, sd_db))
+                   sd_db, unheard=Unheard.of(fit, sd_db))
 
     def for_positions(self) -> EffectModel:
         """Return the same without what takes too long for each place where a device may be.
@@ -127,8 +120,8 @@ class EffectModel:
         return replace(self, effects=tuple(each for each in self.effects
                                            if each.effect.is_cause and not each.effect.in_paths))
 
-    def on_links(self, links: Links) -> tuple[FoldModel, FitResult]:
-        """Return the model of any links (n,), and the fit that goes with it.
+    def on_links(self, links: Links) -> Fit:
+        """Return the fit with any links (n,) in place of those that it has learnt from.
 
         Where the links have no receivers (a map's have none) those are faultless: effects of
         receivers are left out.
@@ -146,12 +139,13 @@ class EffectModel:
             if len(own) != columns.shape[1]:
                 raise BadInput(f"the twin has {len(own)} coefficients where {columns.shape[1]} are "
                                "needed for these links; run `radiotwin fit` again")
-        return model, FitResult(np.concatenate(coefficients), self.scale_db, np.nan)
+        return Fit(np.concatenate(coefficients), self.scale_db, np.nan, model)
 
     def predict(self, links: Links) -> Prediction:
         """Return the levels that are expected of links, see `Prediction`."""
-        model, result = self.on_links(links)
-        mean_db, scale_db, unheard_db = model.predict_parts(result)
+        fit = self.on_links(links)
+        model = fit.model
+        mean_db, scale_db, unheard_db = fit.reading_parts()
         if self.unheard is not None:
             of_them = np.isin(links.device, self.unheard.devices)
             mean_db = mean_db + self.unheard.mean_db * of_them
@@ -170,19 +164,19 @@ class EffectModel:
                                   model.losses))
 
 
-def device_sd_db(model: FoldModel, result: FitResult) -> float:
+def device_sd_db(fit: Fit) -> float:
     """Return the standard deviation of what the training links of a device have in common [dB].
 
     Beyond what the scatter of single links makes of their mean (method of moments).
     """
-    problem = model.training
-    reading = problem.predict(result)
+    problem = fit.model.training
+    reading = problem.predict(fit)
     slope = np.broadcast_to(reading.slope, problem.level_db.shape)
     # At a receiver that passes little on a device's own level does not show.
     seen = np.isfinite(problem.level_db) & (slope > MIN_SLOPE)
-    rest_db = (problem.residual_db(result) / slope)[seen]
+    rest_db = (problem.residual_db(fit) / slope)[seen]
     scale_db = (reading.scale_db / slope)[seen]
-    device = model.links.device[model.train][seen]
+    device = fit.links.device[fit.train][seen]
     rest_db = np.clip(rest_db, -MAX_Z * scale_db, MAX_Z * scale_db)
     count = np.bincount(device)
     enough = count >= MIN_LINKS

@@ -174,21 +174,13 @@ class FoldModel:
                 limit_db = np.maximum(limit_db, own_db)
         return limit_db
 
-    def fit(self, start: FitResult | None = None) -> FitResult:
+    def fit(self, start: FitResult | None = None) -> Fit:
         """Fit to the training links; a class that none of them is of has another one's scale."""
         found = censored_regression.fit(self.training, start)
         there = np.unique(self.training.group)
         scale_db = np.full(self.groups, found.scale_db[there].max())
         scale_db[there] = found.scale_db[there]
-        return replace(found, scale_db=scale_db)
-
-    def predict(self, result: FitResult) -> Linearisation:
-        """Return mean and scale of the readings of all links, before the limit of detection."""
-        return self.regression().predict(result)
-
-    def view(self, result: FitResult) -> ResidualView:
-        """Return the training links as an effect sees them; the same object if asked again."""
-        return _view(self, result)
+        return Fit(found.coefficients, scale_db, found.objective, self)
 
     @property
     def coefficient_slices(self) -> list[slice]:
@@ -196,11 +188,6 @@ class FoldModel:
         widths = [each.term.columns.shape[1] for each in self.effects]
         ends = np.cumsum([self.level_columns.shape[1], *widths]).tolist()
         return [slice(first, end) for first, end in zip(ends, ends[1:], strict=False)]
-
-    def fitted_effects(self, result: FitResult) -> tuple[FittedEffect, ...]:
-        """Return the effects with their coefficients, without their terms on these links."""
-        return tuple(FittedEffect(each.effect, each.params, result.coefficients[own])
-                     for each, own in zip(self.effects, self.coefficient_slices, strict=True))
 
     @cached_property
     def losses(self) -> Losses:
@@ -214,20 +201,6 @@ class FoldModel:
         most = max(every, key=lambda each: float(np.mean(each.drop)))
         return Losses(1.0 - kept, most.drop, most.drop_db)
 
-    def predict_parts(self, result: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return mean of the readings, error scale without unheard levels, and sd of these [dB].
-
-        (n,) each. What is interpolated counts in units of the second; with the third it makes the
-        scale of `predict`.
-        """
-        reading = self.predict(result)
-        mean_db, whole = reading.mean_db, reading.scale_db
-        if all(each.term.unheard_sd_db is None for each in self.effects):
-            return mean_db, whole, np.zeros(len(whole))
-        known = replace(self.regression(), random_effect_sd_db=self._scatter_sd_db(slice(None)))
-        scale_db = known.predict(result).scale_db
-        return mean_db, scale_db, np.sqrt(np.maximum(whole**2 - scale_db**2, 0.0))
-
     def _scatter_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
         return _joined_sd_db([each.term.random_effect_sd_db for each in self.effects], rows)
 
@@ -235,6 +208,86 @@ class FoldModel:
         """Return (n,) the sd of all that is not learnt of a link; 0 where there is none."""
         unheard = [each.term.unheard_sd_db for each in self.effects]
         return np.hypot(self._scatter_sd_db(rows), _joined_sd_db(unheard, rows))
+
+
+@dataclass(frozen=True, eq=False)
+class Fit(FitResult):
+    """A model with the coefficients, error scales and objective of its fit to the training links.
+
+    Attributes:
+        model: that was fitted.
+    """
+
+    model: FoldModel
+
+    @property
+    def links(self) -> Links:
+        """All n links of the model, learnt from or not."""
+        return self.model.links
+
+    @property
+    def train(self) -> np.ndarray:
+        """(n,) bool, links that it has learnt from."""
+        return self.model.train
+
+    @property
+    def usable(self) -> np.ndarray:
+        """(n,) bool, links to devices that have a position."""
+        return self.model.usable
+
+    @property
+    def channel(self) -> ChannelModel:
+        """Fitted to the training links."""
+        return self.model.channel
+
+    @property
+    def effects(self) -> list[AppliedEffect]:
+        """Of the model."""
+        return self.model.effects
+
+    @property
+    def view(self) -> ResidualView:
+        """The training links as an effect sees them; the same object if asked again."""
+        return _view(self)
+
+    @property
+    def fitted_effects(self) -> tuple[FittedEffect, ...]:
+        """The effects with their coefficients, without their terms on these links."""
+        return tuple(FittedEffect(each.effect, each.params, self.coefficients_of(number))
+                     for number, each in enumerate(self.effects))
+
+    def coefficients_of(self, number: int) -> np.ndarray:
+        """Return the coefficients (q,) of one of the effects."""
+        return self.coefficients[self.model.coefficient_slices[number]]
+
+    def with_effects(self, effects: list[AppliedEffect]) -> Fit:
+        """Return the model with other effects, fitted again from these coefficients."""
+        return self.model.with_effects(effects).fit(self)
+
+    def without(self, place: int) -> Fit:
+        """Return the fit with one effect taken away; nothing else is changed."""
+        rest = self.model.with_effects([*self.effects[:place], *self.effects[place + 1:]])
+        own = self.model.coefficient_slices[place]
+        return replace(self, coefficients=np.delete(self.coefficients, own), model=rest)
+
+    def readings(self) -> Linearisation:
+        """Return mean and scale of the readings of all links, before the limit of detection."""
+        return self.model.regression().predict(self)
+
+    def reading_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return mean of the readings, error scale without unheard levels, and sd of these [dB].
+
+        (n,) each. What is interpolated counts in units of the second; with the third it makes the
+        scale of `readings`.
+        """
+        reading = self.readings()
+        mean_db, whole = reading.mean_db, reading.scale_db
+        if all(each.term.unheard_sd_db is None for each in self.effects):
+            return mean_db, whole, np.zeros(len(whole))
+        scatter_sd_db = self.model._scatter_sd_db(slice(None))
+        known = replace(self.model.regression(), random_effect_sd_db=scatter_sd_db)
+        scale_db = known.predict(self).scale_db
+        return mean_db, scale_db, np.sqrt(np.maximum(whole**2 - scale_db**2, 0.0))
 
 
 def _joined_sd_db(parts: list[np.ndarray | None], rows: np.ndarray | slice) -> np.ndarray | float:
@@ -258,10 +311,11 @@ def response(effects: list[AppliedEffect], stage: str, rows: np.ndarray | slice)
 
 
 @lru_cache(maxsize=VIEWS)
-def _view(model: FoldModel, result: FitResult) -> ResidualView:
-    predicted = model.training.predict(result)
+def _view(fit: Fit) -> ResidualView:
+    model = fit.model
+    predicted = model.training.predict(fit)
     # All links stay the same object, of which things are remembered.
     links = model.links if model.train.all() else model.links.select(model.train)
-    return ResidualView(links, model.training.residual_db(result),
+    return ResidualView(links, model.training.residual_db(fit),
                         predicted.scale_db, predicted.mean_db, model.level_at,
                         tuple((each.effect.name, each.params) for each in model.effects))

@@ -17,10 +17,10 @@ from scipy.sparse import csr_array, hstack, issparse, vstack
 from radiotwin.effects.base import DetectionEffect, LimitEffect
 from radiotwin.effects.params import NEAR_SHARE, Estimate, Variation
 from radiotwin.inference import student
-from radiotwin.inference.censored_regression import CensoredRegression, FitResult, Linearisation
+from radiotwin.inference.censored_regression import CensoredRegression, Linearisation
 from radiotwin.inference.sandwich import Scores
 from radiotwin.links import evidence_blocks, places
-from radiotwin.twin.model.fold_model import AppliedEffect, FoldModel
+from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel
 
 MIN_FLIGHTS = 4  # that clusters of flights are made of
 STEP_SHARES = (0.02, 3.0)  # of `Variation.steps`, least and greatest secant
@@ -63,76 +63,71 @@ class Linearised:
     """A fitted model whose readings are linear in all coefficients and numbers.
 
     Attributes:
-        model, result: the fit, of quick levels where numbers vary quickly.
+        fit: the model's, of quick levels where numbers vary quickly.
         design_effect: of its training links.
         variations: of each effect.
         secants: of each effect's numbers, on the training links.
     """
 
-    model: FoldModel
-    result: FitResult
+    fit: Fit
     design_effect: float
     variations: list[Variation | None]
     secants: list[list[Secant]]
 
 
-def linearise(model: FoldModel, result: FitResult,
-              known: Mapping[int, list[Secant]] | None = None) -> Linearised:
+def linearise(fit: Fit, known: Mapping[int, list[Secant]] | None = None) -> Linearised:
     """Return how the readings of a model's training links change with its effects' numbers.
 
     Args:
-        model: with its effects.
-        result: its fit to the training links.
+        fit: of the model with its effects.
         known: secants of effects, by their place in the model, that are not computed again.
     """
-    variations = [each.effect.variation(each.params) for each in model.effects]
-    model, result = _as_varied(model, result, variations)
+    variations = [each.effect.variation(each.params) for each in fit.effects]
+    fit = _as_varied(fit, variations)
     # A design effect of the whole stands in for what each prior counts beside links.
-    design_effect = model.view(result).design_effect
+    design_effect = fit.view.design_effect
     known = known or {}
     secants = [known[number] if number in known
-               else _secants(model, result, number, variation, design_effect)
+               else _secants(fit, number, variation, design_effect)
                for number, variation in enumerate(variations)]
-    return Linearised(model, result, design_effect, variations, secants)
+    return Linearised(fit, design_effect, variations, secants)
 
 
 def estimates(linearised: Linearised) -> list[Estimate]:
     """Return the uncertainty of each effect, in view of places and flights that err alike."""
-    model, result = linearised.model, linearised.result
-    scores = _scores(model, result, [each for of_effect in linearised.secants
-                                     for each in of_effect], linearised.design_effect)
-    links = model.links.select(model.train)
+    fit = linearised.fit
+    scores = _scores(fit, [each for of_effect in linearised.secants for each in of_effect],
+                     linearised.design_effect)
+    links = fit.links.select(fit.train)
     clusterings = [evidence_blocks(links), places(links)]
     if len(np.unique(links.flight)) >= MIN_FLIGHTS:
         clusterings.append(links.flight)
     covariances = scores.covariances(clusterings)
     every_sd = np.sqrt(np.max([np.diag(each) for each in covariances], axis=0))
-    first, found = len(result.coefficients), []
-    for own, of_effect, variation in zip(model.coefficient_slices, linearised.secants,
+    first, found = len(fit.coefficients), []
+    for own, of_effect, variation in zip(fit.model.coefficient_slices, linearised.secants,
                                          linearised.variations, strict=True):
         sd = every_sd[first:first + len(of_effect)]
         if variation is not None:
             sd = np.hypot(sd, variation.resolution_sd)
         sides = np.reshape([each.sides for each in of_effect], (-1, 2)).T
-        found.append(Estimate(result.coefficients[own],
+        found.append(Estimate(fit.coefficients[own],
                               [each[own, own] for each in covariances], sd * sides))
         first += len(of_effect)
     return found
 
 
-def _as_varied(model: FoldModel, result: FitResult,
-               variations: list[Variation | None]) -> tuple[FoldModel, FitResult]:
+def _as_varied(fit: Fit, variations: list[Variation | None]) -> Fit:
     """Return the model as its variations have it: of quick levels, where those vary quickly."""
     effects = [each if variation is None or variation.params(variation.values) == each.params
-               else model.apply(each.effect, variation.params(variation.values))
-               for each, variation in zip(model.effects, variations, strict=True)]
-    if all(new is old for new, old in zip(effects, model.effects, strict=True)):
-        return model, result
-    model = model.with_effects(effects)
-    return model, model.fit(result)
+               else fit.model.apply(each.effect, variation.params(variation.values))
+               for each, variation in zip(fit.effects, variations, strict=True)]
+    if all(new is old for new, old in zip(effects, fit.effects, strict=True)):
+        return fit
+    return fit.with_effects(effects)
 
 
-def _secants(model: FoldModel, result: FitResult, number: int, variation: Variation | None,
+def _secants(fit: Fit, number: int, variation: Variation | None,
              design_effect: float) -> list[Secant]:
     """Return a secant of each number of an effect, about as wide as it is uncertain by itself."""
     if variation is None:
@@ -141,22 +136,22 @@ def _secants(model: FoldModel, result: FitResult, number: int, variation: Variat
     # Of paths first those that folds have asked for, too.
     steps = (NEAR_SHARE if variation.follows_paths else 1.0) * variation.steps
     for i, (step, usual) in enumerate(zip(steps.tolist(), variation.steps.tolist(), strict=True)):
-        secant = _secant(model, result, number, variation, i, step)
-        information = _information(model, result, secant)
+        secant = _secant(fit, number, variation, i, step)
+        information = _information(fit, secant)
         sd = np.sqrt(design_effect / (information + design_effect * secant.precision))
         wanted = float(np.clip(sd, *(share * usual for share in STEP_SHARES)))
         if not 0.5 < wanted / step < 2.0:
-            secant = _secant(model, result, number, variation, i, wanted)
+            secant = _secant(fit, number, variation, i, wanted)
         found.append(secant)
     return found
 
 
-def _secant(model: FoldModel, result: FitResult, number: int, variation: Variation, i: int,
-            step: float) -> Secant:
+def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) -> Secant:
+    model = fit.model
     applied, problem = model.effects[number], model.training
     blanking = isinstance(applied.effect, DetectionEffect | LimitEffect)
-    here = problem.predict(result)
-    nll, prior = problem.nll(result), applied.effect.neg_log_prior(applied.params)
+    here = problem.predict(fit)
+    nll, prior = problem.nll(fit), applied.effect.neg_log_prior(applied.params)
     n = len(nll)
     sides, priors = [], []
     for sign in (-1.0, 1.0):
@@ -166,10 +161,10 @@ def _secant(model: FoldModel, result: FitResult, number: int, variation: Variati
         if moved_by == 0:
             continue
         moved = _moved(model, number, model.apply(applied.effect, variation.params(numbers)))
-        there = moved.predict(result)
+        there = moved.predict(fit)
         change = np.zeros((3, n))
         if blanking:
-            change[2] = nll - moved.nll(result)
+            change[2] = nll - moved.nll(fit)
         else:
             change[0] = there.mean_db - here.mean_db
             change[1] = np.log(there.scale_db / here.scale_db)
@@ -184,7 +179,7 @@ def _secant(model: FoldModel, result: FitResult, number: int, variation: Variati
     secant = Secant(mean_db, log_scale, score, precision)
     if len(sides) < 2:
         return secant
-    own = [_information(model, result, Secant(side[0], side[1], side[2])) + precision
+    own = [_information(fit, Secant(side[0], side[1], side[2])) + precision
            for side in sides]
     below, above = (float(np.sqrt(np.mean(own) / each)) for each in own)
     return replace(secant, sides=(below, above))
@@ -196,9 +191,10 @@ def _moved(model: FoldModel, number: int, applied: AppliedEffect) -> CensoredReg
     return model.with_effects(effects).training
 
 
-def _information(model: FoldModel, result: FitResult, secant: Secant) -> float:
+def _information(fit: Fit, secant: Secant) -> float:
     """Return the information of all links on a number, if all else were known."""
-    curvature, scale_curvature = _curvatures(model.training, model.training.predict(result))[2:]
+    problem = fit.model.training
+    curvature, scale_curvature = _curvatures(problem, problem.predict(fit))[2:]
     return float((curvature * secant.mean_db**2 + scale_curvature * secant.log_scale**2
                   + secant.score**2).sum())
 
@@ -218,11 +214,10 @@ def _curvatures(problem: CensoredRegression, predicted: Linearisation,
             2 * problem.dof / (problem.dof + 3) * seen)
 
 
-def _scores(model: FoldModel, result: FitResult, secants: list[Secant],
-            design_effect: float) -> Scores:
+def _scores(fit: Fit, secants: list[Secant], design_effect: float) -> Scores:
     """Return how links and priors bear on all coefficients, then on all numbers."""
-    problem = model.training
-    predicted = problem.predict(result)
+    problem = fit.model.training
+    predicted = problem.predict(fit)
     law = problem.law_columns
     if predicted.law_slope is not None:
         law = law * predicted.law_slope[:, None]

@@ -80,7 +80,7 @@ def test_what_is_known_of_receivers_brings_devices_nearer_and_the_radii_hold_nin
     world = open_ground.fly(11)
     world.gain_db[world.receiver == 1] += 12.0
     loop = close_loop(open_ground.measured(world), base="log-distance")
-    before, after = (EffectModel.of(each.whole, each.fits[0]) for each in (loop.before, loop.after))
+    before, after = (EffectModel.of(each.whole) for each in (loop.before, loop.after))
     rng, results = np.random.default_rng(0), {"before": [], "after": []}
     for _ in range(12):
         part = few_links(loop.links, rng, 20)
