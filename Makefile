@@ -24,11 +24,11 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	if $$python -c '$(NEW_ENOUGH)' 2> /dev/null; then echo $$python; break; fi; done)
 
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo -n)
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 CAN_APT := command -v apt-get > /dev/null && $(SUDO) true 2> /dev/null
 APT_INSTALL := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=120 install -y -q
 
-.PHONY: help demo test test-all test-flower lint check docs bench llvm clean
+.PHONY: help demo test test-all test-flower lint fast check docs bench llvm clean
 
 help:
 	@echo "make demo    set up, then the whole chain on a small city"
@@ -63,7 +63,11 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/mypy
 
-check: lint
+# mypy takes one core for most of this time; the tests have the other.
+check: $(INSTALLED)
+	@$(MAKE) --no-print-directory -j 2 lint fast
+
+fast: $(INSTALLED)
 	$(PYTEST) -m "not slow and not llvm and not whole_loop" $(FAST_TESTS)
 
 # In a folder of its own, where the examples leave what they make.

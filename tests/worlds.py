@@ -1,5 +1,6 @@
 """Worlds that tests of several packages share: open ground, by plain formulas of their own, and a traced city."""
 
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -67,15 +68,23 @@ def open_ground():
     return SimpleNamespace(fly=fly, measured=measured)
 
 
-@pytest.fixture
-def short_report(monkeypatch):
+@contextmanager
+def shortened():
     """Half of the time goes into what predicts best and what would have been seen, which have tests of their own."""
     def alone(model, *_):
         mean_db = model.held_out_mean_db
         return CombinedPrediction(mean_db, ["named"], np.ones((2, 1)), mean_db[:, None], np.zeros(len(mean_db)),
                                   {"log_distance": mean_db})
-    monkeypatch.setattr("radiotwin.closeloop.run.combined_prediction", alone)
-    monkeypatch.setattr("radiotwin.closeloop.run.detectable", lambda *_: [])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("radiotwin.closeloop.run.combined_prediction", alone)
+        patch.setattr("radiotwin.closeloop.run.detectable", lambda *_: [])
+        yield
+
+
+@pytest.fixture
+def short_report():
+    with shortened():
+        yield
 
 
 @pytest.fixture
@@ -84,7 +93,7 @@ def quick_report(monkeypatch):
     def grown(kind, features, target, seed, *_):
         return grow_trees(kind, features, target, seed, 5)
     for module in ("baselines", "predictor"):
-        monkeypatch.setattr(f"radiotwin.closeloop.{module}.grow_trees", grown)
+        monkeypatch.setattr(f"radiotwin.closeloop.predict.{module}.grow_trees", grown)
     for most in ("MAX_MEMBERS", "MAX_PLACES"):
         monkeypatch.setattr(f"radiotwin.closeloop.verdict.sensitivity.{most}", 1)
 

@@ -53,17 +53,16 @@ def flown(small_scene, tmp_path):
     return tmp_path / "m.csv"
 
 
-def test_the_next_run_says_what_it_took_and_writes_the_same(small_scene, flown, tmp_path, own_cache):
-    command = [sys.executable, "-c", MAIN, "fit", str(flown), "--scene", str(small_scene.folder), "-o"]
-    subprocess.run([*command, "whole"], cwd=tmp_path, check=True, capture_output=True)
+def test_the_next_run_says_what_it_took_and_writes_the_same(run, small_scene, flown, tmp_path, own_cache):
+    command = f"fit {flown} --scene {small_scene.folder} -o"
+    whole = run(f"{command} whole", tmp_path)
     kept = sorted(own_cache.glob("pieces/*.npz"))
-    assert kept
-    again = subprocess.run([*command, "again"], cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert whole.returncode == 0 and kept
+    again = run(f"{command} again", tmp_path)
     assert f"{len(kept)} of " in again.stderr and "parts were kept from an earlier run" in again.stderr
     for name in ("twin.json", "channel.safetensors"):
         assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    assert again.stdout.replace("again", "whole") == subprocess.run(
-        [*command, "whole"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert again.stdout.replace("again", "whole") == whole.stdout
 
 
 def test_ctrl_c_in_what_keeps_nothing_says_so():

@@ -27,6 +27,7 @@ def write(folder, offset_db=0.0, seed=0):
                   "role": "anchor"}).to_csv(folder / "devices.csv", index=False)
 
 
+@pytest.mark.usefixtures("quick_report")
 def test_a_file_and_a_table_of_devices_are_enough(run, tmp_path):
     write(tmp_path, offset_db=6.0)
     done = run("close-loop measurements.csv --out result", tmp_path)

@@ -178,7 +178,10 @@ THIN = {
 }
 
 
-@pytest.mark.parametrize(("edit", "parts"), THIN.values(), ids=THIN)
+# What has nothing to be noted runs with `make test-all`, but for the least that there can be.
+@pytest.mark.parametrize(("edit", "parts"), [
+    pytest.param(*given, id=name, marks=[pytest.mark.slow] * (not given[1] and name != "sixty links"))
+    for name, given in THIN.items()])
 def test_thin_data_gives_a_result_that_says_so(close_loop, tmp_path, edit, parts):
     links, devices, _ = open_ground()
     went_on(tmp_path, close_loop(*edit(links, devices)), *parts)

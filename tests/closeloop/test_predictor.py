@@ -77,6 +77,7 @@ def test_no_error_of_a_fold_has_a_part_in_its_weights(open_ground, monkeypatch):
         assert len(own) and not np.isin(own[:, 0], weighed_db[:, 0]).any()
 
 
+@pytest.mark.slow
 def test_on_levels_that_hold_nothing_the_reported_error_is_not_below_theirs(open_ground):
     ratios = []
     for seed in range(8):

@@ -58,6 +58,7 @@ def everything(measured, scene=None, base="log-distance", executor=None):
         loop.before.held_out_mean_db.tobytes()
 
 
+@pytest.mark.usefixtures("quick_report")
 def test_a_killed_loop_goes_on_and_ends_equal_to_the_bit(measured, kill_after, searches):
     whole = everything(measured)
     total = len(searches)

@@ -26,7 +26,7 @@ def value(report, name, parameter):
     return effect["parameters"][parameter]["value"]
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_where_nothing_is_missing_nothing_is_named(open_ground, seed):
     report = run(open_ground.measured(open_ground.fly(seed)))
     assert report["verdict"] == "none" and not report["effects"] and not report["remaining"]["structured"]
@@ -156,7 +156,8 @@ def test_what_no_effect_explains_is_called_unexplained_and_what_it_depends_on_is
 def test_the_same_seed_gives_the_same_report(open_ground):
     world = open_ground.fly(8)
     world.gain_db[world.receiver == 1] += 3.0
-    assert run(open_ground.measured(world), 4) == run(open_ground.measured(world), 4)
+    measurements = open_ground.measured(world).select(world.slot % 4 == 0)
+    assert run(measurements, 4) == run(measurements, 4)
 
 
 def test_bad_data_is_one_message(open_ground):

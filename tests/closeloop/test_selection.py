@@ -79,6 +79,7 @@ def test_links_with_line_of_sight_are_asked_if_it_moves_them(open_ground, in_sig
     assert ("line of sight" in score.reason) == (not passes)
 
 
+@pytest.mark.usefixtures("short_report")
 def test_what_an_improbable_candidate_has_outdone_is_asked_as_well(open_ground, monkeypatch):
     """A receiver that is 6 dB off gains so much that nothing else is scored, unless it is not believed."""
     world = open_ground.fly(3)
@@ -105,6 +106,7 @@ def passed(name, nats, step=0, repeatable=False):
     return Passed(SimpleNamespace(name=name, repeatable=repeatable), score, MODEL)
 
 
+@pytest.mark.usefixtures("short_report")
 def test_what_may_be_nothing_at_all_is_not_named(open_ground, monkeypatch):
     world = open_ground.fly(3)
     world.gain_db[world.receiver == 1] += 6.0

@@ -76,6 +76,7 @@ def test_a_correct_map_is_left_alone(small_scene):
     assert report["verdict"] == "none", [effect["name"] for effect in report["effects"]]
 
 
+@pytest.mark.usefixtures("quick_report")
 def test_a_building_that_the_map_lacks_is_found_and_goes_into_the_twin(small_scene, tmp_path):
     middle_m = free_position(small_scene)
     box = (middle_m - 9.0, np.array([18.0, 18.0, 60.0]))
@@ -118,6 +119,7 @@ def test_a_building_that_is_gone_is_named(small_scene):
     assert (parameters["x_m"]["value"], parameters["y_m"]["value"]) == pytest.approx(tuple(centres_m[gone, :2]))
 
 
+@pytest.mark.usefixtures("quick_report")
 def test_walls_that_are_off_are_no_cause_but_part_of_the_base(small_scene, tmp_path):
     moved = small_scene.city.with_vertices(small_scene.city.vertices + [1.5, -1.0, 0.0])
 

@@ -9,7 +9,7 @@ from tests.fuzz.honest import LINES
 class Target:
     """A file of the honest folder and a command that reads it.
 
-    `kind` is the class of files in the counts; `slow` commands are not in the 100 cases of every test run.
+    `kind` is the class of files in the counts; `slow` commands are in no case of a test run.
     """
 
     kind: str

@@ -19,6 +19,7 @@ from tests.fuzz.targets import TARGETS
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork") or not os.path.isdir("/proc/self"),
                                 reason="cases run in forked children that are watched through /proc")
+QUICK = {target.kind: target for target in TARGETS if not target.slow}.values()  # one of each kind
 KNOWN = [loads(line) for line in CORPUS.read_text().splitlines()]
 
 
@@ -42,12 +43,16 @@ def cases():
     return st.sampled_from([target for target in TARGETS if not target.slow]).flatmap(of)
 
 
-@settings(max_examples=100, deadline=None, derandomize=True, database=None, phases=(Phase.generate, Phase.shrink),
-          suppress_health_check=list(HealthCheck))
-@given(case=cases())
-def test_damaged_files_keep_the_rule(run, case):
-    outcome = run(case)
-    assert not outcome.breaches, f"{outcome.breaches}\n{case.dumps()}\n{outcome.output[-2000:]}"
+@pytest.mark.parametrize("draws", [25, pytest.param(100, marks=pytest.mark.slow)])
+def test_damaged_files_keep_the_rule(run, draws):
+    @settings(max_examples=draws, deadline=None, derandomize=True, database=None,
+              phases=(Phase.generate, Phase.shrink), suppress_health_check=list(HealthCheck))
+    @given(case=cases())
+    def keeps_the_rule(case):
+        outcome = run(case)
+        assert not outcome.breaches, f"{outcome.breaches}\n{case.dumps()}\n{outcome.output[-2000:]}"
+
+    keeps_the_rule()
 
 
 @pytest.mark.parametrize("case", KNOWN, ids=[f"{case.kind}-{number}" for number, case in enumerate(KNOWN, start=1)])
@@ -57,7 +62,7 @@ def test_what_failed_once_keeps_the_rule(run, case):
 
 
 @pytest.mark.parametrize("target", [
-    pytest.param(target, marks=[pytest.mark.slow] * target.slow, id=f"{target.file} {target.command.partition(' ')[2]}")
+    pytest.param(target, marks=[pytest.mark.slow] * (target not in QUICK), id=f"{target.file} {target.command.partition(' ')[2]}")
     for target in TARGETS])
 def test_undamaged_files_are_read(run, target):
     outcome = run(Case(target.file, target.command))
