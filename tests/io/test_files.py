@@ -226,7 +226,7 @@ def test_a_file_that_another_process_removes_meanwhile_is_written(tmp_path):
     other = threading.Thread(target=remove)
     other.start()
     try:
-        for _ in range(2000):
+        for _ in range(500):
             with atomic_path(path, flush=False) as temporary:
                 temporary.write_bytes(b"x")
     finally:
