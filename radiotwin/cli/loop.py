@@ -152,7 +152,7 @@ def locate(
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Table of the positions.")] = Path("located.csv"),
 ) -> None:
-    """Locate unknown devices with a corrected model.
+    """Locate unknown devices with a twin of close-loop, or of fit.
 
     It works with or without a 3D map.
     """

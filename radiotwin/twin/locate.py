@@ -1,4 +1,4 @@
-"""Devices of unknown position in a file of measurements, located by a corrected twin."""
+"""Devices of unknown position in a file of measurements, located by a twin."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +24,8 @@ NOT_BY_PATHS = ("and following paths from every position where a device may be t
                 "fit --model raytrace locates devices along with the twin")
 MAX_NAMED = 5  # receivers in a note
 TRUTH_COLUMNS = ("x_m", "y_m"), ("latitude", "longitude")
+MAX_PROBES = 2000  # links by which a channel's error scale is looked up
+PLAIN_DOF = 30.0  # degrees of freedom of the errors of a twin of `fit`: nearly normal
 MIN_WIDENING = 1.2  # of residuals, from which a file's links are unlike those learnt from
 
 
@@ -31,18 +33,15 @@ def check_can_locate(twin: Twin, scene: Scene | None) -> None:
     """Check that a twin can locate devices outside its own fit.
 
     Args:
-        twin: made by `close-loop`.
+        twin: made by `fit` or `close-loop`.
         scene: the 3D map that devices are to be located with.
 
     Raises:
-        BadInput: it was not, it follows paths, or it was fitted with a map and none is given, or
-            the other way round.
+        BadInput: it follows paths, or it was fitted with a map and none is given, or the other way
+            round.
     """
     if twin.channel.follows_paths:
         raise BadInput(f"the twin's base is 'raytrace', {NOT_BY_PATHS}")
-    if twin.fitted is None:
-        raise BadInput("the twin was not made by `radiotwin close-loop`, or by an earlier version "
-                       "of it; run that on measurements of devices whose positions are known")
     twin.require_map(scene)
 
 
@@ -53,7 +52,7 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
     Args:
         measurements: their links, and others; converted into the twin's frame where both say where
             on the earth they lie.
-        twin: made by `close-loop`.
+        twin: made by `fit` or `close-loop`.
         scene: the 3D map, if the twin was made with one.
 
     Returns:
@@ -65,8 +64,6 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
             twin's, or nothing that can be used.
     """
     check_can_locate(twin, scene)
-    assert twin.fitted is not None
-    model = twin.fitted.for_positions()
     measurements = in_known_frame(measurements, twin.origin, "the twin")
     unknown = measurements.select(~measurements.is_anchor[measurements.device_index])
     if unknown.table.empty:
@@ -76,9 +73,14 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
         raise BadInput(f"the measurements have {unknown.level_column}, the twin is of "
                        f"{twin.level}; both need the same")
     links = prepare_links(unknown, scene, to_locate=True)
+    model = _by_channel(twin, links) if twin.fitted is None else twin.fitted.for_positions()
     strangers = [name for name in links.receiver_names if name not in model.receivers]
     notes = list(links.notes)
-    if strangers:
+    if twin.fitted is None:
+        notes.append("the twin is of `radiotwin fit`, which does not learn how far links of one "
+                     "device err alike: the devices may be farther away than their radii say. "
+                     "Radii of a twin of `radiotwin close-loop` allow for it")
+    elif strangers:
         others = " and others" if len(strangers) > MAX_NAMED else ""
         notes.append(f"nothing is known of receivers {', '.join(strangers[:MAX_NAMED])}{others}: "
                      "they are taken for faultless ones")
@@ -106,6 +108,31 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
         east_deg, north_deg = to_geographic(measurements.origin, table["x_m"], table["y_m"])
         table = table.assign(latitude_deg=north_deg.round(7), longitude_deg=east_deg.round(7))
     return table, notes
+
+
+def _by_channel(twin: Twin, links: Links) -> EffectModel:
+    """Return a channel with the errors that it states, as it was fitted, for devices anywhere.
+
+    Args:
+        twin: of `radiotwin fit`.
+        links: to be located by; the channel's errors are those of the twin's devices at their
+            receivers.
+    """
+    channel, known = twin.channel.trend, np.isfinite(twin.device_m).all(axis=1)
+    rows = np.unique(np.linspace(0, len(links) - 1, MAX_PROBES).astype(int))
+    device = np.flatnonzero(known)[np.arange(len(rows)) % known.sum()]
+    probes = Links.synthetic(
+        np.nan_to_num(twin.device_m), device, links.receiver_m[rows],
+        device_names=[each.device for each in twin.devices], limit_db=twin.limit_db,
+        frequency_hz=links.frequency_hz, city=links.city, is_gain=links.is_gain,
+        anchors=frozenset()).geometry
+    sd_db, group = channel.predict(probes)[1], channel.error_group(probes)
+    usual_db = [np.median(sd_db[group == each] if (group == each).any() else sd_db)
+                for each in range(channel.error_groups(probes))]
+    scale_db = np.array(usual_db) * np.sqrt((PLAIN_DOF - 2) / PLAIN_DOF)
+    levels = np.zeros(channel.level_columns(probes)[0].shape[1])
+    return EffectModel(channel, (), levels, scale_db, PLAIN_DOF, np.nan_to_num(twin.device_m), (),
+                       links.first_s, 0.0)
 
 
 def _widening(model: EffectModel, links: Links, found: list[PositionEstimate]) -> float:

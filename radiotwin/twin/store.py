@@ -21,8 +21,6 @@ from radiotwin.io.inputs import parse_json, read_bytes, read_text, require_withi
 from radiotwin.links import Links
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB
-from radiotwin.propagation.laws.image_paths import ImagePaths, stored_diffuse
-from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_channel
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.blend import Blend
@@ -30,7 +28,7 @@ from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
 from radiotwin.twin.model.effect_model import EffectModel, Unheard
 from radiotwin.twin.model.fold_model import FittedEffect
 
-SCHEMA, SCHEMA_1 = "radiotwin.twin/2", "radiotwin.twin/1"
+SCHEMA = "radiotwin.twin/2"
 CHANNEL_FILE = "channel.safetensors"
 _Coordinate = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 _Decibels = Annotated[float, Field(ge=-MAX_DB, le=MAX_DB)]
@@ -40,8 +38,6 @@ _Scalar = str | int | float | bool | None
 _Json = _Scalar | list[_Scalar] | dict[str, _Scalar]
 TWIN_FILE = "twin.json"
 TWIN_FILES = {TWIN_FILE, CHANNEL_FILE, "report.html"}  # the last is what `radiotwin report` makes
-_VERSION_1 = ("base", "coefficients", "dof", "scale_db", "receivers", "parts", "first_s",
-              "device_spread_db", "temper", "shadowing", "rest")  # of the effects
 
 
 class _Strict(BaseModel):
@@ -123,7 +119,7 @@ class _Provenance(BaseModel):
 class TwinRecord(_Strict):
     """Content of `twin.json`."""
 
-    schema_: Literal["radiotwin.twin/1", "radiotwin.twin/2"] = Field(alias="schema")
+    schema_: Literal["radiotwin.twin/2"] = Field(alias="schema")
     channel: ChannelRecord
     devices: Annotated[list[DeviceRecord], Field(min_length=1)]
     level: Literal["gain_db", "rssi_dbm"]
@@ -186,7 +182,7 @@ def encode_twin(channel: ChannelModel, devices: list[TwinDevice], level: str,
 
 
 def read_twin(folder: Path | str) -> dict[str, Any]:
-    """Read a twin's folder, of this version or of version 0.1.
+    """Read a twin's folder.
 
     Returns:
         the attributes of `Twin` by name.
@@ -205,7 +201,7 @@ def read_twin(folder: Path | str) -> dict[str, Any]:
 
 
 def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
-    """Return what `encode_twin` described, of this version or of version 0.1.
+    """Return what `encode_twin` described.
 
     Args:
         record: content of `twin.json`.
@@ -221,16 +217,13 @@ def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
     given = parse_json(record, source)
     try:
         schema = given["schema"]
-        if schema not in (SCHEMA, SCHEMA_1):
+        if schema != SCHEMA:
             raise BadInput(f"{source}: schema is {str(schema)[:60]!r}, this version reads "
-                           f"{SCHEMA!r} and {SCHEMA_1!r}")
+                           f"{SCHEMA!r}")
         model, beside = decode_both(channel, f"the channel of {source}")
-        name = model.name
-        if schema == SCHEMA_1:
-            given, model = _from_version_1(given, model)
         content = TwinRecord.model_validate(given)
-        if content.channel.model != name:
-            raise ValueError(f"the channel is {name}, not {content.channel.model[:60]}")
+        if content.channel.model != model.name:
+            raise ValueError(f"the channel is {model.name}, not {content.channel.model[:60]}")
         devices = [_device(device) for device in content.devices]
         fitted = None if content.fitted is None else _fitted(
             content.fitted, model, devices, beside)
@@ -337,40 +330,10 @@ def _check_levels(record: FittedRecord, channel: ChannelModel) -> None:
     if not isinstance(channel, BUILT_IN):
         return
     allowed = {(2, 1), (4, 2)} if channel.uses_map else {(2, 1)}
-    allowed = {(2, 2), (4, 2)} if channel.follows_paths else allowed
+    allowed = {(4, 2)} if channel.follows_paths else allowed
     given = len(record.level_coefficients), len(record.scale_db)
     if given not in allowed:
         raise ValueError(f"{given[0]} levels and {given[1]} scales do not fit {channel.name}")
-
-
-def _from_version_1(record: dict, channel: ChannelModel) -> tuple[dict, ChannelModel]:
-    """Return the record and the channel as version 2 has them.
-
-    There, paths were followed upon a law (`base`), and effects had a `setting`.
-    """
-    old = record.get("effects", [])
-    record = {name: value for name, value in record.items() if name != "effects"}
-    if old in ([], {}):  # a list, always empty, in the earliest twins
-        return record, channel
-    wrong = set(old) - set(_VERSION_1)
-    if wrong:
-        raise ValueError(f"effects: {sorted(wrong)[0][:60]!r} is unknown")
-    if old["base"] == "raytrace":
-        if not isinstance(channel, SegmentedLogDistance):
-            raise ValueError(f"paths do not go with {channel.name}")
-        channel = ImagePaths(channel, stored_diffuse(old["rest"]))
-    shadowing = old.get("shadowing")
-    if shadowing is not None:
-        shadowing = {name: value for name, value in shadowing.items() if name != "sigma"} | {
-            "relative_sd": shadowing["sigma"]}
-    record["fitted"] = {
-        "level_coefficients": old["coefficients"], "scale_db": old["scale_db"], "dof": old["dof"],
-        "effects": [{"name": part["name"], "variant": part["variant"], "params": part["setting"],
-                     "coefficients": part["coefficients"]} for part in old["parts"]],
-        "receivers": old["receivers"], "first_s": old["first_s"],
-        "device_sd_db": old["device_spread_db"], "likelihood_power": old["temper"],
-        "shadowing": shadowing}
-    return record, channel
 
 
 def _device_record(device: TwinDevice) -> dict[str, Any]:

@@ -57,11 +57,11 @@ def inputs(small_scene, tmp_path_factory, run):
     fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).write(folder / "m.csv")
     assert run("fit m.csv --scene scene --model log_distance -o twin", folder).returncode == 0
     (folder / "import.toml").write_text(IMPORT)
-    version_1 = Path(__file__).parents[1] / "twin" / "version_1"
-    shutil.copytree(version_1 / "corrected", folder / "corrected")
+    stored = Path(__file__).parents[1] / "twin" / "stored"
+    shutil.copytree(stored / "corrected", folder / "corrected")
     (folder / "links").mkdir()
-    shutil.copy(version_1 / "links" / "measurements.csv", folder / "links")
-    first, *others = (version_1 / "links" / "devices.csv").read_text().splitlines()
+    shutil.copy(stored / "links" / "measurements.csv", folder / "links")
+    first, *others = (stored / "links" / "devices.csv").read_text().splitlines()
     lost = f"{others[-1].split(',')[0]},,,1.5,unknown,2400000000.0"
     (folder / "links" / "devices.csv").write_text("\n".join([first, *others[:-1], lost, ""]))
     (folder / "points.csv").write_text("x_m,y_m,z_m\n" + "80,60,30\n" * 50)

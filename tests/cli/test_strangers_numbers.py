@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tests.cli.strangers import FIT, MAP, SURVEY, TWIN_1, Strangers, check_stranger
+from tests.cli.strangers import FIT, MAP, STORED, SURVEY, Strangers, check_stranger
 
 stranger = Strangers()
 
@@ -40,7 +40,7 @@ def an_index_too_high(folder):
 def effects(name, change):
     def prepare(folder):
         shutil.rmtree(folder / "twin")
-        shutil.copytree(TWIN_1 / "raytrace", folder / "twin")
+        shutil.copytree(STORED / "raytrace", folder / "twin")
         record = json.loads((folder / "twin" / "twin.json").read_text())
         change(record)
         (folder / "twin" / "twin.json").write_text(json.dumps(record))
@@ -49,11 +49,11 @@ def effects(name, change):
 
 
 for _name, _change in {
-        "null": lambda record: record.update(effects=None), "text": lambda record: record.update(effects="none"),
-        "a_list": lambda record: record.update(effects=[[1]]),
-        "without_freedom": lambda record: record["effects"].update(dof=-1),
-        "texts_for_numbers": lambda record: record["effects"].update(rest=["nan", "inf"]),
-        "null_inside": lambda record: record["effects"].update(receivers=None)}.items():
+        "null": lambda record: record["fitted"].update(effects=None), "text": lambda record: record.update(fitted="none"),
+        "a_list": lambda record: record["fitted"].update(effects=[[1]]),
+        "without_freedom": lambda record: record["fitted"].update(dof=-1),
+        "texts_for_numbers": lambda record: record["fitted"].update(scale_db=["nan", "inf"]),
+        "null_inside": lambda record: record["fitted"].update(receivers=None)}.items():
     stranger(MAP, "twin.json")(effects(_name, _change))
 
 

@@ -21,7 +21,7 @@ from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.errors import BadInput
 from radiotwin.report import closeloop_summary, write_closeloop_page
 
-VERSION_1 = Path(__file__).parent / "version_1" / "closeloop.json"  # of radiotwin 0.1, see tests/twin/version_1
+VERSION_1 = Path(__file__).parent / "version_1" / "closeloop.json"  # of radiotwin 0.1
 
 
 @pytest.fixture

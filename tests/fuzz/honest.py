@@ -197,20 +197,17 @@ def _in_a_child(function: Callable[[Path], None], folder: Path) -> None:
 
 
 def _write_effects(folder: Path) -> None:
-    """Write twins with every kind of effect, of this version and of version 0.1."""
-    from radiotwin.twin import Twin
-
-    source = Path(__file__).parents[1] / "twin" / "version_1"
-    parts = [part for part in json.loads((source / "effects.json").read_text())
-             if part["name"] != "body_shadowing"]  # that of 0.1 had other parameters, and is refused
+    """Write twins with every kind of effect."""
+    source = Path(__file__).parents[1] / "twin" / "stored"
+    parts = json.loads((source / "effects.json").read_text())
     for name, over in (("corrected", "links"), ("raytrace", "map")):
-        old = folder / f"old_{name}"
-        shutil.copytree(source / name, old)
-        record = json.loads((old / "twin.json").read_text())
-        record["effects"]["parts"] = [part for part in parts if part["over"] == over
-                                      and (over == "links" or part["setting"].get("exact"))]
-        (old / "twin.json").write_text(json.dumps(record))
-        Twin.load(old).save(folder / f"twin_{name}")
+        shutil.copytree(source / name, folder / f"twin_{name}")
+        path = folder / f"twin_{name}" / "twin.json"
+        record = json.loads(path.read_text())
+        record["fitted"]["effects"] = [
+            {key: value for key, value in part.items() if key != "over"} for part in parts
+            if part["over"] == over and (over == "links" or part["params"].get("exact"))]
+        path.write_text(json.dumps(record))
     shutil.copytree(source / "links", folder / "links")
     devices = pd.read_csv(folder / "links" / "devices.csv")
     devices.loc[devices.index[-1], "role"] = "unknown"

@@ -114,9 +114,8 @@ TARGETS = (
     *(Target("twin", f"{folder}/{file}", command.format(folder), slow="raytrace" in folder)
       for folder, command in (
         ("twin_corrected", "radiotwin locate links/measurements.csv --twin {} -o out.csv"),
-        ("old_corrected", "radiotwin locate links/measurements.csv --twin {} -o out.csv"),
         ("twin_raytrace", "radiotwin map {} --scene scene --altitudes 55 -o out.nc"),
-        ("old_raytrace", "radiotwin report {} --scene scene -o out.html"),
+        ("twin_raytrace", "radiotwin report {} --scene scene -o out.html"),
         ("twin_kriging", "radiotwin map {} --scene scene --altitudes 55 -o out.png"))
       for file in ("twin.json", "channel.safetensors")),
     Target("twin", "twin/twin.json", _FIT.format("measurements.csv --start twin")),

@@ -11,9 +11,10 @@ from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.io.forms import Origin
-from radiotwin.links.measurements import Measurements
+from radiotwin.links.measurements import Measurements, read_measurements
+from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.propagation.laws.image_paths import ImagePaths
-from radiotwin.propagation.laws.log_distance import LogDistance
+from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin import locate as module
 from radiotwin.twin.model.effect_model import EffectModel
@@ -86,9 +87,30 @@ def test_bad_input_is_one_message(run, tmp_path, open_ground, role, twin, messag
     assert not (tmp_path / "located.csv").exists()
 
 
-def test_only_twins_of_close_loop_whose_channel_is_a_law_locate():
-    law, paths = (Twin(channel, [], "gain_db", None) for channel in (LogDistance(), ImagePaths()))
-    with pytest.raises(BadInput, match="not made by `radiotwin close-loop`"):
+@pytest.mark.parametrize("model", ["segmented_log_distance", "regression_kriging"])
+def test_a_twin_of_fit_locates_a_device_that_it_has_not_seen(run, tmp_path, small_scene, model):
+    truth = segmented_truth(small_scene)
+    fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).write(tmp_path / "all" / "measurements.csv")
+    data = read_measurements(tmp_path / "all" / "measurements.csv")
+    anchors = np.flatnonzero(data.is_anchor)
+    lost = data.devices["device"][anchors[-1]]
+    data.select(data.table["device"].to_numpy() != lost).write(tmp_path / "known" / "measurements.csv")
+    hidden = data.devices.copy()
+    hidden.loc[anchors[-1], ["x_m", "y_m"]] = np.nan
+    hidden.loc[anchors[-1], "role"] = "unknown"
+    Measurements(data.select(data.table["device"].to_numpy() == lost).table, hidden).write(tmp_path / "new" / "measurements.csv")
+    done = run(f"fit known/measurements.csv --scene {small_scene.folder} --model {model} -o twin", tmp_path)
+    assert done.returncode == 0, done.stderr
+    done = run(f"locate new/measurements.csv --scene {small_scene.folder} --twin twin -o located.csv", tmp_path)
+    assert done.returncode == 0, done.stderr
+    located, true_m = pd.read_csv(tmp_path / "located.csv"), data.device_m[anchors[-1]]
+    assert located["device"].tolist() == [lost] and "may be farther away than their radii say" in done.stdout + done.stderr
+    assert np.hypot(located["x_m"][0] - true_m[0], located["y_m"][0] - true_m[1]) < 20.0
+
+
+def test_what_follows_paths_or_lacks_its_map_does_not_locate():
+    law, paths = (Twin(channel, [], "gain_db", None) for channel in (SegmentedLogDistance(), ImagePaths()))
+    with pytest.raises(BadInput, match="made with a 3D map"):
         module.check_can_locate(law, None)
     with pytest.raises(BadInput, match="close-loop --base twin makes one"):
         module.check_can_locate(paths, None)

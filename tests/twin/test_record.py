@@ -13,10 +13,10 @@ from radiotwin.links import prepare_links
 from radiotwin.links.measurements import read_measurements
 from radiotwin.twin import Twin
 
-VERSION_1 = Path(__file__).parent / "version_1"
+STORED = Path(__file__).parent / "stored"
 NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)
-EFFECTS = [each for each in json.loads((VERSION_1 / "effects.json").read_text(encoding="utf-8"))
-           if each["over"] == "links" and each["name"] != "body_shadowing"]  # which has other parameters since
+EFFECTS = [each for each in json.loads((STORED / "effects.json").read_text(encoding="utf-8"))
+           if each["over"] == "links"]
 DEEP = json.loads("[" * 200 + "]" * 200)
 WRONG = [None, "text", "1", [], [1], {}, {"a": 1}, True, -1, 0, 0.5, 1e308, -1e308, float("nan"), 2**70, 10**400, DEEP]
 
@@ -44,25 +44,22 @@ def replaced(record, path, new):
 
 
 def read(name):
-    folder = VERSION_1 / name
+    folder = STORED / name
     return json.loads((folder / "twin.json").read_text(encoding="utf-8")), (folder / "channel.safetensors").read_bytes()
 
 
-def document(name, schema):
-    """A twin's record and channel, with few points of shadowing, as this version or as 0.1 wrote it."""
+def document(name):
+    """A twin's record and channel, with few points of shadowing."""
     record, channel = read(name)
-    shadowing = record["effects"].get("shadowing")
+    shadowing = record["fitted"]["shadowing"]
     if shadowing:
         shadowing["arrays"] = {key: values[:6] for key, values in shadowing["arrays"].items()}
-    if schema == 2:
-        text, channel = Twin.decode(json.dumps(record), channel, "it").encode()
-        record = json.loads(text)
     return record, channel
 
 
 @pytest.fixture(scope="module")
 def measured():
-    return prepare_links(read_measurements(VERSION_1 / "links" / "measurements.csv"), None).select(slice(0, 40))
+    return prepare_links(read_measurements(STORED / "links" / "measurements.csv"), None).select(slice(0, 40))
 
 
 def check(record, channel, measured):
@@ -88,12 +85,11 @@ def check(record, channel, measured):
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("name", ["corrected", "raytrace"])
-@pytest.mark.parametrize("schema", [1, 2])
-def test_every_node_wrong_in_every_way(name, schema, measured):
-    record, channel = document(name, schema)
+def test_every_node_wrong_in_every_way(name, measured):
+    record, channel = document(name)
     assert check(record, channel, measured) == "accepted"
     every = list(paths(record))
-    rng = np.random.default_rng(schema)  # some of 2,700 cases, others for each schema
+    rng = np.random.default_rng(2)  # some of 2,700 cases
     found = [check(replaced(record, path, new), channel, measured)
              for path in every for new in WRONG if rng.random() < 0.05]
     assert found.count("refused") > 4 * found.count("accepted") > 0
@@ -102,14 +98,14 @@ def test_every_node_wrong_in_every_way(name, schema, measured):
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("number", range(len(EFFECTS)), ids=[f"{each['name']}-{i}" for i, each in enumerate(EFFECTS)])
 def test_parameters_of_every_effect_wrong_in_every_way(number, measured):
-    record, channel = document("corrected", 1)
+    record, channel = document("corrected")
     part = {name: value for name, value in EFFECTS[number].items() if name != "over"}
-    record["effects"] |= {"parts": [part], "shadowing": None}
+    record["fitted"] |= {"effects": [part], "shadowing": None}
     assert check(record, channel, measured) == "accepted"
     rng = np.random.default_rng(number)
     for path in paths(part):
         for new in rng.permutation(np.array(WRONG, dtype=object))[:5]:
-            record["effects"]["parts"] = [replaced(part, path, new)]
+            record["fitted"]["effects"] = [replaced(part, path, new)]
             check(record, channel, measured)
 
 
@@ -135,16 +131,9 @@ REFUSED = {
 
 @pytest.mark.parametrize("change", REFUSED.values(), ids=REFUSED)
 def test_what_cannot_be_is_refused(change, measured):
-    record, channel = document("corrected", 2)
+    record, channel = document("corrected")
     record = change(record) or record
     assert check(record, channel, measured) == "refused"
-
-
-@pytest.mark.parametrize("effects", ["text", [1], [[]], 3, True, {"base": "raytrace", "rest": ["nan", "inf"]}, None])
-def test_effects_of_version_0_1_that_are_none_are_not_taken_for_none(effects, measured):
-    record, channel = document("raytrace", 1)
-    assert check(record | {"effects": effects}, channel, measured) == "refused"
-    assert check(record | {"effects": []}, channel, measured) == "accepted"
 
 
 def test_a_twins_files_are_regular_and_of_a_bounded_size(tmp_path, monkeypatch):

@@ -1,9 +1,8 @@
-"""Twins as folders: what comes back is what was saved, also from version 0.1, and damage is one message."""
+"""Twins as folders: what comes back is what was saved, and damage is one message."""
 
 import json
 import shutil
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,18 +14,11 @@ from radiotwin.closeloop.run import close_loop
 from radiotwin.effects import catalogue
 from radiotwin.effects.catalogue.roof_heights import Roof
 from radiotwin.errors import BadInput
-from radiotwin.links import prepare_links
-from radiotwin.links.measurements import read_measurements
-from radiotwin.propagation.laws import followed_paths
-from radiotwin.propagation.paths import path_powers
-from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.materials import Material
 from radiotwin.twin import Twin, check_twin_target, fit_twin
 from radiotwin.twin.model.effect_model import EffectModel
 from radiotwin.twin.model.fold_model import FittedEffect
 
-VERSION_1 = Path(__file__).parent / "version_1"  # made with radiotwin 0.1, see its README.md
-ATOL_DB = 1e-3  # paths are found in another order, and their field is computed in another
+STORED = Path(__file__).parent / "stored"
 NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)
 
 
@@ -82,94 +74,6 @@ def test_a_curve_that_only_describes_is_drawn_on_the_maps_of_a_stored_twin(open_
     assert np.corrcoef(twin.predict(links).mean_db, wave)[0, 1] > 0.7
 
 
-def test_a_corrected_twin_of_version_0_1_predicts_the_same():
-    """Offsets of devices, a step of one receiver, and interpolated shadowing, without a map."""
-    twin, before = Twin.load(VERSION_1 / "corrected"), np.load(VERSION_1 / "corrected.npz")
-    assert twin.is_corrected and twin.description == \
-        "log_distance with device_gain_offset, receiver_drift, correlated_shadowing"
-    found = twin.predict(twin.links(before["receiver_m"], before["device"], NO_MAP))
-    np.testing.assert_allclose(found.mean_db, before["mean_db"], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(found.sd_db, before["sd_db"], atol=1e-6, rtol=0)
-    # As they are read by the receivers that it knows, before shadowing.
-    links = prepare_links(read_measurements(VERSION_1 / "links" / "measurements.csv"), None)
-    fit = twin.fitted.on_links(links)
-    reading = fit.readings()
-    np.testing.assert_allclose(reading.mean_db, before["read_db"], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(reading.scale_db, before["read_scale_db"], atol=ATOL_DB, rtol=0)
-
-
-@pytest.fixture
-def old_scene(small_scene, monkeypatch):
-    """The scene of half-spaces of concrete, which version 0.1 took all surfaces for: a slab too thick to look through."""
-    thick = Material("concrete", itu="concrete", thickness_m=100.0)
-    monkeypatch.setattr("radiotwin.scene.citymap.CONCRETE", thick)
-    monkeypatch.setattr("radiotwin.effects.catalogue.missing_obstacle.CONCRETE", thick)
-    monkeypatch.setattr("radiotwin.propagation.paths.powers.path_powers", partial(path_powers, wedge="luebbers"))
-    scene = replace(small_scene)
-    scene.__dict__["city"] = CityMap(small_scene.city.vertices, small_scene.city.faces, [thick])
-    return scene
-
-
-@pytest.fixture(autouse=True)
-def whole_metres(monkeypatch):
-    """0.1 rounded estimated positions to a metre before it followed paths, not to half a metre."""
-    monkeypatch.setattr(followed_paths, "GRID_M", 1.0)
-
-
-EFFECTS = json.loads((VERSION_1 / "effects.json").read_text(encoding="utf-8"))
-CHANGED = "body_shadowing"  # has other parameters since, which those of 0.1 cannot be turned into
-
-
-@pytest.mark.parametrize("number", range(len(EFFECTS)), ids=[f"{each['name']}-{i}" for i, each in enumerate(EFFECTS)])
-def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, old_scene, tmp_path):
-    """One effect of each kind in place of those that were found; with a map some upon a law, others upon paths."""
-    part, before = EFFECTS[number], np.load(VERSION_1 / "effects.npz")
-    over_map = part["over"] == "map"
-    shutil.copytree(VERSION_1 / ("raytrace" if over_map else "corrected"), tmp_path / "twin")
-    path = tmp_path / "twin" / "twin.json"
-    record = json.loads(path.read_text(encoding="utf-8"))
-    record["effects"] |= {"parts": [part]}
-    record["effects"].pop("shadowing", None)
-    if over_map and not part["setting"].get("exact"):
-        record["effects"] |= {"base": "twin", "coefficients": [1.0, 0.0, -1.0, 0.0]}
-    path.write_text(json.dumps(record), encoding="utf-8")
-    if part["name"] == CHANGED:
-        with pytest.raises(BadInput, match="another version of radiotwin.*run `radiotwin close-loop` again"):
-            Twin.load(tmp_path / "twin")
-        return
-    twin = Twin.load(tmp_path / "twin")
-    if over_map:
-        asked = np.load(VERSION_1 / "raytrace.npz")
-        found = twin.predict(twin.links(asked["receiver_m"][::2], asked["device"][::2], old_scene))
-        values = [found.mean_db, found.sd_db]
-    else:
-        links = prepare_links(read_measurements(VERSION_1 / "links" / "measurements.csv"), None)
-        fit = twin.fitted.on_links(links)
-        reading = fit.readings()
-        values = [reading.mean_db, reading.scale_db, fit.model.regression().nll(fit)]
-    limit_db = 0.1 if part["name"] == "diffraction" else ATOL_DB  # 0.1 did not follow paths over two edges
-    np.testing.assert_allclose(values, before[f"{part['over']}_{number}"], atol=limit_db, rtol=0)
-
-
-def test_a_twin_of_version_0_1_that_follows_paths_predicts_the_same(old_scene):
-    twin, before = Twin.load(VERSION_1 / "raytrace"), np.load(VERSION_1 / "raytrace.npz")
-    assert twin.channel.name == "image_paths" and not twin.is_corrected
-    links = twin.links(before["receiver_m"], before["device"], old_scene)
-    found = twin.predict(links)
-    np.testing.assert_array_equal(links.los, before["los"])
-    np.testing.assert_allclose(found.mean_db, before["mean_db"], atol=ATOL_DB, rtol=0)
-    np.testing.assert_allclose(found.sd_db, before["sd_db"], atol=ATOL_DB, rtol=0)
-
-
-def test_a_twin_of_version_0_1_is_saved_as_one_of_this_version(tmp_path):
-    twin = Twin.load(VERSION_1 / "corrected")
-    twin.save(tmp_path / "twin")
-    assert json.loads((tmp_path / "twin" / "twin.json").read_text())["schema"] == "radiotwin.twin/2"
-    before = np.load(VERSION_1 / "corrected.npz")
-    links = twin.links(before["receiver_m"], before["device"], NO_MAP)
-    assert_equal(twin.predict(links), Twin.load(tmp_path / "twin").predict(links))
-
-
 def test_a_damaged_twin_is_bad_input(twin, tmp_path):
     with pytest.raises(BadInput, match="not a twin's folder"):
         Twin.load(tmp_path)
@@ -205,7 +109,7 @@ def test_a_twin_is_replaced_with_its_page_and_nothing_else_is_lost(twin, tmp_pat
 @pytest.mark.parametrize("name", ["twin.json", "channel.safetensors"])
 def test_a_twin_reads_nothing_outside_its_folder(tmp_path, name):
     (tmp_path / name).touch()
-    shutil.copytree(VERSION_1 / "raytrace", tmp_path / "twin")
+    shutil.copytree(STORED / "raytrace", tmp_path / "twin")
     (tmp_path / "twin" / name).unlink()
     (tmp_path / "twin" / name).symlink_to(tmp_path / name)
     with pytest.raises(BadInput, match="leads out of"):

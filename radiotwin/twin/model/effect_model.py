@@ -130,10 +130,7 @@ class EffectModel:
                    if links.receiver_names or each.effect.is_on_maps(each.params)]
         model = FoldModel.build(links, self.channel, self.dof)
         model = model.with_effects([model.apply(each.effect, each.params) for each in effects])
-        # A twin of 0.1 that follows paths has levels without slopes.
-        more = np.zeros(2 * (self.channel.follows_paths and len(self.level_coefficients) == 2))
-        levels = np.concatenate([self.level_coefficients, more])
-        coefficients = [levels, *(each.coefficients for each in effects)]
+        coefficients = [self.level_coefficients, *(each.coefficients for each in effects)]
         needed = [model.level_columns, *(each.term.columns for each in model.effects)]
         for own, columns in zip(coefficients, needed, strict=True):
             if len(own) != columns.shape[1]:
