@@ -117,7 +117,7 @@ def test_an_output_that_takes_nothing_is_no_traceback(line, status, said, tmp_pa
     assert "standard output cannot be written" in done.stderr or not said
 
 
-@pytest.mark.parametrize("environment", [{"PYTHONIOENCODING": "ascii"}, {"TERM": "dumb", "COLUMNS": "1"},
+@pytest.mark.parametrize("environment", [{"PYTHONIOENCODING": "ascii", "TERM": "dumb", "COLUMNS": "1"},
                                          {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}])
 def test_any_terminal_will_do(environment, tmp_path):
     done = shell("$RADIOTWIN build-scene preset:small --check", tmp_path,

@@ -103,7 +103,8 @@ def test_an_unknown_kind_of_twin_is_refused(reality):
 @pytest.mark.parametrize("algorithm, guide", [("qmix", "planner"), ("iql", "none"), ("planner", "none"),
                                               ("greedy", "none")])
 def test_a_stopped_run_ends_as_an_unbroken_one(small_scene, tmp_path, algorithm, guide):
-    run = run_settings(algorithm=algorithm, guide=guide, seed=1).model_copy(update={"real_episodes": 2})
+    run = run_settings(algorithm=algorithm, guide=guide, twin="log-distance", seed=1).model_copy(update={
+        "real_episodes": 2, "episodes": 20, "planner_iterations": 100})
     unbroken = execute(small_scene, run)
 
     class Killed(Exception):
@@ -158,7 +159,7 @@ def test_training_happens_in_the_twins_map_and_judging_in_the_truths(small_scene
 
 
 def test_location_errors_are_the_twins_even_if_agents_see_true_positions(small_scene):
-    rows = execute(small_scene, run_settings(algorithm="greedy", privileged=True)).rows
+    rows = execute(small_scene, run_settings(algorithm="greedy", twin="log-distance", privileged=True)).rows
     assert rows[-1]["location_error_median_m"] > 0
 
 
@@ -171,7 +172,7 @@ def test_agents_see_estimates_in_the_twin_and_in_reality_alike(small_scene, monk
         enter(self, mission, plan)
 
     monkeypatch.setattr(Trainer, "enter", spy)
-    outcome = execute(small_scene, run_settings(algorithm="qmix"))
+    outcome = execute(small_scene, run_settings(algorithm="qmix", twin="log-distance"))
     true_m = small_scene.device_m[:, :2]
     unknown = [d.role == "unknown" for d in small_scene.config.devices]
     assert (np.abs(seen[-1] - true_m)[unknown] > 1e-9).any(axis=1).all()
