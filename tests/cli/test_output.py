@@ -146,7 +146,7 @@ def test_planning_has_the_same_options(small_scene, tmp_path):
 @pytest.mark.parametrize("given", [None, "2"])
 def test_the_command_has_one_thread_of_blas_if_nothing_else_is_said(given):
     """Several wait for each other busily, and sums have another order for each number of them."""
-    program = ("import sys; from radiotwin import cli, signals; assert 'numpy' not in sys.modules\n"
+    program = ("import sys; from radiotwin import cli; from radiotwin.io import signals; assert 'numpy' not in sys.modules\n"
                "signals.leave, sys.argv = (lambda status: None), ['radiotwin', '--version']\n"
                "cli.main()\n"
                "import numpy, threadpoolctl\n"

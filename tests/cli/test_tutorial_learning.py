@@ -28,6 +28,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_run_in_the_truth_ends_where_the_page_says(folder):
     last = pd.read_csv(folder / "runs/truth/metrics.csv").iloc[-1]
     real, share = re.search(r"After ([\d,]+) of them it collects ([\d.]+)", PAGE).groups()

@@ -10,6 +10,8 @@ import pytest
 
 from tests.walk import ROOT, commands, fences, page, run, table
 
+pytestmark = pytest.mark.slow
+
 PAGE = page("tutorial-planners.md")
 
 
