@@ -62,6 +62,7 @@ def test_a_step_in_time_is_found_where_it_is(open_ground):
     assert value(report, "receiver_drift", "step_db[r1]") == pytest.approx(-6.0, abs=1.0)
 
 
+@pytest.mark.slow
 def test_a_step_after_the_first_flight_is_found_though_no_other_flight_shows_it(open_ground):
     world = open_ground.fly(7)
     world.gain_db[(world.receiver == 1) & (world.flight == 0)] += 12.0
@@ -71,6 +72,7 @@ def test_a_step_after_the_first_flight_is_found_though_no_other_flight_shows_it(
     assert 59 <= value(report, "receiver_drift", "step_time_s[r1]") <= 200
 
 
+@pytest.mark.slow
 def test_a_warm_up_that_only_the_first_flight_shows_is_no_step(open_ground):
     world = open_ground.fly(7)
     world.gain_db[world.receiver == 1] -= 12.0 * np.exp(-world.time_s[world.receiver == 1] / 40.0)
@@ -102,6 +104,7 @@ def test_a_receiver_whose_clock_is_wrong_is_named(open_ground):
     assert value(report, "receiver_clock_offset", "positions_late_by_s[r1]") == pytest.approx(late_s, abs=0.7)
 
 
+@pytest.mark.slow
 def test_flights_that_differ_anyhow_are_no_step(open_ground):
     world = open_ground.fly(9)
     each_db = np.array([[2.0, -2, 2, -2, 2, -2], [-3.0, 3, 0, 0, 3, -3]])
