@@ -20,7 +20,7 @@ from marl.settings import LearnerSettings, RunSettings, stream
 from radiotwin.errors import BadInput
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
-from radiotwin.maps.survey.campaign import declared_devices, heading_deg, link_table
+from radiotwin.maps.survey import declared_devices, heading_deg, link_table
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin, fit_twin
 from radiotwin.twin.shadowing import with_shadowing

@@ -10,7 +10,7 @@ from marl.environment import ACTION_COUNT, Frame, feasible
 from marl.flights import Policy
 from marl.learner import Learner
 from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
-from radiotwin.maps.survey.campaign import fly
+from radiotwin.maps.survey import fly
 from radiotwin.scene import Scene
 
 PATTERN = "random-waypoint"

@@ -10,8 +10,7 @@ import numpy as np
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import MAP_VALUES
 from radiotwin.maps.radiomap import RadioMap
-from radiotwin.maps.survey.grid import HOVER_COST, MOVE_COST, UNREACHABLE, FlightGrid
-from radiotwin.maps.survey.truth import LOS_LAW
+from radiotwin.maps.survey import HOVER_COST, LOS_LAW, MOVE_COST, UNREACHABLE, FlightGrid
 from radiotwin.scene import Scene
 from radiotwin.scene.config import UavConfig
 

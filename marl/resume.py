@@ -20,7 +20,7 @@ from marl.checkpoint import (
 from marl.learner import Learner
 from marl.settings import RunSettings
 from radiotwin.links.measurements import MAX_LEVEL_DB
-from radiotwin.maps.survey.grid import HOVER_COST
+from radiotwin.maps.survey import HOVER_COST
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from radiotwin.importing import import_measurements
     from radiotwin.links.alignment import in_scene_frame
     from radiotwin.links.measurements import Measurements, read_measurements
-    from radiotwin.maps.difference import MapDifference
-    from radiotwin.maps.radiomap import RadioMap
+    from radiotwin.maps.radiomap import MapDifference, RadioMap
     from radiotwin.maps.survey import fly_survey, read_truth, segmented_truth
     from radiotwin.propagation.paths.listing import list_paths
     from radiotwin.report import (
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
     from radiotwin.scene import Scene
     from radiotwin.scene.export import export_scene
     from radiotwin.scene.presets import build_preset
-    from radiotwin.scene.readers.any_source import build_scene
+    from radiotwin.scene.readers import build_scene
     from radiotwin.trace import SolverSettings, choose_quality, read_points, trace_map, trace_points
     from radiotwin.twin import Twin, fit_twin
     from radiotwin.twin.compare import Comparison, compare_models, score_map, split_flights

@@ -17,8 +17,8 @@ from shapely import affinity, box
 from radiotwin import SolverSettings
 from radiotwin.io.files import scratch_folder
 from radiotwin.scene.build import build_scene
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import itu_material
 from radiotwin.trace.solver import Antennas, PathGains
 from studies.runner import Study

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from radiotwin.trace.sionna_scene import import_sionna
+from radiotwin.trace.solver import import_sionna
 
 
 @contextmanager

@@ -17,8 +17,8 @@ import numpy as np
 import trimesh
 
 from radiotwin.io.files import atomic_folder
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import parse_config, write_config
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material
 from radiotwin.scene.presets import building_meshes
 

@@ -11,7 +11,7 @@ import pandas as pd
 
 from radiotwin import Scene, SolverSettings, list_paths
 from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE
-from radiotwin.trace.sionna_scene import candidate_search, import_sionna, load_city
+from radiotwin.trace.solver import candidate_search, import_sionna, load_city
 from studies.runner import Study
 from studies.tables import markdown, scene_folder
 

@@ -17,9 +17,9 @@ import pandas as pd
 from radiotwin import Scene, SolverSettings
 from radiotwin.io.files import atomic_path
 from radiotwin.runtime.execution.job import peak_bytes
-from radiotwin.scene.city_files import read_city
+from radiotwin.scene.folder import read_city
 from radiotwin.trace import trace_gains
-from radiotwin.trace.link_job import Links, SolveTiles, link_pieces
+from radiotwin.trace.link_job import LinkBatch, SolveTiles, link_pieces
 from radiotwin.trace.tiles import (
     RADIUS_M,
     PackedCity,
@@ -107,7 +107,7 @@ def measure_cost(seed: int, settings: dict) -> dict:
     scene = Scene.load(_folder(settings["buildings"], seed) / "scene")
     solve = SolveTiles(scene, solver)
     read_s = time.process_time() - begun_s
-    pieces: list[Links] = []
+    pieces: list[LinkBatch] = []
     for device in range(settings["devices"]):
         points_m = _points(scene, device, settings["links"] // settings["devices"],
                            solver.batch_receivers, seed)

@@ -1,7 +1,7 @@
 """Cities for the study `maps`, and maps of them that are wrong.
 
 Nothing here is shared with the package's generator of scenes, nor with the maps with errors that
-it makes itself (`radiotwin.scene.perturbation`).
+it makes itself (`radiotwin.scene.citymap`).
 """
 
 from collections.abc import Iterator
@@ -15,8 +15,8 @@ from shapely import Polygon, affinity, box
 
 from radiotwin import Scene
 from radiotwin.io.files import scratch_folder
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material, itu_material
 
 SIDE_M = 400.0  # of the square that is flown over, and that devices stand in

@@ -17,7 +17,7 @@ from marl.fedqmix.__main__ import app as planning
 from radiotwin.cli import main
 from radiotwin.io import signals
 from radiotwin.runtime import console
-from radiotwin.runtime.exits import exit_status
+from radiotwin.runtime.command import exit_status
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
 COLUMNS = 100

@@ -14,9 +14,8 @@ from marl.fedqmix.settings import EngineSettings, FederationSettings
 from marl.options import checked, settings_of, with_settings
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
-from radiotwin.runtime.command import with_output_options
+from radiotwin.runtime.command import exit_status, with_output_options
 from radiotwin.runtime.console import say, show_warnings_plainly
-from radiotwin.runtime.exits import exit_status
 
 
 @with_settings(RunSettings, LearnerSettings, EngineSettings, FederationSettings)

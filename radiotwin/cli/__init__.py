@@ -13,6 +13,6 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from radiotwin.cli.commands import app
     from radiotwin.io.signals import after_interrupt
-    from radiotwin.runtime.exits import exit_status
+    from radiotwin.runtime.command import exit_status
 
     signals.leave(exit_status(app, after_interrupt))

@@ -96,8 +96,8 @@ def build_scene(
 
     A report lists its contents and all problems that were found.
     """
-    from radiotwin.scene.readers.any_source import build_scene as build
-    from radiotwin.scene.report import print_report
+    from radiotwin.scene.build import print_report
+    from radiotwin.scene.readers import build_scene as build
 
     report = build(source, out, frequency_hz=frequency_hz, materials=_pairs(material or []),
                    bbox=_bounds(bbox), devices=devices, uavs=uavs, seed=seed,

@@ -15,10 +15,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.formats import FORMATS, expected, find_format, format_named
-from radiotwin.importing.frame import in_metres
-from radiotwin.importing.levels import LEVEL_COLUMN, read_levels
 from radiotwin.importing.log_files import LogFile, flight_names
-from radiotwin.importing.problems import Problems, Tally
 from radiotwin.importing.read_source import read_source
 from radiotwin.importing.repeats import without_repetition
 from radiotwin.importing.settings import (
@@ -30,8 +27,8 @@ from radiotwin.importing.settings import (
     Wide,
     merged,
 )
-from radiotwin.importing.source import ALWAYS, Source, as_text, columns_of
-from radiotwin.importing.times import calendar_days, seconds
+from radiotwin.importing.source import ALWAYS, Problems, Source, Tally, as_text, columns_of
+from radiotwin.importing.units import LEVEL_COLUMN, calendar_days, in_metres, read_levels, seconds
 from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, listed, shown
 from radiotwin.io.forms import name_fault

@@ -1,19 +1,26 @@
-"""Gaussian likelihood of levels of which some lie below the limit of detection (left-censored)."""
+"""Levels with Gaussian errors, some below the limit of detection (left-censored, the Tobit model).
+
+Their likelihood, and the log-distance line of highest likelihood.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.optimize import minimize, minimize_scalar
 from scipy.special import log_ndtr, ndtr
 
 if TYPE_CHECKING:
     import torch
 
 HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
-
 Limit = float | np.ndarray | None
 """Level below which nothing is detected [dB], for all links or each (n,); None or -inf: unknown."""
+MIN_SD_DB, MAX_SD_DB = 0.1, 100.0  # of a fitted standard deviation: far outside what is measured
+# Mean and sd of a normal prior: it decides only where the distances hardly differ.
+EXPONENT_PRIOR = (-3.0, 2.0)
 
 
 def limits_of(limit_db: Limit, n: int) -> np.ndarray:
@@ -129,3 +136,119 @@ def detection_probability(mean_db: np.ndarray, sd_db: np.ndarray,
         in 0..1, of the broadcast shape.
     """
     return ndtr((mean_db - limit_db) / sd_db)
+
+
+@dataclass(frozen=True)
+class LogDistanceLine:
+    """gain = intercept + 10 * exponent * log10(d / 1 m) + N(0, sd^2), the log-distance law.
+
+    Attributes:
+        intercept_db: mean gain at 1 m [dB].
+        exponent: path-loss exponent, negative where the gain falls with distance.
+        sd_db: standard deviation [dB].
+    """
+
+    intercept_db: float
+    exponent: float
+    sd_db: float
+
+    def mean_db(self, log_distance: np.ndarray) -> np.ndarray:
+        """Return the mean gain [dB] at log10(d / 1 m), any shape."""
+        return self.intercept_db + 10.0 * self.exponent * log_distance
+
+
+def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
+             limit_db: Limit) -> LogDistanceLine:
+    """Return the line of highest likelihood, with a weak prior on the exponent.
+
+    The Tobit likelihood has one maximum only (Olsen 1978, 'Note on the uniqueness of the maximum
+    likelihood estimator for the Tobit model', Econometrica 46), so the least-squares line through
+    the detected levels is a safe start.
+
+    Args:
+        log_distance: (n,) log10(d / 1 m).
+        level_db: (n,) [dB], at least two of them detected; NaN: below the limit.
+        limit_db: limit of detection [dB]; unknown only for levels that were detected.
+
+    Returns:
+        line
+    """
+    detected = ~np.isnan(level_db)
+    x, y = log_distance[detected], level_db[detected]
+    # Centred and scaled: L-BFGS wants parameters of about one size.
+    x_mid, x_scale, y_mid = x.mean(), max(float(x.std()), 1e-3), y.mean()
+    u, v = (x - x_mid) / x_scale, y - y_mid
+    u_below = (log_distance[~detected] - x_mid) / x_scale
+    limit = limits_of(limit_db, len(level_db))[~detected] - y_mid
+    prior_slope, prior_sd = (10.0 * x_scale * value for value in EXPONENT_PRIOR)
+
+    def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
+        level, slope, log_sd = theta
+        h = np.exp(-log_sd)
+        z, z_below = h * (v - level - slope * u), h * (limit - level - slope * u_below)
+        log_phi = log_ndtr(z_below)
+        ratio = np.exp(-0.5 * z_below**2 - HALF_LOG_2PI - log_phi)
+        pull = (slope - prior_slope) / prior_sd
+        value = 0.5 * z @ z + len(z) * log_sd - log_phi.sum() + 0.5 * pull**2
+        gradient = [
+            h * (ratio.sum() - z.sum()),
+            h * (ratio @ u_below - z @ u) + pull / prior_sd,
+            len(z) - z @ z + ratio @ z_below,
+        ]
+        return value / len(level_db), np.array(gradient) / len(level_db)
+
+    slope = float(u @ v) / max(float(u @ u), 1e-9)
+    log_floor = np.log(MIN_SD_DB)
+    start = np.array([0.0, slope, max(np.log(np.std(v - slope * u) + 1e-9), log_floor)])
+    bounds = [(None, None), (None, None), (log_floor, None)]
+    level, slope, log_sd = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds,
+                                    options={"ftol": 1e-14, "gtol": 1e-8}).x
+    slope_db = slope / x_scale
+    return LogDistanceLine(float(y_mid + level - slope_db * x_mid), float(slope_db / 10.0),
+                           float(np.exp(log_sd)))
+
+
+def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.ndarray,
+               limit_db: Limit, prior_db: float, prior_sd_db: float) -> LogDistanceLine:
+    """Return the line, moved up or down to few or no levels: a maximum a posteriori shift.
+
+    Args:
+        line: to move.
+        log_distance: (n,) log10(d / 1 m); n may be 0, then the shift is the prior's mean.
+        level_db: (n,) [dB]; NaN: below the limit.
+        limit_db: limit of detection [dB]; None: links that were not detected count nothing.
+        prior_db: mean of the shift's normal prior [dB].
+        prior_sd_db: its standard deviation [dB].
+
+    Returns:
+        line of the same exponent and standard deviation.
+    """
+
+    def objective(shift_db: float) -> float:
+        mean_db = line.mean_db(log_distance) + shift_db
+        nll = gaussian_nll(level_db, mean_db, np.asarray(line.sd_db), limit_db).sum()
+        return nll + 0.5 * ((shift_db - prior_db) / prior_sd_db) ** 2
+
+    reach_db = 10.0 * prior_sd_db
+    shift_db = minimize_scalar(objective, bounds=(prior_db - reach_db, prior_db + reach_db),
+                               method="bounded").x
+    return LogDistanceLine(line.intercept_db + float(shift_db), line.exponent, line.sd_db)
+
+
+def fit_sd_db(level_db: np.ndarray, mean_db: np.ndarray, limit_db: Limit) -> float:
+    """Return the standard deviation of highest likelihood around given means.
+
+    Args:
+        level_db: (n,) [dB]; NaN: below the limit.
+        mean_db: (n,) expected [dB].
+        limit_db: limit of detection [dB]; None: links that were not detected count nothing.
+
+    Returns:
+        [dB], between MIN_SD_DB and MAX_SD_DB.
+    """
+
+    def objective(log_sd: float) -> float:
+        return gaussian_nll(level_db, mean_db, np.exp(log_sd), limit_db).sum()
+
+    bounds = (np.log(MIN_SD_DB), np.log(MAX_SD_DB))
+    return float(np.exp(minimize_scalar(objective, bounds=bounds, method="bounded").x))

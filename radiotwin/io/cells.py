@@ -1,8 +1,7 @@
-"""Tables in files: the cells of .csv, .csv.gz and .parquet, and the layout of a CSV file.
+"""Tables in files: the cells of .csv, .csv.gz and .parquet, and the tables of a run's folder.
 
-The layout of a CSV file: its header, and as many fields in every row, counted in blocks.
-
-The cells of a table in a file: text from .csv and .csv.gz, typed columns from .parquet.
+Cells are text from CSV, whose rows are first checked to have as many fields as the header, and
+typed columns from Parquet.
 """
 
 import csv
@@ -19,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import CELLS, COLUMNS, FILE_BYTES, ROW_BYTES, ROWS
+from radiotwin.io.forms import MAX_NUMBER, MAX_POSITION_M
 from radiotwin.io.inputs import open_gzip, open_input
 from radiotwin.io.texts import unquoted, with_quotes, without_quotes
 
@@ -29,6 +29,17 @@ _NUMBERS_AT_ONCE = 1_000_000  # pandas makes an object of each
 _MAX_DIGITS = 1000  # of a number
 _PARQUET_ROWS, _NESTED_ROWS = 2**17, 2**10  # that are decoded at a time
 _SHOWN_CHARACTERS, _SHOWN_COLUMNS = 80, 50  # of a cell, and of a table, in a message
+POSITION = ("x_m", "y_m", "z_m")
+TRACK = {"flight": "text", "uav": "text", "time_s": "number", "x_m": "number", "y_m": "number",
+         "z_m": "number or nothing"}
+RESIDUALS = {
+    "flight": "text", "receiver": "text", "device": "text", "los": "0 or 1",
+    **dict.fromkeys((f"{end}_{name}" for end in ("receiver", "device") for name in POSITION),
+                    "number or nothing"),
+    "before_db": "number or nothing", "after_db": "number or nothing"}
+PLANNING = {"method": "text", "trained_in": "text", "real_episodes": "number",
+            "truth_ratio": "number"}
+"""Column -> kind of its cells; the columns that a table must have."""
 
 
 class CsvLayout:
@@ -364,3 +375,37 @@ def _read_csv(path: Path, required: Collection[str],
                         chunksize=max(_CHUNK_CELLS // len(layout.header), 1)) as reader:
         chunks = [without_quotes(chunk) if layout.has_apostrophes else chunk for chunk in reader]
     return pd.concat(chunks, ignore_index=True)
+
+
+def read_table(path: Path, kinds: dict[str, str], optional: dict[str, str] | None = None,
+               ) -> pd.DataFrame:
+    """Read columns of a table that a run holds.
+
+    Args:
+        path: `.csv` or `.csv.gz`.
+        kinds: column -> `text`, `number`, `number or nothing` (NaN), or `0 or 1`.
+        optional: the same, of columns that may be missing.
+
+    Raises:
+        BadInput: it cannot be read, a column is missing, or a cell is of another kind.
+    """
+    cells = read_cells(path)
+    missing = [name for name in kinds if name not in cells]
+    if missing:
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; make the run again")
+    wanted = kinds | {name: kind for name, kind in (optional or {}).items() if name in cells}
+    return pd.DataFrame({name: cells[name] if kind == "text" else
+                         _numbers(path, name, cells[name], kind)
+                         for name, kind in wanted.items()})
+
+
+def _numbers(path: Path, name: str, column: pd.Series, kind: str) -> pd.Series:
+    numbers = pd.to_numeric(column, errors="coerce").astype(float)
+    nothing = column.str.strip().isin(["", "nan"]) & (kind == "number or nothing")
+    most = MAX_POSITION_M if name.endswith("_m") else MAX_NUMBER
+    refuse(path, name, column, ~nothing & ~(np.abs(numbers) <= most),
+           f"is not a number within ±{most:g}; make the run again")
+    if kind == "0 or 1":
+        refuse(path, name, column, ~numbers.isin([0.0, 1.0]), "is neither 0 nor 1; make the run "
+                                                              "again")
+    return numbers

@@ -1,19 +1,36 @@
-"""The radio map: channel gain at every lattice position for every device."""
+"""The radio map: channel gain at every lattice position for every device; and a difference of two.
 
-from collections.abc import Iterator
+Both draw themselves into any axes, and give themselves to GIS programs as rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
-from radiotwin.display.axes import GAIN_COLOURS, level_range_db, plain
-from radiotwin.display.summary import Summary, count, some, span
+from radiotwin.display import PlotFrame, geo_data_frame, new_axes
+from radiotwin.display.axes import (
+    DIFFERENCE_COLOURS,
+    GAIN_COLOURS,
+    add_colour_bar,
+    add_legend,
+    draw_cells,
+    draw_points,
+    level_range_db,
+    plain,
+    residual_range_db,
+)
+from radiotwin.display.summary import Summarised, Summary, count, some, span
 from radiotwin.errors import BadInput
+from radiotwin.geo.frames import is_same_frame, place
 from radiotwin.io.forms import Origin
-from radiotwin.maps.difference import MapDifference
 from radiotwin.maps.file import load_dataset, open_dataset, write_parts
 from radiotwin.maps.form import (
     ATTRIBUTES,
@@ -26,13 +43,258 @@ from radiotwin.maps.form import (
     parts_of,
     placed_attributes,
 )
-from radiotwin.maps.view import OverDevices, map_table, pick, plot_values
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
     from matplotlib.axes import Axes
+
+DIFFERENCE = "difference_db"
+SAME_M = 1e-3  # positions nearer than this are one [m]
+
+
+def origin_of(attributes: dict[str, Any]) -> Origin | None:
+    """Return the origin of a map's frame by its attributes; None where they do not have it."""
+    found = {name: float(attributes[f"origin_{name}"]) for name in Origin.model_fields
+             if f"origin_{name}" in attributes}
+    return Origin(**found) if {"latitude_deg", "longitude_deg"} <= found.keys() else None
+
+
+class OverDevices(Summarised):
+    """Base of what has values for each device over a lattice.
+
+    Attributes:
+        dataset: variables with dims (device, z, y, x), coordinates x, y, z [m], provenance.
+    """
+
+    dataset: xr.Dataset
+
+    def __len__(self) -> int:
+        """Return the number of devices."""
+        return self.dataset.sizes["device"]
+
+    @property
+    def devices(self) -> list[str]:
+        """Names of the devices."""
+        return [str(name) for name in self.dataset["device"].values]
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Provenance."""
+        return {str(name): value for name, value in self.dataset.attrs.items()}
+
+    @property
+    def origin(self) -> Origin | None:
+        """Of the local frame; None where it is not known."""
+        return origin_of(self.attributes)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return a copy of the dataset."""
+        return self.dataset.copy(deep=True)
+
+
+def pick(dataset: xr.Dataset, device: str | None, altitude_m: float | None
+         ) -> tuple[str, float, xr.Dataset]:
+    """Return a device, an altitude, and the part of a map for them, with dims (y, x).
+
+    Args:
+        dataset: with dims (device, z, y, x).
+        device: its name; None: the first one.
+        altitude_m: one of the map's [m]; None: the lowest.
+
+    Raises:
+        BadInput: the map has no such device or altitude.
+    """
+    names, heights_m = [str(name) for name in dataset["device"].values], dataset["z"].values
+    device = names[0] if device is None else device
+    if device not in names:
+        raise BadInput(f"device {device!r} is not in the map; it has {some(names)}")
+    altitude_m = float(heights_m[0]) if altitude_m is None else altitude_m
+    if altitude_m not in heights_m:
+        raise BadInput(f"altitude {altitude_m:g} m is not in the map; it has "
+                       f"{some(f'{z:g}' for z in heights_m)} m")
+    return device, altitude_m, dataset.isel(device=names.index(device)).sel(z=altitude_m)
+
+
+def plot_values(values: xr.DataArray, origin: Origin | None, ax: Axes | None,
+                geographic: bool | None, scene: Scene | None, device: str, label: str,
+                extend: str, **look: Any) -> Axes:
+    """Draw values over the positions of a lattice.
+
+    Args:
+        values: (y, x); NaN stays empty.
+        origin: of the frame.
+        ax: to draw into; None: a new figure.
+        geographic: whether axes are longitude and latitude; None: where the origin is known.
+        scene: whose buildings are outlined and in which the device is marked; None: neither.
+        device: of the values.
+        label: of the colour bar.
+        extend: ends of the colour scale that values lie beyond, of `Figure.colorbar`.
+        look: of `Axes.pcolormesh`.
+    """
+    if scene is not None and origin is None:
+        origin = scene.config.origin
+    frame, ax = PlotFrame.choose(origin, geographic), new_axes(ax)
+    drawn = draw_cells(ax, frame, values["x"].values, values["y"].values, values.values, **look)
+    add_colour_bar(ax, drawn, label, extend)
+    if scene is not None:
+        scene.draw_outlines(ax, frame)
+        at = [(each.x_m, each.y_m) for each in scene.config.devices if each.device == device]
+        if at:
+            draw_points(ax, frame, *np.array(at).T, marker="^", s=80, color="white",
+                        edgecolors="black", label=f"device {plain(device)}", zorder=4)
+    frame.prepare(ax)
+    add_legend(ax)
+    return ax
+
+
+def map_table(dataset: xr.Dataset, variables: Sequence[str], origin: Origin | None
+              ) -> GeoDataFrame:
+    """Return a row with a point for each device and position of a map.
+
+    Args:
+        dataset: with dims (device, z, y, x).
+        variables: columns beside `device, x_m, y_m, z_m`, and `above_ground_m` where the map's
+            altitudes are that.
+        origin: of the frame.
+
+    Raises:
+        BadInput: GeoPandas is not installed.
+    """
+    names, *axes_m = (dataset[axis].values for axis in ("device", "z", "y", "x"))
+    name, z_m, y_m, x_m = (each.ravel() for each in np.meshgrid(names, *axes_m, indexing="ij"))
+    columns = {"device": name, "x_m": x_m, "y_m": y_m, "z_m": z_m}
+    if GROUND in dataset:
+        ground_m = np.broadcast_to(dataset[GROUND].values, [len(names), *map(len, axes_m)]).ravel()
+        columns |= {"z_m": z_m + ground_m, "above_ground_m": z_m}
+    columns |= {each: dataset[each].values.ravel() for each in variables}
+    position_m = np.column_stack([x_m, y_m]).astype(float)
+    return geo_data_frame(pd.DataFrame(columns), origin, position_m=position_m)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MapDifference(OverDevices):
+    """Gain of one map minus that of another.
+
+    Of a map of distributions (`sigma_db`) the mean counts, also where a link would not be detected;
+    `score_map` compares with a truth as it is detected.
+
+    Attributes:
+        dataset: variable `difference_db` (float32, NaN where either map has no gain) with dims
+            (device, z, y, x); attributes `minuend` and `subtrahend` are the sources of the maps.
+    """
+
+    dataset: xr.Dataset
+
+    @classmethod
+    def of(cls, first: xr.Dataset, second: xr.Dataset) -> MapDifference:
+        """Subtract the gains of a map from those of another.
+
+        Args:
+            first: dataset of a radio map.
+            second: dataset of another one with the same devices over the same lattice.
+
+        Raises:
+            BadInput: other devices, other positions, other ground, or another frame.
+        """
+        names = [[str(name) for name in each["device"].values] for each in (first, second)]
+        if set(names[0]) != set(names[1]):
+            raise BadInput(f"the maps have different devices, {some(names[0])} and "
+                           f"{some(names[1])}; take those of both with `selected` first")
+        for axis in "xyz":
+            ours_m, theirs_m = first[axis].values, second[axis].values
+            if ours_m.shape != theirs_m.shape or not np.allclose(ours_m, theirs_m, rtol=0,
+                                                                 atol=SAME_M):
+                raise BadInput(f"the maps are over different positions: {axis} goes from "
+                               f"{ours_m[0]:g} to {ours_m[-1]:g} m in {len(ours_m)} steps, and "
+                               f"from {theirs_m[0]:g} to {theirs_m[-1]:g} m in {len(theirs_m)}; "
+                               "make both for the same scene")
+        ground_m, other_m = (each[GROUND].values if GROUND in each else 0.0
+                             for each in (first, second))
+        if not np.allclose(ground_m, other_m, rtol=0, atol=SAME_M):
+            raise BadInput("the maps are over different ground, or one is of heights above the "
+                           "ground and the other of heights above the datum; make both for the "
+                           "same scene")
+        origin, other = (origin_of({str(name): value for name, value in each.attrs.items()})
+                         for each in (first, second))
+        if origin is not None and other is not None and not is_same_frame(origin, other):
+            raise BadInput(f"the maps are in different frames, about {place(origin)} and about "
+                           f"{place(other)}; make both for the same scene")
+        order = [names[1].index(name) for name in names[0]]
+        difference = first["gain_db"].values - second["gain_db"].values[order]
+        known = origin or other
+        attributes = {f"origin_{name}": value
+                      for name, value in (known.model_dump() if known else {}).items()}
+        attributes |= {"minuend": str(first.attrs.get("source", "")),
+                       "subtrahend": str(second.attrs.get("source", ""))}
+        variable = (first["gain_db"].dims, difference.astype(np.float32),
+                    {"units": "dB", "long_name": "difference of the gains"})
+        return cls(xr.Dataset({DIFFERENCE: variable}, first.coords, attributes))
+
+    @property
+    def difference_db(self) -> np.ndarray:
+        """(device, z, y, x) difference [dB]; NaN where either map has no gain."""
+        return self.dataset[DIFFERENCE].values
+
+    @property
+    def rmse_db(self) -> float:
+        """Root of the mean square over all links that both maps have [dB]; NaN without one."""
+        known = self.difference_db[np.isfinite(self.difference_db)].astype(float)
+        return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
+
+    @property
+    def mean_db(self) -> float:
+        """Mean over all links that both maps have [dB]; NaN without one."""
+        known = self.difference_db[np.isfinite(self.difference_db)].astype(float)
+        return float(known.mean()) if len(known) else float("nan")
+
+    def plot(self, device: str | None = None, altitude_m: float | None = None,
+             ax: Axes | None = None, *, scene: Scene | None = None,
+             geographic: bool | None = None) -> Axes:
+        """Draw the difference for one device at one altitude, red where the first map has more.
+
+        Args:
+            device: name; None: the first one.
+            altitude_m: one of the maps' [m]; None: the lowest.
+            ax: axes of matplotlib to draw into; None: a new figure.
+            scene: whose buildings are outlined; None: none are.
+            geographic: whether axes are longitude and latitude; None: where the origin is known.
+
+        Returns:
+            The axes.
+
+        Raises:
+            BadInput: no such device or altitude, or longitude and latitude without an origin.
+        """
+        device, altitude_m, part = pick(self.dataset, device, altitude_m)
+        high_db = residual_range_db(part[DIFFERENCE].values)
+        ax = plot_values(part[DIFFERENCE], self.origin, ax, geographic, scene, device,
+                         "difference of the gains [dB]", "both", cmap=DIFFERENCE_COLOURS,
+                         vmin=-high_db, vmax=high_db)
+        names = " − ".join(plain(self.dataset.attrs[each], 40) or "map"
+                           for each in ("minuend", "subtrahend"))
+        ax.set_title(f"{names}\ndevice {plain(device)} at {altitude_m:g} m")
+        return ax
+
+    def to_geodataframe(self) -> GeoDataFrame:
+        """Return a row with a point for each device and position, in metres of the local frame.
+
+        Raises:
+            BadInput: GeoPandas is not installed.
+        """
+        return map_table(self.dataset, [DIFFERENCE], self.origin)
+
+    @property
+    def _summary(self) -> Summary:
+        known = int(np.isfinite(self.difference_db).sum())
+        names = " − ".join(self.dataset.attrs[each] or "map" for each in ("minuend", "subtrahend"))
+        return Summary(
+            "MapDifference", f"{names}, {count(len(self), 'device')}, RMS {self.rmse_db:.2f} dB, "
+            f"mean {self.mean_db:+.2f} dB", (
+                ("maps", names), ("devices", some(self.devices)),
+                ("links in both", f"{known:,} of {self.difference_db.size:,}"),
+                ("RMS", f"{self.rmse_db:.2f} dB"), ("mean", f"{self.mean_db:+.2f} dB")))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,7 +312,7 @@ class RadioMap(OverDevices):
     @classmethod
     def build(cls, devices: list[str], lattice: Lattice, gain_db: np.ndarray, los: np.ndarray,
               sigma_db: np.ndarray | None = None,
-              attributes: dict[str, Any] | None = None) -> "RadioMap":
+              attributes: dict[str, Any] | None = None) -> RadioMap:
         """Build a map from arrays.
 
         Args:
@@ -71,7 +333,7 @@ class RadioMap(OverDevices):
         return cls(dataset)
 
     @classmethod
-    def collect(cls, stream: "MapStream | RadioMap") -> "RadioMap":
+    def collect(cls, stream: MapStream | RadioMap) -> RadioMap:
         """Return a map in memory: all blocks of a stream, or all values of an opened map."""
         if isinstance(stream, RadioMap):
             return cls(stream.dataset.load())
@@ -85,7 +347,7 @@ class RadioMap(OverDevices):
                                          for name, array in arrays.items()}))
 
     @classmethod
-    def load(cls, path: Path | str) -> "RadioMap":
+    def load(cls, path: Path | str) -> RadioMap:
         """Read a NetCDF-4 file, or a Zarr folder, into memory.
 
         Args:
@@ -100,7 +362,7 @@ class RadioMap(OverDevices):
 
     @classmethod
     @contextmanager
-    def open(cls, path: Path | str) -> Iterator["RadioMap"]:
+    def open(cls, path: Path | str) -> Iterator[RadioMap]:
         """Open a NetCDF-4 file, or a Zarr folder, whose values stay there until they are used.
 
         It has been read once, in parts, and checked. `save`, `blocks` and `selected` keep one part
@@ -153,8 +415,8 @@ class RadioMap(OverDevices):
         return self.lattice.equals(scene.lattice)
 
     def plot(self, device: str | None = None, altitude_m: float | None = None,
-             ax: "Axes | None" = None, *, scene: Scene | None = None,
-             geographic: bool | None = None) -> "Axes":
+             ax: Axes | None = None, *, scene: Scene | None = None,
+             geographic: bool | None = None) -> Axes:
         """Draw the gain of one device at one altitude; white where it is not detected.
 
         Args:
@@ -179,7 +441,7 @@ class RadioMap(OverDevices):
         ax.set_title(f"{source}: device {plain(device)} at {altitude_m:g} m")
         return ax
 
-    def to_geodataframe(self) -> "GeoDataFrame":
+    def to_geodataframe(self) -> GeoDataFrame:
         """Return a row with a point for each device and position, in metres of the local frame.
 
         Raises:
@@ -187,7 +449,7 @@ class RadioMap(OverDevices):
         """
         return map_table(self.dataset, self.variables, self.origin)
 
-    def __sub__(self, other: "RadioMap") -> MapDifference:
+    def __sub__(self, other: RadioMap) -> MapDifference:
         """Return the difference of the gains, see `MapDifference`.
 
         Raises:
@@ -232,7 +494,7 @@ class RadioMap(OverDevices):
                 yield MapBlock(where, {name: array[where].values
                                        for name, array in arrays.items()})
 
-    def placed(self, origin: Origin | None) -> "RadioMap":
+    def placed(self, origin: Origin | None) -> RadioMap:
         """Return the same map with another origin of the local frame.
 
         Args:
@@ -242,11 +504,11 @@ class RadioMap(OverDevices):
         dataset.attrs = placed_attributes(dataset.attrs, origin)
         return RadioMap(dataset)
 
-    def selected(self, devices: list[str], lattice: Lattice) -> "RadioMap":
+    def selected(self, devices: list[str], lattice: Lattice) -> RadioMap:
         """Return the map of some of its devices on some levels of its lattice."""
         return RadioMap(self.dataset.sel(device=devices, z=lattice.z_m))
 
-    def thinned(self, step: int) -> "RadioMap":
+    def thinned(self, step: int) -> RadioMap:
         """Return the map of every n-th position in x and in y."""
         every = slice(None, None, step)
         return RadioMap(self.dataset.isel(y=every, x=every))

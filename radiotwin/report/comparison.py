@@ -34,8 +34,7 @@ from radiotwin.report.map_figures import model_maps_figure, panels, true_positio
 from radiotwin.report.style import LOS_COLOUR, NLOS_COLOUR, save
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
-from radiotwin.scene.plot import height_grid
-from radiotwin.scene.preview import draw_heights
+from radiotwin.scene.plot import draw_heights, height_grid
 from radiotwin.twin import Twin
 from radiotwin.twin.compare import (
     CLASSES,

@@ -12,9 +12,9 @@ import pandas as pd
 from radiotwin.closeloop.output.result_file import read_report
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import PAGE_MAPS, PAGE_VALUES
+from radiotwin.io.cells import PLANNING, POSITION, RESIDUALS, TRACK, read_table
 from radiotwin.io.forms import Record, read_record, validated
 from radiotwin.io.inputs import is_within, require_within
-from radiotwin.io.run_tables import PLANNING, POSITION, RESIDUALS, TRACK, read_table
 from radiotwin.links.alignment import in_known_frame
 from radiotwin.links.measurements import read_measurements
 from radiotwin.maps.form import NETCDF, ZARR, MapStream

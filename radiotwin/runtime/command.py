@@ -1,18 +1,36 @@
-"""Options that the commands of both packages share."""
+"""What all commands share: `--quiet` and `--json`, one message at the end, and an exit status.
 
+| status | |
+|---|---|
+| 0 | done |
+| 1 | failed while running, by a mistake of ours, too |
+| 2 | input that cannot be used |
+| 128 + signal | 129 terminal closed, 130 interrupted, 141 nobody reads the output, 143 ended |
+"""
+
+import errno
 import functools
 import inspect
+import io
 import json
 import math
+import os
+import platform
+import shlex
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Annotated, Any
 
 import typer
 
+from radiotwin import __version__
+from radiotwin.errors import BadInput, RunFailed
+from radiotwin.io import signals
 from radiotwin.runtime import console as progress
-from radiotwin.runtime.console import collected, console
+from radiotwin.runtime.console import collected, complain, console, printable
 
 TABLES = ("build-scene", "import", "fit", "compare", "coverage", "close-loop", "locate", "demo",
           "doctor", "cache")
@@ -21,6 +39,9 @@ QUIET = Annotated[bool, typer.Option(
     "--quiet", "-q", help="Print nothing but warnings and errors.")]
 JSON = Annotated[bool, typer.Option(
     "--json", help="Print tables and messages as one JSON document.")]
+NOBODY_READS = 141  # as the shell has it for a command that SIGPIPE has ended
+MAX_ERROR_CHARACTERS = 300
+_ClickError: Any = typer.BadParameter.__mro__[2]  # Typer has no name of its own for it
 
 
 def add_output_options(app: typer.Typer) -> None:
@@ -97,3 +118,170 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "item") and not isinstance(value, str):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class _OutputLost(Exception):
+    """Standard output takes no more. No OSError, which Typer and Rich have their own ways with."""
+
+
+class _Output:
+    """A text stream whose OSErrors are distinguished from those of the work."""
+
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def write(self, text: str) -> int:
+        try:
+            return self.stream.write(text)
+        except OSError as error:
+            raise _OutputLost from error
+
+    def flush(self) -> None:
+        try:
+            self.stream.flush()
+        except OSError as error:
+            raise _OutputLost from error
+
+
+def exit_status(work: Callable[[], Any], kept: str | Callable[[], str]) -> int:
+    """Do the work of a command; print one message for whatever keeps it from being done.
+
+    With `--json` on the command line the message is also on standard output:
+    `{"error": {"message": "...", "status": 2}}`.
+
+    Args:
+        work: a Typer app, or any function; it may end the process itself.
+        kept: part of the message after a signal: what is kept and how to go on; or a function that
+            returns it.
+
+    Returns:
+        exit status, as this module has them.
+    """
+    _open_standard_streams()
+    signals.handle()
+    signals.begin()
+    before, sys.stdout = sys.stdout, _Output(sys.stdout)  # type: ignore[assignment]
+    try:
+        try:
+            done = work(standalone_mode=False) if isinstance(work, typer.Typer) else work()
+            sys.stdout.flush()
+        finally:
+            signals.end()
+        status, message = done if isinstance(done, int) else 0, ""
+    except BaseException as error:  # noqa: BLE001  # the one place that knows what to say
+        status, message = _explained(error, kept if isinstance(kept, str) else kept())
+    finally:
+        signals.end()
+        sys.stdout = before
+    if message:
+        complain(message)
+        if "--json" in sys.argv[1:] and status != NOBODY_READS:
+            document = {"error": {"message": message, "status": status}}
+            with suppress(OSError):
+                print(json.dumps(document, indent=1), flush=True)
+    _close_lost_output()
+    signals.finish(status)
+    return status
+
+
+def _explained(error: BaseException, kept: str) -> tuple[int, str]:
+    """Return exit status and message of what has ended the work."""
+    if isinstance(error, SystemExit) and not error.code:
+        return 0, ""
+    number = signals.received()
+    if number is not None:  # whatever it has become on its way
+        return 128 + number, f"{signals.word(number)}; {kept}"
+    if isinstance(error, SystemExit):
+        return (error.code, "") if isinstance(error.code, int) else (1, str(error.code))
+    if isinstance(error, _ClickError):
+        return error.exit_code, _usage(error)
+    if isinstance(error, BadInput):
+        return 2, str(error)
+    if isinstance(error, RunFailed):
+        return 1, str(error)
+    if isinstance(error, _OutputLost):
+        if isinstance(error.__cause__, BrokenPipeError):
+            return NOBODY_READS, ""
+        return 1, f"standard output cannot be written: {error.__cause__}; send it elsewhere"
+    if isinstance(error, MemoryError):
+        return 1, (f"out of memory while running {_command()}{_said(error)}; use a smaller input, "
+                   "fewer processes, or a machine with more memory")
+    if isinstance(error, OSError) and _folder_is_gone():
+        return 2, "the working folder does not exist any more; change to another one"
+    if isinstance(error, OSError) and error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+        return 2, (f"{str(error.filename)[:60]}… cannot be a path ({error.strerror}); give the "
+                   "path of a file or folder that exists")
+    return 1, _mistake(error)
+
+
+def _usage(error: Any) -> str:
+    """Return the message about wrong options or arguments; none where it is the help itself."""
+    message = error.format_message()
+    if message.startswith("Usage:"):  # a command without the arguments that it needs
+        error.show()
+        return ""
+    command = error.ctx.command_path if getattr(error, "ctx", None) else "the command"
+    return f"{message.rstrip('.')}; {command} --help shows what is allowed"
+
+
+def _mistake(error: BaseException) -> str:
+    """Save the traceback of an error that should not be; return the message about it."""
+    said = f"unexpected error while running {_command()}: {type(error).__name__}{_said(error)}"
+    try:
+        handle, path = tempfile.mkstemp(prefix="radiotwin-error-", suffix=".txt")
+        with open(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
+            file.write(f"radiotwin {__version__}, Python {platform.python_version()}, "
+                       f"{platform.platform()}\n{_command()}\n\n")
+            file.write("".join(traceback.format_exception(error)))
+    except Exception as again:  # noqa: BLE001  # a full disk, no memory, no folder
+        return f"{said}; the details could not be saved ({type(again).__name__})"
+    return f"{said}; this is a mistake in radiotwin: please report it with {path}"
+
+
+def _said(error: BaseException) -> str:
+    """Return the first line of an error's message, after a colon."""
+    try:
+        lines = str(error).strip().splitlines()
+    except Exception:  # noqa: BLE001  # of a library
+        return ""
+    return f": {lines[0][:MAX_ERROR_CHARACTERS]}" if lines else ""
+
+
+def _command() -> str:
+    name = "radiotwin" if "marl" not in sys.argv[0] else "python -m marl.fedqmix"
+    return printable(shlex.join([name, *sys.argv[1:]]))[:MAX_ERROR_CHARACTERS]
+
+
+def _folder_is_gone() -> bool:
+    try:
+        os.getcwd()
+    except OSError:
+        return True
+    return False
+
+
+def _open_standard_streams() -> None:
+    """Make all three writable: an output file would become the stream that is closed."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+    sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal may lack our × and –
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _close_lost_output() -> None:
+    """Keep Python from complaining when it flushes an output that takes nothing."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())

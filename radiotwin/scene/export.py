@@ -11,7 +11,7 @@ from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_folder, atomic_path
 from radiotwin.scene import Scene
 from radiotwin.scene.build import check_target
-from radiotwin.scene.city_files import CityShape, read_city, write_city
+from radiotwin.scene.folder import CityShape, read_city, write_city
 from radiotwin.scene.materials import Material
 
 _MODEL_SUFFIXES = (".glb", ".gltf", ".obj")

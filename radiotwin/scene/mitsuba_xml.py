@@ -20,7 +20,7 @@ Allowlist of the elements, types and attributes in `city.xml` of a scene folder.
   `texture`; a `$` in a value; a number that is none.
 
 None of it reaches Mitsuba, which would load files and plugins that it names: the ray tracer gets a
-file that `radiotwin.scene.city_files` writes from the triangles and materials that were read.
+file that `radiotwin.scene.folder` writes from the triangles and materials that were read.
 """
 
 import os
@@ -32,8 +32,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import DOCUMENT_BYTES, ELEMENTS, FILES, NESTING, SEARCH_FOLDERS, SHAPES
-from radiotwin.io.inputs import require_within
-from radiotwin.io.safe_xml import parse_elements
+from radiotwin.io.inputs import parse_elements, require_within
 
 SHAPE_TYPES = ("ply", "obj", "cube", "rectangle", "sphere", "merge")
 # The last four are colours of older files: the name of such a material says what it is made of.

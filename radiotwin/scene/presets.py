@@ -18,8 +18,7 @@ import trimesh
 from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_folder, scratch_folder
 from radiotwin.scene import Scene
-from radiotwin.scene.build import BuildOptions, build_scene, check_target
-from radiotwin.scene.city_files import CityShape, write_city
+from radiotwin.scene.build import BuildOptions, BuildReport, build_scene, check_target
 from radiotwin.scene.config import (
     DeviceConfig,
     Extent,
@@ -29,10 +28,9 @@ from radiotwin.scene.config import (
     UavConfig,
     write_config,
 )
-from radiotwin.scene.folder import keep_declarations
+from radiotwin.scene.folder import CityShape, keep_declarations, write_city
 from radiotwin.scene.materials import itu_material
-from radiotwin.scene.preview import draw_preview
-from radiotwin.scene.report import BuildReport
+from radiotwin.scene.plot import draw_preview
 
 
 @dataclass(frozen=True)

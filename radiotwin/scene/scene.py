@@ -14,11 +14,10 @@ from radiotwin.errors import BadInput
 from radiotwin.io.budgets import SHAPES
 from radiotwin.io.inputs import open_input, read_bytes, require_within
 from radiotwin.scene.antennas import Antenna, Pattern, read_pattern
-from radiotwin.scene.city_files import mesh_paths
-from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.citymap import CityMap, shape_height_sds_m
 from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
+from radiotwin.scene.folder import mesh_paths
 from radiotwin.scene.lattice import Lattice
-from radiotwin.scene.perturbation import shape_height_sds_m
 from radiotwin.scene.vegetation import Vegetation
 
 if TYPE_CHECKING:

@@ -1,8 +1,11 @@
-"""Tracing in pieces: what one call of the solver gets, and the function that solves it.
+"""Tracing in pieces: what one call of the solver gets, what solves it, and where it is kept.
 
-Gains averaged over the cells of a lattice, by Sionna RT's radio map solver.
+Each finished piece of a map is kept on disk, so that an interrupted trace can be resumed.
 """
 
+import hashlib
+import io
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,79 +14,87 @@ from typing import Any
 import numpy as np
 
 from radiotwin.errors import BadInput
+from radiotwin.io.files import atomic_path
+from radiotwin.io.inputs import read_bytes, require_within
+from radiotwin.io.signals import note_finished
 from radiotwin.runtime.cuda import share_of_gpu
-from radiotwin.runtime.execution import Job, Resources
+from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
-from radiotwin.scene.city_files import CityShape, read_city
+from radiotwin.scene.folder import CityShape, read_city
 from radiotwin.scene.lattice import Lattice
-from radiotwin.trace.batches import BatchStore
-from radiotwin.trace.settings import SolverSettings
-from radiotwin.trace.sionna_scene import City, import_sionna, load_city
-from radiotwin.trace.solver import Antennas, PathGains, power_to_db
+from radiotwin.trace.settings import FINER, SolverSettings
+from radiotwin.trace.solver import Antennas, CellGains, PathGains
 from radiotwin.trace.tiles import PackedCity, Tile, batches_by_place, longest_path_m, tile_of
 
 GEOMETRY_COPIES = 3  # of a packed city in a worker: as received, unpacked, and a tile of it
 
 
-class CellGains:
-    """Gains from one device to the cells around lattice positions, one altitude at a time.
-
-    A cell is a horizontal square of side `lattice.step_m`, centred on its position. Its gain is the
-    power that all rays carry through it: an average over 400 m² where the step is 20 m, not the
-    gain at a point. So the border of a shadow is blurred, and a link in it has no sharp LoS.
+class BatchStore:
+    """A folder of arrays that belong to one key.
 
     Args:
-        city: `city.xml` of a scene folder, or what `read_city` returns; None for free space.
-        frequency_hz: Frequency [Hz].
-        settings: Settings with solver `map`.
-        lattice: Positions.
+        scene_folder: Its folder `cache` holds them.
+        key: Everything that decides the arrays; different keys have different folders.
 
-    Raises:
-        BadInput: The file cannot be read.
-        RunFailed: No usable libLLVM.
+    Attributes:
+        hash: SHA-256 of the key.
+        folder: The folder.
     """
 
-    def __init__(self, city: City, frequency_hz: float, settings: SolverSettings,
-                 lattice: Lattice) -> None:
-        self.settings = settings
-        self.lattice = lattice
-        self._city = load_city(city, frequency_hz, settings.compute_device)
-        rt = import_sionna(settings.compute_device)
-        self._solver = rt.RadioMapSolver()
-        self._transmitter = rt.Transmitter("device", position=[0.0, 0.0, 0.0])
-        self._city.add(self._transmitter)
+    def __init__(self, scene_folder: Path, key: dict[str, Any]) -> None:
+        text = json.dumps(key, sort_keys=True, indent=1)
+        self.hash = hashlib.sha256(text.encode()).hexdigest()
+        self.folder = require_within(scene_folder,
+                                     scene_folder / "cache" / f"trace-{self.hash[:12]}",
+                                     str(scene_folder))
+        if not (self.folder / "key.json").is_file():
+            with atomic_path(self.folder / "key.json") as temporary:
+                temporary.write_text(text + "\n", encoding="utf-8")
 
-    def solve(self, device_m: np.ndarray, z_m: float) -> np.ndarray:
-        """Solve one altitude.
+    def get(self, name: str, size: int) -> np.ndarray | None:
+        """Read an array.
 
         Args:
-            device_m: (3,) position [m].
-            z_m: Altitude [m].
+            name: Name that it was saved under.
+            size: Its length.
 
         Returns:
-            (ny * nx,) gain [dB]; NaN where no ray came through.
+            (size,) array; None where it is absent, damaged, or not as `put` writes it.
         """
-        import drjit
+        try:
+            data = read_bytes(self.folder / f"{name}.npy", "batch of a trace")
+        except BadInput:
+            return None
+        if len(data) < 8 * size:
+            return None
+        array = np.frombuffer(data[len(data) - 8 * size:], dtype=float)
+        if data != _file_content(array):
+            return None
+        note_finished()
+        return array
 
-        settings, lattice = self.settings, self.lattice
-        step_m = lattice.step_m
-        self._transmitter.position = [float(value) for value in device_m]
-        radio_map = self._solver(
-            self._city,
-            center=[float(np.mean(lattice.x_m)), float(np.mean(lattice.y_m)), float(z_m)],
-            orientation=[0.0, 0.0, 0.0], cell_size=[step_m, step_m],
-            size=[len(lattice.x_m) * step_m, len(lattice.y_m) * step_m],
-            samples_per_tx=settings.samples_per_src, max_depth=settings.max_depth,
-            refraction=settings.refraction, diffraction=settings.diffraction, seed=settings.seed)
-        power = np.array(radio_map.path_gain, dtype=float).reshape(-1)
-        del radio_map
-        drjit.flush_malloc_cache()
-        return power_to_db(power)
+    def put(self, name: str, array: np.ndarray) -> None:
+        """Save an array, completely or not at all.
+
+        Args:
+            name: Name in the store.
+            array: (n,) floats.
+        """
+        with atomic_path(self.folder / f"{name}.npy") as temporary:
+            temporary.write_bytes(_file_content(array))
+        note_finished()
+
+
+def _file_content(array: np.ndarray) -> bytes:
+    """Return the bytes of a `.npy` file of floats."""
+    file = io.BytesIO()
+    np.save(file, np.asarray(array, dtype=float), allow_pickle=False)
+    return file.getvalue()
 
 
 @dataclass(frozen=True, eq=False)
-class Links:
+class LinkBatch:
     """Links from one device that are solved together: one piece of a trace.
 
     What a piece holds does not depend on the number of workers, as a gain depends, in rare cases,
@@ -108,7 +119,7 @@ class Links:
     def __len__(self) -> int:
         return len(self.points_m)
 
-    def halves(self) -> "tuple[Links, Links] | None":
+    def halves(self) -> "tuple[LinkBatch, LinkBatch] | None":
         """Return two pieces that are solved in half the memory; None where it has one point."""
         if len(self) < 2 or self.batch_receivers < 2:
             return None
@@ -121,7 +132,7 @@ class Links:
 
 def link_pieces(scene: Scene, settings: SolverSettings,
                 devices: Sequence[tuple[str, np.ndarray, Antenna | None]], points_m: np.ndarray,
-                size: int | None = None) -> tuple[list[Links], np.ndarray]:
+                size: int | None = None) -> tuple[list[LinkBatch], np.ndarray]:
     """Return the links of some devices to the same points in pieces.
 
     Points are solved together in their order, or where there are tiles by place.
@@ -149,8 +160,8 @@ def link_pieces(scene: Scene, settings: SolverSettings,
             tile = None
             if settings.radius_m is not None and settings.is_tiled:
                 tile = tile_of(device_m, points_m[batch], settings.radius_m, longest_m)
-            pieces.append(Links(f"{name}-{number:05d}", device_m, points_m[batch],
-                                (antenna, scene.uav_antenna), settings.batch_receivers, tile))
+            pieces.append(LinkBatch(f"{name}-{number:05d}", device_m, points_m[batch],
+                                    (antenna, scene.uav_antenna), settings.batch_receivers, tile))
     return pieces, np.concatenate([np.zeros(0, dtype=int), *batches])
 
 
@@ -173,7 +184,7 @@ class _Solve:
 class SolveLinks(_Solve):
     """Gains along paths, see `PathGains`."""
 
-    def __call__(self, piece: Links) -> np.ndarray:
+    def __call__(self, piece: LinkBatch) -> np.ndarray:
         """Return (n,) gains [dB]."""
         if self._solver is None or self._solver.settings.batch_receivers != piece.batch_receivers:
             settings = replace(self._settings, batch_receivers=piece.batch_receivers)
@@ -205,7 +216,7 @@ class SolveTiles:
         """Memory that the geometry takes beside the solver's own."""
         return GEOMETRY_COPIES * self._city.nbytes
 
-    def __call__(self, piece: Links) -> np.ndarray:
+    def __call__(self, piece: LinkBatch) -> np.ndarray:
         """Return (n,) gains [dB]."""
         assert piece.tile is not None
         if self._solved != (piece.tile, piece.batch_receivers):
@@ -226,14 +237,15 @@ class SolveCells(_Solve):
         super().__init__(scene, settings)
         self._lattice: Lattice = scene.lattice
 
-    def __call__(self, piece: Links) -> np.ndarray:
+    def __call__(self, piece: LinkBatch) -> np.ndarray:
         """Return (n,) gains [dB]."""
         if self._solver is None:
             self._solver = CellGains(self._city, self._frequency_hz, self._settings, self._lattice)
         return self._solver.solve(piece.device_m, piece.points_m[0, 2])
 
 
-def link_job(scene: Scene, settings: SolverSettings, description: str) -> Job[Links, np.ndarray]:
+def link_job(scene: Scene, settings: SolverSettings,
+             description: str) -> Job[LinkBatch, np.ndarray]:
     """Return the job that traces pieces.
 
     Args:
@@ -247,10 +259,10 @@ def link_job(scene: Scene, settings: SolverSettings, description: str) -> Job[Li
     if settings.is_tiled:
         solve = SolveTiles(scene, settings)
         return Job(description, solve, _resources(settings, solve.geometry_bytes), len,
-                   Links.halves, lambda first, second: np.concatenate([first, second]))
+                   LinkBatch.halves, lambda first, second: np.concatenate([first, second]))
     resources = _resources(settings)
     if settings.solver == "paths":
-        return Job(description, SolveLinks(scene, settings), resources, len, Links.halves,
+        return Job(description, SolveLinks(scene, settings), resources, len, LinkBatch.halves,
                    lambda first, second: np.concatenate([first, second]))
     if any(antenna is not None for antenna in (*scene.device_antennas, scene.uav_antenna)):
         raise BadInput(f"{scene.folder / 'scene.toml'} declares antennas, which the solver 'map' "
@@ -272,11 +284,107 @@ class KeptBatches:
 
     store: BatchStore
 
-    def get(self, piece: Links) -> tuple[np.ndarray] | None:
+    def get(self, piece: LinkBatch) -> tuple[np.ndarray] | None:
         """Return the gains of a piece in a tuple; None where they are not kept."""
         found = self.store.get(piece.name, len(piece))
         return None if found is None else (found,)
 
-    def put(self, piece: Links, result: np.ndarray, messages: list[str], seconds: float) -> None:
+    def put(self, piece: LinkBatch, result: np.ndarray, messages: list[str],
+            seconds: float) -> None:
         """Keep the gains of a piece."""
         self.store.put(piece.name, result)
+
+
+def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
+                  executor: Executor) -> np.ndarray:
+    """Return the gains of every lattice position; only what the store lacks is solved.
+
+    Args:
+        scene: City, devices and lattice.
+        settings: Settings of the solver.
+        store: Store of this scene and these settings.
+        index: Indices into `scene.config.devices`.
+        executor: Where it runs.
+
+    Returns:
+        (devices, positions) gain [dB], NaN where there is no path.
+
+    Raises:
+        BadInput: The scene cannot be read, or the store not written.
+        RunFailed: No usable libLLVM.
+    """
+    pieces = lattice_pieces(scene, settings, index)
+    return _solve(scene, settings, store, pieces, executor, "tracing")
+
+
+def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
+                executor: Executor) -> tuple[slice, np.ndarray, np.ndarray]:
+    """Solve a sample of links with ten times the rays, in the same memory.
+
+    The sample is 1 % of the positions (at least 8; drawn by the settings' seed) for all devices.
+    With the solver `map`, which solves whole altitudes, it is the lowest altitude for the first
+    device.
+
+    Args:
+        scene: City, devices and lattice.
+        settings: Settings of the solver.
+        store: Store of this scene and these settings.
+        index: Indices into `scene.config.devices`.
+        executor: Where it runs.
+
+    Returns:
+        Rows and columns in the result of `solve_lattice`, and their gains (rows, columns) [dB].
+
+    Raises:
+        BadInput: The scene cannot be read, or the store not written.
+        RunFailed: No usable libLLVM.
+    """
+    total = len(scene.lattice.positions_m)
+    if settings.solver == "paths":
+        count = min(total, max(8, round(0.01 * total)))
+        rng = np.random.default_rng(settings.seed)
+        columns = np.sort(rng.choice(total, size=count, replace=False))
+        rows = slice(0, len(index))
+    else:
+        columns, rows = np.arange(_plane(scene)), slice(0, 1)
+    finer = settings.finer(FINER)
+    pieces = lattice_pieces(scene, finer, index[rows], columns, "finer")
+    gain_db = _solve(scene, finer, store, pieces, executor, "numerical noise")
+    return rows, columns, gain_db
+
+
+def _plane(scene: Scene) -> int:
+    """Return the number of positions at one altitude."""
+    return len(scene.lattice.y_m) * len(scene.lattice.x_m)
+
+
+def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
+                   columns: np.ndarray | None = None, label: str = ""
+                   ) -> tuple[list[LinkBatch], np.ndarray]:
+    """Return the pieces that a map is traced in, and the order of the positions in them.
+
+    Args:
+        scene: City, devices and lattice.
+        settings: Settings of the solver.
+        index: Indices into `scene.config.devices`.
+        columns: Indices of positions; None: all.
+        label: Of their names; empty: that of a map's own.
+    """
+    points_m = scene.lattice.positions_m if columns is None else scene.lattice.positions_m[columns]
+    label = label or ("batch" if settings.solver == "paths" else "altitude")
+    devices = [(f"device-{device:03d}-{label}", scene.device_m[device],
+                scene.device_antennas[device]) for device in index]
+    size = settings.batch_receivers if settings.solver == "paths" else _plane(scene)
+    return link_pieces(scene, settings, devices, points_m, size)
+
+
+def _solve(scene: Scene, settings: SolverSettings, store: BatchStore,
+           traced: tuple[list[LinkBatch], np.ndarray], executor: Executor, description: str
+           ) -> np.ndarray:
+    """Return the (devices, positions) gains of all pieces [dB]."""
+    pieces, order = traced
+    job = link_job(scene, settings, description)
+    solved_db = np.concatenate(executor.run(job, pieces, KeptBatches(store)))
+    gain_db = np.empty((len(solved_db) // len(order), len(order)))
+    gain_db[:, order] = solved_db.reshape(gain_db.shape)
+    return gain_db

@@ -22,10 +22,8 @@ from radiotwin.runtime.execution.job import peak_bytes
 from radiotwin.runtime.execution.local import LocalPool
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
-from radiotwin.trace.gates import noise_figures
-from radiotwin.trace.lattice_gains import lattice_pieces
-from radiotwin.trace.link_job import KeptBatches, Links, link_job
-from radiotwin.trace.run import device_indices, open_store
+from radiotwin.trace.link_job import KeptBatches, LinkBatch, lattice_pieces, link_job
+from radiotwin.trace.run import device_indices, noise_figures, open_store
 from radiotwin.trace.settings import FINER, QUALITIES, SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, PathGains
 from radiotwin.trace.tiles import with_radius
@@ -86,7 +84,7 @@ class _Measured:
 
     function: Any
 
-    def __call__(self, piece: Links) -> tuple[np.ndarray, float, float, int]:
+    def __call__(self, piece: LinkBatch) -> tuple[np.ndarray, float, float, int]:
         wall_s, processor_s = time.perf_counter(), time.process_time()
         found = self.function(piece)
         return (found, time.perf_counter() - wall_s, time.process_time() - processor_s,

@@ -19,7 +19,7 @@ from radiotwin.runtime.pieces import KeptParts
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import CityMap
-from radiotwin.trace.link_job import Links, link_job, link_pieces
+from radiotwin.trace.link_job import LinkBatch, link_job, link_pieces
 from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB
@@ -59,7 +59,7 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
         device_m, antennas or [None] * len(device_m))], points_m)
     decided_by = scene.content_hash()
 
-    def inputs(piece: Links) -> tuple:
+    def inputs(piece: LinkBatch) -> tuple:
         own = replace(settings, batch_receivers=piece.batch_receivers)
         return (decided_by, own.attributes(), piece.device_m, piece.points_m, piece.antennas,
                 *([] if piece.tile is None else [piece.tile]))

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.scene import Scene
-from radiotwin.scene.city_files import CityShape
+from radiotwin.scene.folder import CityShape
 from radiotwin.scene.materials import Material
 from radiotwin.trace.settings import SolverSettings
 

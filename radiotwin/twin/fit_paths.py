@@ -28,8 +28,7 @@ from radiotwin.runtime.console import progress
 from radiotwin.runtime.execution import Executor
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
-from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.perturbation import perturbed_map
+from radiotwin.scene.citymap import CityMap, perturbed_map
 from radiotwin.twin.fit_links import fit_links, provenance, reliable_m
 from radiotwin.twin.localize import (
     Relocation,

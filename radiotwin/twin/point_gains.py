@@ -9,8 +9,7 @@ import xarray as xr
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import ROWS
-from radiotwin.maps.export.ns3 import write_ns3
-from radiotwin.maps.export.tables import check_map_place
+from radiotwin.maps.export.tables import check_map_place, write_ns3
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin

@@ -16,7 +16,7 @@ import pytest
 from radiotwin.errors import RunFailed
 from radiotwin.maps.export import EXPORTERS
 from radiotwin.maps.survey import fly_survey, segmented_truth
-from radiotwin.trace.batches import BatchStore
+from radiotwin.trace.link_job import BatchStore
 from tests.command_line import run_planning
 
 DISK_BYTES = 1024 * 1024

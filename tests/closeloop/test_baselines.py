@@ -18,7 +18,7 @@ from radiotwin.closeloop.predict.baselines import (
     published_laws,
 )
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
-from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.links import prepare_links
 from radiotwin.links.variables import feature_count, link_features
 from radiotwin.propagation.laws.log_distance import LogDistance

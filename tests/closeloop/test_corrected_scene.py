@@ -25,11 +25,10 @@ from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.materials import itu_material
+from radiotwin.scene.folder import CityShape, write_city
+from radiotwin.scene.materials import STANDARD, itu_material, with_pairs
 from radiotwin.scene.readers import MapOptions, build_scene_from_map
-from radiotwin.scene.readers.material_table import STANDARD, with_pairs
 from radiotwin.trace import SolverSettings, trace_gains
 from tests.terrains import incline, terrain_map
 

@@ -8,8 +8,8 @@ import trimesh
 
 from radiotwin.propagation.laws.log_distance import LogDistance, LogDistanceLine
 from radiotwin.scene import Scene
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import parse_config, write_config
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import itu_material
 from radiotwin.twin import Twin
 from radiotwin.twin.localize import TwinDevice

@@ -9,7 +9,7 @@ import trimesh
 from radiotwin.effects.catalogue.lock_loss import LockLoss
 from radiotwin.effects.catalogue.path_strength import WallReflection
 from radiotwin.effects.catalogue.roof_heights import RoofHeights
-from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.effect_model import EffectModel, device_sd_db

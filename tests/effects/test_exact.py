@@ -8,7 +8,7 @@ from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
 from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
 from radiotwin.effects.catalogue.position_errors import DevicePositionError, ReceiverPositionError
 from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle, only_blocker
-from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model import fitting

@@ -6,7 +6,7 @@ import pytest
 from radiotwin.effects.catalogue.ground_reflection import GroundReflection, two_ray_db
 from radiotwin.effects.catalogue.interference import Interference
 from radiotwin.effects.catalogue.lock_loss import LockLoss
-from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin.model.effect_model import EffectModel

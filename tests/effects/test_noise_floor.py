@@ -9,7 +9,7 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.search.selection import fit_candidate, score_candidate
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.effects.catalogue.noise_floor import NoiseFloor
-from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.links import evidence_blocks
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.runtime.execution import Executor

@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import quad
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.frame import Frame, find_frame, to_geographic
+from radiotwin.importing.positions import Frame, find_frame, to_geographic
 from radiotwin.io.forms import Origin
 
 A_M, F = 6378137.0, 1 / 298.257223563

@@ -6,7 +6,7 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.repeats import stay_representatives
-from radiotwin.importing.times import clock_notes
+from radiotwin.importing.units import clock_notes
 
 COLUMNS = {"level": "level", "device": "device", "x": "x", "y": "y", "time": "t"}
 GIVEN = {"columns": COLUMNS, "length_unit": "m", "time_format": "ISO 8601", "time_zone": "UTC"}

@@ -9,7 +9,7 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.source import Source
-from radiotwin.importing.times import calendar_days, seconds
+from radiotwin.importing.units import calendar_days, seconds
 
 
 def read(values, form, zone=None):

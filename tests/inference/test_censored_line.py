@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from radiotwin.inference.censored_line import LogDistanceLine, fit_line, fit_sd_db, shift_line
+from radiotwin.inference.gaussian import LogDistanceLine, fit_line, fit_sd_db, shift_line
 
 TRUE = np.array([-35.0, -3.04, 5.0**0.5])
 LIMIT_DB = -107.0

@@ -152,7 +152,7 @@ def test_what_no_radio_map_has_is_refused_before_memory_is_taken(path, tmp_path,
 
 
 def test_a_piece_that_swells_is_refused(path, monkeypatch):
-    monkeypatch.setattr("radiotwin.io.hdf5._MAX_INFLATED", 2**16)
+    monkeypatch.setattr("radiotwin.io.array_stores._MAX_INFLATED", 2**16)
     with h5py.File(path, "r+") as file:
         del file["gain_db"]
         gain = file.create_dataset("gain_db", (1, 1, 100, 100), "f4", chunks=(1, 1, 100, 100), compression="gzip")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.io.run_tables import read_table
+from radiotwin.io.cells import read_table
 
 KINDS = {"flight": "text", "time_s": "number", "x_m": "number or nothing", "los": "0 or 1"}
 HEADER = "flight,time_s,x_m,los,other\n"

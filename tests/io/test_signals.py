@@ -67,8 +67,8 @@ def signalled(self, *item):
     return set_item(self, *item)
 enum._EnumDict.__setitem__ = signalled
 from radiotwin.io import signals
-from radiotwin.runtime.exits import exit_status
-from radiotwin.trace.sionna_scene import import_sionna
+from radiotwin.runtime.command import exit_status
+from radiotwin.trace.solver import import_sionna
 signals.leave(exit_status(import_sionna, "all is kept"))
 """
 

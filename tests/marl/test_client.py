@@ -20,7 +20,7 @@ from marl.fedqmix.shared import Shared, initial_weights
 from marl.settings import PRESETS, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.maps.survey import fly_survey, segmented_truth
-from radiotwin.runtime.exits import exit_status
+from radiotwin.runtime.command import exit_status
 
 LEARNER = PRESETS["fast"].model_copy(update={
     "parallel": 4, "batch": 4, "replay": 16, "hidden": 8, "mixing_width": 4, "federate_every": 8,

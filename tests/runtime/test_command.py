@@ -13,7 +13,7 @@ import typer
 
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.io import files, signals
-from radiotwin.runtime.exits import exit_status
+from radiotwin.runtime.command import exit_status
 
 ROOT = Path(__file__).parents[2]
 

@@ -148,7 +148,7 @@ def test_the_device_is_among_what_decides_a_gain_but_for_the_processor():
 
 @pytest.mark.llvm
 def test_one_process_traces_on_one_device():
-    from radiotwin.trace.sionna_scene import import_sionna, load_city
+    from radiotwin.trace.solver import import_sionna, load_city
 
     import_sionna()
     with pytest.raises(RunFailed, match="llvm_ad_mono_polarized in this process already"):

@@ -7,8 +7,7 @@ from rich.console import Console
 
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
-from radiotwin.scene.build import BuildOptions, build_scene
-from radiotwin.scene.report import print_report
+from radiotwin.scene.build import BuildOptions, build_scene, print_report
 
 
 def check(source, **options):

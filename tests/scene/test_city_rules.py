@@ -5,8 +5,8 @@ import shutil
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.city_files import read_city, read_triangles
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.folder import read_city, read_triangles
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 
 GROUND = '<shape type="rectangle" id="g"><transform><scale value="50"/></transform><ref id="mat-concrete"/></shape>'

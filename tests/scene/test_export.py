@@ -11,8 +11,8 @@ import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
-from radiotwin.scene.city_files import CityShape, read_city, write_city
 from radiotwin.scene.export import Y_UP, export_scene
+from radiotwin.scene.folder import CityShape, read_city, write_city
 
 POINTS_M = np.array([[x, y, z] for x in (10.0, 130.0, 250.0) for y in (20.0, 170.0, 290.0) for z in (2.0, 55.0)])
 
@@ -86,8 +86,7 @@ def test_traced_gains_agree_before_and_after(small_scene, tmp_path):
     """Rationale: a city that leaves and comes back must be the same one for radio waves. Expected: gains of Sionna RT
     in the exported XML, and in cities put together again from glTF and OBJ, equal those of the scene."""
     from radiotwin.trace import SolverSettings
-    from radiotwin.trace.sionna_scene import import_sionna
-    from radiotwin.trace.solver import PathGains
+    from radiotwin.trace.solver import PathGains, import_sionna
 
     settings = SolverSettings(samples_per_src=10_000, batch_receivers=len(POINTS_M), max_num_paths_per_src=100_000)
     frequency_hz, device_m = small_scene.config.radio.frequency_hz, small_scene.device_m[0]

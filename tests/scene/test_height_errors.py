@@ -9,8 +9,7 @@ from radiotwin.effects.boxes import Box
 from radiotwin.effects.catalogue.missing_obstacle import _with_box
 from radiotwin.errors import BadInput
 from radiotwin.io.content_hash import content_hash
-from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.perturbation import shape_height_sds_m
+from radiotwin.scene.citymap import CityMap, shape_height_sds_m
 from radiotwin.scene.presets import building_meshes
 
 

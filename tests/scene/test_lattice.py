@@ -8,9 +8,8 @@ from rich.console import Console
 
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
-from radiotwin.scene.build import BuildOptions, build_scene
+from radiotwin.scene.build import BuildOptions, build_scene, print_report
 from radiotwin.scene.lattice import Lattice
-from radiotwin.scene.report import print_report
 
 
 def test_both_borders_belong_to_it():

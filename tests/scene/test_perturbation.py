@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.citymap import CityMap, building_of_vertex, perturbed_map
 from radiotwin.scene.materials import Material
-from radiotwin.scene.perturbation import building_of_vertex, perturbed_map
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 
 SIDE = 12  # houses along each side of the town

@@ -4,8 +4,7 @@ import pytest
 
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions, build_scene
-from radiotwin.scene.plot import height_grid
-from radiotwin.scene.preview import draw_preview
+from radiotwin.scene.plot import draw_preview, height_grid
 
 
 @pytest.fixture

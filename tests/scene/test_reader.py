@@ -7,8 +7,8 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
-from radiotwin.scene.city_files import read_city, read_triangles, write_city
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.folder import read_city, read_triangles, write_city
 
 FOREIGN = """
   <integrator type="no-such-plugin"/>
@@ -44,7 +44,7 @@ def test_nothing_foreign_is_passed_on(folder, tmp_path):
 @pytest.mark.llvm
 def test_mitsuba_does_not_read_the_file_of_the_scene(folder, small_scene):
     """Rationale: Mitsuba loads plugins and files that an XML file names. Expected: it gets none of them."""
-    from radiotwin.trace.sionna_scene import load_city
+    from radiotwin.trace.solver import load_city
 
     city = load_city(change(folder, "\n</scene>", FOREIGN), 2.4e9)
     assert len(city.objects) == len(load_city(small_scene.xml_path, 2.4e9).objects)

@@ -9,10 +9,9 @@ import trimesh
 from scipy.ndimage import gaussian_filter
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.citymap import CityMap, perturbed_map
 from radiotwin.scene.config import parse_config
 from radiotwin.scene.lattice import Lattice
-from radiotwin.scene.perturbation import perturbed_map
 from radiotwin.scene.terrain import HeightGrid, triangulate
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 from tests.terrains import incline, ridge, terrain_map

@@ -1,8 +1,8 @@
 import pytest
 import trimesh
 
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material, itu_material
 
 

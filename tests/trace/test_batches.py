@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.trace.batches import BatchStore
+from radiotwin.trace.link_job import BatchStore
 
 
 def test_array_comes_back_to_the_bit(tmp_path):

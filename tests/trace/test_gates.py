@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import RunFailed
-from radiotwin.trace.gates import check_gains, free_space_gain_db
+from radiotwin.trace.run import check_gains, free_space_gain_db
 
 FREQUENCY_HZ = 2.4e9
 

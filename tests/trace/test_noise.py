@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.trace.gates import noise_figures
+from radiotwin.trace.run import noise_figures
 
 
 def test_figures_of_a_known_difference():

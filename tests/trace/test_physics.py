@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.special import fresnel
 
-from radiotwin.scene.city_files import CityShape, write_city
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains

@@ -8,7 +8,7 @@ import pytest
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.io.forms import Origin
 from radiotwin.maps.radiomap import RadioMap
-from radiotwin.maps.survey.truth import read_truth
+from radiotwin.maps.survey import read_truth
 from radiotwin.scene import Scene
 from radiotwin.scene.config import write_config
 from radiotwin.scene.ply import read_ply, write_ply

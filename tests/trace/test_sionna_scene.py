@@ -11,8 +11,8 @@ import pytest
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
 from radiotwin.scene.build import build_scene
-from radiotwin.scene.city_files import read_city
-from radiotwin.trace.sionna_scene import import_sionna, load_city
+from radiotwin.scene.folder import read_city
+from radiotwin.trace.solver import import_sionna, load_city
 
 ROOT = Path(__file__).parents[2]
 MARKER = """

@@ -5,10 +5,10 @@ import pytest
 import trimesh
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.city_files import CityShape, read_city
+from radiotwin.scene.folder import CityShape, read_city
 from radiotwin.scene.materials import Material
 from radiotwin.trace import SolverSettings, trace_gains, trace_map
-from radiotwin.trace.lattice_gains import lattice_pieces
+from radiotwin.trace.link_job import lattice_pieces
 from radiotwin.trace.tiles import (
     PackedCity,
     batches_by_place,

@@ -9,7 +9,7 @@ import pytest
 from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
-from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.io.forms import Origin
 from radiotwin.links.measurements import Measurements, read_measurements
 from radiotwin.maps.survey import fly_survey, segmented_truth

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.twin import Twin, TwinDevice

@@ -17,8 +17,8 @@ import trimesh
 
 from radiotwin.io.files import atomic_path
 from radiotwin.scene import Scene
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material, permittivity
 from tests.undeclared.shapes import corners_of, fits, prism, turned
 

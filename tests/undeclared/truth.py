@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from radiotwin.trace.sionna_scene import candidate_search, import_sionna, load_city
+from radiotwin.trace.solver import candidate_search, import_sionna, load_city
 
 SPECULAR = {"max_depth": 5, "samples_per_src": 60_000, "max_num_paths_per_src": 1_000_000, "diffraction": True,
             "refraction": False, "seed": 20_011}

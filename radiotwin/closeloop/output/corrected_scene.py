@@ -32,12 +32,11 @@ from radiotwin.io.files import atomic_folder, require_writable
 from radiotwin.io.inputs import is_within, require_within
 from radiotwin.links import site_of
 from radiotwin.scene import Scene
-from radiotwin.scene.city_files import CityShape, read_city, write_city
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, write_config
-from radiotwin.scene.folder import SCENE_FILES, check_target
+from radiotwin.scene.folder import SCENE_FILES, CityShape, check_target, read_city, write_city
 from radiotwin.scene.materials import itu_material, safe_name, traceable, unique_name
-from radiotwin.scene.preview import draw_preview
+from radiotwin.scene.plot import draw_preview
 
 ANTENNAS = "antennas"
 AZIMUTH_DEG, ELEVATION_DEG = np.arange(0.0, 360.0, 5.0), np.arange(-90.0, 91.0, 2.0)

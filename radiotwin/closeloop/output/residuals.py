@@ -19,10 +19,9 @@ from radiotwin.display.axes import RESIDUAL_COLOURS, plain, residual_range_db
 from radiotwin.display.summary import Summarised, count
 from radiotwin.errors import BadInput
 from radiotwin.geo.frames import read_frame
-from radiotwin.io.cells import write_csv
+from radiotwin.io.cells import RESIDUALS, read_table, write_csv
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import Origin
-from radiotwin.io.run_tables import RESIDUALS, read_table
 from radiotwin.links.view import links_dataset, links_table, of_device, plot_links
 from radiotwin.scene import Scene
 

@@ -15,7 +15,7 @@ from radiotwin.effects.arrays import LinkCache, city_of
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
 from radiotwin.links import Links
-from radiotwin.scene.perturbation import perturbed_map
+from radiotwin.scene.citymap import perturbed_map
 
 # Between the accuracies of buildings as blocks with roofs (2 m) and of surveyed ones (0.5 m): LoD2
 # and LoD3 of CityGML 2.0 (OGC 12-019, Table 1); heights are often counted from storeys.

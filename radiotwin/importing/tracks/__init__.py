@@ -1,5 +1,115 @@
-"""Positions of a receiver over time: from files of its own, joined with a log in time."""
+"""Positions of receivers from tracks of their own, at the times of a log's readings."""
 
-from radiotwin.importing.tracks.join import add_tracks
+from datetime import UTC, datetime
+from pathlib import Path
 
-__all__ = ["add_tracks"]
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.importing.read_source import read_source
+from radiotwin.importing.settings import HEIGHTS, Settings, TrackFile
+from radiotwin.importing.source import Source, Tally
+from radiotwin.importing.tracks.fixes import COLUMNS, Fixes, make_fixes
+from radiotwin.importing.tracks.gnss import read_gpx, read_nmea
+from radiotwin.importing.tracks.rosbag import is_rosbag, read_rosbag
+from radiotwin.importing.tracks.ulog import read_ulog
+from radiotwin.importing.units import ISO, METRES, seconds
+from radiotwin.io.cells import listed
+
+_READERS = {".gpx": read_gpx, ".nmea": read_nmea, ".nma": read_nmea, ".ulg": read_ulog}
+
+
+def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
+               tally: Tally) -> tuple[pd.DataFrame, list[str]]:
+    """Fill in the positions that a log does not have from tracks.
+
+    Args:
+        source: the log, for messages.
+        links: as of `build_links`.
+        settings: tracks, and between which positions is interpolated.
+        tally: counts the links at whose time a track has no position.
+
+    Returns:
+        links with `latitude, longitude, altitude` and, where a track has them, angles; and notes.
+
+    Raises:
+        BadInput: a track that cannot be read, no times, or times that have none in common.
+    """
+    if not settings.track:
+        return links, []
+    if "time_s" not in links:
+        raise BadInput(f"{source.path}: a track is joined by time; give the column of the time: "
+                       "--columns time=…")
+    links = links.reset_index(names="row")  # several links of a row share its number
+    time_s = links["time_s"].to_numpy(dtype=float)
+    notes: list[str] = []
+    columns = {name: links[name].to_numpy(dtype=float, copy=True) for name in COLUMNS
+               if name in links}
+    # A height that the log or the settings give is not that of the track.
+    has_height = links.reindex(columns=[*HEIGHTS]).notna().any(axis=1).to_numpy()
+    without = np.ones(len(links), dtype=bool)
+    for name in ("latitude", "x"):
+        if name in links:
+            without &= links[name].isna().to_numpy()
+    for track in settings.track:
+        fixes = _read(track)
+        notes += fixes.notes
+        own = without & (links["receiver"].to_numpy() == track.receiver
+                         if track.receiver else np.True_)
+        if not own.any():
+            raise BadInput(f"{track.file}: no reading needs it: " + (
+                f"receiver {track.receiver!r} is none of {listed(links['receiver'].unique())}"
+                if track.receiver else "the log has positions of its own"))
+        _check_common(source, track, time_s[own] - track.time_offset_s, fixes)
+        found = fixes.at(time_s[own] - track.time_offset_s, settings.track_max_gap_s)
+        for name, values in found.items():
+            column = columns.setdefault(name, np.full(len(links), np.nan))
+            missing = np.isnan(column[own]) & ~(has_height[own] & (name == "altitude"))
+            column[own] = np.where(missing, values, column[own])
+    links = links.assign(**columns).set_index("row")
+    lost = without & np.isnan(columns["latitude"])
+    return tally.drop(links, lost, f"no position of the track within {settings.track_max_gap_s:g} "
+                                   "s", "time", source.where), notes
+
+
+def _read(track: TrackFile) -> Fixes:
+    path = Path(track.file)
+    if is_rosbag(path):
+        return read_rosbag(path, track.topic)
+    if track.topic is not None:
+        raise BadInput(f"{path} is no ROS bag, and has no topic {track.topic!r}; leave the topic "
+                       "out, or give a .bag, .mcap or .db3 file")
+    if path.suffix.lower() in _READERS:
+        return _READERS[path.suffix.lower()](path)
+    source = read_source(path)
+    units = {f"{name}_{unit}": (name, factor) for name in ("altitude",)
+             for unit, factor in METRES.items()}
+    units |= {f"{name}_deg": (name, 1.0) for name in ("latitude", "longitude")}
+    units |= {name: (name, 1.0) for name in COLUMNS} | {"altitude": ("altitude", 1.0)}
+    time = next((name for name in ("time_s", "time") if name in source.table), "time")
+    source.require({"time": time} | {name: name for name in ("latitude", "longitude")
+                                     if f"{name}_deg" not in source.table})
+    time_s = seconds(source, time, "epoch s" if time == "time_s" else ISO, "UTC")
+    values = {name: source.numbers(spec, name) * factor for spec, (name, factor) in units.items()
+              if spec in source.table}
+    return make_fixes(path, time_s, values)
+
+
+def _check_common(source: Source, track: TrackFile, time_s: np.ndarray, fixes: Fixes) -> None:
+    """Refuse a track of another time, as a log in another time zone has."""
+    first_s, last_s = np.nanmin(time_s), np.nanmax(time_s)
+    if last_s < fixes.time_s[0] or first_s > fixes.time_s[-1]:
+        off_h = (first_s - fixes.time_s[0]) / 3600
+        raise BadInput(f"{track.file} runs from {_stamp(fixes.time_s[0])} to "
+                       f"{_stamp(fixes.time_s[-1])} UTC, {source.path} from {_stamp(first_s)} to "
+                       f"{_stamp(last_s)} UTC: they have no time in common, the log begins "
+                       f"{off_h:+.2f} h later. Is time_zone right? time_offset_s of the track is "
+                       "added to its times")
+
+
+def _stamp(time_s: float) -> str:
+    try:
+        return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    except (ValueError, OverflowError, OSError):  # of years that no calendar has
+        return f"{time_s:g} s"

@@ -14,8 +14,7 @@ from typing import Any, Self
 import numpy as np
 from typing_extensions import override
 
-from radiotwin.inference.censored_line import LogDistanceLine, fit_line, shift_line
-from radiotwin.inference.gaussian import Limit
+from radiotwin.inference.gaussian import Limit, LogDistanceLine, fit_line, shift_line
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.base import (
     MAX_DB,

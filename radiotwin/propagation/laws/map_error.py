@@ -36,7 +36,7 @@ from radiotwin.propagation.laws.image_paths import (
     paths_db,
 )
 from radiotwin.runtime.console import progress
-from radiotwin.scene.perturbation import perturbed_map
+from radiotwin.scene.citymap import perturbed_map
 
 MEMBERS = 3  # maps of each size of error
 WALL_SIZES_M = (0.0, 1.0, 2.0, 4.0)

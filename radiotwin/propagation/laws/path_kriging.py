@@ -23,7 +23,7 @@ from radiotwin.propagation.laws.class_fit import DOF, fit_class, scale_db
 from radiotwin.propagation.laws.image_paths import DIFFUSE_DEFAULT, paths_db, stored_diffuse
 from radiotwin.propagation.laws.kriging import RegressionKriging, ResidualField
 from radiotwin.propagation.laws.map_error import Found, MapError, estimate_map_error
-from radiotwin.scene.perturbation import perturbed_map
+from radiotwin.scene.citymap import perturbed_map
 
 MEMBERS = 6  # maps with errors, beside the one that is given
 FOLDS = 4  # of the links that the weight is found with

@@ -17,8 +17,7 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from radiotwin.inference.censored_line import fit_sd_db
-from radiotwin.inference.gaussian import Limit, gaussian_nll_torch
+from radiotwin.inference.gaussian import Limit, fit_sd_db, gaussian_nll_torch
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.adam import Adam
 from radiotwin.propagation.laws.base import (

@@ -40,6 +40,25 @@ _OF_OWN_CLUSTER = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ENABLE_WINDOWS_OR_OSX_CL
                    "RAY_AUTH_MODE": "token"}
 
 
+# A cluster of one command, in a process group of its own: it prints its address, and ends itself
+# when its standard input closes, as that of a killed driver does. Ray's own helpers may outlive a
+# killed driver by a minute.
+_HEAD_PROGRAM = """
+import json, os, shutil, signal, sys
+options = json.loads(sys.stdin.readline())
+import ray
+try:
+    head = ray.init(include_dashboard=False, log_to_driver=False, configure_logging=False,
+                    **options)
+    print(json.dumps({"address": head.address_info["address"]}), flush=True)
+    sys.stdin.read()
+    ray.shutdown()
+finally:
+    shutil.rmtree(options["_temp_dir"], ignore_errors=True)
+    os.killpg(os.getpgrp(), signal.SIGKILL)
+"""
+
+
 class RayPool(Pool):
     """Actors of a Ray cluster.
 
@@ -160,7 +179,7 @@ class _Head:
         self._folder = Path(tempfile.mkdtemp(prefix="radiotwin-ray-"))
         with kept_from_children():
             self._process = subprocess.Popen(
-                [sys.executable, "-P", str(Path(__file__).with_name("ray_head.py"))],
+                [sys.executable, "-P", "-c", _HEAD_PROGRAM],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
                 start_new_session=True, cwd=self._folder)
         assert self._process.stdin is not None and self._process.stdout is not None

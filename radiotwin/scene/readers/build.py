@@ -18,13 +18,15 @@ from radiotwin.io.budgets import FEATURES, SHAPES
 from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import check_input
 from radiotwin.scene import checks
-from radiotwin.scene.build import BuildOptions, Declared, check_target, finish_scene
+from radiotwin.scene.build import BuildOptions, BuildReport, Declared, check_target, finish_scene
 from radiotwin.scene.checks import Problem
 from radiotwin.scene.folder import scene_name, source_text
 from radiotwin.scene.importer import ImportedCity
 from radiotwin.scene.materials import (
     RESERVED_NAMES,
+    STANDARD,
     Material,
+    MaterialTable,
     Names,
     itu_material,
     safe_name,
@@ -49,7 +51,6 @@ from radiotwin.scene.readers.heights import (
     no_height_text,
 )
 from radiotwin.scene.readers.heights import source_text as height_text
-from radiotwin.scene.readers.material_table import STANDARD, MaterialTable
 from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml
 from radiotwin.scene.readers.shapefiles import read_shapefile
 from radiotwin.scene.readers.solids import (
@@ -64,7 +65,6 @@ from radiotwin.scene.readers.solids import (
 from radiotwin.scene.readers.systems import check_declared_system
 from radiotwin.scene.readers.terrain import Ground, make_ground, stand_on
 from radiotwin.scene.readers.vegetation import make_vegetation, vegetation_fact
-from radiotwin.scene.report import BuildReport
 from radiotwin.scene.surfaces import Surfaces
 from radiotwin.scene.vegetation import VegetationConfig
 

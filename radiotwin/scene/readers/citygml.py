@@ -16,7 +16,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import FEATURES, NESTING, TAG_BYTES, VERTICES
-from radiotwin.io.safe_xml import parse_elements
+from radiotwin.io.inputs import parse_elements
 from radiotwin.scene.readers.city_objects import (
     BUILT,
     CityObject,

@@ -39,8 +39,7 @@ from shapely.geometry.base import BaseGeometry
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.io.budgets import FEATURES, FILE_BYTES, OUTLINE_CORNERS, VERTICES
 from radiotwin.io.files import atomic_file
-from radiotwin.io.inputs import check_input
-from radiotwin.io.safe_xml import parse_elements
+from radiotwin.io.inputs import check_input, parse_elements
 from radiotwin.scene.readers.features import (
     BUILDING_KEYS,
     Feature,

@@ -24,11 +24,10 @@ from radiotwin.geo.geodesy import to_local
 from radiotwin.io.budgets import CORNERS, FACES, OVERLAPS, PART_PAIRS, TOUCHING_CORNERS
 from radiotwin.io.forms import Origin
 from radiotwin.scene.checks import Problem, Severity
-from radiotwin.scene.materials import Material
+from radiotwin.scene.materials import Material, MaterialTable
 from radiotwin.scene.meshes import clean
 from radiotwin.scene.readers.features import Feature, Shell, problems_of
 from radiotwin.scene.readers.heights import KNOWN, MAX_HEIGHT_M, Height, HeightColumn, height_of
-from radiotwin.scene.readers.material_table import MaterialTable
 from radiotwin.scene.surfaces import Surfaces
 
 GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do

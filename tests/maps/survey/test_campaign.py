@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.maps.survey import campaign, fly_survey, segmented_truth
-from radiotwin.maps.survey.campaign import PATTERNS
+from radiotwin.maps import survey as campaign
+from radiotwin.maps.survey import PATTERNS, fly_survey, segmented_truth
 from radiotwin.scene import Scene
 
 

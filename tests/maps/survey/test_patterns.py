@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from radiotwin.maps.survey.campaign import PATTERNS
-from radiotwin.maps.survey.grid import FlightGrid
+from radiotwin.maps.survey import PATTERNS, FlightGrid
 
 
 def cost(cells: np.ndarray) -> float:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from radiotwin.propagation.paths import path_powers
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import itu_material
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains

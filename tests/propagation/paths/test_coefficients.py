@@ -13,7 +13,7 @@ from radiotwin.propagation.paths.coefficients import (
     wedge_coefficients,
 )
 from radiotwin.scene.materials import Material, constants, itu_material
-from radiotwin.trace.sionna_scene import import_sionna
+from radiotwin.trace.solver import import_sionna
 
 CONCRETE = slabs_of([itu_material("concrete", thickness_m=0.1)], 2.4e9)
 CONDUCTOR = slabs_of([itu_material("metal")], 2.4e9)

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from radiotwin.propagation.paths.listing import follow_rays
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import itu_material
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains

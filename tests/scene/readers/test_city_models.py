@@ -16,11 +16,11 @@ from radiotwin.geo.geodesy import to_local
 from radiotwin.io.budgets import TAG_BYTES, VERTICES
 from radiotwin.io.forms import Origin
 from radiotwin.scene import Scene
+from radiotwin.scene.materials import STANDARD
 from radiotwin.scene.readers import MapOptions, build_scene_from_map, with_pairs
 from radiotwin.scene.readers.citygml import read_citygml
 from radiotwin.scene.readers.cityjson import read_cityjson
 from radiotwin.scene.readers.extrude import make_blocks
-from radiotwin.scene.readers.material_table import STANDARD
 from radiotwin.scene.readers.solids import find_contacts, make_shell_prisms
 from tests.scene.readers import city_models as made
 

@@ -1,8 +1,7 @@
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.materials import ITU_TABLE
-from radiotwin.scene.readers.material_table import STANDARD, read_material_table, with_pairs
+from radiotwin.scene.materials import ITU_TABLE, STANDARD, read_material_table, with_pairs
 
 
 def of(table, **tags):

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from radiotwin.geo.geodesy import to_geographic
 from radiotwin.io.forms import Origin
+from radiotwin.scene.materials import STANDARD
 from radiotwin.scene.readers.extrude import SLOT_M, make_blocks
 from radiotwin.scene.readers.features import Feature
-from radiotwin.scene.readers.material_table import STANDARD
 from radiotwin.scene.readers.solids import find_contacts, find_overlaps, make_prisms
 
 ORIGIN = Origin(latitude_deg=47.5, longitude_deg=8.7)

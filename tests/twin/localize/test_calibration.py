@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.links import prepare_links
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin.localize import calibrate_radii, locate, misfit

@@ -7,7 +7,7 @@ import pytest
 
 from radiotwin.closeloop.run import close_loop
 from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset
-from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.links import prepare_links
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin.localize.without_map import locate

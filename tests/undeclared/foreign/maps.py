@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from radiotwin.scene.city_files import CityShape, write_city
 from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
+from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material, permittivity
 from tests.undeclared.foreign.layouts import GROUND, Building
 from tests.undeclared.foreign.worlds import World

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from radiotwin.trace.sionna_scene import candidate_search, import_sionna, load_city
+from radiotwin.trace.solver import candidate_search, import_sionna, load_city
 from tests.undeclared.foreign.worlds import Settings
 
 MOST_PATHS, WEAKEST_DB = 8, -25.0  # of a link, below its strongest

@@ -1,18 +1,22 @@
-"""Conversion of clock readings to seconds since 1970-01-01 UTC.
+"""Cells of a log in the units of the project: times [s], levels [dB, dBm] and lengths [m].
 
-Clocks that begin anew, or overlap: a receiver would be at two places at once.
+Times count from 1970-01-01 UTC. Clocks that begin anew, or overlap, are noted: a receiver would be
+at two places at once.
 """
 
 import re
+from dataclasses import dataclass
 from zoneinfo import ZoneInfo, available_timezones
 
 import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.source import Source, as_text
-from radiotwin.io.cells import shown
+from radiotwin.importing.settings import Settings
+from radiotwin.importing.source import EMPTY, Source, as_text
+from radiotwin.io.cells import as_numbers, shown
 
+METRES = {"m": 1.0, "ft": 0.3048}  # the international foot, exact since 1959
 EPOCH_S = {"epoch s": 1.0, "epoch ms": 1e-3}
 ISO = "ISO 8601"
 ALLOWED = (f"allowed are {', '.join(EPOCH_S)}, {ISO}, or a strftime format, such as "
@@ -27,6 +31,13 @@ ELSEWHERE_M = 20.0  # within that time, for which a receiver would have to fly
 FAST_M_S = 100.0  # beyond this it does not fly
 MIN_PAIRS = 3  # of readings at two places, that are no single bad fix
 MIN_SHARE = 0.02  # of the pairs of readings that follow each other so fast
+LEVEL_COLUMN = {"dBm": "rssi_dbm", "mW": "rssi_dbm", "W": "rssi_dbm", "dB": "gain_db"}
+"""Unit in the file -> column of `measurements.csv`."""
+NOT_A_NUMBER = "nan"
+MILLIWATTS = {"mW": 1.0, "W": 1e3}
+POSSIBLE_DB = (-250.0, 0.0)
+"""Open interval [dBm or dB]: thermal noise in 1 Hz is -174 dBm, no receiver gets a milliwatt
+(0 dBm), and no channel amplifies."""
 
 
 def seconds(source: Source, spec: str, time_format: str | None, zone: str | None) -> np.ndarray:
@@ -190,3 +201,109 @@ def clock_notes(links: pd.DataFrame) -> list[str]:
                 f"flight {flight[at[0]]!r}): its clock began anew, or it is several receivers; "
                 "split the log where the clock goes back, or name them")
     return notes
+
+
+def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
+    """Convert lengths to metres.
+
+    Args:
+        numbers: (n,) in `unit`.
+        unit: of `METRES`; None if it is not declared.
+        column: file and column, for the message.
+
+    Returns:
+        lengths [m], (n,).
+
+    Raises:
+        BadInput: the unit is not declared.
+    """
+    if unit is None:
+        known = numbers[np.isfinite(numbers)]
+        values = f"run from {known.min():g} to {known.max():g}" if len(known) else "are all empty"
+        raise BadInput(f"{column}: length_unit is not given; allowed are {' and '.join(METRES)}. "
+                       f"The values {values}")
+    return numbers * METRES[unit]
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of one column.
+
+    Attributes:
+        db: level [dBm, or dB for gains], (n,); NaN = not detected, or not usable.
+        not_measured: (n,) bool, the receiver did not listen.
+        impossible: (n,) bool, outside `POSSIBLE_DB`.
+    """
+
+    db: np.ndarray
+    not_measured: np.ndarray
+    impossible: np.ndarray
+
+
+def read_levels(source: Source, spec: str, settings: Settings,
+                offset_db: float | np.ndarray = 0.0) -> Levels:
+    """Read the levels of one column.
+
+    Args:
+        source: the file.
+        spec: the column.
+        settings: unit, and the values that mean not detected or not measured.
+        offset_db: added to each level, or (n,) to each its own.
+
+    Raises:
+        BadInput: the unit is not declared, a cell is not a number, or empty cells have no declared
+            meaning.
+    """
+    cells = source.cells(spec, "level")
+    text = as_text(cells)
+    is_text = cells.dtype.kind not in "fiu"
+    if is_text:  # the word, unlike an empty cell, is what a program wrote
+        named = cells.notna() & (cells.astype(str).str.strip().str.lower() == NOT_A_NUMBER)
+        text = text.mask(named, NOT_A_NUMBER)
+    numbers = as_numbers(text)
+    not_measured = _is_one_of(text, numbers, settings.not_measured, is_text)
+    not_detected = _is_one_of(text, numbers, settings.not_detected, is_text) & ~not_measured
+    declared = not_measured | not_detected
+    source.refuse(spec, text, (text == "") & ~declared,
+                  "is empty; say what that means: not_detected = [\"empty\"] (it was too weak, "
+                  "which is information) or not_measured = [\"empty\"] (nobody listened)")
+    source.refuse(spec, text, ~np.isfinite(numbers) & ~declared,
+                  "is not a number; if it means that the level was not detected, put it into "
+                  "not_detected; if nobody listened, into not_measured")
+    _check_unit(source, spec, numbers[~declared], settings.level_unit)
+    if settings.not_detected_at_or_below is not None:
+        not_detected |= ~declared & (numbers <= settings.not_detected_at_or_below)
+    factor = MILLIWATTS.get(str(settings.level_unit))
+    with np.errstate(divide="ignore", invalid="ignore"):  # power <= 0 is found to be impossible
+        db = numbers if factor is None else 10 * np.log10(numbers * factor)
+    db = db + offset_db
+    low, high = POSSIBLE_DB
+    impossible = ~not_measured & ~not_detected & ~((db > low) & (db < high))
+    db = np.where(not_measured | not_detected | impossible, np.nan, db)
+    return Levels(db, not_measured, impossible)
+
+
+def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str],
+               is_text: bool) -> np.ndarray:
+    """Return where a cell equals one of the values, (n,) bool; texts in any case.
+
+    Only in a column of texts is the word NaN another value than an empty cell.
+    """
+    labels = {value.strip().lower() for value in values if isinstance(value, str)}
+    labels = {label if label == NOT_A_NUMBER and is_text else
+              "" if label in (*EMPTY, "empty") else label for label in labels}
+    result = np.isin(numbers, [value for value in values if not isinstance(value, str)])
+    if labels:
+        result |= text.str.lower().isin(labels).to_numpy(dtype=bool)
+    return result
+
+
+def _check_unit(source: Source, spec: str, numbers: np.ndarray, unit: str | None) -> None:
+    if unit is None:
+        values = "are all not detected"
+        if len(numbers):
+            values = (f"run from {numbers.min():g} to {numbers.max():g}, median "
+                      f"{np.median(numbers):g}")
+        raise BadInput(f"{source.path}: column {spec}: level_unit is not given; allowed are dBm, "
+                       "mW and W (received power) and dB (channel gain, negative). The values "
+                       f"{values}")

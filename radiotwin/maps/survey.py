@@ -1,26 +1,207 @@
-"""A measurement campaign: every UAV flies every flight, and measures all devices in every slot.
+"""A simulated campaign: UAVs fly through a truth map and bring back measurements.
 
-Flight patterns: functions that draw the cells of one flight, from the start to the terminal.
-
-Each takes the grid of its altitude, the start (row, column), the battery [units] and a source of
-random numbers, and returns one cell (row, column) per slot. The terminal is reached in time.
+The truth is traced, any other radio map, or the statistical one of Chen et al. 2023: a distance law
+per LoS class, and shadowing. The flights are by the model of that paper (Sec. II), too: one lattice
+step north, west, south or east costs 1 battery unit, a hover 0.5; a UAV stays on the map and must
+be able to reach its terminal. A flight pattern takes the grid of an altitude, the start, the
+battery and a source of random numbers, and returns one cell (row, column) per slot.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import ROWS
+from radiotwin.io.inputs import require_within
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
-from radiotwin.maps.survey.grid import HOVER_COST, MOVE_COST, UNREACHABLE, Cell, FlightGrid
-from radiotwin.maps.survey.truth import read_truth, require_possible
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
 from radiotwin.scene.config import UavConfig
 
+MOVES = np.array([(1, 0), (0, -1), (-1, 0), (0, 1)])  # north, west, south, east as (row, column)
+MOVE_COST = 1.0  # battery units
+HOVER_COST = 0.5  # battery units
+UNREACHABLE = np.iinfo(np.int64).max // 4  # a number of moves; sums of a few do not overflow
+Cell = tuple[int, int]
 _MAX_FLIGHTS = 100_000  # far beyond any campaign: a typing error
 _MAX_NOISE_DB = 50.0  # as is this: receivers are off by some decibels
+
+
+class FlightGrid:
+    """The cells of one altitude.
+
+    Args:
+        allowed: (ny, nx) bool; False inside buildings.
+        terminal: (row, column) where a flight must end.
+    """
+
+    def __init__(self, allowed: np.ndarray, terminal: Cell) -> None:
+        self.allowed = allowed
+        self.terminal = terminal
+        self._steps: dict[Cell, np.ndarray] = {}
+
+    def steps_to(self, cell: Cell) -> np.ndarray:
+        """Return the (ny, nx) moves from every cell to `cell`; UNREACHABLE where there is no way.
+
+        Args:
+            cell: (row, column).
+        """
+        cell = (int(cell[0]), int(cell[1]))
+        if cell not in self._steps:
+            steps = np.full(self.allowed.shape, UNREACHABLE)
+            front, distance = np.zeros_like(self.allowed), 0
+            front[cell] = self.allowed[cell]
+            while front.any():
+                steps[front] = distance
+                spread = np.zeros_like(front)
+                spread[1:] |= front[:-1]
+                spread[:-1] |= front[1:]
+                spread[:, 1:] |= front[:, :-1]
+                spread[:, :-1] |= front[:, 1:]
+                front, distance = spread & self.allowed & (steps == UNREACHABLE), distance + 1
+            self._steps[cell] = steps
+        return self._steps[cell]
+
+    def steps_home(self, cell: Cell) -> int:
+        """Return the number of moves from a cell to the terminal."""
+        return int(self.steps_to(self.terminal)[tuple(cell)])
+
+    def neighbours(self, cell: Cell) -> list[Cell]:
+        """Return the allowed cells one move away."""
+        rows, columns = self.allowed.shape
+        cells = [(int(row), int(column)) for row, column in np.asarray(cell) + MOVES]
+        return [(row, column) for row, column in cells
+                if 0 <= row < rows and 0 <= column < columns and self.allowed[row, column]]
+
+    def path(self, start: Cell, end: Cell, rng: np.random.Generator) -> list[Cell]:
+        """Draw one of the shortest paths.
+
+        Args:
+            start: First cell, which is not part of the result.
+            end: Last cell, which is.
+            rng: Source of the choice.
+
+        Returns:
+            Cells (row, column) in order; none where there is no way to go.
+        """
+        steps, cells, cell = self.steps_to(end), [], start
+        while steps[tuple(cell)] > 0:
+            nearer = [n for n in self.neighbours(cell) if steps[n] < steps[tuple(cell)]]
+            cell = nearer[rng.integers(len(nearer))]
+            cells.append(cell)
+        return cells
+
+
+@dataclass(frozen=True)
+class SegmentedLaw:
+    """gain = intercept_db + 10 · slope · log10(d / 1 m) + N(0, sigma_db²)."""
+
+    intercept_db: float
+    slope: float
+    sigma_db: float
+
+    def mean_db(self, log10_distance: np.ndarray) -> np.ndarray:
+        """Return the mean gain [dB] at log10(d / 1 m), any shape."""
+        return self.intercept_db + 10 * self.slope * log10_distance
+
+
+# Parameters of Chen et al. 2023
+LOS_LAW = SegmentedLaw(-30.0, -2.5, 2**0.5)
+NLOS_LAW = SegmentedLaw(-35.0, -3.04, 5**0.5)
+
+
+def segmented_truth(scene: Scene) -> RadioMap:
+    """Return the mean gain and the shadowing of the segmented law over a scene's lattice.
+
+    The mean is given below sensitivity, too: a survey draws the shadowing before it decides what is
+    detected.
+
+    Args:
+        scene: City, devices and lattice.
+
+    Returns:
+        A map with `sigma_db`.
+    """
+    receiver_m = scene.lattice.positions_m
+    gain_db, sigma_db, los = [], [], []
+    for device_m in scene.device_m:
+        seen = scene.city.line_of_sight(receiver_m, device_m[None])
+        distance_m = np.sqrt(((receiver_m - device_m) ** 2).sum(axis=1))
+        log_distance = np.log10(np.maximum(distance_m, 1.0))  # the law begins at 1 m
+        gain_db.append(np.where(seen, LOS_LAW.mean_db(log_distance),
+                                NLOS_LAW.mean_db(log_distance)))
+        sigma_db.append(np.where(seen, LOS_LAW.sigma_db, NLOS_LAW.sigma_db))
+        los.append(seen)
+    return RadioMap.build(
+        [device.device for device in scene.config.devices], scene.lattice, np.array(gain_db),
+        np.array(los), np.array(sigma_db),
+        {"source": "segmented", "frequency_hz": scene.config.radio.frequency_hz,
+         "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash()}
+    ).placed(scene.config.origin)
+
+
+def read_truth(scene: Scene, truth: str = "traced") -> RadioMap:
+    """Return the radio map that a command's option `--truth` names.
+
+    Args:
+        scene: the world to fly in.
+        truth: `traced` (SCENE/truth.nc), `segmented` (statistical), or the path of a radio map.
+
+    Raises:
+        BadInput: the scene was not traced, or the file is not a radio map.
+    """
+    if truth == "segmented":
+        return segmented_truth(scene)
+    if truth == "traced":
+        path = scene.folder / "truth.nc"
+        if not path.is_file():
+            raise BadInput(f"{path} does not exist; run `radiotwin trace {scene.folder}` first, or "
+                           "use --truth segmented")
+        return RadioMap.read(require_within(scene.folder, path, str(scene.folder)))
+    return RadioMap.read(truth)
+
+
+# A map says nothing of its links' paths. In a street, two walls and the ground give 16 paths of at
+# most four reflections, each weaker than the direct one: 9 off the walls, 7 off the ground, too.
+_MAX_PATHS = 16
+
+
+def require_possible(scene: Scene, truth: RadioMap) -> None:
+    """Raise BadInput if a traced link with line of sight is far above free space.
+
+    The bound is free space (ITU-R P.525-4, eq. 4) between the peaks of the antennas, and 12 dB, or
+    24 dB where fields were added: 16 paths as strong as the direct one. Maps that are not of gains
+    at points (the solver `map`, statistical truths) are not checked.
+
+    Args:
+        scene: Scene that the map was made for.
+        truth: Map with all its devices.
+    """
+    attributes = truth.dataset.attrs
+    if attributes.get("source") != "raytrace" or attributes.get("solver") != "paths":
+        return
+    coherent = attributes.get("combining") == "coherent"
+    bound_db = (20 if coherent else 10) * np.log10(_MAX_PATHS)
+    positions_m, frequency_hz = scene.lattice.positions_m, scene.config.radio.frequency_hz
+    for device, at_m, antenna in zip(scene.config.devices, scene.device_m, scene.device_antennas):
+        row = truth.devices.index(device.device)
+        distance_m = np.maximum(np.linalg.norm(positions_m - at_m, axis=1), 0.01)
+        above_db = (truth.gain_db[row].ravel() - sum(
+            end.pattern.peak_dbi for end in (antenna, scene.uav_antenna) if end is not None)
+            - 20 * np.log10(speed_of_light / (4 * np.pi * frequency_hz * distance_m)))
+        wrong = truth.los[row].ravel() & (above_db > bound_db)
+        if wrong.any():
+            worst = int(np.where(wrong, above_db, -np.inf).argmax())
+            position = ", ".join(f"{value:g}" for value in positions_m[worst])
+            raise BadInput(
+                f"{wrong.sum()} links with line of sight of {device.device} lie more than "
+                f"{bound_db:.0f} dB above free space (at {position} m {above_db[worst]:+.1f} dB), "
+                "which no reflections bring; versions that counted a direct path several times "
+                "made such maps: run `radiotwin trace` again")
 
 
 def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator

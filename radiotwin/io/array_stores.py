@@ -1,8 +1,9 @@
-"""Check that a Zarr folder holds plain arrays in the folder itself, of bounded size.
+"""Check that an HDF5 file or a Zarr folder holds plain arrays of bounded size, in itself.
 
-A Zarr folder can lead elsewhere by links, name codecs that are loaded as plug-ins, and stand for
-far more values than it has bytes. All of that is refused by its description, before zarr opens it.
-The format is Zarr 3, https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html.
+HDF5 files can name other files (external links, raw data, virtual datasets), call for filters that
+are loaded as plug-ins, and stand for far more values than they have bytes. So can Zarr folders, by
+links and codecs. All of that is refused by its description, before any value is read. The format of
+Zarr is version 3, https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html.
 """
 
 import math
@@ -12,10 +13,14 @@ import zlib
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+
+import h5py  # type: ignore[import-untyped]
+import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import (
+    DOCUMENT_BYTES,
     FILE_BYTES,
     MAP_ATTRIBUTES,
     MAP_CHUNKS,
@@ -26,6 +31,16 @@ from radiotwin.io.budgets import (
 )
 from radiotwin.io.inputs import parse_json, read_text
 
+_FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
+_LAYOUTS = {h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED}
+_TYPES = {h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.ENUM, h5py.h5t.STRING}
+_REFERRING = {"DIMENSION_LIST", "REFERENCE_LIST"}  # of which axis a dimension is
+_MAX_OBJECTS = 1_000  # of a file; a radio map has eight
+_MAX_CHUNK_VALUES = 2**24  # of a chunk that is larger than its array
+_MAX_INFLATED = 2**28  # bytes that one chunk may become without being tried
+_DEFLATE_RATIO = 1032  # the most that a byte can stand for
+_HEAP, _HEAP_HEADER = b"GCOL", 16
+_BLOCK_BYTES = 2**22
 METADATA = "zarr.json"
 _PIECES = "c"  # folder of an array's pieces, by the default chunk key encoding
 _FORMAT_2 = (".zgroup", ".zarray", ".zattrs", ".zmetadata")
@@ -37,8 +52,128 @@ _CRC_BYTES = 4
 _MAX_DIMS = 4
 _MAX_DIGITS = 9  # of the number of a piece
 _HEAD_BYTES = 18  # the longest head of a Zstandard frame
-_ADVICE = ("write it again with radiotwin, or with xarray's to_zarr(…, zarr_format=3) and its "
-           "standard codecs")
+_ADVICE = "a radio map is one file with plain arrays: make it again"
+_ZARR_ADVICE = ("write it again with radiotwin, or with xarray's to_zarr(…, zarr_format=3) and its "
+                "standard codecs")
+
+
+def check_hdf5(file: IO[bytes], path: Path) -> None:
+    """Check that reading the root group of an HDF5 file is safe.
+
+    Args:
+        file: open for reading; its position changes.
+        path: of it, for messages.
+
+    Raises:
+        BadInput: it refers to another file, has groups, links, filters or types that radio maps do
+            not have, or is too large.
+        Exception: h5py's, of many classes: it is damaged, or not HDF5.
+    """
+    heap_bytes = _largest_heap(file)
+    with h5py.File(file, "r") as opened:
+        root = opened.id
+        if root.links is None or len(opened) > _MAX_OBJECTS:
+            raise BadInput(f"{path} holds more than {_MAX_OBJECTS} objects; {_ADVICE}")
+        texts = _check_attributes(root, path, "the file")
+        for name in list(opened):
+            if root.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
+                raise BadInput(f"{path}: {name!r} is a link to another place or file; {_ADVICE}")
+            each = h5py.h5o.open(root, name.encode())
+            if not isinstance(each, h5py.h5d.DatasetID):
+                raise BadInput(f"{path}: {name!r} is not an array; {_ADVICE}")
+            texts += _check_attributes(each, path, repr(name))
+            _check_array(each, path, name, heap_bytes)
+        DOCUMENT_BYTES.check(texts * heap_bytes, f"{path}: its attributes")
+
+
+def _check_array(array: h5py.h5d.DatasetID, path: Path, name: str, heap_bytes: int) -> None:
+    """Check where the values of an array are, in which form, and how many."""
+    plan, what = array.get_create_plist(), f"{path}: {name!r}"
+    if plan.get_layout() not in _LAYOUTS or plan.get_external_count():
+        raise BadInput(f"{what} takes its values from other files or arrays; {_ADVICE}")
+    filters = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
+    if not set(filters) <= _FILTERS or len(set(filters)) < len(filters):
+        raise BadInput(f"{what} is compressed by other filters ({filters}) than gzip, shuffle and "
+                       f"fletcher32, each once; {_ADVICE}")
+    kind = array.get_type()
+    if kind.get_class() not in _TYPES:
+        raise BadInput(f"{what} holds neither numbers nor texts; {_ADVICE}")
+    values = int(np.prod(array.shape, dtype=float))
+    MAP_VALUES.check(values, what)
+    FILE_BYTES.check(values * (heap_bytes if _is_text(kind) else 1), what)
+    if not _is_text(kind):
+        FILE_BYTES.check(max(values, 1) * kind.get_size() if kind.get_size() > 8 else 0, what)
+    if plan.get_layout() == h5py.h5d.CHUNKED:
+        chunk = int(np.prod(plan.get_chunk(), dtype=float))
+        if chunk > max(values, _MAX_CHUNK_VALUES):
+            MAP_VALUES.refuse(what, f"pieces of {chunk:,} values for {values:,} in all")
+        pieces = np.prod([-(-size // part) for size, part in
+                          zip(array.shape, plan.get_chunk(), strict=True)], dtype=float)
+        MAP_CHUNKS.check(pieces, what)
+        if filters:
+            _check_inflation(array, chunk * kind.get_size(), what)
+
+
+def _check_inflation(array: h5py.h5d.DatasetID, chunk_bytes: int, what: str) -> None:
+    """Check that no chunk becomes far larger than it should: HDF5 inflates it to its end."""
+    stored: list[tuple[tuple[int, ...], int]] = []
+    array.chunk_iter(lambda info: stored.append((info.chunk_offset, info.size)))
+    for offset, size in stored:
+        if size > 2 * chunk_bytes + 1024:
+            raise BadInput(f"{what} has a compressed piece larger than it is; {_ADVICE}")
+        if size * _DEFLATE_RATIO > chunk_bytes + _MAX_INFLATED:
+            mask, data = array.read_direct_chunk(offset)
+            inflater = zlib.decompressobj()
+            try:
+                inflater.decompress(data, chunk_bytes + 64)
+            except zlib.error:
+                continue  # not compressed, or damaged: HDF5 says so
+            if inflater.unconsumed_tail:
+                FILE_BYTES.refuse(what, f"a piece of more than {chunk_bytes:,} bytes when "
+                                        "decompressed")
+
+
+def _check_attributes(owner: h5py.h5g.GroupID | h5py.h5d.DatasetID, path: Path, what: str) -> int:
+    """Check attributes by their descriptions; return how many texts of unknown length they have."""
+    count = h5py.h5a.get_num_attrs(owner)
+    MAP_ATTRIBUTES.check(count, f"{path}: {what}")
+    texts = size = 0
+    for index in range(count):
+        attribute = h5py.h5a.open(owner, index=index)
+        kind, refers = attribute.get_type(), attribute.name.decode("utf-8", "replace") in _REFERRING
+        if kind.get_class() not in _TYPES and not refers:
+            raise BadInput(f"{path}: an attribute of {what} is neither a number nor a text; "
+                           f"{_ADVICE}")
+        size += attribute.get_storage_size()
+        if kind.get_class() == h5py.h5t.VLEN or _is_text(kind):
+            texts += int(np.prod(attribute.shape, dtype=float))
+    SETTINGS_BYTES.check(size, f"{path}: the attributes of {what}")
+    return texts
+
+
+def _is_text(kind: h5py.h5t.TypeID) -> bool:
+    """Return whether values lie in a heap, each as long as it likes."""
+    return isinstance(kind, h5py.h5t.TypeStringID) and bool(kind.is_variable_str())
+
+
+def _largest_heap(file: IO[bytes]) -> int:
+    """Return the bytes of the largest heap of a file: no text in it is longer.
+
+    HDF5 has the length of a text only after reading it. A heap begins with `GCOL`, a version, three
+    zeros and its size (HDF5 File Format Specification 3.0, III.E); chance makes the same eight
+    bytes once in 10^19.
+    """
+    file.seek(0)
+    largest, tail = 0, b""
+    while block := file.read(_BLOCK_BYTES):
+        data = tail + block
+        at = data.find(_HEAP + b"\1\0\0\0")
+        while 0 <= at <= len(data) - _HEAP_HEADER:
+            largest = max(largest, int.from_bytes(data[at + 8:at + _HEAP_HEADER], "little"))
+            at = data.find(_HEAP + b"\1\0\0\0", at + 1)
+        tail = data[1 - _HEAP_HEADER:]
+    file.seek(0)
+    return largest
 
 
 @dataclass(frozen=True)
@@ -75,7 +210,7 @@ def check_zarr(folder: Path, known: Collection[str], streamed: Budget) -> dict[s
     MAP_ATTRIBUTES.check(len(group.get("attributes", {})), f"{folder}: its attributes")
     missing = {}
     for name in sorted(entries - {METADATA}):
-        missing[name] = _check_array(folder / name, streamed)
+        missing[name] = _check_zarr_array(folder / name, streamed)
     return missing
 
 
@@ -84,7 +219,7 @@ def _listed(folder: Path, allowed: Collection[str]) -> set[str]:
     names = set()
     for entry in os.scandir(folder):
         if entry.name in _FORMAT_2:
-            raise BadInput(f"{folder} is of Zarr format 2; {_ADVICE}")
+            raise BadInput(f"{folder} is of Zarr format 2; {_ZARR_ADVICE}")
         if entry.name not in allowed:
             raise BadInput(f"{folder} holds {entry.name[:60]!r}, which is no part of a radio map "
                            "in Zarr: remove it")
@@ -107,11 +242,11 @@ def _metadata(folder: Path, kind: str) -> dict[str, Any]:
     if not isinstance(found, dict) or found.get("zarr_format") != 3 \
             or found.get("node_type") != kind \
             or not isinstance(found.get("attributes", {}), dict):
-        raise BadInput(f"{path} does not describe a Zarr {kind} of format 3; {_ADVICE}")
+        raise BadInput(f"{path} does not describe a Zarr {kind} of format 3; {_ZARR_ADVICE}")
     return found
 
 
-def _check_array(folder: Path, streamed: Budget) -> int:
+def _check_zarr_array(folder: Path, streamed: Budget) -> int:
     """Check an array; return how many of its pieces are missing."""
     names = _listed(folder, (METADATA, _PIECES))
     described = _metadata(folder, "array")
@@ -119,7 +254,7 @@ def _check_array(folder: Path, streamed: Budget) -> int:
         array = _described(folder, described, streamed)
     except (LookupError, TypeError, AttributeError, ValueError) as error:
         raise BadInput(f"{folder / METADATA} is damaged ({type(error).__name__}: "
-                       f"{str(error)[:200]}); {_ADVICE}") from None
+                       f"{str(error)[:200]}); {_ZARR_ADVICE}") from None
     found = _check_pieces(folder / _PIECES, array.grid, array) if _PIECES in names else 0
     missing = math.prod(array.grid) - found
     if missing and not array.missing_is_nothing:
@@ -132,10 +267,10 @@ def _described(folder: Path, described: dict[str, Any], streamed: Budget) -> _Ar
     MAP_ATTRIBUTES.check(len(described.get("attributes", {})), f"{folder}: its attributes")
     shape = _sizes(described["shape"], 0)
     if described["chunk_grid"]["name"] != "regular" or described.get("storage_transformers"):
-        raise BadInput(f"{folder} is not cut into equal pieces; {_ADVICE}")
+        raise BadInput(f"{folder} is not cut into equal pieces; {_ZARR_ADVICE}")
     keys = described["chunk_key_encoding"]
     if keys["name"] != "default" or keys.get("configuration", {}).get("separator", "/") != "/":
-        raise BadInput(f"{folder} names its pieces otherwise than c/0/0; {_ADVICE}")
+        raise BadInput(f"{folder} names its pieces otherwise than c/0/0; {_ZARR_ADVICE}")
     chunk = _sizes(described["chunk_grid"]["configuration"]["chunk_shape"], 1)
     if len(chunk) != len(shape) or len(shape) > _MAX_DIMS:
         raise ValueError(f"{len(shape)} dims, in pieces of {len(chunk)}")
@@ -168,7 +303,7 @@ def _kind(folder: Path, data_type: Any) -> tuple[str, int]:
         (item_bytes,) = _sizes([data_type["configuration"]["length_bytes"]], 4)
         return _TEXT, item_bytes
     raise BadInput(f"{folder} holds values of the type {str(data_type)[:60]!r}; allowed are "
-                   f"numbers, bool and {_TEXT}: {_ADVICE}")
+                   f"numbers, bool and {_TEXT}: {_ZARR_ADVICE}")
 
 
 def _codecs(folder: Path, codecs: Any) -> tuple[str | None, bool]:
@@ -178,7 +313,7 @@ def _codecs(folder: Path, codecs: Any) -> tuple[str | None, bool]:
     compressor = rest.pop(0) if rest and rest[0] in _COMPRESSORS else None
     if names[:1] != ["bytes"] or rest not in ([], ["crc32c"]):
         raise BadInput(f"{folder} is stored by the codecs {str(names)[:100]}; allowed are bytes, "
-                       f"then zstd or gzip or neither, then crc32c or not: {_ADVICE}")
+                       f"then zstd or gzip or neither, then crc32c or not: {_ZARR_ADVICE}")
     return compressor, bool(rest)
 
 
