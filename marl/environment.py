@@ -7,10 +7,10 @@ and assign devices anew. So the first position counts and the last one does not.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.fft import fft2, next_fast_len
 
 from marl.mission import COSTS, MOVES, NO_OP, Mission
+from radiotwin.runtime.compiled import njit
 
 ACTION_COUNT = len(COSTS)
 

@@ -4,10 +4,10 @@ The replay memory keeps frames, which take a fifth of the memory, and makes feat
 """
 
 import numpy as np
-from numba import njit
 
 from marl.environment import ACTION_COUNT, Frame, feasible
 from marl.mission import Mission
+from radiotwin.runtime.compiled import njit
 
 DEVICE_FEATURES = 7  # SNR, reachable, data left, distance, dx, dy, assigned
 UAV_FEATURES = 6  # SNR, reachable, distance, dx, dy, battery

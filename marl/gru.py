@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
+
+from radiotwin.runtime.compiled import njit
 
 _ONE, _HALF = np.float32(1), np.float32(0.5)
 

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from typing_extensions import override
 
 from marl.environment import ACTION_COUNT, Frame, feasible
@@ -11,6 +10,7 @@ from marl.flights import Policy
 from marl.learner import Learner
 from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
 from radiotwin.maps.survey import fly
+from radiotwin.runtime.compiled import njit
 from radiotwin.scene import Scene
 
 PATTERN = "random-waypoint"

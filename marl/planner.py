@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.stats import norm
 from typing_extensions import override
 
@@ -18,6 +17,7 @@ from marl.flights import Policy
 from marl.learner import Learner, Setup
 from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
 from marl.settings import stream
+from radiotwin.runtime.compiled import njit
 from radiotwin.runtime.console import progress
 
 MAX_WAYPOINTS = 8  # of a UAV

@@ -3,11 +3,11 @@
 from collections.abc import Iterable
 
 import numpy as np
-from numba import njit
 
 from marl.environment import ACTION_COUNT, Frame
 from marl.mission import Mission
 from marl.planner import Plan, expected_data, fly_on, improve, next_action, plan, take_off
+from radiotwin.runtime.compiled import njit
 
 
 class ReplanPolicy:

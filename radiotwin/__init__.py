@@ -4,8 +4,8 @@
 first used, so that importing the package takes no time.
 """
 
-import sys
-from importlib import import_module, util
+from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -46,40 +46,6 @@ if TYPE_CHECKING:
 
 __version__: str  # found when it is asked for, as all names
 
-_MODULES = {
-    "cli.demo": ["run_demo"],
-    "cli.doctor": ["diagnose"],
-    "closeloop.output.corrected_scene": ["write_corrected_scene"],
-    "closeloop.output.corrected_twin": ["corrected_twin"],
-    "closeloop.output.residuals": ["Residuals", "residuals"],
-    "closeloop.output.result_file": ["make_report"],
-    "closeloop.run": ["Loop", "close_loop"],
-    "closeloop.verdict.criteria": ["SelectionCriteria"],
-    "coverage": ["CoverageSettings", "predict_coverage"],
-    "errors": ["BadInput", "RunFailed"],
-    "importing": ["import_measurements"],
-    "links.alignment": ["in_scene_frame"],
-    "links.measurements": ["Measurements", "read_measurements"],
-    "maps.difference": ["MapDifference"],
-    "maps.radiomap": ["RadioMap"],
-    "maps.survey": ["fly_survey", "read_truth", "segmented_truth"],
-    "propagation.paths.listing": ["list_paths"],
-    "report": ["export_map", "read_run", "write_closeloop_folder", "write_comparison_folder",
-               "write_report"],
-    "report.comparison": ["compare_held_out"],
-    "runtime.pieces": ["cache_content", "clear_cache", "keep_pieces"],
-    "scene": ["Scene"],
-    "scene.export": ["export_scene"],
-    "scene.presets": ["build_preset"],
-    "scene.readers.any_source": ["build_scene"],
-    "trace": ["SolverSettings", "choose_quality", "read_points", "trace_map", "trace_points"],
-    "twin": ["Twin", "fit_twin"],
-    "twin.compare": ["Comparison", "compare_models", "score_map", "split_flights"],
-    "twin.locate": ["locate_devices", "position_errors"],
-    "twin.point_gains": ["export_ns3"],
-}
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-
 __all__ = [  # noqa: F822 - names that __getattr__ finds
     "BadInput", "Comparison", "CoverageSettings", "Loop", "MapDifference", "Measurements",
     "RadioMap", "Residuals", "RunFailed", "Scene", "SelectionCriteria", "SolverSettings", "Twin",
@@ -95,9 +61,21 @@ __all__ = [  # noqa: F822 - names that __getattr__ finds
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return _version()
-    if name not in _MODULE_OF:
+    if name not in __all__:
         raise AttributeError(f"module 'radiotwin' has no attribute {name!r}")
-    return getattr(import_module(f"radiotwin.{_MODULE_OF[name]}"), name)
+    return getattr(import_module(_modules()[name]), name)
+
+
+@cache
+def _modules() -> dict[str, str]:
+    """Return the module of each name, as the imports for type checkers above have it."""
+    import ast  # when the first name is loaded, which takes longer
+
+    with open(__file__, encoding="utf-8") as file:
+        tree = ast.parse(file.read())
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    return {each.name: str(node.module) for node in block.body
+            if isinstance(node, ast.ImportFrom) for each in node.names}
 
 
 def _version() -> str:
@@ -111,16 +89,3 @@ def _version() -> str:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
-
-
-def _hide_folder_coverage() -> None:
-    """Hide a folder `coverage` in the working directory from `import coverage`.
-
-    numba imports that package where there is one, and would take our output folder for it.
-    """
-    found = util.find_spec("coverage") if "coverage" not in sys.modules else None
-    if found is not None and found.origin is None:  # a folder without a module
-        sys.modules["coverage"] = None  # type: ignore[assignment]
-
-
-_hide_folder_coverage()

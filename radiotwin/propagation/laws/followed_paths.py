@@ -12,12 +12,12 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkGeometry, Links
 from radiotwin.propagation.paths.powers import paths_with_points
+from radiotwin.runtime.compiled import njit
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.pieces import KeptParts, Piece
 from radiotwin.runtime.processes import in_threads

@@ -27,7 +27,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numba import njit
 
 from radiotwin.propagation.paths.clearance import clear_paths
 from radiotwin.propagation.paths.facets import (
@@ -59,6 +58,7 @@ from radiotwin.propagation.paths.surfaces import (
 )
 from radiotwin.propagation.paths.two_edges import FacetEdges
 from radiotwin.propagation.paths.wedges import around_edge
+from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
 SAMPLE_M, SAMPLE_RAD = 0.3, 0.002  # [m], [rad] seen from the device: step of points on an edge

@@ -3,10 +3,10 @@
 from collections.abc import Iterator
 
 import numpy as np
-from numba import njit
 
 from radiotwin.propagation.paths.images import Candidates, PathBuffer, find_paths, sequence_length
 from radiotwin.propagation.paths.surfaces import NORMAL, NORMAL_0, NORMAL_N, Surfaces
+from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
 

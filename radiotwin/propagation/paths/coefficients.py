@@ -37,9 +37,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.constants import speed_of_light
 
+from radiotwin.runtime.compiled import njit
 from radiotwin.scene.materials import Material, constants
 
 VACUUM_PERMITTIVITY_F_M = 8.8541878128e-12  # [F/m], CODATA 2018

@@ -23,7 +23,6 @@ and slivers are dropped; their neighbours then meet along the same short segment
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -31,6 +30,7 @@ from scipy.spatial import cKDTree
 from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.vectors import cross, dot
 from radiotwin.propagation.paths.vectors import cross as cross_product
+from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import CityMap
 
 WELD_M = 0.002  # [m], well above the single precision of PLY files: 0.06 mm at 1 km

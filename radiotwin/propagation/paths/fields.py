@@ -7,13 +7,13 @@ Complex gain of a path between vertically polarised antennas.
 """
 
 import numpy as np
-from numba import njit
 
 from radiotwin.propagation.paths.coefficients import Slabs
 from radiotwin.propagation.paths.images import Candidates, PathBuffer, sequence_length
 from radiotwin.propagation.paths.surfaces import MATERIAL, Surfaces
 from radiotwin.propagation.paths.vectors import cross, dot
 from radiotwin.propagation.paths.wedges import diffract, reflect
+from radiotwin.runtime.compiled import njit
 
 VERTICAL, AVERAGE = 0, 1
 

@@ -8,7 +8,6 @@ after it; the ray is reflected where the straight line between the images goes t
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from radiotwin.propagation.paths.pruning import lit_part, over_edge, through_facet
 from radiotwin.propagation.paths.surfaces import (
@@ -22,6 +21,7 @@ from radiotwin.propagation.paths.surfaces import (
     within,
 )
 from radiotwin.propagation.paths.wedges import around_edge
+from radiotwin.runtime.compiled import njit
 
 MAX_INTERACTIONS = 6  # reflections and diffraction of one path: bounds the arrays
 

@@ -4,7 +4,6 @@ Every test is necessary and none is sufficient; all are slightly looser than the
 """
 
 import numpy as np
-from numba import njit
 
 from radiotwin.propagation.paths.surfaces import (
     ALONG,
@@ -22,6 +21,7 @@ from radiotwin.propagation.paths.surfaces import (
     height,
     mirrored,
 )
+from radiotwin.runtime.compiled import njit
 
 ROUNDING_M = 1e-6  # [m], slack of the tests for rounding in double precision
 

@@ -6,9 +6,9 @@ On a terrain its triangles are facets like any other, and nothing lies above the
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from radiotwin.propagation.paths.facets import Edges, Facets
+from radiotwin.runtime.compiled import njit
 
 ON_PLANE_M = 1e-4  # [m], a point this close to a plane is on neither side of it
 GROUND_MATERIAL = -1  # last row of `Slabs`

@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from numba import njit
 
 from radiotwin.propagation.paths.coefficients import Slabs
 from radiotwin.propagation.paths.facets import expand
@@ -24,6 +23,7 @@ from radiotwin.propagation.paths.fields import VERTICAL, send, vertical
 from radiotwin.propagation.paths.surfaces import ALONG, LENGTH, NORMAL_0, NORMAL_N, START, Surfaces
 from radiotwin.propagation.paths.vectors import cross, dot
 from radiotwin.propagation.paths.wedges import around_edge, diffract
+from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
 STEPS = 30  # of the search for the points on two edges; it mostly takes five

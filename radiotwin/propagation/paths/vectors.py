@@ -3,7 +3,8 @@
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from radiotwin.runtime.compiled import njit
 
 
 @njit(cache=True)

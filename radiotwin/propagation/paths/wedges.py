@@ -7,7 +7,6 @@ Reflection of a ray's field at a surface.
 """
 
 import numpy as np
-from numba import njit
 
 from radiotwin.propagation.paths.coefficients import (
     Slabs,
@@ -27,6 +26,7 @@ from radiotwin.propagation.paths.surfaces import (
     TANGENT,
 )
 from radiotwin.propagation.paths.vectors import cross, dot
+from radiotwin.runtime.compiled import njit
 
 LUEBBERS, SIONNA = 0, 1
 MIN_SINE = 1e-4  # of the angle between ray and face; rays closer to a face are not followed
