@@ -19,7 +19,7 @@ from shapely import affinity, transform
 from shapely.geometry import Point, Polygon, box, mapping
 
 import radiotwin as rt
-from radiotwin.geo.geodesy import to_geographic
+from radiotwin.geo import to_geographic
 from radiotwin.io.forms import Origin
 from radiotwin.scene.readers import MapOptions, build_scene_from_map
 from radiotwin.trace.points import trace_gains

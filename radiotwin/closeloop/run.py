@@ -31,7 +31,7 @@ from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.intervals import effect_parameters, effect_size_db
 from radiotwin.closeloop.verdict.residual_tests import ResidualDependence, residual_dependences
 from radiotwin.closeloop.verdict.sensitivity import Detectable, detectable
-from radiotwin.display.summary import Summarised, Summary, count, some
+from radiotwin.display import Summarised, Summary, count, some
 from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
 from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue

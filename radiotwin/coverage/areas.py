@@ -16,7 +16,7 @@ from radiotwin.coverage.radio import location_probability
 from radiotwin.coverage.settings import CoverageSettings
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import to_local
+from radiotwin.geo import to_local
 from radiotwin.scene import Scene
 from radiotwin.scene.readers.gis_files import read_geojson
 

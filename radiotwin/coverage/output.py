@@ -22,7 +22,7 @@ from matplotlib.patches import Patch
 from radiotwin.coverage.legends import Legend, drawn_rasters, file_stem, legend_of
 from radiotwin.coverage.run import Coverage
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import local_crs, to_geographic
+from radiotwin.geo import local_crs, to_geographic
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_file, atomic_path
 from radiotwin.io.forms import Origin

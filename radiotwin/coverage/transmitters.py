@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import between_frames, is_same_frame, read_frame
-from radiotwin.geo.geodesy import to_local
+from radiotwin.geo import between_frames, is_same_frame, read_frame, to_local
 from radiotwin.io.budgets import DEVICES
 from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import name_fault

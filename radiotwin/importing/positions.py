@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import ALLOWED, reference_system, to_local
+from radiotwin.geo import ALLOWED, reference_system, to_local
 from radiotwin.importing.read_source import read_source
 from radiotwin.importing.reading import LIMITS_DEG
 from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings, check_position
@@ -33,7 +33,7 @@ MOVING_M = 1.0  # a device whose positions differ by more than this is not at re
 
 @dataclass(frozen=True)
 class Frame:
-    """The local frame about an origin (see `radiotwin.geo.geodesy`); heights are left as they are.
+    """The local frame about an origin (see `radiotwin.geo`); heights are left as they are.
 
     Attributes:
         origin: None where all positions are local already.

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import FRAME_FILE
+from radiotwin.geo import FRAME_FILE
 from radiotwin.importing.log_files import list_files
 from radiotwin.importing.positions import PositionedLinks, add_positions
 from radiotwin.importing.reading import Logs, read_logs

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import is_same_frame, place
+from radiotwin.geo import is_same_frame, place
 from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene

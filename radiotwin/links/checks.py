@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import is_same_frame, place
+from radiotwin.geo import is_same_frame, place
 from radiotwin.io.texts import percent
 from radiotwin.links.links import Links
 from radiotwin.links.measurements import MAX_APART_M, Measurements

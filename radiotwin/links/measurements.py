@@ -15,11 +15,20 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from radiotwin.display import PlotFrame, Summary, new_axes
-from radiotwin.display.axes import GAIN_COLOURS, level_range_db, plain
-from radiotwin.display.summary import Summarised, count, some, span
+from radiotwin.display import (
+    GAIN_COLOURS,
+    PlotFrame,
+    Summarised,
+    Summary,
+    count,
+    level_range_db,
+    new_axes,
+    plain,
+    some,
+    span,
+)
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import (
+from radiotwin.geo import (
     FRAME_FILE,
     GroundHeight,
     above_datum,

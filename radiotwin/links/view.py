@@ -8,9 +8,14 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from radiotwin.display import PlotFrame, geo_data_frame
-from radiotwin.display.axes import add_colour_bar, add_legend, draw_points
-from radiotwin.display.summary import some
+from radiotwin.display import (
+    PlotFrame,
+    add_colour_bar,
+    add_legend,
+    draw_points,
+    geo_data_frame,
+    some,
+)
 from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
 

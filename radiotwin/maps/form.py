@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import local_crs
+from radiotwin.geo import local_crs
 from radiotwin.io.files import atomic_file
 from radiotwin.io.forms import Origin
 from radiotwin.runtime.console import progress

@@ -15,21 +15,27 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from radiotwin.display import PlotFrame, geo_data_frame, new_axes
-from radiotwin.display.axes import (
+from radiotwin.display import (
     DIFFERENCE_COLOURS,
     GAIN_COLOURS,
+    PlotFrame,
+    Summarised,
+    Summary,
     add_colour_bar,
     add_legend,
+    count,
     draw_cells,
     draw_points,
+    geo_data_frame,
     level_range_db,
+    new_axes,
     plain,
     residual_range_db,
+    some,
+    span,
 )
-from radiotwin.display.summary import Summarised, Summary, count, some, span
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import is_same_frame, place
+from radiotwin.geo import is_same_frame, place
 from radiotwin.io.forms import Origin
 from radiotwin.maps.file import load_dataset, open_dataset, write_parts
 from radiotwin.maps.form import (

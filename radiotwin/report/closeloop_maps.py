@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from radiotwin.closeloop.output.residuals import rmse_db
-from radiotwin.display.axes import GAIN_COLOURS, RESIDUAL_COLOURS, plain, residual_range_db
+from radiotwin.display import GAIN_COLOURS, RESIDUAL_COLOURS, plain, residual_range_db
 from radiotwin.effects.boxes import buildings
 from radiotwin.report.closeloop_data import EffectData, LoopData
 from radiotwin.report.labels import join_names, name_label

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from radiotwin.closeloop.output.result_file import check_report
-from radiotwin.display.summary import count
+from radiotwin.display import count
 from radiotwin.report import closeloop_words as words
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from pydantic import field_validator
 
-from radiotwin.display.axes import plain
+from radiotwin.display import plain
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_path

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from radiotwin.display.axes import plain
+from radiotwin.display import plain
 from radiotwin.report.closeloop_data import BinMeans, EffectData, bin_index, bin_means
 from radiotwin.report.closeloop_maps import (
     RESIDUAL_LABEL,

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from radiotwin.display.axes import DIFFERENCE_COLOURS, GAIN_COLOURS, level_range_db, plain
+from radiotwin.display import DIFFERENCE_COLOURS, GAIN_COLOURS, level_range_db, plain
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report.closeloop_data import LinkArrays
 from radiotwin.report.labels import MODELS

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from radiotwin.display.axes import plain
+from radiotwin.display import plain
 from radiotwin.io.files import atomic_file
 
 LOS_COLOUR, NLOS_COLOUR = "#2a7f9e", "#d1495b"

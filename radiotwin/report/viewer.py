@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from radiotwin.display.axes import level_range_db, residual_range_db
+from radiotwin.display import level_range_db, residual_range_db
 from radiotwin.io.forms import MAX_POSITION_M
 from radiotwin.links.view import moving_end
 from radiotwin.maps.radiomap import RadioMap

@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import local_crs
+from radiotwin.geo import local_crs
 from radiotwin.io.budgets import DEVICES, UAVS
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_folder

@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import local_crs
+from radiotwin.geo import local_crs
 from radiotwin.io.budgets import DEVICES, UAVS
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import MAX_COORDINATE_M, Metres, Number, Origin, Table

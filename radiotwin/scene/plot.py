@@ -10,13 +10,15 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from radiotwin.display import PlotFrame, geo_data_frame, new_axes
-from radiotwin.display.axes import (
+from radiotwin.display import (
     METRES,
+    PlotFrame,
     add_colour_bar,
     add_legend,
     draw_cells,
     draw_points,
+    geo_data_frame,
+    new_axes,
     plain,
 )
 from radiotwin.errors import BadInput

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from radiotwin.display.summary import Summarised, Summary, count, some
+from radiotwin.display import Summarised, Summary, count, some
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import SHAPES
 from radiotwin.io.inputs import open_input, read_bytes, require_within

@@ -9,7 +9,7 @@ import pandas as pd
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import to_local
+from radiotwin.geo import to_local
 from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, listed, read_cells, write_csv
 from radiotwin.io.files import atomic_path, require_suffix, require_writable

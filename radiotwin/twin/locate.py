@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import to_geographic, to_local
+from radiotwin.geo import to_geographic, to_local
 from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, prepare_links

@@ -14,11 +14,20 @@ import numpy as np
 import pandas as pd
 
 import radiotwin
-from radiotwin.display import PlotFrame, Summary, geo_data_frame, new_axes
-from radiotwin.display.axes import add_legend, draw_points, plain
-from radiotwin.display.summary import Summarised, count, some
+from radiotwin.display import (
+    PlotFrame,
+    Summarised,
+    Summary,
+    add_legend,
+    count,
+    draw_points,
+    geo_data_frame,
+    new_axes,
+    plain,
+    some,
+)
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import is_same_frame, place
+from radiotwin.geo import is_same_frame, place
 from radiotwin.inference.gaussian import detection_probability
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from radiotwin.geo.geodesy import to_geographic
+from radiotwin.geo import to_geographic
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from radiotwin.geo.geodesy import to_geographic
+from radiotwin.geo import to_geographic
 from radiotwin.io.forms import Origin
 from radiotwin.links.measurements import read_measurements
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.geo.geodesy import to_local
+from radiotwin.geo import to_local
 from radiotwin.scene import Scene
 from tests.walk import ROOT, commands, fences, page, run
 

@@ -19,7 +19,7 @@ from radiotwin.coverage import CoverageSettings, predict_coverage
 from radiotwin.coverage.legends import drawn_rasters, legend_of
 from radiotwin.coverage.output import FILES, available_formats, write_formats, write_tables
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import to_geographic
+from radiotwin.geo import to_geographic
 from radiotwin.report import write_coverage_pictures
 from radiotwin.report.coverage_figures import attribution
 from radiotwin.scene import Scene

@@ -8,8 +8,7 @@ from radiotwin.coverage.transmitters import (
     with_defaults,
 )
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import write_frame
-from radiotwin.geo.geodesy import to_geographic, to_local
+from radiotwin.geo import to_geographic, to_local, write_frame
 from radiotwin.io.forms import Origin
 
 PATTERN = "azimuth_deg,elevation_deg,gain_dbi\n" + "".join(

@@ -6,8 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 from pyproj import Geod
 
-from radiotwin.display import PlotFrame
-from radiotwin.display.axes import draw_cells
+from radiotwin.display import PlotFrame, draw_cells
 from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
 

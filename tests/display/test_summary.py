@@ -2,7 +2,7 @@
 
 import pytest
 
-from radiotwin.display.summary import MAX_LINE, Summary, count, some, span
+from radiotwin.display import MAX_LINE, Summary, count, some, span
 
 HOSTILE = "<script>alert('x')</script>\x1b[31m\u202e\n"
 

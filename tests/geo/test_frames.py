@@ -6,7 +6,7 @@ import pytest
 from pyproj import Geod
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import FRAME_FILE, between_frames, is_same_frame, read_frame
+from radiotwin.geo import FRAME_FILE, between_frames, is_same_frame, read_frame
 from radiotwin.io.forms import Origin
 from radiotwin.links.measurements import Measurements, read_measurements
 

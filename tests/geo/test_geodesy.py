@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pyproj import CRS, Geod, Transformer
 
-from radiotwin.geo.geodesy import local_crs, to_geographic, to_local
+from radiotwin.geo import local_crs, to_geographic, to_local
 from radiotwin.io.forms import Origin
 
 ORIGIN = Origin(latitude_deg=47.5, longitude_deg=8.7)

@@ -6,7 +6,7 @@ import pytest
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError
 
-from radiotwin.geo.geodesy import reference_system
+from radiotwin.geo import reference_system
 
 BOUND = """BOUNDCRS[
 SOURCECRS[GEOGCRS["x",DATUM["d",ELLIPSOID["Bessel",6377397.155,299.1528128]],CS[ellipsoidal,2],AXIS["lat",north],

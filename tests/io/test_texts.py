@@ -2,7 +2,7 @@
 
 import pytest
 
-from radiotwin.display.axes import plain
+from radiotwin.display import plain
 from radiotwin.io.texts import MAX_TEXT, percent, shortly, shown, shown_data
 from radiotwin.report.style import shorten
 

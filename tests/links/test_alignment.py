@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import between_frames
+from radiotwin.geo import between_frames
 from radiotwin.io.forms import Origin
 from radiotwin.links.alignment import best_shift, in_scene_frame
 from radiotwin.links.measurements import Measurements

@@ -14,11 +14,18 @@ import pandas as pd
 import xarray as xr
 
 from radiotwin.closeloop.run import Loop
-from radiotwin.display import PlotFrame, Summary, new_axes
-from radiotwin.display.axes import RESIDUAL_COLOURS, plain, residual_range_db
-from radiotwin.display.summary import Summarised, count
+from radiotwin.display import (
+    RESIDUAL_COLOURS,
+    PlotFrame,
+    Summarised,
+    Summary,
+    count,
+    new_axes,
+    plain,
+    residual_range_db,
+)
 from radiotwin.errors import BadInput
-from radiotwin.geo.frames import read_frame
+from radiotwin.geo import read_frame
 from radiotwin.io.cells import RESIDUALS, read_table, write_csv
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import Origin

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import local_crs
+from radiotwin.geo import local_crs
 from radiotwin.io.files import atomic_file, atomic_path
 from radiotwin.io.forms import Origin
 from radiotwin.maps.form import MapBlock, MapStream

@@ -22,7 +22,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
-from radiotwin.geo.geodesy import to_geographic
+from radiotwin.geo import to_geographic
 from radiotwin.io.budgets import MAP_PICTURES
 from radiotwin.io.files import atomic_file
 from radiotwin.io.forms import Origin

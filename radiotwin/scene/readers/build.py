@@ -13,7 +13,7 @@ import pandas as pd
 import shapely
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import to_local
+from radiotwin.geo import to_local
 from radiotwin.io.budgets import FEATURES, SHAPES
 from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import check_input

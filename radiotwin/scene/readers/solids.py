@@ -20,7 +20,7 @@ import trimesh
 from manifold3d import Error, Manifold, Mesh64
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.geo.geodesy import to_local
+from radiotwin.geo import to_local
 from radiotwin.io.budgets import CORNERS, FACES, OVERLAPS, PART_PAIRS, TOUCHING_CORNERS
 from radiotwin.io.forms import Origin
 from radiotwin.scene.checks import Problem, Severity

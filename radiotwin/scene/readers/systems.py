@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import reference_system
+from radiotwin.geo import reference_system
 
 if TYPE_CHECKING:
     from pyproj import CRS

@@ -19,7 +19,7 @@ import shapely
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import to_geographic, to_local
+from radiotwin.geo import to_geographic, to_local
 from radiotwin.io.budgets import TERRAIN_BLOCK_BYTES, TERRAIN_PIXELS
 from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import check_input

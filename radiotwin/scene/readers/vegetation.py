@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import shapely
 
-from radiotwin.geo.geodesy import to_local
+from radiotwin.geo import to_local
 from radiotwin.io.budgets import VEGETATION_CORNERS
 from radiotwin.io.forms import Origin
 from radiotwin.scene.checks import Problem

@@ -4,7 +4,7 @@ import rasterio
 from pyproj import CRS, Transformer
 
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.geo.geodesy import to_geographic
+from radiotwin.geo import to_geographic
 from radiotwin.maps.export.geotiff import write_geotiff
 from radiotwin.maps.export.tables import write_csv
 from radiotwin.maps.radiomap import RadioMap

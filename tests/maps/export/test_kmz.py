@@ -7,7 +7,7 @@ import pytest
 from matplotlib import colormaps
 from PIL import Image
 
-from radiotwin.geo.geodesy import to_local
+from radiotwin.geo import to_local
 from radiotwin.maps.export.kmz import GX, KML, OPACITY, write_kmz
 from radiotwin.maps.radiomap import RadioMap
 

@@ -7,7 +7,7 @@ import xarray as xr
 from pyproj import CRS
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import local_crs
+from radiotwin.geo import local_crs
 from radiotwin.maps.export import EXPORTERS, check_format, select
 from radiotwin.maps.radiomap import RadioMap
 

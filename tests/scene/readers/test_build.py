@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import local_crs, to_local
+from radiotwin.geo import local_crs, to_local
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.readers import MapOptions, build_scene_from_map, map_name, map_suffix

@@ -12,7 +12,7 @@ import trimesh
 from pyproj import Transformer
 
 from radiotwin.errors import BadInput
-from radiotwin.geo.geodesy import to_local
+from radiotwin.geo import to_local
 from radiotwin.io.budgets import TAG_BYTES, VERTICES
 from radiotwin.io.forms import Origin
 from radiotwin.scene import Scene

@@ -6,7 +6,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from radiotwin.geo.geodesy import to_geographic
+from radiotwin.geo import to_geographic
 from radiotwin.io.forms import Origin
 from radiotwin.scene.materials import STANDARD
 from radiotwin.scene.readers.extrude import SLOT_M, make_blocks

@@ -1,1 +1,0 @@
-"""Frames, reference systems, and conversion between them."""
