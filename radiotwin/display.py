@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.geo import local_crs, to_geographic
 from radiotwin.io.forms import Origin
 from radiotwin.io.texts import shown
@@ -254,11 +254,9 @@ def geo_data_frame(table: pd.DataFrame, origin: Origin | None, *, position_m: np
     Raises:
         BadInput: GeoPandas is not installed.
     """
-    try:
-        import geopandas
-    except ImportError:
-        raise BadInput("a GeoDataFrame needs the package geopandas, which is not installed; "
-                       "install it with `pip install 'radiotwin[geo]'`") from None
+    geopandas = optional_package(
+        "geopandas", "a GeoDataFrame needs the package geopandas, which is not installed; install "
+                     "it with `pip install 'radiotwin[geo]'`")
     if geometry is None:
         import shapely
 

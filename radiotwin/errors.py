@@ -1,5 +1,8 @@
 """The two errors that a command reports to its user, each with its exit status."""
 
+from importlib import import_module
+from typing import Any
+
 
 class BadInput(Exception):
     """Input that cannot be used: exit status 2.
@@ -11,3 +14,19 @@ class BadInput(Exception):
 
 class RunFailed(Exception):
     """Valid input on which the work could not be done: exit status 1."""
+
+
+def optional_package(name: str, message: str) -> Any:
+    """Return a module of a package that is not installed with the others.
+
+    Args:
+        name: of the module.
+        message: what needs it, and how to install it or do without.
+
+    Raises:
+        BadInput: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError:
+        raise BadInput(message) from None

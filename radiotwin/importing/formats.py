@@ -23,8 +23,6 @@ from radiotwin.io.budgets import CELLS, COLUMNS, ROWS
 
 _FIRST = 6  # fields before the bins
 _EDGE = 1e-6  # of a step: an edge of the band on that of a bin
-MADE_UP = "made-up"
-"""Tried on a file that was made up after the description only."""
 SEMTECH = "Semtech, SX1276/77/78/79 data sheet, rev. 4, 5.5.5"
 _LEVEL = "power of the packet, dBm: RSSI, plus SNR where that is below 0"
 _CAUTION = ("the RSSI of a packet below the noise is mostly noise, so level = RSSI + SNR where SNR "
@@ -134,7 +132,6 @@ class Format:
         level: what the level is, with its unit.
         source: of the description.
         settings: others than `columns`.
-        tried_on: `MADE_UP`, or which original.
         caution: of the units, which is printed at every import.
         without_header: how a file without a header is recognised and read, or None.
     """
@@ -146,7 +143,6 @@ class Format:
     level: str
     source: str
     settings: Mapping[str, Any] = field(default_factory=dict)
-    tried_on: str = MADE_UP
     caution: str = ""
     without_header: WithoutHeader | None = None
 

@@ -20,7 +20,7 @@ from typing import IO, Any
 import numpy as np
 import pandas as pd
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.importing.log_files import BINARIES, TEXTS, Lines, LogFile, open_archive, open_member
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.source import Source
@@ -137,11 +137,9 @@ def read_sheet(file: LogFile, sheet: str | None) -> Sheet:
         BadInput: openpyxl is not installed, no such sheet, or the workbook is damaged or too large.
     """
     _check(file)
-    try:
-        import openpyxl
-    except ImportError:
-        raise BadInput(f"{file}: workbooks need the package openpyxl; `pip install "
-                       "radiotwin[xlsx]`, or save the sheet as CSV") from None
+    openpyxl = optional_package(
+        "openpyxl", f"{file}: workbooks need the package openpyxl; `pip install radiotwin[xlsx]`, "
+                    "or save the sheet as CSV")
     try:
         book = openpyxl.load_workbook(file.path, read_only=True, data_only=True, keep_links=False)
         try:

@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from radiotwin.errors import BadInput
-from radiotwin.io.cells import as_numbers, listed, shown
+from radiotwin.io.cells import as_numbers, listed, refuse
 from radiotwin.io.forms import name_fault
 
 EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
@@ -158,11 +158,7 @@ class Source:
         Raises:
             BadInput: names file, row and column.
         """
-        rows = np.flatnonzero(np.asarray(bad, dtype=bool))
-        if len(rows):
-            more = f" ({len(rows)} such rows)" if len(rows) > 1 else ""
-            raise BadInput(f"{self.path}: {self.where(cells.index[rows[0]])}, column {spec}: "
-                           f"{shown(cells.iloc[rows[0]])} {reason}{more}")
+        refuse(self.path, spec, cells, bad, reason, lambda row: self.where(cells.index[row]))
 
 
 def as_text(cells: pd.Series) -> pd.Series:

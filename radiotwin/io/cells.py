@@ -7,7 +7,7 @@ typed columns from Parquet.
 import csv
 import gzip
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from itertools import chain
 from pathlib import Path, PurePath
 from typing import IO, Any
@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.io.budgets import CELLS, COLUMNS, FILE_BYTES, ROW_BYTES, ROWS
 from radiotwin.io.forms import MAX_NUMBER, MAX_POSITION_M
 from radiotwin.io.inputs import open_gzip, open_input
@@ -234,14 +234,12 @@ def require_pyarrow(path: Path) -> None:
     Raises:
         BadInput: it is not.
     """
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError:
-        raise BadInput(f"{path}: Parquet needs the package pyarrow; `pip install "
-                       "radiotwin[parquet]`, or use .csv.gz") from None
+    optional_package("pyarrow", f"{path}: Parquet needs the package pyarrow; `pip install "
+                                "radiotwin[parquet]`, or use .csv.gz")
 
 
-def refuse(path: Path, name: str, column: pd.Series, bad: ArrayLike, reason: str) -> None:
+def refuse(path: Path | str, name: str, column: pd.Series, bad: ArrayLike, reason: str,
+           where: Callable[[int], str] = lambda index: f"row {index + 2}") -> None:
     """Raise BadInput about the first bad cell of a column, if there is one.
 
     Args:
@@ -250,14 +248,15 @@ def refuse(path: Path, name: str, column: pd.Series, bad: ArrayLike, reason: str
         column: its cells, (n,).
         bad: (n,) bool.
         reason: end of the message, after the cell's text.
+        where: number of a row -> its place in the file; by default row 1 is the header.
 
     Raises:
-        BadInput: names file, row (1 is the header) and column.
+        BadInput: names file, row and column.
     """
     rows = np.flatnonzero(np.asarray(bad, dtype=bool))
     if len(rows):
         more = f" ({len(rows)} such rows)" if len(rows) > 1 else ""
-        raise BadInput(f"{path}: row {rows[0] + 2}, column {name}: "
+        raise BadInput(f"{path}: {where(int(rows[0]))}, column {name}: "
                        f"{shown(column.iloc[rows[0]])} {reason}{more}")
 
 

@@ -180,10 +180,10 @@ def _show_unraisable(unraisable: Any) -> None:
         sys.__unraisablehook__(unraisable)
 
 
-def note_finished(count: int = 1) -> None:
-    """Count finished parts that the next run will not do again."""
+def note_finished() -> None:
+    """Count a finished part that the next run will not do again."""
     global _finished
-    _finished += count
+    _finished += 1
 
 
 def after_interrupt() -> str:

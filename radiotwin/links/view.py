@@ -18,6 +18,7 @@ from radiotwin.display import (
 )
 from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
+from radiotwin.scene.plot import draw_outlines
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
@@ -69,7 +70,7 @@ def plot_links(table: pd.DataFrame, values: np.ndarray, ax: Axes, frame: PlotFra
     other = ENDS[1 - ENDS.index(end)]
     x_m, y_m = (table[f"{end}_{axis}_m"].to_numpy(dtype=float) for axis in "xy")
     if scene is not None:
-        scene.draw_outlines(ax, frame)
+        draw_outlines(ax, scene, frame)
     seen = np.isfinite(values)
     if not seen.all():
         draw_points(ax, frame, x_m[~seen], y_m[~seen], s=7, color="0.75", linewidths=0,

@@ -16,7 +16,7 @@ import numpy as np
 import xarray as xr
 from xarray.conventions import decode_cf_variable
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.io.array_stores import METADATA, check_hdf5, check_zarr
 from radiotwin.io.budgets import DEVICES, MAP_AXIS, MAP_STREAM_VALUES, MAP_VALUES
 from radiotwin.io.files import atomic_folder, require_writable
@@ -164,14 +164,9 @@ def require_zarr(path: Path) -> Any:
     Raises:
         BadInput: it is not installed.
     """
-    try:
-        import zarr
-        import zarr.codecs
-        import zarr.storage
-    except ImportError:
-        raise BadInput(f"{path}: Zarr needs the package zarr, which is not installed; install it "
-                       "with `pip install 'radiotwin[zarr]'`, or take a .nc file") from None
-    return zarr
+    return optional_package(
+        "zarr", f"{path}: Zarr needs the package zarr, which is not installed; install it with "
+                "`pip install 'radiotwin[zarr]'`, or take a .nc file")
 
 
 def check_zarr_target(path: Path) -> None:

@@ -5,7 +5,8 @@ Both draw themselves into any axes, and give themselves to GIS programs as rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from abc import abstractmethod
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,6 +52,7 @@ from radiotwin.maps.form import (
 )
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
+from radiotwin.scene.plot import draw_outlines
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
@@ -81,6 +83,15 @@ class OverDevices(Summarised):
         return self.dataset.sizes["device"]
 
     @property
+    @abstractmethod
+    def variables(self) -> tuple[str, ...]:
+        """Names of the variables; the first one is drawn."""
+
+    @abstractmethod
+    def _look(self, values: np.ndarray) -> tuple[str, str, dict[str, Any]]:
+        """Return the beginning of the title, the label of the colours, and their scale."""
+
+    @property
     def devices(self) -> list[str]:
         """Names of the devices."""
         return [str(name) for name in self.dataset["device"].values]
@@ -99,84 +110,66 @@ class OverDevices(Summarised):
         """Return a copy of the dataset."""
         return self.dataset.copy(deep=True)
 
+    def plot(self, device: str | None = None, altitude_m: float | None = None,
+             ax: Axes | None = None, *, scene: Scene | None = None,
+             geographic: bool | None = None) -> Axes:
+        """Draw the values of one device at one altitude; white where there are none.
 
-def pick(dataset: xr.Dataset, device: str | None, altitude_m: float | None
-         ) -> tuple[str, float, xr.Dataset]:
-    """Return a device, an altitude, and the part of a map for them, with dims (y, x).
+        Args:
+            device: name; None: the first one.
+            altitude_m: one of the map's [m]; None: the lowest.
+            ax: axes of matplotlib to draw into; None: a new figure.
+            scene: whose buildings are outlined and in which the device is marked; None: neither.
+            geographic: whether axes are longitude and latitude; None: where the origin is known.
 
-    Args:
-        dataset: with dims (device, z, y, x).
-        device: its name; None: the first one.
-        altitude_m: one of the map's [m]; None: the lowest.
+        Returns:
+            The axes.
 
-    Raises:
-        BadInput: the map has no such device or altitude.
-    """
-    names, heights_m = [str(name) for name in dataset["device"].values], dataset["z"].values
-    device = names[0] if device is None else device
-    if device not in names:
-        raise BadInput(f"device {device!r} is not in the map; it has {some(names)}")
-    altitude_m = float(heights_m[0]) if altitude_m is None else altitude_m
-    if altitude_m not in heights_m:
-        raise BadInput(f"altitude {altitude_m:g} m is not in the map; it has "
-                       f"{some(f'{z:g}' for z in heights_m)} m")
-    return device, altitude_m, dataset.isel(device=names.index(device)).sel(z=altitude_m)
+        Raises:
+            BadInput: no such device or altitude, or longitude and latitude without an origin.
+        """
+        names, heights_m = self.devices, self.dataset["z"].values
+        device = names[0] if device is None else device
+        if device not in names:
+            raise BadInput(f"device {device!r} is not in the map; it has {some(names)}")
+        altitude_m = float(heights_m[0]) if altitude_m is None else altitude_m
+        if altitude_m not in heights_m:
+            raise BadInput(f"altitude {altitude_m:g} m is not in the map; it has "
+                           f"{some(f'{z:g}' for z in heights_m)} m")
+        part = self.dataset.isel(device=names.index(device)).sel(z=altitude_m)
+        values = part[self.variables[0]].values
+        title, label, colours = self._look(values)
+        origin = scene.config.origin if scene is not None and self.origin is None else self.origin
+        frame, ax = PlotFrame.choose(origin, geographic), new_axes(ax)
+        drawn = draw_cells(ax, frame, part["x"].values, part["y"].values, values, **colours)
+        add_colour_bar(ax, drawn, label, "both")
+        if scene is not None:
+            draw_outlines(ax, scene, frame)
+            at = [(each.x_m, each.y_m) for each in scene.config.devices if each.device == device]
+            if at:
+                draw_points(ax, frame, *np.array(at).T, marker="^", s=80, color="white",
+                            edgecolors="black", label=f"device {plain(device)}", zorder=4)
+        frame.prepare(ax)
+        add_legend(ax)
+        ax.set_title(f"{title}device {plain(device)} at {altitude_m:g} m")
+        return ax
 
+    def to_geodataframe(self) -> GeoDataFrame:
+        """Return a row with a point for each device and position, in metres of the local frame.
 
-def plot_values(values: xr.DataArray, origin: Origin | None, ax: Axes | None,
-                geographic: bool | None, scene: Scene | None, device: str, label: str,
-                extend: str, **look: Any) -> Axes:
-    """Draw values over the positions of a lattice.
-
-    Args:
-        values: (y, x); NaN stays empty.
-        origin: of the frame.
-        ax: to draw into; None: a new figure.
-        geographic: whether axes are longitude and latitude; None: where the origin is known.
-        scene: whose buildings are outlined and in which the device is marked; None: neither.
-        device: of the values.
-        label: of the colour bar.
-        extend: ends of the colour scale that values lie beyond, of `Figure.colorbar`.
-        look: of `Axes.pcolormesh`.
-    """
-    if scene is not None and origin is None:
-        origin = scene.config.origin
-    frame, ax = PlotFrame.choose(origin, geographic), new_axes(ax)
-    drawn = draw_cells(ax, frame, values["x"].values, values["y"].values, values.values, **look)
-    add_colour_bar(ax, drawn, label, extend)
-    if scene is not None:
-        scene.draw_outlines(ax, frame)
-        at = [(each.x_m, each.y_m) for each in scene.config.devices if each.device == device]
-        if at:
-            draw_points(ax, frame, *np.array(at).T, marker="^", s=80, color="white",
-                        edgecolors="black", label=f"device {plain(device)}", zorder=4)
-    frame.prepare(ax)
-    add_legend(ax)
-    return ax
-
-
-def map_table(dataset: xr.Dataset, variables: Sequence[str], origin: Origin | None
-              ) -> GeoDataFrame:
-    """Return a row with a point for each device and position of a map.
-
-    Args:
-        dataset: with dims (device, z, y, x).
-        variables: columns beside `device, x_m, y_m, z_m`, and `above_ground_m` where the map's
-            altitudes are that.
-        origin: of the frame.
-
-    Raises:
-        BadInput: GeoPandas is not installed.
-    """
-    names, *axes_m = (dataset[axis].values for axis in ("device", "z", "y", "x"))
-    name, z_m, y_m, x_m = (each.ravel() for each in np.meshgrid(names, *axes_m, indexing="ij"))
-    columns = {"device": name, "x_m": x_m, "y_m": y_m, "z_m": z_m}
-    if GROUND in dataset:
-        ground_m = np.broadcast_to(dataset[GROUND].values, [len(names), *map(len, axes_m)]).ravel()
-        columns |= {"z_m": z_m + ground_m, "above_ground_m": z_m}
-    columns |= {each: dataset[each].values.ravel() for each in variables}
-    position_m = np.column_stack([x_m, y_m]).astype(float)
-    return geo_data_frame(pd.DataFrame(columns), origin, position_m=position_m)
+        Raises:
+            BadInput: GeoPandas is not installed.
+        """
+        names, *axes_m = (self.dataset[axis].values for axis in ("device", "z", "y", "x"))
+        name, z_m, y_m, x_m = (each.ravel() for each in np.meshgrid(names, *axes_m, indexing="ij"))
+        columns = {"device": name, "x_m": x_m, "y_m": y_m, "z_m": z_m}
+        if GROUND in self.dataset:
+            ground_m = np.broadcast_to(self.dataset[GROUND].values,
+                                       [len(names), *map(len, axes_m)]).ravel()
+            columns |= {"z_m": z_m + ground_m, "above_ground_m": z_m}
+        columns |= {each: self.dataset[each].values.ravel() for each in self.variables}
+        position_m = np.column_stack([x_m, y_m]).astype(float)
+        return geo_data_frame(pd.DataFrame(columns), self.origin, position_m=position_m)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -255,41 +248,18 @@ class MapDifference(OverDevices):
         known = self.difference_db[np.isfinite(self.difference_db)].astype(float)
         return float(known.mean()) if len(known) else float("nan")
 
-    def plot(self, device: str | None = None, altitude_m: float | None = None,
-             ax: Axes | None = None, *, scene: Scene | None = None,
-             geographic: bool | None = None) -> Axes:
-        """Draw the difference for one device at one altitude, red where the first map has more.
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """The one variable."""
+        return (DIFFERENCE,)
 
-        Args:
-            device: name; None: the first one.
-            altitude_m: one of the maps' [m]; None: the lowest.
-            ax: axes of matplotlib to draw into; None: a new figure.
-            scene: whose buildings are outlined; None: none are.
-            geographic: whether axes are longitude and latitude; None: where the origin is known.
-
-        Returns:
-            The axes.
-
-        Raises:
-            BadInput: no such device or altitude, or longitude and latitude without an origin.
-        """
-        device, altitude_m, part = pick(self.dataset, device, altitude_m)
-        high_db = residual_range_db(part[DIFFERENCE].values)
-        ax = plot_values(part[DIFFERENCE], self.origin, ax, geographic, scene, device,
-                         "difference of the gains [dB]", "both", cmap=DIFFERENCE_COLOURS,
-                         vmin=-high_db, vmax=high_db)
+    def _look(self, values: np.ndarray) -> tuple[str, str, dict[str, Any]]:
+        """Red is where the first map has more."""
+        high_db = residual_range_db(values)
         names = " − ".join(plain(self.dataset.attrs[each], 40) or "map"
                            for each in ("minuend", "subtrahend"))
-        ax.set_title(f"{names}\ndevice {plain(device)} at {altitude_m:g} m")
-        return ax
-
-    def to_geodataframe(self) -> GeoDataFrame:
-        """Return a row with a point for each device and position, in metres of the local frame.
-
-        Raises:
-            BadInput: GeoPandas is not installed.
-        """
-        return map_table(self.dataset, [DIFFERENCE], self.origin)
+        return (f"{names}\n", "difference of the gains [dB]",
+                {"cmap": DIFFERENCE_COLOURS, "vmin": -high_db, "vmax": high_db})
 
     @property
     def _summary(self) -> Summary:
@@ -420,40 +390,11 @@ class RadioMap(OverDevices):
         """Return whether the map is over a scene's lattice."""
         return self.lattice.equals(scene.lattice)
 
-    def plot(self, device: str | None = None, altitude_m: float | None = None,
-             ax: Axes | None = None, *, scene: Scene | None = None,
-             geographic: bool | None = None) -> Axes:
-        """Draw the gain of one device at one altitude; white where it is not detected.
-
-        Args:
-            device: name; None: the first one.
-            altitude_m: one of the map's [m]; None: the lowest.
-            ax: axes of matplotlib to draw into; None: a new figure.
-            scene: whose buildings are outlined; None: none are.
-            geographic: whether axes are longitude and latitude; None: where the origin is known.
-
-        Returns:
-            The axes.
-
-        Raises:
-            BadInput: no such device or altitude, or longitude and latitude without an origin.
-        """
-        device, altitude_m, part = pick(self.dataset, device, altitude_m)
-        low_db, high_db = level_range_db(part["gain_db"].values)
-        ax = plot_values(part["gain_db"], self.origin, ax, geographic, scene, device,
-                         "channel gain [dB]", "both", cmap=GAIN_COLOURS, vmin=low_db,
-                         vmax=high_db)
+    def _look(self, values: np.ndarray) -> tuple[str, str, dict[str, Any]]:
+        low_db, high_db = level_range_db(values)
         source = plain(str(self.attributes.get("source", ""))) or "radio map"
-        ax.set_title(f"{source}: device {plain(device)} at {altitude_m:g} m")
-        return ax
-
-    def to_geodataframe(self) -> GeoDataFrame:
-        """Return a row with a point for each device and position, in metres of the local frame.
-
-        Raises:
-            BadInput: GeoPandas is not installed.
-        """
-        return map_table(self.dataset, self.variables, self.origin)
+        return (f"{source}: ", "channel gain [dB]",
+                {"cmap": GAIN_COLOURS, "vmin": low_db, "vmax": high_db})
 
     def __sub__(self, other: RadioMap) -> MapDifference:
         """Return the difference of the gains, see `MapDifference`.

@@ -7,13 +7,12 @@ be able to reach its terminal. A flight pattern takes the grid of an altitude, t
 battery and a source of random numbers, and returns one cell (row, column) per slot.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import pandas as pd
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
+from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.io.budgets import ROWS
 from radiotwin.io.inputs import require_within
 from radiotwin.links.measurements import Measurements
@@ -96,22 +95,9 @@ class FlightGrid:
         return cells
 
 
-@dataclass(frozen=True)
-class SegmentedLaw:
-    """gain = intercept_db + 10 · slope · log10(d / 1 m) + N(0, sigma_db²)."""
-
-    intercept_db: float
-    slope: float
-    sigma_db: float
-
-    def mean_db(self, log10_distance: np.ndarray) -> np.ndarray:
-        """Return the mean gain [dB] at log10(d / 1 m), any shape."""
-        return self.intercept_db + 10 * self.slope * log10_distance
-
-
 # Parameters of Chen et al. 2023
-LOS_LAW = SegmentedLaw(-30.0, -2.5, 2**0.5)
-NLOS_LAW = SegmentedLaw(-35.0, -3.04, 5**0.5)
+LOS_LAW = LogDistanceLine(-30.0, -2.5, 2**0.5)
+NLOS_LAW = LogDistanceLine(-35.0, -3.04, 5**0.5)
 
 
 def segmented_truth(scene: Scene) -> RadioMap:
@@ -134,7 +120,7 @@ def segmented_truth(scene: Scene) -> RadioMap:
         log_distance = np.log10(np.maximum(distance_m, 1.0))  # the law begins at 1 m
         gain_db.append(np.where(seen, LOS_LAW.mean_db(log_distance),
                                 NLOS_LAW.mean_db(log_distance)))
-        sigma_db.append(np.where(seen, LOS_LAW.sigma_db, NLOS_LAW.sigma_db))
+        sigma_db.append(np.where(seen, LOS_LAW.sd_db, NLOS_LAW.sd_db))
         los.append(seen)
     return RadioMap.build(
         [device.device for device in scene.config.devices], scene.lattice, np.array(gain_db),

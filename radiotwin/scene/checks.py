@@ -52,10 +52,10 @@ def fixed(message: str, shape: str = "") -> Problem:
     return Problem("fixed", shape, message)
 
 
-def listed(names: Sequence[str], most: int = 3) -> str:
+def listed(names: Sequence[str]) -> str:
     """Return `'a', 'b', 'c' and 7 more`: names for a message about many shapes at once."""
-    text = ", ".join(repr(name) for name in names[:most])
-    return text if len(names) <= most else f"{text} and {len(names) - most} more"
+    text = ", ".join(map(repr, names[:3]))
+    return text if len(names) <= 3 else f"{text} and {len(names) - 3} more"
 
 
 def upright(vertices: np.ndarray, up: str) -> np.ndarray:

@@ -19,8 +19,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from radiotwin.errors import BadInput, RunFailed
@@ -29,6 +27,7 @@ from radiotwin.io.inputs import require_within
 from radiotwin.runtime.processes import in_threads
 from radiotwin.scene.folder import read_triangles
 from radiotwin.scene.materials import Material
+from radiotwin.scene.meshes import connected
 from radiotwin.scene.vegetation import Vegetation
 
 SKIN_M = 0.01  # step past a surface before the next is looked for [m]
@@ -385,8 +384,7 @@ def building_of_vertex(city: CityMap) -> np.ndarray:
     above = ~city.terrain if city.terrain is not None else (
         city.vertices[city.faces][:, :, 2] > GROUND_M).any(axis=1)
     sides = faces[above][:, [[0, 1], [1, 2]]].reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(sides)), sides.T), shape=(len(corners),) * 2)
-    label = connected_components(graph, directed=False)[1]
+    label = connected(sides, len(corners))
     built = np.zeros(len(corners), dtype=bool)
     built[sides.ravel()] = True
     _, building = np.unique(np.where(built, label, -1), return_inverse=True)

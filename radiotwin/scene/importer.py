@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from radiotwin.errors import BadInput
 from radiotwin.runtime.console import progress
@@ -23,7 +21,7 @@ from radiotwin.scene.materials import (
     safe_name,
     unique_name,
 )
-from radiotwin.scene.meshes import MeshBudget, RawMesh, clean, load_shape
+from radiotwin.scene.meshes import MeshBudget, RawMesh, clean, connected, load_shape
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 from radiotwin.scene.models import UP_AXES, read_model
 from radiotwin.scene.surfaces import FLAT_M, Surfaces
@@ -267,8 +265,7 @@ def _joined(names: list[str], materials: list[Material | None], surfaces: Surfac
     if len(pairs) == 0:
         return names, materials, surfaces, []
     size = surfaces.shapes
-    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(size, size))
-    building = connected_components(graph, directed=False)[1]
+    building = connected(pairs, size)
     meshes, whole, first = surfaces.meshes(), [], []
     order = np.argsort(building, kind="stable")
     for members in np.split(order, np.cumsum(np.bincount(building))[:-1]):

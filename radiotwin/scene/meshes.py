@@ -9,6 +9,8 @@ from pathlib import Path
 
 import mapbox_earcut
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import CORNERS, DOCUMENT_BYTES, FACES, SHAPES, VERTICES
@@ -336,3 +338,14 @@ def is_volume(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
         return False
     a, b, c = (vertices_m - vertices_m[0])[faces].swapaxes(0, 1)
     return bool(np.einsum("ij,ij->", a, np.cross(b, c)) > 0)
+
+
+def connected(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Return the (count,) label of the group that each of some things is in.
+
+    Args:
+        pairs: (n, 2) indices of things that belong together.
+        count: number of things.
+    """
+    graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(count, count))
+    return connected_components(graph, directed=False)[1]

@@ -26,8 +26,6 @@ from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import DOCUMENT_BYTES, FACES, FILE_BYTES, FILES, SHAPES, VERTICES
@@ -36,6 +34,7 @@ from radiotwin.scene.meshes import (
     MeshBudget,
     RawMesh,
     check_vertices,
+    connected,
     cut_polygons,
     read_obj_groups,
 )
@@ -48,21 +47,35 @@ _COMPONENTS = {"SCALAR": 1, "VEC3": 3}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression",
                "KHR_mesh_quantization")
-Part = tuple[str, str | None, np.ndarray, np.ndarray]
 UP_AXES = {".obj": "z", ".glb": "y", ".gltf": "y", ".stl": "z", ".ply": "z"}
 """Suffix -> axis that points up where nothing else is said: that of glTF is fixed [1]."""
 # [1] https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#coordinate-system-and-units
 _STL_HEADER, _STL_FACE = 84, 50  # bytes
 
 
-def read_gltf(path: Path) -> list[Part]:
+@dataclass(frozen=True, eq=False)
+class ModelPart:
+    """One object of a model.
+
+    Attributes:
+        name: of the object.
+        material: name of its material; None: it has none.
+        mesh: its triangles, in the file's units and axes.
+    """
+
+    name: str
+    material: str | None
+    mesh: RawMesh
+
+
+def read_gltf(path: Path) -> list[ModelPart]:
     """Read the objects of a glTF file in the places that it gives them.
 
     Args:
         path: `.glb` or `.gltf` file.
 
     Returns:
-        Name, name of the material or None, (v, 3) vertices and (f, 3) faces of each, y up.
+        The objects, y up.
 
     Raises:
         BadInput: no such file, not glTF 2.0, damaged, compressed, or too large.
@@ -155,7 +168,7 @@ class _Document:
         except binascii.Error as error:
             raise ValueError(f"a buffer is not in base64: {error}") from None
 
-    def parts(self) -> Iterator[Part]:
+    def parts(self) -> Iterator[ModelPart]:
         """Yield what the scene's objects are made of."""
         vertices = parts = 0
         for name, mesh, to_world in self._placed():
@@ -173,8 +186,9 @@ class _Document:
                 moved = points @ to_world[:3, :3].T + to_world[:3, 3]
                 mirrored = np.linalg.det(to_world[:3, :3]) < 0
                 material = primitive.get("material")
-                yield (name, None if material is None else self._name("materials", material),
-                       moved, faces[:, ::-1] if mirrored else faces)
+                yield ModelPart(
+                    name, None if material is None else self._name("materials", material),
+                    RawMesh(moved, faces[:, ::-1] if mirrored else faces))
 
     def _placed(self) -> Iterator[tuple[str, int, np.ndarray]]:
         """Yield name, mesh and transform of each node of the scene; each node stands once."""
@@ -266,21 +280,6 @@ def _transform(node: dict[str, Any]) -> np.ndarray:
     return made
 
 
-@dataclass(frozen=True, eq=False)
-class ModelPart:
-    """One object of a model.
-
-    Attributes:
-        name: of the object.
-        material: name of its material; None: it has none.
-        mesh: its triangles, in the file's units and axes.
-    """
-
-    name: str
-    material: str | None
-    mesh: RawMesh
-
-
 def read_model(path: Path) -> list[ModelPart]:
     """Read the objects of a model.
 
@@ -302,8 +301,7 @@ def read_model(path: Path) -> list[ModelPart]:
         parts = [ModelPart(name or path.stem, material, _own_mesh(path, vertices, polygons))
                  for (name, material), polygons in groups.items()]
     elif suffix in (".glb", ".gltf"):
-        parts = [ModelPart(name, material, RawMesh(vertices, faces))
-                 for name, material, vertices, faces in read_gltf(path)]
+        parts = read_gltf(path)
     else:
         whole = (cut_polygons(path, *read_ply(path)) if suffix == ".ply" else read_stl(path))
         parts = [ModelPart(f"{path.stem}_{number}", None, mesh)
@@ -384,10 +382,7 @@ def _connected(mesh: RawMesh) -> list[RawMesh]:
         return [mesh]
     vertices, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = same.reshape(-1)[mesh.faces]
-    starts, ends = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
-    graph = coo_matrix((np.ones(len(starts), dtype=bool), (starts, ends)),
-                       shape=(len(vertices), len(vertices)))
-    label = connected_components(graph, directed=False)[1][faces[:, 0]]
+    label = connected(faces[:, [[0, 1], [1, 2]]].reshape(-1, 2), len(vertices))[faces[:, 0]]
     order = np.argsort(label, kind="stable")
     parts = np.split(faces[order], np.flatnonzero(np.diff(label[order])) + 1)
     polygons = [mesh.polygons, *[0] * (len(parts) - 1)]

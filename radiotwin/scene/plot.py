@@ -77,8 +77,7 @@ def plot_scene(scene: Scene, ax: Axes | None, geographic: bool | None) -> Axes:
     frame, ax = PlotFrame.choose(scene.config.origin, geographic), new_axes(ax)
     x_m, y_m = _centres(scene, PLOT_CELLS)
     height_m = _built_m(scene, np.meshgrid(x_m, y_m))
-    built = height_m[height_m > MIN_HEIGHT_M]
-    top_m = max(float(np.percentile(built, 99.5)), 1.0) if len(built) else 1.0
+    top_m = _top_m(height_m)
     ax.set_facecolor(GROUND_COLOUR)
     drawn = draw_cells(ax, frame, x_m, y_m, np.ma.masked_less(height_m, MIN_HEIGHT_M),
                        cmap=colormaps["YlGnBu"], vmin=0, vmax=top_m)
@@ -196,6 +195,12 @@ def scene_table(scene: Scene, layer: str) -> GeoDataFrame:
     return geo_data_frame(table, origin, geometry=np.array(outlines, dtype=object))
 
 
+def _top_m(height_m: np.ndarray) -> float:
+    """Return the upper end of the scale of heights [m]: nearly all buildings are lower."""
+    built = height_m[height_m > MIN_HEIGHT_M]
+    return max(float(np.percentile(built, 99.5)), 1.0) if len(built) else 1.0
+
+
 def _centres(scene: Scene, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """Return x (nx,) and y (ny,) of cells over the extent [m]."""
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
@@ -267,9 +272,8 @@ def draw_heights(axes: Axes, height_m: np.ndarray, bounds: Bounds) -> AxesImage:
     from matplotlib.colors import LightSource
 
     colours = colormaps["YlGnBu"].with_extremes(bad=GROUND_COLOUR)
-    built = height_m[height_m > 0.5]
-    top_m = max(float(np.percentile(built, 99.5)), 1.0) if len(built) else 1.0
-    image = axes.imshow(np.ma.masked_less(height_m, 0.5), origin="lower", extent=bounds,
+    top_m = _top_m(height_m)
+    image = axes.imshow(np.ma.masked_less(height_m, MIN_HEIGHT_M), origin="lower", extent=bounds,
                         cmap=colours, vmin=0, vmax=top_m, interpolation="nearest")
     cell_m = (bounds[1] - bounds[0]) / height_m.shape[1]
     shade = LightSource(azdeg=315, altdeg=50).hillshade(np.flipud(height_m), vert_exag=0.25,

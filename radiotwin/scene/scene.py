@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from geopandas import GeoDataFrame
     from matplotlib.axes import Axes
 
-    from radiotwin.display import PlotFrame
-
 _BLOCK_BYTES = 2**20
 
 
@@ -93,12 +91,6 @@ class Scene(Summarised):
         from radiotwin.scene.plot import plot_scene
 
         return plot_scene(self, ax, geographic)
-
-    def draw_outlines(self, ax: "Axes", frame: "PlotFrame") -> None:
-        """Draw the outlines of the buildings into axes that have a frame."""
-        from radiotwin.scene.plot import draw_outlines
-
-        draw_outlines(ax, self, frame)
 
     def to_xarray(self, step_m: float = 1.0) -> "xr.Dataset":
         """Return the heights over the extent as a raster.

@@ -4,10 +4,8 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from radiotwin.scene.meshes import WELD_M
+from radiotwin.scene.meshes import WELD_M, connected
 
 FLAT_M = 0.5  # surfaces that differ by less than a kerb or a step are at one level [m]
 _MAX_WALL_COSINE = 0.3  # of a wall's normal to the vertical: walls lean by at most 17 degrees
@@ -37,7 +35,7 @@ class Surfaces:
         self.shape = np.repeat(np.arange(len(meshes)), [len(faces) for _, faces in meshes])
         self.shapes = len(meshes)
         self._starts = starts
-        label = _labels(self.faces, len(self.vertices))
+        label = connected(self.faces[:, [[0, 1], [1, 2]]].reshape(-1, 2), len(self.vertices))
         self.part = np.unique(label[self.faces[:, 0]], return_inverse=True)[1]
         self.parts = int(self.part.max()) + 1
 
@@ -215,14 +213,6 @@ class Surfaces:
                  & (self._upright[first] != self._upright[second]))
         pairs = self.shape[np.stack([first, second], axis=1)[meets]]
         return np.unique(np.sort(pairs, axis=1), axis=0)
-
-
-def _labels(faces: np.ndarray, vertices: int) -> np.ndarray:
-    """Return the (v,) label of the connected part that each vertex belongs to."""
-    rows, columns = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
-    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)),
-                       shape=(vertices, vertices))
-    return connected_components(graph, directed=False)[1]
 
 
 def _edge_keys(edges: np.ndarray) -> np.ndarray:

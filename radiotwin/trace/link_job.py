@@ -31,7 +31,7 @@ GEOMETRY_COPIES = 3  # of a packed city in a worker: as received, unpacked, and 
 
 
 class BatchStore:
-    """A folder of arrays that belong to one key.
+    """Gains of finished pieces in a folder, as a job's cache; they belong to one key.
 
     Args:
         scene_folder: Its folder `cache` holds them.
@@ -52,37 +52,25 @@ class BatchStore:
             with atomic_path(self.folder / "key.json") as temporary:
                 temporary.write_text(text + "\n", encoding="utf-8")
 
-    def get(self, name: str, size: int) -> np.ndarray | None:
-        """Read an array.
-
-        Args:
-            name: Name that it was saved under.
-            size: Its length.
-
-        Returns:
-            (size,) array; None where it is absent, damaged, or not as `put` writes it.
-        """
+    def get(self, piece: "LinkBatch") -> tuple[np.ndarray] | None:
+        """Return the gains of a piece in a tuple; None where they are absent or damaged."""
         try:
-            data = read_bytes(self.folder / f"{name}.npy", "batch of a trace")
+            data = read_bytes(self.folder / f"{piece.name}.npy", "batch of a trace")
         except BadInput:
             return None
-        if len(data) < 8 * size:
+        if len(data) < 8 * len(piece):
             return None
-        array = np.frombuffer(data[len(data) - 8 * size:], dtype=float)
-        if data != _file_content(array):
+        array = np.frombuffer(data[len(data) - 8 * len(piece):], dtype=float)
+        if data != _file_content(array):  # not as `put` writes it
             return None
         note_finished()
-        return array
+        return (array,)
 
-    def put(self, name: str, array: np.ndarray) -> None:
-        """Save an array, completely or not at all.
-
-        Args:
-            name: Name in the store.
-            array: (n,) floats.
-        """
-        with atomic_path(self.folder / f"{name}.npy") as temporary:
-            temporary.write_bytes(_file_content(array))
+    def put(self, piece: "LinkBatch", result: np.ndarray, messages: list[str],
+            seconds: float) -> None:
+        """Save the gains of a piece, completely or not at all."""
+        with atomic_path(self.folder / f"{piece.name}.npy") as temporary:
+            temporary.write_bytes(_file_content(result))
         note_finished()
 
 
@@ -278,33 +266,20 @@ def _resources(settings: SolverSettings, geometry_bytes: int = 0) -> Resources:
     return Resources(memory_bytes, is_bound=False, gpu_share=share_of_gpu(memory_bytes))
 
 
-@dataclass(frozen=True)
-class KeptBatches:
-    """The store of a trace's batches, as a job's cache."""
-
-    store: BatchStore
-
-    def get(self, piece: LinkBatch) -> tuple[np.ndarray] | None:
-        """Return the gains of a piece in a tuple; None where they are not kept."""
-        found = self.store.get(piece.name, len(piece))
-        return None if found is None else (found,)
-
-    def put(self, piece: LinkBatch, result: np.ndarray, messages: list[str],
-            seconds: float) -> None:
-        """Keep the gains of a piece."""
-        self.store.put(piece.name, result)
-
-
 def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
-                  executor: Executor) -> np.ndarray:
-    """Return the gains of every lattice position; only what the store lacks is solved.
+                  executor: Executor, columns: np.ndarray | None = None, label: str = "",
+                  description: str = "tracing") -> np.ndarray:
+    """Return the gains of lattice positions; only what the store lacks is solved.
 
     Args:
         scene: City, devices and lattice.
         settings: Settings of the solver.
-        store: Store of this scene and these settings.
+        store: Store of this scene and its map's settings.
         index: Indices into `scene.config.devices`.
         executor: Where it runs.
+        columns: As of `lattice_pieces`.
+        label: As of `lattice_pieces`.
+        description: Shown with the progress.
 
     Returns:
         (devices, positions) gain [dB], NaN where there is no path.
@@ -313,8 +288,12 @@ def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, ind
         BadInput: The scene cannot be read, or the store not written.
         RunFailed: No usable libLLVM.
     """
-    pieces = lattice_pieces(scene, settings, index)
-    return _solve(scene, settings, store, pieces, executor, "tracing")
+    pieces, order = lattice_pieces(scene, settings, index, columns, label)
+    job = link_job(scene, settings, description)
+    solved_db = np.concatenate(executor.run(job, pieces, store))
+    gain_db = np.empty((len(solved_db) // len(order), len(order)))
+    gain_db[:, order] = solved_db.reshape(gain_db.shape)
+    return gain_db
 
 
 def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
@@ -325,19 +304,10 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
     With the solver `map`, which solves whole altitudes, it is the lowest altitude for the first
     device.
 
-    Args:
-        scene: City, devices and lattice.
-        settings: Settings of the solver.
-        store: Store of this scene and these settings.
-        index: Indices into `scene.config.devices`.
-        executor: Where it runs.
+    Args and what is raised are those of `solve_lattice`.
 
     Returns:
         Rows and columns in the result of `solve_lattice`, and their gains (rows, columns) [dB].
-
-    Raises:
-        BadInput: The scene cannot be read, or the store not written.
-        RunFailed: No usable libLLVM.
     """
     total = len(scene.lattice.positions_m)
     if settings.solver == "paths":
@@ -347,10 +317,8 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
         rows = slice(0, len(index))
     else:
         columns, rows = np.arange(_plane(scene)), slice(0, 1)
-    finer = settings.finer(FINER)
-    pieces = lattice_pieces(scene, finer, index[rows], columns, "finer")
-    gain_db = _solve(scene, finer, store, pieces, executor, "numerical noise")
-    return rows, columns, gain_db
+    return rows, columns, solve_lattice(scene, settings.finer(FINER), store, index[rows], executor,
+                                        columns, "finer", "numerical noise")
 
 
 def _plane(scene: Scene) -> int:
@@ -376,15 +344,3 @@ def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
                 scene.device_antennas[device]) for device in index]
     size = settings.batch_receivers if settings.solver == "paths" else _plane(scene)
     return link_pieces(scene, settings, devices, points_m, size)
-
-
-def _solve(scene: Scene, settings: SolverSettings, store: BatchStore,
-           traced: tuple[list[LinkBatch], np.ndarray], executor: Executor, description: str
-           ) -> np.ndarray:
-    """Return the (devices, positions) gains of all pieces [dB]."""
-    pieces, order = traced
-    job = link_job(scene, settings, description)
-    solved_db = np.concatenate(executor.run(job, pieces, KeptBatches(store)))
-    gain_db = np.empty((len(solved_db) // len(order), len(order)))
-    gain_db[:, order] = solved_db.reshape(gain_db.shape)
-    return gain_db

@@ -22,7 +22,7 @@ from radiotwin.runtime.execution.job import peak_bytes
 from radiotwin.runtime.execution.local import LocalPool
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
-from radiotwin.trace.link_job import KeptBatches, LinkBatch, lattice_pieces, link_job
+from radiotwin.trace.link_job import LinkBatch, lattice_pieces, link_job
 from radiotwin.trace.run import device_indices, noise_figures, open_store
 from radiotwin.trace.settings import FINER, QUALITIES, SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, PathGains
@@ -72,10 +72,10 @@ class TracePlan:
         rounds = math.ceil((1 + NOISE_SHARE) * left / workers)
         return self.start_s + rounds * self.batch_s
 
-    def rows(self, more: Sequence[int] = ()) -> list[tuple[int, float, float]]:
+    def rows(self) -> list[tuple[int, float, float]]:
         """Return (workers, seconds, memory of all [bytes]) for some numbers of workers."""
         return [(count, self.seconds(count), count * float(self.memory_bytes))
-                for count in sorted({*WORKERS, *more, self.workers})]
+                for count in sorted({*WORKERS, self.workers})]
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,8 @@ def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None
     index = device_indices(scene, devices)
     settings = with_radius(scene, settings)
     store = open_store(scene, settings)
-    kept, (pieces, _) = KeptBatches(store), lattice_pieces(scene, settings, index)
-    missing = [piece for piece in pieces if kept.get(piece) is None]
+    pieces, _ = lattice_pieces(scene, settings, index)
+    missing = [piece for piece in pieces if store.get(piece) is None]
     job = link_job(scene, settings, "calibrating")
     pool = LocalPool(1)
     try:
@@ -126,7 +126,7 @@ def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None
     finally:
         pool.close()
     for piece, (gain_db, *_) in zip(chosen, found):
-        kept.put(piece, gain_db, [], 0.0)
+        store.put(piece, gain_db, [], 0.0)
     # The first one compiles kernels.
     walls_s, seconds = np.array([each[1:3] for each in found[1:] or found] or [(0.0, 0.0)]).T
     busy = float(walls_s.sum() / max(seconds.sum(), 1e-9)) if count else 1.0

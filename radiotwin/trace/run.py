@@ -7,7 +7,6 @@ when ten times the rays are sent.
 import hashlib
 import math
 import warnings
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -27,35 +26,19 @@ from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, library_versions
 from radiotwin.trace.tiles import with_radius
 
+# Limits of physics for LoS links, relative to free space. The power of an LoS link is that of the
+# direct path plus that of each reflected or diffracted one. None of them is stronger than the
+# direct path, as each is longer and loses power at every interaction; over a city there are rarely
+# more than the ground and two walls that come close. So the median LoS link lies 0 to 3 dB above
+# free space. The fields of the same paths may also cancel (no lower bound). The 0.5 dB below allow
+# for numerical noise. How far one link may lie above free space depends on its paths:
+# `PathGains.solve` checks it.
+MEDIAN_EXCESS_DB = (-0.5, 3.0)  # lowest and highest
+MIN_EXCESS_DB = -0.5  # of a link that the tracer sees in LoS
+# Where a ray grazes an edge, the tracer and the map's own ray test may differ in LoS: such a share
+# of LoS links may lie below, and as many however small the map.
+MAX_DARK_SHARE, MAX_DARK_LINKS = 0.005, 3
 MAX_STEM = 100  # characters of a file's name
-
-
-@dataclass(frozen=True)
-class _Limits:
-    """Limits of physics for LoS links, relative to free space.
-
-    The power of an LoS link is that of the direct path plus that of each reflected or diffracted
-    one. None of them is stronger than the direct path, as each is longer and loses power at every
-    interaction; over a city there are rarely more than the ground and two walls that come close. So
-    the median LoS link lies 0 to 3 dB above free space. The fields of the same paths may also
-    cancel (no lower bound). The 0.5 dB below allow for numerical noise. How far one link may lie
-    above free space depends on its paths: `PathGains.solve` checks it.
-
-    Attributes:
-        median_excess_db: Lowest and highest median.
-        min_excess_db: Lowest gain of a link that the tracer sees in LoS.
-        max_dark_share: Share of LoS links that may lie below: the map decides LoS by a ray test of
-            its own, and where a ray grazes an edge the two tests may differ.
-        max_dark_links: Number of such links that is accepted however small the map.
-    """
-
-    median_excess_db: tuple[float, float] = (-0.5, 3.0)
-    min_excess_db: float = -0.5
-    max_dark_share: float = 0.005
-    max_dark_links: int = 3
-
-
-_LIMITS = _Limits()
 
 
 def free_space_gain_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
@@ -109,19 +92,19 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
     above_db = np.where(found, gain_db, -np.inf) - free_space_gain_db(distance_m, frequency_hz)
     excess_db, peak_excess_db = (above_db - direct_dbi)[los], (above_db - peak_dbi)[los]
     median_db, highest_db = float(np.median(excess_db)), float(peak_excess_db.max())
-    dark_share = float(np.mean(excess_db < _LIMITS.min_excess_db))
+    dark_share = float(np.mean(excess_db < MIN_EXCESS_DB))
     figures |= {"los_excess_median_db": median_db, "los_excess_highest_db": highest_db,
                 "los_below_free_space_share": dark_share}
     powers = combining == "power"
-    low_db, high_db = _LIMITS.median_excess_db
+    low_db, high_db = MEDIAN_EXCESS_DB
     if powers and (median_db < low_db or np.median(peak_excess_db) > high_db):
         raise RunFailed(f"LoS links lie {median_db:+.1f} dB from free space in the median; "
                         f"{low_db:+.1f} to {high_db:+.1f} dB is possible: is city.xml in metres, "
                         "and its ground below the devices?")
-    if (solver == "paths" and powers and dark_share > _LIMITS.max_dark_share
-            and dark_share * len(excess_db) > _LIMITS.max_dark_links):
+    if (solver == "paths" and powers and dark_share > MAX_DARK_SHARE
+            and dark_share * len(excess_db) > MAX_DARK_LINKS):
         raise RunFailed(f"{100 * dark_share:.1f} % of the links that have LoS by the 3D map are "
-                        f"weaker than free space, {100 * _LIMITS.max_dark_share:.1f} % may be: the "
+                        f"weaker than free space, {100 * MAX_DARK_SHARE:.1f} % may be: the "
                         "ray tracer and the map do not see the same city")
     return figures
 

@@ -12,7 +12,7 @@ at the same point.
 import logging
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -311,15 +311,14 @@ class PathGains:
         possible = power <= bound * 10 ** (_BOUND_TOLERANCE_DB / 10)
         return np.where(possible, power_to_db(power), IMPOSSIBLE_DB)
 
-    def gains(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None),
-              advance: Callable[[int], None] = lambda n: None) -> np.ndarray:
+    def gains(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None)
+              ) -> np.ndarray:
         """Solve any number of points, batch by batch.
 
         Args:
             device_m: (3,) position [m].
             points_m: (n, 3) positions [m].
             antennas: As in `solve`.
-            advance: Called with the number of points after each batch.
 
         Returns:
             (n,) gain [dB] as in `solve`.
@@ -327,7 +326,6 @@ class PathGains:
         gain_db = np.full(len(points_m), np.nan)
         for part in self.batches(len(points_m)):
             gain_db[part] = self.solve(device_m, points_m[part], antennas)
-            advance(part.stop - part.start)
         return gain_db
 
     def _combine(self, paths: Any, antennas: Antennas) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,7 @@ from radiotwin.propagation.laws.kriging import RegressionKriging, ResidualField
 from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
-from radiotwin.scene.plot import MARKS
+from radiotwin.scene.plot import MARKS, draw_outlines
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 from radiotwin.twin.model.effect_model import EffectModel
@@ -60,7 +60,7 @@ def plot_positions(devices: list[TwinDevice], ax: Axes | None, origin: Origin | 
     """Draw devices with the circles of their 90 % radii; see `Twin.plot`."""
     frame, ax = PlotFrame.choose(origin, geographic), new_axes(ax)
     if scene is not None:
-        scene.draw_outlines(ax, frame)
+        draw_outlines(ax, scene, frame)
     placed = [each for each in devices if np.isfinite([each.x_m, each.y_m]).all()]
     for role, marker, size, colour, label in MARKS:
         for sure in (True, False):

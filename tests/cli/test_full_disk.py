@@ -16,7 +16,7 @@ import pytest
 from radiotwin.errors import RunFailed
 from radiotwin.maps.export import EXPORTERS
 from radiotwin.maps.survey import fly_survey, segmented_truth
-from radiotwin.trace.link_job import BatchStore
+from radiotwin.trace.link_job import BatchStore, LinkBatch
 from tests.command_line import run_planning
 
 DISK_BYTES = 1024 * 1024
@@ -207,10 +207,11 @@ def test_trace(run, disk, inputs, traced):
 def test_batches_of_a_trace(disk):
     fill(disk, 4096)
     store = BatchStore(disk, {"a": 1})
+    piece = LinkBatch("0", np.zeros(3), np.zeros((2000, 3)), (None, None), 100)
     before = content(disk)
     with pytest.raises(RunFailed, match="No space left on device"):
-        store.put("0", np.zeros(2000))
-    assert content(disk) == before and store.get("0", 2000) is None
+        store.put(piece, np.zeros(2000), [], 0.0)
+    assert content(disk) == before and store.get(piece) is None
 
 
 @pytest.mark.parametrize("free", [120 * 1024, *(pytest.param(size * 1024, marks=pytest.mark.slow)

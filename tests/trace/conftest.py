@@ -43,7 +43,7 @@ def law(monkeypatch, small_scene):
             gain_db = np.where(~los & (distance_m > 250), np.nan, gain_db)
             return np.where([point_m.tolist() in Law.impossible_m for point_m in points_m], IMPOSSIBLE_DB, gain_db)
 
-        def gains(self, device_m, points_m, antennas=(None, None), advance=lambda n: None):
+        def gains(self, device_m, points_m, antennas=(None, None)):
             return np.concatenate([self.solve(device_m, points_m[part], antennas)
                                    for part in self.batches(len(points_m))])
 

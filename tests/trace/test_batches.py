@@ -7,19 +7,27 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.trace.link_job import BatchStore
+from radiotwin.trace.link_job import BatchStore, LinkBatch
+
+
+def piece(name, size):
+    return LinkBatch(name, np.zeros(3), np.zeros((size, 3)), (None, None), size)
+
+
+def put(store, name, array):
+    store.put(piece(name, len(array)), array, [], 0.0)
 
 
 def test_array_comes_back_to_the_bit(tmp_path):
     array = np.random.default_rng(0).normal(size=7)
     array[3] = np.nan
-    BatchStore(tmp_path, {"a": 1}).put("batch", array)
-    assert BatchStore(tmp_path, {"a": 1}).get("batch", 7).tobytes() == array.tobytes()
+    put(BatchStore(tmp_path, {"a": 1}), "batch", array)
+    assert BatchStore(tmp_path, {"a": 1}).get(piece("batch", 7))[0].tobytes() == array.tobytes()
 
 
 def test_keys_do_not_see_each_other(tmp_path):
-    BatchStore(tmp_path, {"a": 1}).put("batch", np.zeros(3))
-    assert BatchStore(tmp_path, {"a": 2}).get("batch", 3) is None
+    put(BatchStore(tmp_path, {"a": 1}), "batch", np.zeros(3))
+    assert BatchStore(tmp_path, {"a": 2}).get(piece("batch", 3)) is None
     assert len(list((tmp_path / "cache").iterdir())) == 2
 
 
@@ -38,13 +46,13 @@ def test_a_link_out_of_the_scene_is_refused_before_anything_is_written(tmp_path)
 def test_damaged_file_counts_as_missing(tmp_path, content):
     store = BatchStore(tmp_path, {})
     (store.folder / "batch.npy").write_bytes(content)
-    assert store.get("batch", 3) is None
+    assert store.get(piece("batch", 3)) is None
 
 
 @pytest.mark.parametrize("spoil", ["zip", "pickle", "huge", "int", "short", "pipe", "folder"])
 def test_a_batch_of_a_stranger_is_no_batch(tmp_path, spoil):
     store = BatchStore(tmp_path, {"a": 1})
-    store.put("b", np.arange(4.0))
+    put(store, "b", np.arange(4.0))
     path = store.folder / "b.npy"
     data = path.read_bytes()
     path.unlink()
@@ -63,4 +71,4 @@ def test_a_batch_of_a_stranger_is_no_batch(tmp_path, spoil):
         os.mkfifo(path)
     else:
         path.mkdir()
-    assert store.get("b", 4) is None
+    assert store.get(piece("b", 4)) is None

@@ -38,7 +38,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.importing.tracks.fixes import Fixes, make_fixes
 from radiotwin.io.budgets import BAG_CHUNK_BYTES, ENTRIES, FILE_BYTES, ROW_BYTES, ROWS
 from radiotwin.io.cells import listed
@@ -362,13 +362,11 @@ def read_rosbag(path: Path, topic: str | None = None) -> Fixes:
 
 def _decoders(path: Path) -> tuple[Callable[[bytes, str], Any], Callable[[bytes, str], Any]]:
     """Return what decodes messages of ROS 2, and of ROS 1."""
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise BadInput(f"{path}: ROS bags need the package rosbags; `pip install radiotwin[ros]`, "
-                       "or convert its positions to GPX or a table") from None
-    return (get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr,
-            get_typestore(Stores.ROS1_NOETIC).deserialize_ros1)
+    types = optional_package(
+        "rosbags.typesys", f"{path}: ROS bags need the package rosbags; `pip install "
+                           "radiotwin[ros]`, or convert its positions to GPX or a table")
+    return (types.get_typestore(types.Stores.ROS2_HUMBLE).deserialize_cdr,
+            types.get_typestore(types.Stores.ROS1_NOETIC).deserialize_ros1)
 
 
 def _parts(path: Path) -> list[Path]:

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.importing.tracks.fixes import Fixes, make_fixes
 from radiotwin.io.budgets import FILE_BYTES, ROWS
 from radiotwin.io.inputs import open_input
@@ -94,14 +94,12 @@ def read_ulog(path: Path) -> Fixes:
         BadInput: pyulog is not installed, the log is damaged, or has no position or no UTC.
     """
     messages = needed_messages(path, _TOPICS)
-    try:
-        from pyulog import ULog
-    except ImportError:
-        raise BadInput(f"{path}: PX4 flight logs need the package pyulog; `pip install "
-                       "radiotwin[tracks]`, or convert it to GPX") from None
+    pyulog = optional_package(
+        "pyulog", f"{path}: PX4 flight logs need the package pyulog; `pip install "
+                  "radiotwin[tracks]`, or convert it to GPX")
     try:
         with redirect_stdout(io.StringIO()):  # on which it remarks on damage
-            log = ULog(messages, disable_str_exceptions=True)
+            log = pyulog.ULog(messages, disable_str_exceptions=True)
         topics = {each.name: each.data for each in reversed(log.data_list)}  # instance 0 counts
         return _fixes(path, topics)
     except BadInput:

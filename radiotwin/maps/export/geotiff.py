@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.geo import local_crs
 from radiotwin.io.files import atomic_file, atomic_path
 from radiotwin.io.forms import Origin
@@ -115,13 +115,10 @@ def require_rasterio(path: Path) -> Any:
     Raises:
         BadInput: it is not installed.
     """
-    try:
-        import rasterio
-    except ImportError:
-        raise BadInput(
-            f"{path}: GeoTIFF is written with the package rasterio, which is not installed; "
-            "install it with `pip install 'radiotwin[gis]'`, or write .nc or .csv") from None
-    return rasterio
+    return optional_package(
+        "rasterio", f"{path}: GeoTIFF is written with the package rasterio, which is not "
+                    "installed; install it with `pip install 'radiotwin[gis]'`, or write .nc or "
+                    ".csv")
 
 
 def georeference(x_m: np.ndarray, y_m: np.ndarray, step_m: float,

@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from radiotwin.errors import BadInput, RunFailed
+from radiotwin.errors import BadInput, RunFailed, optional_package
 from radiotwin.io.signals import deferred, kept_from_children
 from radiotwin.runtime.execution.job import (
     SHARE_ROUNDING,
@@ -79,7 +79,9 @@ class RayPool(Pool):
         self._head: _Head | None = None
         if address == OWN:
             _require_token()
-        self._ray = _import_ray()
+        self._ray = optional_package(
+            "ray", "--cluster needs Ray, which is not installed; install it with `pip install "
+                   "'radiotwin[ray]'`, or leave the option out")
         try:
             if address == OWN:
                 self._head = _Head(workers or usable_cores())
@@ -277,15 +279,6 @@ def _require_token() -> None:
                            "import radiotwin's part first, or give the address of your cluster")
         os.environ.update(_OF_OWN_CLUSTER)
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
-
-
-def _import_ray() -> Any:
-    try:
-        import ray
-    except ImportError:
-        raise BadInput("--cluster needs Ray, which is not installed; install it with `pip install "
-                       "'radiotwin[ray]'`, or leave the option out") from None
-    return ray
 
 
 def _first_line(error: BaseException) -> str:

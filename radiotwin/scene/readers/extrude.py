@@ -12,12 +12,10 @@ import numpy as np
 import shapely
 import trimesh
 from manifold3d import Manifold, Mesh64, OpType
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from radiotwin.runtime.console import progress
 from radiotwin.scene.materials import Material
-from radiotwin.scene.meshes import clean, is_volume
+from radiotwin.scene.meshes import clean, connected, is_volume
 from radiotwin.scene.readers.solids import GRID_M, Contacts, Prism
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
@@ -58,8 +56,7 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
     pairs = contacts.pairs[contacts.shared_m > GRID_M]
     pairs = pairs[~is_open[pairs].any(axis=1)]
     same = np.array([prisms[a].material == prisms[b].material for a, b in pairs], dtype=bool)
-    graph = coo_matrix((np.ones(same.sum()), pairs[same].T), shape=(len(prisms), len(prisms)))
-    block_of = connected_components(graph, directed=False)[1]
+    block_of = connected(pairs[same], len(prisms))
     volume_m3 = np.array([prism.area.area * (prism.height.top_m - prism.height.bottom_m)
                           for prism in prisms])
     block_m3 = np.bincount(block_of, volume_m3)

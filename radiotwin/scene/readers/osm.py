@@ -36,7 +36,7 @@ from typing import IO, Any, Literal
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.errors import BadInput, RunFailed
+from radiotwin.errors import BadInput, RunFailed, optional_package
 from radiotwin.io.budgets import FEATURES, FILE_BYTES, OUTLINE_CORNERS, VERTICES
 from radiotwin.io.files import atomic_file
 from radiotwin.io.inputs import check_input, parse_elements
@@ -368,13 +368,10 @@ def read_osm_pbf(path: Path) -> OsmElements:
     Raises:
         BadInput: pyosmium is not installed, no such file, or not a PBF file.
     """
-    try:
-        import osmium
-    except ImportError:
-        raise BadInput(
-            f"{path}: .osm.pbf is read with the package osmium, which is not installed; install it "
-            "with `pip install 'radiotwin[gis]'`, or convert the file: `osmium cat area.osm.pbf -o "
-            "area.osm`") from None
+    osmium = optional_package(
+        "osmium", f"{path}: .osm.pbf is read with the package osmium, which is not installed; "
+                  "install it with `pip install 'radiotwin[gis]'`, or convert the file: `osmium "
+                  "cat area.osm.pbf -o area.osm`")
     check_input(path, "map in OpenStreetMap's PBF format")
     # An absolute path: what begins with `http:` would be fetched, `-` is standard input
     file = osmium.io.File(str(path.absolute()), "pbf")

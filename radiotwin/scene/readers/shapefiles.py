@@ -23,7 +23,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.io.budgets import COLUMNS, ENTRIES, FEATURES, FILE_BYTES, OUTLINE_CORNERS, VERTICES
 from radiotwin.io.inputs import open_input, read_bytes, require_within
 from radiotwin.scene.readers.city_objects import (
@@ -202,11 +202,9 @@ def _text(data: bytes) -> str:
 def _rows(path: Path, name: str, files: Mapping[str, bytes], convert: Callable[[Any], Any]
           ) -> Iterator[tuple[str, dict[str, Any], Any]]:
     """Yield name, columns and converted shape of each building."""
-    try:
-        import shapefile
-    except ImportError:
-        raise BadInput(f"{path}: Shapefiles are read with the package pyshp, which is not "
-                       "installed; install it with `pip install 'radiotwin[gis]'`") from None
+    shapefile = optional_package(
+        "shapefile", f"{path}: Shapefiles are read with the package pyshp, which is not installed; "
+                     "install it with `pip install 'radiotwin[gis]'`")
     subject = f"{path}, {name}"
     records = _check_records(subject, files[".shp"])
     codec = _CODECS.get(_text(files.get(".cpg", b"")).lower(), "utf-8")

@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.geo import to_geographic, to_local
 from radiotwin.io.budgets import TERRAIN_BLOCK_BYTES, TERRAIN_PIXELS
 from radiotwin.io.forms import Origin
@@ -103,13 +103,11 @@ def read_heights(path: Path, origin: Origin, box_m: Bounds) -> HeightGrid:
 def _opened(path: Path) -> Iterator[Any]:
     """Open a GeoTIFF of one band whose blocks are small enough."""
     check_input(path, "terrain raster (GeoTIFF)")
-    try:
-        import rasterio
-        from rasterio.errors import NotGeoreferencedWarning, RasterioError
-    except ImportError:
-        raise BadInput(f"{path}: terrain is read with the package rasterio, which is not installed;"
-                       " install it with `pip install 'radiotwin[gis]'`") from None
+    rasterio = optional_package(
+        "rasterio", f"{path}: terrain is read with the package rasterio, which is not installed; "
+                    "install it with `pip install 'radiotwin[gis]'`")
     from pyproj.exceptions import ProjError
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     try:
         with rasterio.Env(**_GDAL), warnings.catch_warnings():
