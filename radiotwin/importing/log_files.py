@@ -1,7 +1,4 @@
-"""The files of an import: named ones, those of a folder, and those in a zip file.
-
-Lines of a text, counted and bounded.
-"""
+"""The files of an import: named ones, those of a folder, and those in a zip file."""
 
 import io
 import os

@@ -1,10 +1,7 @@
-"""Opening of a file of measurements: text, JSON lines or a workbook, by name and first line.
+"""Opening of a file of measurements: its format is known by its name and its first line.
 
-Opening of a file of measurements: the format by its name and its first line.
-
-JSON lines: one object a line, whose nested values become columns with dots in their names.
-
-A sheet of a workbook (.xlsx) as the text of a table.
+Of JSON lines, one object a line, nested values become columns with dots in their names. A sheet of
+a workbook (.xlsx) becomes the text of a table.
 """
 
 import csv

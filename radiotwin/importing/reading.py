@@ -1,9 +1,4 @@
-"""The files of an import as links: one row per receiver, device and reading.
-
-All files of an import, each by its own format, as links.
-
-The rows of a file as links: one row per receiver, device and reading.
-"""
+"""The files of an import as links, each by its own format: a row per receiver, device, reading."""
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping

@@ -1,15 +1,10 @@
 """Readings at one place: repeated rows, stays of a receiver, and local means over fast fading.
 
-Local means over fast fading.
-
-The phases of the paths, and with them the level, change within half a wavelength; shadowing
-changes over tens of metres. A mean over 20 to 40 wavelengths removes the first and keeps the
-second, and 36 to 50 readings bring it within 1 dB (W. C. Y. Lee, "Estimate of local average power
-of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1), 1985).
-
-One reading of a stay: a receiver that hovers reads one and the same error many times.
-
-Rows of a file that repeat an earlier one.
+A receiver that hovers reads one and the same error many times: of a stay one reading counts. The
+phases of the paths, and with them the level, change within half a wavelength; shadowing changes
+over tens of metres. A mean over 20 to 40 wavelengths removes the first and keeps the second, and 36
+to 50 readings bring it within 1 dB (W. C. Y. Lee, "Estimate of local average power of a mobile
+radio signal", IEEE Trans. Veh. Technol. 34(1), 1985).
 """
 
 from typing import Literal

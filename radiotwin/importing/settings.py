@@ -1,9 +1,4 @@
-"""Settings of an import: fields, TOML file, and options of the command line.
-
-Settings of an import: the same in its TOML file and in the options of the command line.
-
-Settings from and to TOML, and from pairs of the command line.
-"""
+"""Settings of an import: the same in its TOML file and in the options of the command line."""
 
 import codecs
 import os

@@ -1,9 +1,4 @@
-"""Tables in texts of any dialect: encoding, separator, decimal mark, and lines around the table.
-
-Cells of a table in a text of any dialect.
-
-How a text holds a table: encoding, separator, decimal mark, lines before and after the table.
-"""
+"""Tables in texts of any dialect: encoding, separator, decimal mark, and lines around the table."""
 
 import codecs
 import csv

@@ -1,14 +1,9 @@
 """Held-out data: groups, how surely a gain is not chance, and weights of predictions.
 
-Groups that are held out together.
-
-Convex combination of predictions: weights that are not negative and sum to one.
-
-Breiman 1996, 'Stacked regressions', Machine Learning 24; van der Laan, Polley and Hubbard 2007,
-'Super learner', Statistical Applications in Genetics and Molecular Biology 6. The weights may pass
-from one set to another with a share that each prediction has.
-
-How surely a gain on held-out data is not chance.
+Weights are those of a convex combination: not negative, with the sum one (Breiman 1996, 'Stacked
+regressions', Machine Learning 24; van der Laan, Polley and Hubbard 2007, 'Super learner',
+Statistical Applications in Genetics and Molecular Biology 6). They may pass from one set to another
+with a share that each prediction has.
 """
 
 from __future__ import annotations

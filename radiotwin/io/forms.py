@@ -1,9 +1,4 @@
-"""Forms of TOML and JSON files, by which they are validated when they are read.
-
-Base classes of the tables in TOML files, which are validated when they are read.
-
-Read JSON records of a run by a schema: each field has its type before anything uses it.
-"""
+"""Forms of TOML and JSON files: each field has its type before anything uses it."""
 
 import re
 from collections.abc import Sequence

@@ -4,9 +4,8 @@ Before the work begins, the first one ends the process with its message: nothing
 During the work it is raised as `Stopped`, so that temporaries are removed. Whatever runs then may
 swallow it, or turn it into an error of its own (Dr.Jit in a loop that it records, a module while it
 is imported, `__del__`): then it is raised again, and what became of it still counts as a stop. A
-second one does not disturb the removal of temporaries.
-
-Count of kept parts of this process's work, for the message after Ctrl-C.
+second one does not disturb the removal of temporaries. The message counts the finished parts that
+the next run will not do again.
 """
 
 import atexit

@@ -1,8 +1,7 @@
 """Texts of strangers as pages, figures and spreadsheets may show them.
 
-Texts of a run as pages and figures show them: nothing hidden, nothing endless.
-
-Texts in which a spreadsheet finds no formula: those that look like one get an apostrophe.
+Nothing is hidden or endless in them, and a spreadsheet finds no formula: what looks like one gets
+an apostrophe.
 """
 
 import re

@@ -1,10 +1,6 @@
-"""What commands print: messages, warnings, tables and progress bars.
-
-Print messages, warnings and tables the same way in every command.
+"""What commands print: messages, warnings, tables, and one progress display for all.
 
 Names come from strangers' files: what a terminal would obey is shown as an escape.
-
-One progress display for the whole project.
 """
 
 import logging

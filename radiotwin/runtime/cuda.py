@@ -1,8 +1,6 @@
-"""Whether a GPU of NVIDIA, or this CPU, can trace: found out by one link.
+"""Whether work can run on a GPU of NVIDIA: found out by running some of it there.
 
-Whether work can run on a GPU of NVIDIA: found out by running some of it there.
-
-One link that is traced in a process of its own: a wrong library or driver may abort it.
+A link is traced in a process of its own: a wrong library or driver may abort it.
 """
 
 import ctypes

@@ -1,9 +1,4 @@
-"""Processes and threads: memory, cores, and the end together with the parent process.
-
-This process and its machine: memory, and the end together with the process that started it.
-
-Work that is mostly compiled code which lets other threads run: rays, paths.
-"""
+"""This process, its machine and its threads: memory, cores, the end together with its parent."""
 
 import ctypes
 import os

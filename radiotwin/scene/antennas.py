@@ -1,11 +1,4 @@
-"""Measured antenna patterns: read from files, oriented, and evaluated in a direction.
-
-Measured antenna patterns: read from files, oriented, and evaluated in a direction.
-
-Gain of an antenna by direction.
-
-Readers of antenna patterns: MSI Planet (.msi, .pln) and CSV.
-"""
+"""Measured antenna patterns: read from MSI Planet (.msi, .pln) and CSV, oriented, evaluated."""
 
 import io
 import re

@@ -1,9 +1,4 @@
-"""Problems of a city: plausibility checks of its geometry, and how a finding is worded.
-
-Plausibility checks of a city's geometry: axis, units, ground, open meshes.
-
-Findings about a city, each with a message that says what was found and what to do.
-"""
+"""Findings about a city, and the checks of its geometry: axis, units, ground, open meshes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

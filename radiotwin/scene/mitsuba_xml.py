@@ -1,26 +1,18 @@
 """Mitsuba 3 and Sionna RT scene files, read without Mitsuba and by an allowlist.
 
-Mitsuba 3 / Sionna RT scene files, read without Mitsuba.
+This is the only reader of scene XML. Mitsuba would load files and plugins that a file names:
+nothing of it reaches Mitsuba but the triangles and materials that are read here.
 
-Read: `ply`, `obj`, `cube`, `rectangle` and `sphere` shapes (also within `merge`), `to_world`
+Read are `ply`, `obj`, `cube`, `rectangle` and `sphere` shapes (also within `merge`), `to_world`
 transforms, materials by reference or inline, `<default>` parameters, `<include>` and `<path>`
-within the file's folder. Cameras, lights and integrators have no meaning for radio and are
-skipped. A scene folder may say less, see `radiotwin.scene.mitsuba_xml`. This is the only reader of
-scene XML: nothing of a file reaches Mitsuba but the triangles and materials that are read here.
+within the file's folder. Cameras, lights and integrators have no meaning for radio and are skipped.
 
-XML as a tree of elements that know their line, and the numbers in their attributes.
-
-Allowlist of the elements, types and attributes in `city.xml` of a scene folder.
-
+The `city.xml` of a scene folder may say less:
 - Read: `scene`; `bsdf` and `shape` of the types below; `ref`; `transform` with `translate`,
   `rotate`, `scale`, `matrix`; `string`, `float`, `integer`, `boolean`, `rgb`, `point`, `vector`.
-- Ignored, with all that is in them: `integrator`, `sensor` and `emitter` beside the shapes. They
-  have no meaning for radio.
+- Ignored, with all that is in them: `integrator`, `sensor` and `emitter` beside the shapes.
 - Refused: every other element, attribute or type, so `default`, `include`, `path`, `alias`,
   `texture`; a `$` in a value; a number that is none.
-
-None of it reaches Mitsuba, which would load files and plugins that it names: the ray tracer gets a
-file that `radiotwin.scene.folder` writes from the triangles and materials that were read.
 """
 
 import os

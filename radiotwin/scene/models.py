@@ -1,16 +1,10 @@
-"""Models of cities as meshes, from any program: OBJ, STL, PLY and glTF.
+"""Models of cities as meshes, from any program: OBJ, STL, PLY and glTF 2.0 [1].
 
-Models of cities as meshes: OBJ, glTF 2.0, STL and PLY, from any program.
-
-Their coordinates are metres, and z points up; in glTF, by its specification, y. Materials are
-names; what else they hold (colours, pictures) has no meaning for radio, and no file that they name
+Their coordinates are metres, and z points up; in glTF, by its specification, y. Only triangles,
+their places and the names of objects and materials are read, each checked against the bytes that
+are there: a header can claim any number of vertices, and a graph of objects can hold itself.
+General readers, trimesh's too, believe the former and open the pictures. No file that a model names
 is opened, except the buffers of a `.gltf`, in its own folder.
-
-Reader of the triangles in glTF 2.0 files [1], binary (`.glb`) or JSON (`.gltf`).
-
-Only triangles, their places and the names of objects and materials are read, each checked against
-the bytes that are there: a header can claim any number of vertices, and a graph of objects can hold
-itself. General readers, trimesh's too, believe the former and open the pictures.
 
 [1] https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """

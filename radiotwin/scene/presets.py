@@ -1,12 +1,8 @@
-"""Built-in scenes, and random cities of blocks.
+"""Built-in scenes: random cities of blocks between avenues and streets, with a mission in each.
 
-Built-in scenes: two after the maps of Chen et al. 2023, and a small one for demonstration.
-
-Random cities of blocks between avenues and streets, with every building's height declared.
-
-The parameters follow the maps of Chen et al., "Model-aided Federated Reinforcement Learning for
-Multi-UAV Trajectory Planning in IoT Networks", GLOBECOM Workshops 2023. The cities are our own
-draws.
+Two follow the maps of Chen et al., "Model-aided Federated Reinforcement Learning for Multi-UAV
+Trajectory Planning in IoT Networks", GLOBECOM Workshops 2023, a small one is for demonstration. The
+cities are our own draws.
 """
 
 from dataclasses import dataclass, replace

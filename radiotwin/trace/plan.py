@@ -1,9 +1,4 @@
-"""Before a trace: its cost, and how many rays the city needs, from a few links.
-
-Estimated cost of a trace, from a few of its batches.
-
-How many rays a city needs: a few links solved with more and more of them.
-"""
+"""Before a trace: its cost, from a few batches; and the rays a city needs, from a few links."""
 
 import math
 import time

@@ -1,29 +1,17 @@
-"""Positions from recordings of ROS: bags of ROS 1, tables of ROS 2, and MCAP.
+"""Positions from recordings of ROS: bags of ROS 1 [1], and of ROS 2 in SQLite (.db3) or MCAP [2].
 
-Positions of a ROS bag: messages of type sensor_msgs/NavSatFix, decoded by rosbags.
+A bag of ROS 1 is a sequence of records: length and fields of a header, length and data; chunks hold
+connections (topic and type) and messages. An MCAP file is one, too: type (1 byte), length (8
+bytes), content. Their index is not used: it is what a recording that was cut off lacks, and a few
+bytes of it can name any place of the file many times. A few bytes of bz2, lz4 or Zstandard can
+stand for gigabytes, so chunks are decompressed within budgets.
 
-rosbags makes Python code of the message definitions that a bag brings along, and runs it. Those of
-a stranger's bag are not given to it: the type is decoded by the definition that rosbags has.
+Messages of type sensor_msgs/NavSatFix are decoded by rosbags, which makes Python code of the
+message definitions that a bag brings along, and runs it. Those of a stranger's bag are not given to
+it: the type is decoded by the definition that rosbags has.
 
-Messages of a ROS 1 bag, format 2.0 (https://wiki.ros.org/Bags/Format/2.0).
-
-A bag is a sequence of records: length and fields of a header, length and data. Chunks hold
-connections (topic and type) and messages. Its index is not used: it is what a recording that was
-cut off lacks, and a few bytes of it can name one chunk many times.
-
-Messages of a ROS 2 bag in SQLite (.db3), of any version of its tables.
-
-Messages of an MCAP file (https://mcap.dev/spec).
-
-A file is a sequence of records: type (1 byte), length (8 bytes), content. Its index is not used: it
-is what a recording that was cut off lacks, and it can name any place of the file.
-
-Chunks of recordings, decompressed within budgets.
-
-A few bytes of bz2, lz4 or Zstandard can stand for gigabytes, and readers of ROS bags decompress a
-chunk whole.
-
-A message of a recording as its container has it.
+[1] https://wiki.ros.org/Bags/Format/2.0
+[2] https://mcap.dev/spec
 """
 
 import bz2

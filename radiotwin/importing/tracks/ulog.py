@@ -1,10 +1,10 @@
-"""Positions and attitude of a PX4 flight log (ULog), read by pyulog.
+"""Positions and attitude of a PX4 flight log (ULog [1]), read by pyulog.
 
-The messages of a ULog that a track needs, checked before pyulog decodes them.
+A ULog is a header of 16 bytes and messages: size (2 bytes), type (1 byte), body. pyulog looks for
+messages from every byte of damage on, and takes memory for as many fields as a format declares: it
+gets only the messages that a track needs, checked before.
 
-A ULog is a header of 16 bytes and messages: size (2 bytes), type (1 byte), body
-(https://docs.px4.io/main/en/dev_log/ulog_file_format). pyulog looks for messages from every byte of
-damage on, and takes memory for as many fields as a format declares.
+[1] https://docs.px4.io/main/en/dev_log/ulog_file_format
 """
 
 import io

@@ -1,6 +1,6 @@
-"""Runs jobs: the order of the pieces, retries, the cache, progress. It knows no backend.
+"""Runs jobs where the user wants them: the order of the pieces, retries, the cache, progress.
 
-From what a user says about workers to an executor.
+It knows no backend.
 """
 
 import logging

@@ -1,10 +1,7 @@
-"""A job: a function over pieces of work, the workers that run it, and its part in their process.
+"""A job, a function over pieces of work, and the interface of a place for it.
 
-A function over pieces of work, and what a process needs to run it.
-
-The part of a job that runs in a worker's process.
-
-Interface of a place for work: workers, each of which runs one piece at a time.
+A place has workers, each of which runs one piece at a time. Some of the code here runs in their
+processes.
 """
 
 import logging

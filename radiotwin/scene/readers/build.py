@@ -1,7 +1,4 @@
-"""Scene folders from maps with footprints.
-
-The file `buildings.csv`: position, height and material of each building, and their sources.
-"""
+"""Scene folders from maps with footprints, with a table of all buildings (`buildings.csv`)."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

@@ -1,9 +1,7 @@
-"""Areas of a map file with their tags, as every reader returns them.
+"""Areas of a map file with their tags, as every reader returns them, and budgets of outlines.
 
-Budgets of outlines, checked before geometry is computed from them.
-
-To take apart an outline that crosses itself costs time and memory by the number of crossings,
-which can be the square of the number of corners.
+To take apart an outline that crosses itself costs time and memory by the number of crossings, which
+can be the square of the number of corners: it is checked before geometry is computed.
 """
 
 from collections.abc import Mapping, Sequence

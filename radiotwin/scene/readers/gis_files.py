@@ -1,21 +1,15 @@
-"""Readers of GeoJSON, GeoPackage and GeoParquet.
-
-Reader of GeoJSON, and what it shares with that of GeoPackages: columns of a table as tags.
+"""Readers of GeoJSON, GeoPackage [1] and GeoParquet [2]: columns of a table become tags.
 
 Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only such
 rows are buildings; else every polygon is one. `_` may stand for the `:` of a tag, and case does not
 matter. The tags in GDAL's column `other_tags` are read, too.
 
-Reader of GeoPackages [1]: their tables by SQLite, without GDAL.
-
-GDAL looks at a file's content, not at its ending: a `.gpkg` can be an XML that names other files
-or servers.
+GeoPackages are read by SQLite, and the well-known binary of GeoParquet by pyarrow, without GDAL. It
+looks at a file's content, not at its ending: a `.gpkg` can be an XML that names other files or
+servers.
 
 [1] https://www.geopackage.org/spec140
-
-Reader of GeoParquet [1]: geometries in well-known binary, read by pyarrow.
-
-[1] https://geoparquet.org/releases/v1.1.0
+[2] https://geoparquet.org/releases/v1.1.0
 """
 
 import re
@@ -299,7 +293,7 @@ def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
     Args:
         path: `.parquet` file.
         crs: coordinate reference system of a file that names none; None: longitude and latitude, as
-            [1] has it, or where it says that the system is not known, refuse it.
+            [2] has it, or where it says that the system is not known, refuse it.
 
     Raises:
         BadInput: no such file, no GeoParquet, damaged, or too large; no pyarrow.

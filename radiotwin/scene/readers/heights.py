@@ -1,13 +1,6 @@
 """Height of a building from its tags, or from the columns of a publisher, with its source.
 
-Height of a building from its tags, with its source.
-
-Tags and units as in OpenStreetMap [1]: metres unless a unit is given, `33'`, `33 ft`, `33'6"`.
-
-[1] https://wiki.openstreetmap.org/wiki/Key:height
-
-Columns of maps that say how tall a building is, and what each publisher means by its own.
-
+Tags and units are as in OpenStreetMap [1]: metres unless a unit is given, `33'`, `33 ft`, `33'6"`.
 A height counts from the ground beside the building. An elevation counts from a vertical datum, so
 that of the ground is subtracted. Storeys count 3 m each. Only columns whose meaning and unit are
 published are known by name: OpenStreetMap [1], Overture Maps [2], CityGML 2.0 (section 10.3), 3D

@@ -1,24 +1,13 @@
-"""OpenStreetMap: areas of buildings, from .osm and .osm.pbf files and from the Overpass API.
+"""OpenStreetMap: areas of buildings and vegetation, from files and from the Overpass API [1].
 
-Areas of buildings from OpenStreetMap's nodes, ways and relations.
-
-A closed way is an area, and so is a relation of type multipolygon whose ways form closed rings
-[1]; rings of role `inner` are courtyards.
-
-[1] https://wiki.openstreetmap.org/wiki/Relation:multipolygon
-
-Reader of `.osm` files: the XML of OpenStreetMap's API, of Overpass and of JOSM.
-
-Reader of `.osm.pbf` files, with libosmium [1].
-
-The file is read in several passes that keep only what belongs to buildings and vegetation, so that
-an extract of a whole region needs little memory.
-
-[1] https://osmcode.org/pyosmium
-
-Download of an area's buildings and vegetation from OpenStreetMap's database (Overpass API [1]).
+A closed way is an area, and so is a relation of type multipolygon whose ways form closed rings [2];
+rings of role `inner` are courtyards. `.osm` files are the XML of OpenStreetMap's API, of Overpass
+and of JOSM. `.osm.pbf` files are read with libosmium [3] in several passes that keep only what is
+needed, so that an extract of a whole region needs little memory.
 
 [1] https://wiki.openstreetmap.org/wiki/Overpass_API
+[2] https://wiki.openstreetmap.org/wiki/Relation:multipolygon
+[3] https://osmcode.org/pyosmium
 """
 
 import http.client

@@ -1,14 +1,11 @@
 """Reader of ESRI Shapefiles [1]: a folder's `.shp`, `.dbf` and `.prj`, or a ZIP archive of them.
 
-The bytes are taken from the files that were named, or from the archive without unpacking it, and
-read by pyshp. It is plain Python and opens nothing by itself: GDAL would take a file for what it
-looks like, and could be led to others.
+Polygons are outlines, multipatches are buildings in three dimensions. The bytes are taken from the
+files that were named, or from the archive without unpacking it, and read by pyshp. It is plain
+Python and opens nothing by itself: GDAL would take a file for what it looks like, and could be led
+to others.
 
 [1] https://www.esri.com/library/whitepapers/pdfs/shapefile.pdf
-
-Surfaces of the multipatches of a Shapefile [1]: buildings in three dimensions.
-
-[1] https://www.esri.com/library/whitepapers/pdfs/shapefile.pdf, MultiPatch
 """
 
 import io

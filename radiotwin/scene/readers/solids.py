@@ -1,9 +1,5 @@
 """Prisms of buildings in the local frame, from areas with tags or from shells in three dimensions.
 
-Prisms in the local frame from areas with tags, and a report of their defects.
-
-Prisms of buildings that a file has in three dimensions: their shells, in the local frame.
-
 Closed shells become solids like the extruded ones, so that coincident walls of neighbours are
 united. Open ones are kept as they are, and reported. Each building stands on the flat ground, with
 its lowest point: where the file has terrain below it, that is left out.

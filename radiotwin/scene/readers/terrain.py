@@ -1,10 +1,9 @@
 """The ground of a scene from a map: flat, or a terrain that buildings stand on.
 
-Heights of the ground from a GeoTIFF, at the nodes of a grid in the local frame.
-
-GDAL opens the file with the driver for GeoTIFF alone, so a file that is something else under its
-name (a VRT, which names other files or servers) is refused, and looks at no file beside it. It
-reads windows in full resolution: for others it would open the overviews that a file names.
+Heights are from a GeoTIFF, at the nodes of a grid in the local frame. GDAL opens the file with the
+driver for GeoTIFF alone, so a file that is something else under its name (a VRT, which names other
+files or servers) is refused, and looks at no file beside it. It reads windows in full resolution:
+for others it would open the overviews that a file names.
 """
 
 import warnings
