@@ -38,21 +38,14 @@ _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ
           "10 dB and are no one quantity; keep one with --only {}=LTE")
 
 
-def read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np.ndarray]:
-    """Sum the bins of each sweep that lie in a band.
+def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np.ndarray]:
+    """Return the power of each sweep in the band of the settings, or of all bins.
 
-    Bins are powers; a bin counts where its centre lies in the band.
-
-    Args:
-        file: of rtl_power.
-        settings: with the band, or None for all bins.
+    A bin counts where its centre lies in the band.
 
     Returns:
         texts `date, time, band, power_db, bins`, `power_db` empty where a sweep does not cover the
         band; and the first line of each sweep.
-
-    Raises:
-        BadInput: a line that is none of rtl_power, or no bin in the band.
     """
     band_hz = settings.band_hz
     sweeps: list[list[str]] = []
@@ -367,7 +360,7 @@ SCANNER = (
                 "--level-offset-db, and never compare files with different gains or bins. Times "
                 "are those of the computer: give its --time-zone. Positions come from a --track",
         without_header=WithoutHeader(
-            r"\d{4}-\d\d-\d\d, \d\d:\d\d:\d\d, \d+, \d+, [\d.]+, \d+, .*", read=read_rtl_power)),
+            r"\d{4}-\d\d-\d\d, \d\d:\d\d:\d\d, \d+, \d+, [\d.]+, \d+, .*", read=_read_rtl_power)),
 )
 
 

@@ -155,41 +155,24 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
                                                      latitude=degrees[:, 1])
 
 
-def numbered(names: pd.Series, since_s: np.ndarray) -> pd.Series:
-    """Return names in which the places of a device are numbered in the order of time.
-
-    Args:
-        names: of devices, (n,).
-        since_s: since when each was there, (n,).
-
-    Returns:
-        `NAME@1`, … where a name occurs more than once, else the name.
-    """
+def _numbered(names: pd.Series, since_s: np.ndarray) -> pd.Series:
+    """Return names (n,) of devices, as `NAME@1`, … in the order of time where one occurs twice."""
     order = np.lexsort((np.arange(len(names)), np.nan_to_num(since_s, nan=-np.inf)))
     number = names.iloc[order].groupby(names.iloc[order]).cumcount() + 1
     several = names.duplicated(keep=False)
     return names.mask(several, names + "@" + number.reindex(names.index).astype(str))
 
 
-def at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -> pd.DataFrame:
+def _at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -> pd.DataFrame:
     """Name the device of each link after the place where it was at the time.
 
-    Args:
-        source: the log, for messages.
-        links: with `device`, and `time_s`.
-        table: of devices, as of `read_positions`.
-
-    Returns:
-        links; a device that was nowhere at a time keeps its name, and has no position then.
-
-    Raises:
-        BadInput: a device has places over time, and its readings have no times.
+    A device that was nowhere at a time keeps its name, and has no position then.
     """
     if table is None or SINCE not in table:
         return links
     place_of = pd.Series(table.index, index=table.index)
     owner = place_of.str.replace(r"@\d+$", "", regex=True)
-    # Of `numbered` there are several and none without a number; others are called so.
+    # Of `_numbered` there are several and none without a number; others are called so.
     numbered_ones = owner.duplicated(keep=False) & ~owner.isin(place_of)
     owner = owner.where(numbered_ones, place_of).to_numpy()
     names = links["device"].to_numpy(dtype=object, copy=True)
@@ -212,23 +195,11 @@ def at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) ->
     return links.assign(device=names)
 
 
-def place_names(source: Source, links: pd.DataFrame, device_m: np.ndarray,
+def _place_names(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                 place_m: float) -> np.ndarray:
-    """Name the device of each link after the place where the log says that it was.
+    """Return the name (n,) of each link's device: `NAME@1`, … of one at several places in the log.
 
-    Places are numbered as they occur; a position within `place_m` of one belongs to it.
-
-    Args:
-        source: the log, for messages.
-        links: n rows with `device`.
-        device_m: position of each link's device [m], (n, 3); NaN where unknown.
-        place_m: [m].
-
-    Returns:
-        names, (n,): `NAME@1`, … of devices at more than one place.
-
-    Raises:
-        BadInput: a device is at very many places.
+    Places are numbered as they occur; a position (n, 3) [m] within `place_m` of one belongs to it.
     """
     names = links["device"].to_numpy(dtype=object, copy=True)
     filled_m = np.nan_to_num(device_m)
@@ -255,8 +226,8 @@ def place_names(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     return names
 
 
-def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
-    """Read a table of positions.
+def _read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
+    """Read a table of positions; `key` is the column of the names, `device` or `receiver`.
 
     Several rows of one device are its places over time: column `since`, and `until` where it was
     nowhere in between, in ISO 8601. They become devices `NAME@1`, `NAME@2`, ….
@@ -265,17 +236,9 @@ def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
     may end in its unit (`latitude_deg`, `height_m`, `z_ft`); lengths without one are in
     `length_unit`.
 
-    Args:
-        path: of the table.
-        key: column of the names, `device` or `receiver`.
-        settings: `length_unit` and `crs`.
-
     Returns:
         columns of `POSITION` [degrees, m] and those of `DEVICE_OPTIONAL` that the table has; the
         index holds the names.
-
-    Raises:
-        BadInput: names file, row and column.
     """
     source = read_source(path)
     DEVICES.check(len(source), path)
@@ -284,7 +247,7 @@ def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
     period: dict[str, np.ndarray] = {}
     if key == "device" and "since" in source.table:
         period = _period(source, settings)
-        names = numbered(names, period[SINCE])
+        names = _numbered(names, period[SINCE])
     source.refuse(key, names, names.duplicated(), f"occurs twice; every {key} has one row")
     columns = {name: (spec, unit) for spec in map(str, source.table)
                for name, unit in [_quantity_and_unit(spec)] if name}
@@ -392,16 +355,16 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     Raises:
         BadInput: a table that cannot be used, a position far from the origin, or a moving device.
     """
-    tables = {name: None if path is None else read_positions(path, name, settings)
+    tables = {name: None if path is None else _read_positions(path, name, settings)
               for name, path in (("receiver", settings.receivers), ("device", settings.devices))}
-    links = at_times(source, links, tables["device"])
+    links = _at_times(source, links, tables["device"])
     receivers = _positions(links, "", tables["receiver"], links["receiver"], settings.crs)
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
     frame = find_frame(settings.origin, receivers, devices)
     receiver_m, device_m = frame.local_m(receivers), frame.local_m(devices)
     del receivers, devices  # as much memory as the links themselves
     if settings.place_m:
-        links = links.assign(device=place_names(source, links, device_m, settings.place_m))
+        links = links.assign(device=_place_names(source, links, device_m, settings.place_m))
     _check_near(source, links, receiver_m, "receiver")
     _check_near(source, links, device_m, "device")
     links = links.assign(**{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})

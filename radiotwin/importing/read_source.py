@@ -36,18 +36,10 @@ _DOCTYPES = tuple("<!DOCTYPE".encode(name) for name in ("utf-8", "utf-16-le", "u
 _HEAD_BYTES = 2**16  # in which the first line is looked for
 
 
-def read_json_lines(file: LogFile) -> tuple[pd.DataFrame, np.ndarray]:
-    """Read JSON lines.
+def _read_json_lines(file: LogFile) -> tuple[pd.DataFrame, np.ndarray]:
+    """Return the cells of JSON lines as texts, and the line of each row, from 1.
 
-    Args:
-        file: of text in UTF-8.
-
-    Returns:
-        cells as texts, `""` where a value is null, missing, or a list other than `LISTS`; and the
-        line of each row, from 1.
-
-    Raises:
-        BadInput: a line that is no JSON object, or too many values.
+    A cell is `""` where a value is null, missing, or a list other than `LISTS`.
     """
     rows: list[dict[str, str]] = []
     numbers: list[int] = []
@@ -123,16 +115,8 @@ class Sheet(LogFile):
         yield io.BytesIO(self.text)
 
 
-def read_sheet(file: LogFile, sheet: str | None) -> Sheet:
-    """Read a sheet by openpyxl, row by row; formulas have the values that were saved with them.
-
-    Args:
-        file: `.xlsx`.
-        sheet: name, or None for the first.
-
-    Raises:
-        BadInput: openpyxl is not installed, no such sheet, or the workbook is damaged or too large.
-    """
+def _read_sheet(file: LogFile, sheet: str | None) -> Sheet:
+    """Read a sheet, or the first, by openpyxl; formulas have the values saved with them."""
     _check(file)
     openpyxl = optional_package(
         "openpyxl", f"{file}: workbooks need the package openpyxl; `pip install radiotwin[xlsx]`, "
@@ -253,7 +237,7 @@ def read_source(file: LogFile | Path | str, settings: Settings | None = None,
         source = Source(str(file), _read_geojson(file), lambda index: f"feature {index + 1}")
     elif file.suffix == ".xlsx" and file.member is None:
         settings = (settings or Settings()).model_copy(update={"decimal": ".", "delimiter": ","})
-        source = _read_text(read_sheet(file, settings.sheet), settings, expected)
+        source = _read_text(_read_sheet(file, settings.sheet), settings, expected)
     elif file.suffix in TEXTS:
         source = _read_text(file, settings or Settings(), expected)
     else:
@@ -271,7 +255,7 @@ def _read_text(file: LogFile, settings: Settings, expected: Expected) -> Source:
                  if re.fullmatch(each.first_line, first)), None)
     notes: tuple[str, ...] = ()
     if first.startswith("{"):
-        table, lines = read_json_lines(file)
+        table, lines = _read_json_lines(file)
     elif kind is not None and kind.read is not None:
         table, lines = kind.read(file, settings)
     else:

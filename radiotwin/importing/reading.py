@@ -51,14 +51,7 @@ class LevelColumn:
 
 def build_links(source: Source, settings: Settings, tally: Tally, problems: Problems,
                 file_name: str) -> tuple[pd.DataFrame, int]:
-    """Convert rows to links.
-
-    Args:
-        source: the file.
-        settings: mapping and units.
-        tally: counts the readings that are left out.
-        problems: gets all that is wrong; then the links are incomplete.
-        file_name: the name that `by file` stands for.
+    """Convert the rows of a file to links, and note all that is wrong: then they are incomplete.
 
     Returns:
         links in the order of the file, and the number of readings per row of the file. The index is
@@ -236,13 +229,8 @@ def _wide_columns(source: Source, block: Wide) -> list[LevelColumn]:
     return found
 
 
-def naming_notes(source: Source, settings: Settings) -> list[str]:
-    """Return notes on names that are made of those of columns, as a misspelt column would be.
-
-    Args:
-        source: the file.
-        settings: mapping.
-    """
+def _naming_notes(source: Source, settings: Settings) -> list[str]:
+    """Return notes on names that are made of those of columns, as a misspelt column would be."""
     notes = []
     for block in settings.wide:
         for end in ("device", "receiver"):
@@ -354,7 +342,7 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
             level_column = LEVEL_COLUMN[str(own.level_unit)]  # one for all files
             records.append({"file": file.name, "rows": count, "readings": count * per_row,
                             "format": format_name})
-            notes += [*source.notes, *naming_notes(source, own),
+            notes += [*source.notes, *_naming_notes(source, own),
                       *([f"{file.name}: {caution}"] if caution else [])]
     problems.check()
     links = parts[0] if len(parts) == 1 else pd.concat(parts)

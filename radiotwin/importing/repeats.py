@@ -40,7 +40,7 @@ def average(links: pd.DataFrame, length_m: float,
     """
     links = links.reset_index(drop=True)
     track = links.groupby(["receiver", "device", "flight"], sort=False).ngroup().to_numpy()
-    links, track = in_track_order(links, track)
+    links, track = _in_track_order(links, track)
     bin_index, first = _bins(links, track, length_m)
     count = np.bincount(bin_index)
     means = {name: _mean(links[name].to_numpy(dtype=float), bin_index, len(count))
@@ -68,16 +68,8 @@ def in_wavelengths(length_m: float, frequency_hz: float) -> float:
     return length_m * frequency_hz / speed_of_light
 
 
-def in_track_order(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
-    """Sort links by track, and within a track by time where all of its times are known.
-
-    Args:
-        links: n rows.
-        track: number of each link's track, (n,).
-
-    Returns:
-        links with a new index, and their tracks.
-    """
+def _in_track_order(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
+    """Sort links by track (n,), and within a track by time where all of its times are known."""
     time_s = np.zeros(len(links))
     if "time_s" in links:
         time_s = links["time_s"].to_numpy(dtype=float)
@@ -153,7 +145,7 @@ def stay_representatives(links: pd.DataFrame, distance_m: float) -> np.ndarray:
     rows = pd.DataFrame({"row": np.arange(len(links)), "level_db": links["level_db"].to_numpy()})
     if "time_s" in links:
         rows["time_s"] = links["time_s"].to_numpy()
-    ordered, track = in_track_order(rows, track)
+    ordered, track = _in_track_order(rows, track)
     stay = _stays(positions_m(links)[ordered["row"].to_numpy()], track, distance_m)
     level_db = np.nan_to_num(ordered["level_db"].to_numpy(), nan=-np.inf)
     by_level = np.lexsort((np.arange(len(stay)), level_db, stay))

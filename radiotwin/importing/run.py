@@ -42,21 +42,10 @@ DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}
 """End of a column's name -> decimals that are written; all finer than any measurement."""
 
 
-def make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Tally,
+def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Tally,
                 positioned: PositionedLinks, measurements: Measurements,
                 settings: Settings) -> dict[str, Any]:
-    """Make the content of `import.json`.
-
-    Args:
-        logs: what was read.
-        notes: on how it was read.
-        others: number of files that have a format that is not read.
-        kept: readings that were not left out.
-        tally: readings that were left out; with `kept` they add up to `readings`.
-        positioned: the links that were kept.
-        measurements: what is written; fewer rows after averaging.
-        settings: of the import.
-    """
+    """Return the content of `import.json`; the readings kept and left out add up to those read."""
     table, devices = measurements.table, measurements.devices
     origin = positioned.frame.origin
     time_s = table["time_s"].dropna() if "time_s" in table else pd.Series(dtype=float)
@@ -220,7 +209,7 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
         table = average(table, settings.average_m, settings.average)
     measurements = _measurements(table, positioned.devices, logs.level_column,
                                  positioned.frame.origin)
-    report = make_report(logs, [*logs.notes, *notes], others, kept, tally, positioned,
+    report = _make_report(logs, [*logs.notes, *notes], others, kept, tally, positioned,
                          measurements, settings)
     on_progress("writing")
     used = settings.model_copy(update={"origin": positioned.frame.origin,

@@ -58,7 +58,7 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
             zone's clocks skipped or showed twice.
     """
     if zone is not None:
-        check_zone(zone)
+        _check_zone(zone)
     cells = source.cells(spec, "time")
     typed = cells.dtype.kind == "M"  # Parquet has typed times
     if time_format is None and not typed:
@@ -102,15 +102,8 @@ def calendar_days(time_s: np.ndarray, zone: str | None) -> np.ndarray:
     return days
 
 
-def check_zone(zone: str) -> None:
-    """Check the name of a time zone.
-
-    Args:
-        zone: IANA name.
-
-    Raises:
-        BadInput: unknown; names similar ones.
-    """
+def _check_zone(zone: str) -> None:
+    """Raise BadInput for an unknown time zone; the message names similar ones."""
     try:
         ZoneInfo(zone)
     except (KeyError, ValueError, OSError):  # which one depends on how the name is wrong

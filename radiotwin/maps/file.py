@@ -103,13 +103,10 @@ def axis_problem(dataset: xr.Dataset) -> str | None:
     return None
 
 
-def value_problem(dataset: xr.Dataset) -> str | None:
+def _value_problem(dataset: xr.Dataset) -> str | None:
     """Return the first reason why the values of a dataset cannot be those of a radio map.
 
     They are read in parts, each of whole pieces as the file stores them.
-
-    Args:
-        dataset: of the right form; its values may still be in the file.
     """
     names = [name for name in VARIABLES if name in dataset]
     regions = {name: list(_regions(dataset[name])) for name in names}
@@ -155,30 +152,16 @@ def _regions(values: xr.DataArray) -> Iterator[tuple[slice, ...]]:
                                     for size, length in zip(values.shape, step))))
 
 
-def require_zarr(path: Path) -> Any:
-    """Return the package zarr.
-
-    Args:
-        path: of the map, for the message.
-
-    Raises:
-        BadInput: it is not installed.
-    """
+def _require_zarr(path: Path) -> Any:
+    """Return the package zarr, which writes or reads a map."""
     return optional_package(
         "zarr", f"{path}: Zarr needs the package zarr, which is not installed; install it with "
                 "`pip install 'radiotwin[zarr]'`, or take a .nc file")
 
 
-def check_zarr_target(path: Path) -> None:
-    """Check that a Zarr folder can be written under a name.
-
-    Args:
-        path: of the folder.
-
-    Raises:
-        BadInput: zarr is not installed, or `path` is a file, or a folder with something else.
-    """
-    require_zarr(path)
+def _check_zarr_target(path: Path) -> None:
+    """Raise BadInput unless a Zarr folder can be written under a name."""
+    _require_zarr(path)
     if path.exists() and not path.is_dir():
         raise BadInput(f"{path} is a file; a radio map in Zarr is a folder: choose another name")
     if path.is_dir() and any(path.iterdir()) and not (path / METADATA).is_file():
@@ -189,26 +172,16 @@ def check_zarr_target(path: Path) -> None:
     folder.with_name(f"{path.name}.radiotwin-try").rmdir()
 
 
-def write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[MapBlock],
+def _write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[MapBlock],
                path: Path | str) -> None:
-    """Write a radio map as a Zarr folder by the CF conventions, atomically.
+    """Write a radio map as a Zarr folder by the CF conventions; arguments as of `write_parts`.
 
     Each block is a piece of its own, so that one block is in memory. The folder is written beside
     its place and renamed.
-
-    Args:
-        top: coordinates and attributes of the map.
-        dtypes: of its variables, by name.
-        blocks: of it, as `parts_of` cuts them.
-        path: of the folder; an older map there is replaced.
-
-    Raises:
-        BadInput: zarr is not installed, or `path` cannot be written or is no map's.
-        RunFailed: the disk is full or failed; an older map is unchanged.
     """
     path = Path(path)
-    check_zarr_target(path)
-    zarr = require_zarr(path)
+    _check_zarr_target(path)
+    zarr = _require_zarr(path)
     shape = tuple(top.sizes[name] for name in DIMS)
     first = next(parts_of(shape[1:]))
     placed = with_cf(top)
@@ -234,16 +207,9 @@ def write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[Ma
 
 
 @contextmanager
-def open_zarr(path: Path) -> Iterator[xr.Dataset]:
-    """Open a Zarr folder after checking it; values stay in it until they are asked for.
-
-    Args:
-        path: of the folder.
-
-    Raises:
-        BadInput: as `check_zarr`, or zarr is not installed.
-    """
-    zarr = require_zarr(path)
+def _open_zarr(path: Path) -> Iterator[xr.Dataset]:
+    """Open a Zarr folder after checking it; values stay in it until they are asked for."""
+    zarr = _require_zarr(path)
     missing = check_zarr(path, _KNOWN, MAP_STREAM_VALUES)
     if any(missing.values()):
         warnings.warn(f"{path} lacks {sum(missing.values()):,} pieces of its arrays "
@@ -306,7 +272,7 @@ def _opened(path: Path) -> Iterator[xr.Dataset]:
     with ExitStack() as stack:
         with _reported(path):
             if is_zarr(path):
-                opened = stack.enter_context(open_zarr(path))
+                opened = stack.enter_context(_open_zarr(path))
             else:
                 file = stack.enter_context(open_input(path, "radio map (.nc, .zarr)"))
                 check_hdf5(file, path)
@@ -324,7 +290,7 @@ def _prepared(path: Path, opened: xr.Dataset, is_loaded: bool = False) -> xr.Dat
             if is_loaded:
                 MAP_VALUES.check(dataset["gain_db"].size, path)
                 dataset = dataset.load()
-            problem = axis_problem(dataset) or value_problem(dataset)
+            problem = axis_problem(dataset) or _value_problem(dataset)
     if problem:
         raise BadInput(f"{path} is not a radio map: {problem}; {MAKERS} makes one")
     return without_cf(dataset.drop_encoding())
@@ -360,7 +326,7 @@ def check_target(path: Path | str) -> None:
         RunFailed: the disk is full.
     """
     if is_zarr(path):
-        check_zarr_target(Path(path))
+        _check_zarr_target(Path(path))
     else:
         require_writable(path)
 
@@ -393,4 +359,4 @@ def write_parts(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[M
         BadInput: `path` cannot be written.
         RunFailed: the disk is full or failed; an older map is unchanged.
     """
-    (write_zarr if is_zarr(path) else write_blocks)(top, dtypes, blocks, path)
+    (_write_zarr if is_zarr(path) else write_blocks)(top, dtypes, blocks, path)

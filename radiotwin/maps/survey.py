@@ -156,16 +156,12 @@ def read_truth(scene: Scene, truth: str = "traced") -> RadioMap:
 _MAX_PATHS = 16
 
 
-def require_possible(scene: Scene, truth: RadioMap) -> None:
+def _require_possible(scene: Scene, truth: RadioMap) -> None:
     """Raise BadInput if a traced link with line of sight is far above free space.
 
     The bound is free space (ITU-R P.525-4, eq. 4) between the peaks of the antennas, and 12 dB, or
     24 dB where fields were added: 16 paths as strong as the direct one. Maps that are not of gains
     at points (the solver `map`, statistical truths) are not checked.
-
-    Args:
-        scene: Scene that the map was made for.
-        truth: Map with all its devices.
     """
     attributes = truth.dataset.attrs
     if attributes.get("source") != "raytrace" or attributes.get("solver") != "paths":
@@ -192,14 +188,7 @@ def require_possible(scene: Scene, truth: RadioMap) -> None:
 
 def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
                     ) -> list[Cell]:
-    """Fly straight to random cells, as long as there is battery for one and home again.
-
-    Args:
-        grid: Cells of the altitude.
-        start: First cell.
-        battery: Battery units.
-        rng: Source of the waypoints.
-    """
+    """Fly straight to random cells, as long as there is battery for one and home again."""
     cells = [start]
     while True:
         left = battery - MOVE_COST * (len(cells) - 1)
@@ -214,14 +203,7 @@ def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.rando
 
 def lawnmower(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
               ) -> list[Cell]:
-    """Fly parallel lanes, as narrow as the battery allows, in a random direction and order.
-
-    Args:
-        grid: Cells of the altitude.
-        start: First cell.
-        battery: Battery units.
-        rng: Source of direction, offset and order.
-    """
+    """Fly parallel lanes, as narrow as the battery allows, in a random direction and order."""
     cells = [start]
     for corner in _lane_ends(grid.allowed.shape, battery, rng):
         if grid.steps_home(corner) == UNREACHABLE:
@@ -251,14 +233,7 @@ def _lane_ends(shape: tuple[int, ...], battery: float, rng: np.random.Generator)
 
 def random_walk(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
                 ) -> list[Cell]:
-    """Move or hover with equal chances in every slot, as long as the terminal stays in reach.
-
-    Args:
-        grid: Cells of the altitude.
-        start: First cell.
-        battery: Battery units.
-        rng: Source of the moves.
-    """
+    """Move or hover with equal chances in every slot, as long as the terminal stays in reach."""
     cells, left = [start], battery
     while True:
         options = [(cell, MOVE_COST) for cell in grid.neighbours(cells[-1])]
@@ -451,4 +426,4 @@ def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: 
     ROWS.check(slots * len(scene.config.devices), f"{path}: {flights} flights, as far as the "
                "batteries of its UAVs go")
     truth.require_of(scene)
-    require_possible(scene, truth)
+    _require_possible(scene, truth)

@@ -190,14 +190,10 @@ def shown(text: str) -> str:
     return repr(text if len(text) <= 60 else text[:60] + "…")
 
 
-def check_city(root: Node) -> None:
-    """Check that `city.xml` of a scene folder says only what is allowed.
+def _check_city(root: Node) -> None:
+    """Raise BadInput unless `city.xml` of a scene folder says only what is allowed.
 
-    Args:
-        root: Its `<scene>`; elements that are ignored are removed from it.
-
-    Raises:
-        BadInput: Names file and line of what is not allowed.
+    Elements that are ignored are removed from its `<scene>`.
     """
     root.children = [child for child in root.children if child.tag not in IGNORED]
     waiting = [root]
@@ -299,7 +295,7 @@ class _Reader:
             raise BadInput(f"{root.position}: the file begins with <{root.tag[:60]}>, not <scene>; "
                            "give a Mitsuba or Sionna RT scene file")
         if self.scene_folder:
-            check_city(root)
+            _check_city(root)
         self._read_children(root, (*above, path.resolve()))
 
     def _read_children(self, parent: Node, files: tuple[Path, ...]) -> None:
@@ -387,23 +383,13 @@ class _Reader:
             elif child.tag == "ref" and child.attributes.get("name", "bsdf") == "bsdf":
                 material = child.attributes.get("id", "")
         transform = next((child for child in node.children if child.tag == "transform"), None)
-        to_world = np.eye(4) if transform is None else read_transform(transform)
+        to_world = np.eye(4) if transform is None else _read_transform(transform)
         self.city.shapes.append(
             DeclaredShape(identifier, kind, node, to_world, mesh_path, material))
 
 
-def read_transform(node: Node) -> np.ndarray:
-    """Return the matrix of a `<transform>`: its operations, each applied after the one before.
-
-    Args:
-        node: The element.
-
-    Returns:
-        (4, 4) matrix.
-
-    Raises:
-        BadInput: An operation that meshes do not need (`lookat`), an unknown one, or wrong numbers.
-    """
+def _read_transform(node: Node) -> np.ndarray:
+    """Return the (4, 4) matrix of a `<transform>`, whose operations follow each other."""
     matrix = np.eye(4)
     for step in node.children:
         operation = np.eye(4)

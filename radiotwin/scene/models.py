@@ -62,18 +62,8 @@ class ModelPart:
     mesh: RawMesh
 
 
-def read_gltf(path: Path) -> list[ModelPart]:
-    """Read the objects of a glTF file in the places that it gives them.
-
-    Args:
-        path: `.glb` or `.gltf` file.
-
-    Returns:
-        The objects, y up.
-
-    Raises:
-        BadInput: no such file, not glTF 2.0, damaged, compressed, or too large.
-    """
+def _read_gltf(path: Path) -> list[ModelPart]:
+    """Read the objects of a `.glb` or `.gltf` file in the places that it gives them, y up."""
     data = read_bytes(path, "glTF model")
     text, binary = _chunks(path, data) if data[:4] == _MAGIC else (data, None)
     DOCUMENT_BYTES.check(len(text), path)
@@ -295,9 +285,9 @@ def read_model(path: Path) -> list[ModelPart]:
         parts = [ModelPart(name or path.stem, material, _own_mesh(path, vertices, polygons))
                  for (name, material), polygons in groups.items()]
     elif suffix in (".glb", ".gltf"):
-        parts = read_gltf(path)
+        parts = _read_gltf(path)
     else:
-        whole = (cut_polygons(path, *read_ply(path)) if suffix == ".ply" else read_stl(path))
+        whole = (cut_polygons(path, *read_ply(path)) if suffix == ".ply" else _read_stl(path))
         parts = [ModelPart(f"{path.stem}_{number}", None, mesh)
                  for number, mesh in enumerate(_connected(whole), start=1)]
     if not any(len(part.mesh.faces) for part in parts):
@@ -310,15 +300,8 @@ def read_model(path: Path) -> list[ModelPart]:
     return parts
 
 
-def read_stl(path: Path) -> RawMesh:
-    """Read an STL file, binary or ASCII.
-
-    Args:
-        path: STL file.
-
-    Raises:
-        BadInput: no such file, too large, cut off, or with what are no numbers.
-    """
+def _read_stl(path: Path) -> RawMesh:
+    """Read an STL file, binary or ASCII."""
     data = read_bytes(path, "STL model")
     count = int.from_bytes(data[80:_STL_HEADER], "little") if len(data) >= _STL_HEADER else 0
     if data[:5].lower() == b"solid" and len(data) != _STL_HEADER + _STL_FACE * count:

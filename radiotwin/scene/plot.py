@@ -230,7 +230,7 @@ def draw_preview(scene: Scene, path: Path | str) -> None:
     draw_vegetation(axes, scene)
     on_terrain = scene.city.terrain is not None
     if on_terrain:
-        draw_contours(axes, scene)
+        _draw_contours(axes, scene)
     clipped = height_m.max() > image.norm.vmax
     figure.colorbar(image, ax=axes, shrink=0.85, pad=0.02,
                     label="height above the ground [m]" if on_terrain else "height [m]",
@@ -243,13 +243,8 @@ def draw_preview(scene: Scene, path: Path | str) -> None:
         figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15)
 
 
-def draw_contours(axes: Axes, scene: Scene) -> None:
-    """Draw lines of equal height of a terrain above the datum, with their heights [m].
-
-    Args:
-        axes: Axes in metres.
-        scene: Scene with a terrain.
-    """
+def _draw_contours(axes: Axes, scene: Scene) -> None:
+    """Draw lines of equal height of a terrain above the datum, with their heights [m]."""
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     x_m, y_m = np.meshgrid(np.linspace(x_min, x_max, 200), np.linspace(y_min, y_max, 200))
     lines = axes.contour(x_m, y_m, scene.city.ground_height_m(x_m, y_m), levels=10,

@@ -124,15 +124,8 @@ def is_fix(kind: str) -> bool:
     return kind in (FIX, "sensor_msgs/NavSatFix")
 
 
-def ros1_messages(path: Path) -> Iterator[BagMessage]:
-    """Yield the position messages of a ROS 1 bag; one that was cut off ends with its last chunk.
-
-    Args:
-        path: of the bag.
-
-    Raises:
-        BadInput: no such bag, damaged, or too large.
-    """
+def _ros1_messages(path: Path) -> Iterator[BagMessage]:
+    """Yield the position messages of a ROS 1 bag; one that was cut off ends with its last chunk."""
     topics: dict[bytes, str] = {}
     chunks = Chunks(path)
     with open_input(path, "ROS bag (.bag)") as file:
@@ -198,15 +191,8 @@ def _fields(header: bytes) -> Fields:
     return fields
 
 
-def ros2_table_messages(path: Path) -> Iterator[BagMessage]:
-    """Yield the position messages of a ROS 2 bag in SQLite.
-
-    Args:
-        path: of the `.db3` file.
-
-    Raises:
-        BadInput: no such bag, damaged, or too large.
-    """
+def _ros2_table_messages(path: Path) -> Iterator[BagMessage]:
+    """Yield the position messages of a ROS 2 bag in SQLite, of any version of its tables."""
     chunks = Chunks(path)
     try:
         with open_tables(path, "ROS 2 bag (.db3)") as database:
@@ -225,15 +211,8 @@ def ros2_table_messages(path: Path) -> Iterator[BagMessage]:
         raise BadInput(f"{path} is not a readable ROS 2 bag ({error}); fetch it again") from None
 
 
-def mcap_messages(path: Path) -> Iterator[BagMessage]:
-    """Yield the position messages of an MCAP file; one that was cut off ends with its last chunk.
-
-    Args:
-        path: of the file.
-
-    Raises:
-        BadInput: no such file, damaged, or too large.
-    """
+def _mcap_messages(path: Path) -> Iterator[BagMessage]:
+    """Yield the position messages of an MCAP file; one that was cut off ends with a chunk."""
     walk = _Walk(path)
     with open_input(path, "recording (.mcap)") as file:
         if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
@@ -307,7 +286,7 @@ def _text(body: bytes, at: int) -> tuple[str, int]:
 
 
 _CONTAINERS: dict[str, Callable[[Path], Iterator[BagMessage]]] = {
-    ".bag": ros1_messages, ".mcap": mcap_messages, ".db3": ros2_table_messages}
+    ".bag": _ros1_messages, ".mcap": _mcap_messages, ".db3": _ros2_table_messages}
 
 
 def is_rosbag(path: Path) -> bool:

@@ -29,15 +29,10 @@ _GPS = ("vehicle_gps_position", "sensor_gps")
 _TOPICS = ["vehicle_global_position", *_GPS, "vehicle_attitude"]
 
 
-def needed_messages(path: Path, topics: Collection[str]) -> io.BytesIO:
+def _needed_messages(path: Path, topics: Collection[str]) -> io.BytesIO:
     """Return a ULog with the formats, subscriptions and data of some topics only.
 
-    Args:
-        path: of the log; one that was cut off ends with its last whole message.
-        topics: names.
-
-    Raises:
-        BadInput: no ULog, damaged, or a format of one of these topics is unusual.
+    One that was cut off ends with its last whole message.
     """
     result = io.BytesIO()
     subscribed: set[bytes] = set()
@@ -93,7 +88,7 @@ def read_ulog(path: Path) -> Fixes:
     Raises:
         BadInput: pyulog is not installed, the log is damaged, or has no position or no UTC.
     """
-    messages = needed_messages(path, _TOPICS)
+    messages = _needed_messages(path, _TOPICS)
     pyulog = optional_package(
         "pyulog", f"{path}: PX4 flight logs need the package pyulog; `pip install "
                   "radiotwin[tracks]`, or convert it to GPX")

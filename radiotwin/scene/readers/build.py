@@ -83,20 +83,14 @@ DEFAULT_HEIGHT_M = 10.0  # [m], about three storeys
 Bounds = tuple[float, float, float, float]
 
 
-def building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
+def _building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
                    on_terrain: bool = False) -> pd.DataFrame:
-    """Return the table of buildings, with one row a prism.
+    """Return the table of buildings, with one row a prism, and its shape by its index.
 
-    Args:
-        prisms: of all buildings.
-        shape_of: prism -> name of its shape in `city.xml`.
-        on_terrain: whether the ground is not flat.
-
-    Returns:
-        Columns building, shape, x_m, y_m (a point inside), area_m2, on terrain ground_m (the lowest
-        ground under the building), bottom_m and top_m (as ground_m above the datum), height_from,
-        height_sd_m (see `height_sds_m`), unusable (tags that were skipped), material and
-        material_from.
+    Columns are building, shape, x_m, y_m (a point inside), area_m2, on terrain ground_m (the lowest
+    ground under the building), bottom_m and top_m (as ground_m above the datum), height_from,
+    height_sd_m (see `height_sds_m`), unusable (tags that were skipped), material and
+    material_from.
     """
     rows, heights_sd_m = [], height_sds_m(
         np.array([prism.height.top_m - prism.ground_m for prism in prisms]),
@@ -243,7 +237,7 @@ def build_scene_from_map(
     contacts = find_contacts(prisms)
     problems += [*_overlaps(prisms, contacts), *ground.problems]
     city, shape_of = _city(prisms, contacts, ground, map_options.materials, problems)
-    table = building_table(prisms, shape_of, ground.config is not None)
+    table = _building_table(prisms, shape_of, ground.config is not None)
     counts = height_counts(table)
     vegetation, unusable = make_vegetation(found.vegetation, origin,
                                            _both(around.bounds, extent.bounds))

@@ -54,17 +54,8 @@ _ERRORS = (struct.error, ValueError, LookupError, TypeError, AttributeError, Ass
            EOFError, OSError, OverflowError, shapely.errors.GEOSException)
 
 
-def patches_file(path: Path, rows: Iterable[tuple[str, Mapping, Any]], system: str) -> MapFile:
-    """Return the buildings of multipatches, as those of 3D city models.
-
-    Args:
-        path: file, for messages.
-        rows: name, columns and surfaces of each, as of `patch_surfaces`.
-        system: name of the coordinate reference system.
-
-    Raises:
-        BadInput: an unknown system.
-    """
+def _patches_file(path: Path, rows: Iterable[tuple[str, Mapping, Any]], system: str) -> MapFile:
+    """Return the buildings of rows (name, columns, surfaces) of multipatches."""
     known = find_system(path, system)
     project, unit_m = degrees_from(path, plane_of(known)), vertical_unit_m(known)
     objects = []
@@ -82,15 +73,8 @@ def patches_file(path: Path, rows: Iterable[tuple[str, Mapping, Any]], system: s
     return city_features(path, objects, ["OGC:CRS84"])
 
 
-def patch_surfaces(shape: Any) -> list[Polygon]:
-    """Return the polygons of a multipatch: triangles of strips and fans, rings with their holes.
-
-    Args:
-        shape: as pyshp reads it.
-
-    Raises:
-        ValueError: a part begins outside its shape, or a corner is not finite.
-    """
+def _patch_surfaces(shape: Any) -> list[Polygon]:
+    """Return the polygons of a multipatch: triangles of strips and fans, rings with their holes."""
     starts = list(shape.parts)
     if not starts:
         return []
@@ -144,8 +128,8 @@ def read_shapefile(path: Path, crs: str | None = None) -> MapFile:
         system = chosen_system(path, _text(files[".prj"]) if ".prj" in files else None, crs)
         assert system is not None
         is_patch = files[".shp"][32:36] == struct.pack("<i", MULTIPATCH)
-        rows = _rows(path, name, files, patch_surfaces if is_patch else _area)
-        part = (patches_file if is_patch else map_file)(path, rows, system)
+        rows = _rows(path, name, files, _patch_surfaces if is_patch else _area)
+        part = (_patches_file if is_patch else map_file)(path, rows, system)
         found.features += part.features
         found.left_out += part.left_out
     return found

@@ -358,7 +358,7 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
     faces_so_far = 0
     for feature in features:
         assert feature.shell is not None
-        vertices, faces = triangulate(feature.shell, origin)
+        vertices, faces = _triangulate(feature.shell, origin)
         faces_so_far += len(faces)
         FACES.check(faces_so_far, "the map")
         area = _footprint(vertices, faces)
@@ -407,12 +407,8 @@ def elevation_fact(features: Sequence[Feature]) -> str:
             "vertical datum; each was put on the ground")
 
 
-def triangulate(shell: Shell, origin: Origin) -> tuple[np.ndarray, np.ndarray]:
+def _triangulate(shell: Shell, origin: Origin) -> tuple[np.ndarray, np.ndarray]:
     """Cut the polygons of a shell into triangles.
-
-    Args:
-        shell: as in the file.
-        origin: of the local frame.
 
     Returns:
         (v, 3) corners in the local frame, above the ground of the building [m], and (f, 3) faces.

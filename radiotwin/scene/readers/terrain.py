@@ -351,7 +351,7 @@ def stand_on(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
         return list(prisms)
     # Parts of a building share its site, of which the ground is looked up once
     sites = {id(site): site for site in (prism.site or prism.area for prism in prisms)}
-    lowest_m = dict(zip(sites, lowest_ground_m(list(sites.values()), ground).tolist()))
+    lowest_m = dict(zip(sites, _lowest_ground_m(list(sites.values()), ground).tolist()))
     stood = []
     for prism in prisms:
         low_m, height = round(lowest_m[id(prism.site or prism.area)], 3), prism.height
@@ -364,13 +364,8 @@ def stand_on(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
     return stood
 
 
-def lowest_ground_m(areas: Sequence[shapely.Geometry], ground: Ground) -> np.ndarray:
-    """Return the (n,) lowest height of the ground under areas [m].
-
-    Args:
-        areas: n polygons, in the rectangle of the ground [m].
-        ground: with a terrain.
-    """
+def _lowest_ground_m(areas: Sequence[shapely.Geometry], ground: Ground) -> np.ndarray:
+    """Return the (n,) lowest height of a terrain under polygons in its rectangle [m]."""
     surface = CityMap(ground.vertices, ground.faces,
                       terrain=np.ones(len(ground.faces), dtype=bool))
     outlines = shapely.segmentize(shapely.boundary(np.asarray(areas, dtype=object)), SAMPLE_M)
