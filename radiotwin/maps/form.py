@@ -19,7 +19,7 @@ from radiotwin.scene.lattice import Lattice
 DIMS = ("device", "z", "y", "x")
 NETCDF, ZARR = ".nc", ".zarr"  # suffixes of radio maps
 VARIABLES = ("gain_db", "los", "sigma_db")
-SCHEMA = "radiotwin.maps.radiomap/1"
+SCHEMA = "radiotwin.radiomap/1"
 CONVENTIONS = "CF-1.11"  # https://cfconventions.org
 GRID_MAPPING = "crs"
 GROUND = "ground_m"  # coordinate of a map whose altitudes are above the ground

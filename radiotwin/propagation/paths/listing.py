@@ -39,7 +39,7 @@ from radiotwin.trace.run import device_indices
 RECEIVER_CHUNK = 500  # receivers at once
 PATH_CHUNK = 20_000  # paths at once: about 10 MB
 NO_INTERACTION, REFLECTION, DIFFRACTION = 0, 1, 2
-SCHEMA = "radiotwin.propagation.paths/1"
+SCHEMA = "radiotwin.paths/1"
 _UNITS = {"db": "dB", "s": "s", "hz": "Hz", "deg": "degree", "rad": "rad", "m": "m"}
 _LONG_NAMES = {
     "gain_db": "sum of the paths' powers (NaN: no path)",
