@@ -32,11 +32,11 @@ APT_INSTALL := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock:
 
 help:
 	@echo "make demo    set up, then the whole chain on a small city"
-	@echo "make test     set up, then every test but the slow ones (a quarter of an hour on two cores)"
+	@echo "make test     set up, then every test but the slow ones (about ten minutes on two cores)"
 	@echo "make test-all every test: statistics over many seeds, real data where it is, long chains"
 	@echo "make test-flower the tests of federation over Flower, in an environment of their own"
 	@echo "make lint     ruff and mypy"
-	@echo "make check    these and the fast tests (a few minutes)"
+	@echo "make check    these and the fast tests (about two minutes on two cores)"
 	@echo "make docs    the site, in site/; runs the examples"
 	@echo "make bench   what takes how long; \`python -m studies --list\` lists all studies"
 	@echo "make llvm    set up only: the package and a libLLVM for tracing"
