@@ -31,6 +31,22 @@ def comparison(small_scene, truth, flown):
     return compare_models(train, test, small_scene, truth, seed=0, models=("log_distance", "segmented_log_distance"))
 
 
+@pytest.fixture(scope="module")
+def tables(small_scene, truth, flown):
+    """`tables(executor)` compares three models: what is written, as text."""
+    def compared(executor=None):
+        found = compare_models(*split_flights(flown, 1), small_scene, truth, seed=0, executor=executor,
+                               models=("log_distance", "segmented_nn", "regression_kriging"))
+        return found.scores.to_csv(), found.locations.to_csv(), found.predictions.to_csv()
+    return compared
+
+
+@pytest.fixture(scope="module")
+def whole(tables):
+    """The tables of a run that nothing has stopped, in this process."""
+    return tables()
+
+
 def test_the_last_flights_are_held_out_whole(flown):
     train, test = split_flights(flown, 2)
     assert train.flights == ["f0"] and test.flights == ["f1", "f2"]
@@ -146,20 +162,12 @@ def test_devices_of_unknown_position_are_in_neither_class(small_scene, flown):
     assert 0 < n["LoS"] and 0 < n["NLoS"] and n["LoS"] + n["NLoS"] < n["all"]
 
 
-def test_a_killed_comparison_goes_on_with_the_models_that_were_fitted(small_scene, truth, flown, monkeypatch):
+def test_a_killed_comparison_goes_on_with_the_models_that_were_fitted(tables, whole, monkeypatch):
     from radiotwin.propagation.laws.segmented_nn import SegmentedNN
     from radiotwin.runtime import pieces
     from radiotwin.twin.localize import on_map
 
     monkeypatch.setattr(pieces, "MIN_SECONDS", 0.0)
-    train, test = split_flights(flown, 1)
-    models = ("log_distance", "segmented_nn", "regression_kriging")
-
-    def tables():
-        found = compare_models(train, test, small_scene, truth, seed=0, models=models)
-        return found.scores.to_csv(), found.locations.to_csv(), found.predictions.to_csv()
-
-    whole = tables()
     with monkeypatch.context() as killed, pieces.keep_pieces() as store, pytest.raises(KeyboardInterrupt):
         def kill(*_, **__):
             raise KeyboardInterrupt
@@ -176,18 +184,10 @@ def test_a_killed_comparison_goes_on_with_the_models_that_were_fitted(small_scen
     assert store.made == 0
 
 
-def test_models_that_are_fitted_in_other_processes_are_the_same_to_the_bit(small_scene, truth, flown, tmp_path):
+def test_models_that_are_fitted_in_other_processes_are_the_same_to_the_bit(tables, whole, tmp_path):
     from radiotwin.runtime import pieces
     from tests.runtime.execution.jobs import two_workers
 
-    train, test = split_flights(flown, 1)
-    models = ("log_distance", "segmented_nn", "regression_kriging")
-
-    def tables(executor=None):
-        found = compare_models(train, test, small_scene, truth, seed=0, models=models, executor=executor)
-        return found.scores.to_csv(), found.locations.to_csv(), found.predictions.to_csv()
-
-    whole = tables()
     with two_workers("local", one_is_killed=False) as (executor, _), pieces.keep_pieces(tmp_path):
         assert tables(executor) == whole
     assert list(tmp_path.glob("positions-*"))  # kept there, for a command that is killed

@@ -77,6 +77,7 @@ def test_few_links_at_once_find_the_same_position(open_ground, monkeypatch):
     assert found[1].radius_m == pytest.approx(found[0].radius_m)
 
 
+@pytest.mark.slow
 def test_what_is_known_of_receivers_brings_devices_nearer_and_the_radii_hold_nine_in_ten(open_ground):
     world = open_ground.fly(11)
     world.gain_db[world.receiver == 1] += 12.0
