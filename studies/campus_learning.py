@@ -48,7 +48,7 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
     by_twin, dof = twin.predict(others), twin.fitted.dof
     scale_db = by_twin.sd_db * np.sqrt((dof - 2) / dof)
     predicted = {TWIN: by_twin.mean_db, NAMED: named.predict(others).mean_db}
-    unlimited = replace(links, limit_db=np.full(len(links), -np.inf))
+    unlimited = links.with_columns(limit_db=np.full(len(links), -np.inf))
     for kind in (LogDistance, SegmentedLogDistance, RegressionKriging):
         predicted[kind.name] = law_db(kind, unlimited, rows, test)
     for name in (EXTRA_TREES, BOOSTING):

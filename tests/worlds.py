@@ -10,7 +10,7 @@ import pytest
 
 from radiotwin.closeloop.predict.baselines import grow_trees
 from radiotwin.closeloop.predict.predictor import CombinedPrediction
-from radiotwin.links import Links
+from radiotwin.links.links import Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import fly_survey
@@ -113,19 +113,34 @@ def narrow_street():
         links.reset_index(drop=True), devices.reset_index(drop=True)))
 
 
+def synthetic_links(device_m, device, receiver_m, *, level_db=np.nan, limit_db=-np.inf, receiver=0, flight=0,
+                    time_s=np.nan, heading_deg=np.nan, frequency_hz=2.4e9, city=None, is_gain=True, **columns):
+    """Return n links as they would be made of measurements; a number that is given holds for every link.
+
+    Args:
+        device_m: (k, 3) positions of the devices, all declared [m].
+        device: (n,) index of each link's device.
+        receiver_m: (n, 3) positions of the receivers [m].
+        columns: of `Columns`, beside those above.
+    """
+    device_m, device, receiver_m = np.asarray(device_m, float), np.asarray(device), np.asarray(receiver_m, float)
+    given = {"level_db": level_db, "limit_db": limit_db, "time_s": time_s, "heading_deg": heading_deg}
+    of_each = {name: np.broadcast_to(np.asarray(value, float), len(device)).copy() for name, value in given.items()}
+    index = {name: np.broadcast_to(value, len(device)).copy()
+             for name, value in {"receiver": receiver, "flight": flight}.items()}
+    columns = Columns(device=device, receiver_m=receiver_m, **of_each, **index, **columns)
+    names = {f"{kind}_names": [f"{kind[0]}{i}" for i in range(index[kind].max(initial=0) + 1)] for kind in index}
+    ends = Ends(device_names=[f"d{i}" for i in range(len(device_m))], device_m=device_m,
+                anchors=frozenset(range(len(device_m))), flown=Flown.of(columns), **names)
+    return Links(columns=columns, ends=ends, world=World(frequency_hz=frequency_hz, city=city, is_gain=is_gain))
+
+
 @pytest.fixture
 def make_links():
     """Make the links of every receiver position (n, 3) to every device (k, 3): Links of n k links."""
     def make(device_m, receiver_m, **given):
         device_m, receiver_m = np.atleast_2d(device_m).astype(float), np.atleast_2d(receiver_m).astype(float)
-        each, count = len(device_m), len(receiver_m) * len(device_m)
-        values = {"level_db": np.zeros(count), "receiver": np.zeros(count, int), "flight": np.zeros(count, int),
-                  "time_s": np.full(count, np.nan), "heading_deg": np.full(count, np.nan), "limit_db": None} | given
-        names = [[f"{letter}{i}" for i in range(total)] for letter, total in
-                 (("d", each), ("r", values["receiver"].max() + 1), ("f", values["flight"].max() + 1))]
-        limit_db = -np.inf if values["limit_db"] is None else values["limit_db"]
-        return Links(values["level_db"], np.full(count, float(limit_db)), np.repeat(receiver_m, each, axis=0), device_m,
-                        np.tile(np.arange(each), len(receiver_m)), values["receiver"], values["flight"],
-                        values["time_s"], values["heading_deg"], *names, values.get("frequency_hz", 2.4e9),
-                        values.get("city"), True, frozenset(range(each)))
+        values = {"level_db": 0.0} | given
+        return synthetic_links(device_m, np.tile(np.arange(len(device_m)), len(receiver_m)),
+                               np.repeat(receiver_m, len(device_m), axis=0), **values)
     return make

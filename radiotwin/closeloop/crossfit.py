@@ -399,7 +399,7 @@ def without_quality(model: CrossFit) -> CrossFit:
         assert quality is not None
         known = quality[each.train & np.isfinite(quality)]
         usual = float(np.median(known)) if len(known) else np.nan
-        links = replace(each.links, quality=np.full(len(quality), usual))
+        links = each.links.with_columns(quality=np.full(len(quality), usual))
         effects = [applied if "quality" not in applied.effect.uses
                    else AppliedEffect(applied.effect, applied.params, applied.effect.term(
                        links, applied.params, each.model.level_at)) for applied in each.effects]
@@ -431,8 +431,8 @@ def cross_validate(links: Links, base: Base, folds: Folds,
     dof = best_dof(links, twin.channel, device_m)
     whole = FoldModel.build(links, twin.channel, dof, device_m=device_m)
     links = _with_evidence(links, whole)
-    whole = replace(whole, links=replace(whole.links, evidence=links.evidence, notes=links.notes,
-                                         known_los=whole.links.los))
+    columns = {"evidence": links.evidence, "known_los": whole.links.los}
+    whole = replace(whole, links=replace(whole.links.with_columns(**columns), notes=links.notes))
     models = []
     for number, part in enumerate(parts):
         with warnings.catch_warnings():
@@ -450,4 +450,4 @@ def _with_evidence(links: Links, whole: FoldModel) -> Links:
     view, z = whole.fit().view, np.full(len(links), np.nan)
     z[whole.train] = view.residual_db / view.scale_db
     located = with_evidence(whole.links, z)
-    return replace(links, evidence=located.evidence, notes=located.notes)
+    return replace(links.with_columns(evidence=located.evidence), notes=located.notes)

@@ -6,7 +6,7 @@ Fewer links where more say nothing new: piles at one place, and samples of very 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -75,7 +75,7 @@ def thin_piles(links: Links) -> Links:
     note = (f"receivers stayed at {(count > most).sum():,} places, where "
             f"{len(links) - len(kept):,} of {len(links):,} links are left out, evenly in time: "
             f"readings at one place err alike and count as one; {most:.0f} of them are used")
-    return replace(links.select(kept), notes=[*links.notes, note])
+    return links.select(kept).with_notes(note)
 
 
 def thin_links(links: Links, seed: int) -> Links:
@@ -99,7 +99,7 @@ def thin_links(links: Links, seed: int) -> Links:
     note = (f"of {n:,} links {len(rows):,} are used, drawn evenly from all flights, devices, "
             f"receivers and times, as above {MAX_LINKS:,} the loop would take hours; errors, "
             "evidence and residuals are those of the sample")
-    return replace(links.select(rows), notes=[*links.notes, note])
+    return links.select(rows).with_notes(note)
 
 
 @dataclass(eq=False, repr=False)

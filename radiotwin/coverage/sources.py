@@ -8,7 +8,8 @@ from typing_extensions import override
 
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkGeometry, Links
+from radiotwin.links import LinkGeometry
+from radiotwin.links.links import Columns, Ends, Links, World
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import channel_named
 from radiotwin.propagation.laws.image_paths import ImagePaths
@@ -203,12 +204,13 @@ class TwinSource(GainSource):
             return found.mean_db, found.sd_db
         twin = self._twin
         device_m = np.vstack([np.nan_to_num(twin.device_m), each.position_m])
-        links = Links.synthetic(
-            device_m, np.full(len(receiver_m), len(twin.devices)), receiver_m,
-            device_names=[*(device.device for device in twin.devices), each.name],
-            limit_db=twin.limit_db, frequency_hz=self._scene.config.radio.frequency_hz,
-            city=self._scene.city, is_gain=True,
-            anchors=frozenset(range(len(device_m))))
+        device = np.full(len(receiver_m), len(twin.devices))
+        links = Links(
+            columns=Columns.unmeasured(receiver_m, device, twin.limit_db),
+            ends=Ends(device_names=[*(device.device for device in twin.devices), each.name],
+                      device_m=device_m, anchors=frozenset(range(len(device_m)))),
+            world=World(frequency_hz=self._scene.config.radio.frequency_hz,
+                        city=self._scene.city, is_gain=True))
         if twin.fitted is None:
             mean_db, sd_db = twin.channel.trend.predict(links.geometry)
         else:

@@ -1,7 +1,5 @@
 """Links that err alike: pieces of evidence, and how many links count as one."""
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 
@@ -76,7 +74,7 @@ def with_evidence(links: Links, z: np.ndarray) -> Links:
     if squares < LITTLE:
         notes.append(f"links within {width_m:.0f} m of each other err alike, and the campaign has "
                      f"been at {squares} such places only, so evidence is little")
-    return replace(links, evidence=pieces, notes=[*links.notes, *notes])
+    return links.with_columns(evidence=pieces).with_notes(*notes)
 
 
 def fitting_width_m(links: Links, wanted_m: float, places: int = MIN_PLACES) -> float:

@@ -11,7 +11,7 @@ It serves to tell how weak a link that was not detected probably was, before any
 map, no line of sight, and devices whose position is unknown have no distance.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import log_ndtr, logsumexp, ndtr, stdtr
@@ -410,7 +410,7 @@ def limits_to_explain(links: Links) -> Links:
         blank = np.isnan(links.level_db)
         if blank.any():
             limit_db[:] = np.nanmin(links.level_db)
-        return replace(links, limit_db=limit_db)
+        return links.with_columns(limit_db=limit_db)
     own_db = links.receiver_limits_db
     off_db = own_db - usual_db
     finite = np.isfinite(own_db)
@@ -418,4 +418,4 @@ def limits_to_explain(links: Links) -> Links:
     deaf = off_db > max(DEAF_DB, DEAF_SDS * scatter_db)
     shift_db = np.where(deaf, off_db, 0.0)[links.receiver]
     limit_db = np.where(known, limit_db - shift_db, usual_db)
-    return replace(links, limit_db=limit_db)
+    return links.with_columns(limit_db=limit_db)

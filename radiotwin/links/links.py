@@ -1,20 +1,16 @@
-"""Measured links as numbers.
+"""Measured links as arrays: what was read, both ends, map and radio; and their predicted levels.
 
-What was read, where both ends were, and all that a residual may depend on.
-
-Clocks: whether the times of different flights can be compared.
-
-Geometry of links: the two ends, line of sight, and the 3D map between them if there is one.
-
-Predicted levels of links.
+`LinkGeometry` is the part that a channel model may see. Whether the times of different flights can
+be compared is told from the tracks of their receivers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from operator import attrgetter
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -23,6 +19,7 @@ from scipy.constants import speed_of_light
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 
+Value = TypeVar("Value")
 Tracks = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
 """(receiver, flight) -> times (t,) in order [s] and positions (t, 3) then [m]."""
 ELSEWHERE_M = 20.0  # a receiver is not at two places so far apart at one time
@@ -35,9 +32,6 @@ RESTART_NOTE = ("time_s begins anew in each flight (flights of one receiver over
 REFERENCE_DISTANCE_M = 1.0  # of the log-distance law; shorter links count as this long
 ROOF_SAMPLES = 60  # points along a link at which the roofs below it are looked up
 ROOF_CHUNK = 5000  # links a time: bounds the memory of that to 10 MB
-_OF_EACH_LINK = ("level_db", "limit_db", "receiver_m", "device", "receiver", "flight", "time_s",
-                 "heading_deg", "pitch_deg", "roll_deg", "quality", "known_los", "time_in_flight_s",
-                 "evidence")
 
 
 def clocks_restart(tracks: Tracks) -> bool:
@@ -167,37 +161,22 @@ def link_geometry(device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarr
     return LinkGeometry(ends_m, receiver_m, np.asarray(los, bool), device, city)
 
 
-@dataclass(frozen=True, eq=False)
-class Links:
-    """n links, as arrays; made by `radiotwin.links.prepare_links` from measurements.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Columns:
+    """What was measured of each of n links.
 
     Attributes:
         level_db: (n,) measured gain [dB] or power [dBm]; NaN = not detected.
         limit_db: (n,) level below which the link's receiver does not detect [dB]; -inf where it is
             unknown, and a blank says nothing of the level.
         receiver_m: (n, 3) positions of the receivers [m].
-        device_m: (k, 3) positions of the devices as far as they are known [m]; NaN where not.
-        device, receiver, flight: (n,) index into the names.
+        device, receiver, flight: (n,) index into the names of the ends.
         time_s: (n,) NaN where unknown.
         heading_deg: (n,) clockwise from north; NaN where unknown.
-        device_names, receiver_names, flight_names: the names.
-        frequency_hz: of the radio [Hz]; NaN where unknown.
-        city: 3D map; None without a scene.
-        is_gain: whether the level is a gain rather than a power.
-        anchors: indices of the devices whose positions are declared.
-        notes: what the data's checks found and did about it, a sentence each.
         pitch_deg, roll_deg: (n,) nose up, and right side down, are positive; None if unknown.
         quality: (n,) as the receiver reports it; None if it does not.
         known_los: (n,) bool, line of sight where it is known already; None: from the map.
-        time_in_flight_s: (n,) since the first measurement of the track [s].
-        first_s, last_s: time of the first and the last measurement [s]; NaN without times. They,
-            and `tracks`, stay those of all the data when links are selected.
-        tracks: where each receiver was in each flight; only links with a time count.
-        time_restarts: whether clocks begin anew in each flight, so that `time_s` orders readings
-            within a flight only; stays that of all the data, too.
-        boresight_deg: (k,) declared azimuth of each device's antenna, clockwise from north [deg];
-            NaN where none is, and where None is given.
-        tilt_deg: (k,) declared tilt of each device's antenna, upwards [deg]; likewise.
+        time_in_flight_s: (n,) since the first measurement of the track [s]; None: from these links.
         evidence: (n, 2) piece of evidence and place of each link, see
             `radiotwin.links.with_evidence`; None before a residual has been looked at.
     """
@@ -205,71 +184,200 @@ class Links:
     level_db: np.ndarray
     limit_db: np.ndarray
     receiver_m: np.ndarray
-    device_m: np.ndarray
     device: np.ndarray
     receiver: np.ndarray
     flight: np.ndarray
     time_s: np.ndarray
     heading_deg: np.ndarray
-    device_names: list[str]
-    receiver_names: list[str]
-    flight_names: list[str]
-    frequency_hz: float
-    city: CityMap | None
-    is_gain: bool
-    anchors: frozenset[int]
-    notes: list[str] = field(default_factory=list)
     pitch_deg: np.ndarray | None = None
     roll_deg: np.ndarray | None = None
     quality: np.ndarray | None = None
     known_los: np.ndarray | None = None
-    time_in_flight_s: np.ndarray = None  # type: ignore[assignment]  # filled in below, as the rest
-    first_s: float = None  # type: ignore[assignment]
-    last_s: float = None  # type: ignore[assignment]
-    tracks: Tracks = None  # type: ignore[assignment]
-    time_restarts: bool = None  # type: ignore[assignment]
+    time_in_flight_s: np.ndarray = None  # type: ignore[assignment]  # filled in below
     evidence: np.ndarray | None = None
-    boresight_deg: np.ndarray = None  # type: ignore[assignment]
-    tilt_deg: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        timed = np.isfinite(self.time_s).any()
-        derived: dict[str, Any] = {
-            "first_s": lambda: float(np.nanmin(self.time_s)) if timed else np.nan,
-            "last_s": lambda: float(np.nanmax(self.time_s)) if timed else np.nan,
-            "time_in_flight_s": self._time_in_flight_s, "tracks": self._tracks,
-            "time_restarts": lambda: clocks_restart(self.tracks),
-            "boresight_deg": lambda: np.full(len(self.device_names), np.nan),
-            "tilt_deg": lambda: np.full(len(self.device_names), np.nan)}
-        for name, derive in derived.items():
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, derive())
-
-    def __len__(self) -> int:
-        return len(self.level_db)
+        if self.time_in_flight_s is None:
+            object.__setattr__(self, "time_in_flight_s", self._time_in_flight_s())
 
     @classmethod
-    def synthetic(cls, device_m: np.ndarray, device: np.ndarray, receiver_m: np.ndarray, *,
-                  device_names: Sequence[str], limit_db: float | None, frequency_hz: float,
-                  city: CityMap | None, is_gain: bool, anchors: frozenset[int]) -> Links:
-        """Return links that nobody measured: receiver, flight, time and heading are unset.
+    def unmeasured(cls, receiver_m: np.ndarray, device: np.ndarray,
+                   limit_db: float | None = None) -> Columns:
+        """Return n links that nobody measured: receiver, flight, time and heading are unset.
 
         Args:
-            device_m: (k, 3) positions of the devices [m].
-            device: (n,) index of each link's device.
             receiver_m: (n, 3) positions of the receivers [m].
-            device_names: k names.
+            device: (n,) index of each link's device.
             limit_db: level below which receivers do not detect [dB]; None where it is unknown.
-            frequency_hz: of the radio [Hz]; NaN where unknown.
-            city: 3D map; None without a scene.
-            is_gain: whether the level is a gain rather than a power.
-            anchors: indices of the devices whose positions are declared.
         """
         n = len(receiver_m)
         unset, unknown = np.full(n, -1), np.full(n, np.nan)
-        limits_db = np.full(n, -np.inf if limit_db is None else limit_db)
-        return cls(unknown, limits_db, receiver_m, device_m, device, unset, unset, unknown, unknown,
-                   list(device_names), [], [], frequency_hz, city, is_gain, anchors)
+        return cls(level_db=unknown, limit_db=np.full(n, -np.inf if limit_db is None else limit_db),
+                   receiver_m=receiver_m, device=device, receiver=unset, flight=unset,
+                   time_s=unknown, heading_deg=unknown)
+
+    @cached_property
+    def track(self) -> np.ndarray:
+        """(n,) index of the flight of a receiver that a link was measured on."""
+        key = self.flight * (self.receiver.max() + 1) + self.receiver
+        return np.unique(key, return_inverse=True)[1]
+
+    def select(self, rows: np.ndarray | slice) -> Columns:
+        """Return the links of a mask, a slice or an index array."""
+        values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        return Columns(**{name: None if value is None else value[rows]
+                          for name, value in values.items()})
+
+    def _time_in_flight_s(self) -> np.ndarray:
+        if np.isnan(self.time_s).all():
+            return self.time_s
+        first = np.full(self.track.max() + 1, np.inf)
+        np.minimum.at(first, self.track, np.where(np.isnan(self.time_s), np.inf, self.time_s))
+        return self.time_s - first[self.track]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Flown:
+    """When and where receivers measured, in all the data: it stays when links are selected.
+
+    Attributes:
+        first_s, last_s: time of the first and the last measurement [s]; NaN without times.
+        tracks: where each receiver was in each flight; only links with a time count.
+        time_restarts: whether clocks begin anew in each flight, so that `time_s` orders readings
+            within a flight only.
+    """
+
+    first_s: float = np.nan
+    last_s: float = np.nan
+    tracks: Tracks = field(default_factory=dict)
+    time_restarts: bool = False
+
+    @classmethod
+    def of(cls, columns: Columns) -> Flown:
+        """Return the tracks of links."""
+        timed = np.flatnonzero(np.isfinite(columns.time_s))
+        if not len(timed):
+            return cls()
+        tracks: Tracks = {}
+        order = timed[np.lexsort((columns.time_s[timed], columns.flight[timed],
+                                  columns.receiver[timed]))]
+        ends = np.column_stack([columns.receiver[order], columns.flight[order]])
+        starts = np.flatnonzero(np.diff(ends, axis=0).any(axis=1)) + 1
+        for rows in np.split(order, starts):
+            time_s, first = np.unique(columns.time_s[rows], return_index=True)
+            key = int(columns.receiver[rows[0]]), int(columns.flight[rows[0]])
+            tracks[key] = time_s, columns.receiver_m[rows[first]]
+        return cls(first_s=float(np.nanmin(columns.time_s)), tracks=tracks,
+                   last_s=float(np.nanmax(columns.time_s)), time_restarts=clocks_restart(tracks))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Ends:
+    """The devices, receivers and flights that links have by their index.
+
+    Attributes:
+        device_names, receiver_names, flight_names: the names.
+        device_m: (k, 3) positions of the devices as far as they are known [m]; NaN where not.
+        anchors: indices of the devices whose positions are declared.
+        boresight_deg: (k,) declared azimuth of each device's antenna, clockwise from north [deg];
+            NaN where none is, and where None is given.
+        tilt_deg: (k,) declared tilt of each device's antenna, upwards [deg]; likewise.
+        flown: when and where receivers measured.
+    """
+
+    device_names: list[str]
+    device_m: np.ndarray
+    anchors: frozenset[int]
+    receiver_names: list[str] = field(default_factory=list)
+    flight_names: list[str] = field(default_factory=list)
+    boresight_deg: np.ndarray = None  # type: ignore[assignment]  # filled in below, as the next
+    tilt_deg: np.ndarray = None  # type: ignore[assignment]
+    flown: Flown = Flown()
+
+    def __post_init__(self) -> None:
+        for name in ("boresight_deg", "tilt_deg"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.full(len(self.device_names), np.nan))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class World:
+    """What all links share.
+
+    Attributes:
+        frequency_hz: of the radio [Hz]; NaN where unknown.
+        city: 3D map; None without a scene.
+        is_gain: whether the level is a gain rather than a power.
+    """
+
+    frequency_hz: float
+    city: CityMap | None
+    is_gain: bool
+
+
+class _Of(Generic[Value]):
+    """An attribute of a part of links, under its name there."""
+
+    def __init__(self, part: str) -> None:
+        self._part = part
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._get = attrgetter(f"{self._part}.{name}")
+
+    def __get__(self, links: Links, owner: type) -> Value:
+        return self._get(links)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Links:
+    """n links, as arrays; made by `radiotwin.links.prepare_links` from measurements.
+
+    What the parts hold is read under the same name here: `links.level_db`, `links.device_m`.
+
+    Attributes:
+        columns: what was measured of each link.
+        ends: the devices, receivers and flights.
+        world: the 3D map and the radio.
+        notes: what the data's checks found and did about it, a sentence each.
+    """
+
+    columns: Columns
+    ends: Ends
+    world: World
+    notes: tuple[str, ...] = ()
+
+    level_db = _Of[np.ndarray]("columns")
+    limit_db = _Of[np.ndarray]("columns")
+    receiver_m = _Of[np.ndarray]("columns")
+    device = _Of[np.ndarray]("columns")
+    receiver = _Of[np.ndarray]("columns")
+    flight = _Of[np.ndarray]("columns")
+    time_s = _Of[np.ndarray]("columns")
+    heading_deg = _Of[np.ndarray]("columns")
+    pitch_deg = _Of[np.ndarray | None]("columns")
+    roll_deg = _Of[np.ndarray | None]("columns")
+    quality = _Of[np.ndarray | None]("columns")
+    known_los = _Of[np.ndarray | None]("columns")
+    time_in_flight_s = _Of[np.ndarray]("columns")
+    evidence = _Of[np.ndarray | None]("columns")
+    track = _Of[np.ndarray]("columns")
+    device_names = _Of[list[str]]("ends")
+    receiver_names = _Of[list[str]]("ends")
+    flight_names = _Of[list[str]]("ends")
+    device_m = _Of[np.ndarray]("ends")
+    anchors = _Of[frozenset[int]]("ends")
+    boresight_deg = _Of[np.ndarray]("ends")
+    tilt_deg = _Of[np.ndarray]("ends")
+    first_s = _Of[float]("ends.flown")
+    last_s = _Of[float]("ends.flown")
+    tracks = _Of[Tracks]("ends.flown")
+    time_restarts = _Of[bool]("ends.flown")
+    frequency_hz = _Of[float]("world")
+    city = _Of[CityMap | None]("world")
+    is_gain = _Of[bool]("world")
+
+    def __len__(self) -> int:
+        return len(self.level_db)
 
     @cached_property
     def geometry(self) -> LinkGeometry:
@@ -294,12 +402,6 @@ class Links:
         """The limit of detection of most receivers [dB]: the median; None where none is known."""
         known_db = np.sort(self.receiver_limits_db[np.isfinite(self.receiver_limits_db)])
         return float(known_db[(len(known_db) - 1) // 2]) if len(known_db) else None
-
-    @cached_property
-    def track(self) -> np.ndarray:
-        """(n,) index of the flight of a receiver that a link was measured on."""
-        key = self.flight * (self.receiver.max() + 1) + self.receiver
-        return np.unique(key, return_inverse=True)[1]
 
     @cached_property
     def absolute_time_s(self) -> np.ndarray:
@@ -387,31 +489,45 @@ class Links:
 
     def select(self, rows: np.ndarray | slice) -> Links:
         """Return the links of a mask, a slice or an index array."""
-        values = {name: getattr(self, name) for name in _OF_EACH_LINK}
-        values["known_los"] = self.los
-        return replace(self, **{name: value[rows] for name, value in values.items()
-                                if value is not None})
+        return replace(self, columns=replace(self.columns, known_los=self.los).select(rows))
+
+    def with_columns(self, **columns: Any) -> Links:
+        """Return the same links with other values (n,) of some `Columns`."""
+        return replace(self, columns=replace(self.columns, **columns))
+
+    def with_receivers(self, receiver_m: np.ndarray) -> Links:
+        """Return the same links with the receivers at (n, 3) [m]."""
+        return self.with_columns(receiver_m=receiver_m, known_los=None)
+
+    def with_los(self, los: np.ndarray) -> Links:
+        """Return the same links with lines of sight (n,) other than the map's."""
+        return self.with_columns(known_los=los)
+
+    def with_ends(self, **ends: Any) -> Links:
+        """Return the same links with other values of some `Ends`, at the same positions."""
+        return replace(self, ends=replace(self.ends, **ends))
 
     def with_devices(self, device_m: np.ndarray) -> Links:
         """Return the same links with the devices at (k, 3) [m]."""
-        return replace(self, device_m=device_m, known_los=None)
+        return self.with_ends(device_m=device_m).with_columns(known_los=None)
+
+    def of_devices(self, device: np.ndarray, device_m: np.ndarray, names: list[str],
+                   anchors: frozenset[int]) -> Links:
+        """Return the same links as those of other devices.
+
+        Args:
+            device: (n,) index of each link's device.
+            device_m: (k, 3) positions of the devices [m].
+            names: k names.
+            anchors: indices of the devices whose positions are declared.
+        """
+        links = self.with_columns(device=device, known_los=None)
+        return links.with_ends(device_m=device_m, device_names=names, anchors=anchors)
 
     def located(self, device_m: np.ndarray) -> Links:
         """Return the links of devices that have a position in (k, 3) [m], there; NaN: none."""
         rows = np.isfinite(device_m).all(axis=1)[self.device]
         return self.with_devices(np.nan_to_num(device_m)).select(rows)
-
-    def with_receivers(self, receiver_m: np.ndarray) -> Links:
-        """Return the same links with the receivers at (n, 3) [m]."""
-        return replace(self, receiver_m=receiver_m, known_los=None)
-
-    def with_los(self, los: np.ndarray) -> Links:
-        """Return the same links with lines of sight (n,) other than the map's."""
-        return replace(self, known_los=los)
-
-    def with_city(self, city: CityMap | None) -> Links:
-        """Return the same links over another map."""
-        return replace(self, city=city, known_los=None)
 
     def renumber_receivers(self, names: Sequence[str]) -> Links:
         """Return the same links, counting receivers by `names`, which hold all of theirs."""
@@ -419,28 +535,22 @@ class Links:
         number = np.array([place[name] for name in self.receiver_names])
         tracks = {(int(number[receiver]), flight): track
                   for (receiver, flight), track in self.tracks.items()}
-        return replace(self, receiver=number[self.receiver], receiver_names=list(names),
-                       tracks=tracks)
+        links = self.with_columns(receiver=number[self.receiver])
+        return links.with_ends(receiver_names=list(names),
+                               flown=replace(self.ends.flown, tracks=tracks))
 
-    def _time_in_flight_s(self) -> np.ndarray:
-        if np.isnan(self.time_s).all():
-            return self.time_s
-        first = np.full(self.track.max() + 1, np.inf)
-        np.minimum.at(first, self.track, np.where(np.isnan(self.time_s), np.inf, self.time_s))
-        return self.time_s - first[self.track]
+    def since(self, first_s: float) -> Links:
+        """Return the same links, with times that count from another first measurement [s]."""
+        return self.with_ends(flown=replace(self.ends.flown, first_s=first_s))
 
-    def _tracks(self) -> Tracks:
-        found: Tracks = {}
-        timed = np.flatnonzero(np.isfinite(self.time_s))
-        keys = (self.time_s[timed], self.flight[timed], self.receiver[timed])
-        order = timed[np.lexsort(keys)]
-        ends = np.column_stack([self.receiver[order], self.flight[order]])
-        starts = np.flatnonzero(np.diff(ends, axis=0).any(axis=1)) + 1
-        for rows in np.split(order, starts) if len(order) else ():
-            time_s, first = np.unique(self.time_s[rows], return_index=True)
-            key = int(self.receiver[rows[0]]), int(self.flight[rows[0]])
-            found[key] = time_s, self.receiver_m[rows[first]]
-        return found
+    def with_city(self, city: CityMap | None) -> Links:
+        """Return the same links over another map."""
+        links = self.with_columns(known_los=None)
+        return replace(links, world=replace(self.world, city=city))
+
+    def with_notes(self, *notes: str) -> Links:
+        """Return the same links with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,5 @@
 """Measurements joined with devices, 3D map and radio: checked, and without what cannot be used."""
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 
@@ -25,7 +23,7 @@ from radiotwin.links.checks import (
     useless_receivers,
 )
 from radiotwin.links.limits import estimate_limits
-from radiotwin.links.links import RESTART_NOTE, Links
+from radiotwin.links.links import RESTART_NOTE, Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 
@@ -57,9 +55,9 @@ def join_links(measurements: Measurements, scene: Scene) -> Links:
     if outside.any():
         notes.append(f"{outside.sum():,} of {len(outside):,} links have their receiver outside the "
                      "3D map")
-    return _link_data(measurements, measurements.table.reset_index(drop=True), scene,
-                      measurements.level_db, receiver_m, device_m, measurements.device_index,
-                      np.arange(len(device_m)), notes)
+    return _join(measurements, measurements.table.reset_index(drop=True), scene,
+                 measurements.level_db, receiver_m, device_m, measurements.device_index,
+                 np.arange(len(device_m)), notes)
 
 
 def prepare_links(measurements: Measurements, scene: Scene | None,
@@ -144,10 +142,9 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
                        + ("; ".join(notes) or "measure more"))
     refuse_empty_levels(level_db[keep], measurements.level_column)
     device = (np.cumsum(placed) - 1)[device_index[keep]]
-    links = _link_data(measurements, table[keep], scene, level_db[keep], receiver_m[keep],
-                       device_m[placed], device, np.flatnonzero(placed), notes)
-    notes += [RESTART_NOTE] * links.time_restarts
-    return links
+    links = _join(measurements, table[keep], scene, level_db[keep], receiver_m[keep],
+                  device_m[placed], device, np.flatnonzero(placed), notes)
+    return links.with_notes(RESTART_NOTE) if links.time_restarts else links
 
 
 def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:
@@ -164,9 +161,9 @@ def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.
     return below_m
 
 
-def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
-               level_db: np.ndarray, receiver_m: np.ndarray, device_m: np.ndarray,
-               device: np.ndarray, kept_devices: np.ndarray, notes: list[str]) -> Links:
+def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
+          level_db: np.ndarray, receiver_m: np.ndarray, device_m: np.ndarray, device: np.ndarray,
+          kept_devices: np.ndarray, notes: list[str]) -> Links:
     """Join rows that are kept already; `kept_devices` (k,) are rows of the table of devices."""
     receiver, receiver_names = pd.factorize(table["receiver"], sort=True)
     flight, flight_names = pd.factorize(table["flight"])
@@ -181,22 +178,26 @@ def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | N
     frequency_hz = _frequency_hz(measurements, scene)
     notes += _other_frequencies(_column(measurements.devices, "frequency_hz")[kept_devices],
                                 frequency_hz)
-    anchors = frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist())
-    links = Links(
-        level_db, np.full(len(level_db), -np.inf), receiver_m, device_m, device, receiver,
-        flight, _column(table, "time_s"), heading_deg % 360,
-        list(measurements.devices["device"].iloc[kept_devices]), list(receiver_names),
-        list(flight_names), frequency_hz,
-        scene.city if scene is not None else None,
-        is_gain, anchors, notes, _column(table, "pitch_deg"), _column(table, "roll_deg"),
-        _column(table, "quality"),
-        boresight_deg=_column(measurements.devices, "azimuth_deg")[kept_devices],
-        tilt_deg=_column(measurements.devices, "tilt_deg")[kept_devices])
+    columns = Columns(
+        level_db=level_db, limit_db=np.full(len(level_db), -np.inf), receiver_m=receiver_m,
+        device=device, receiver=receiver, flight=flight, time_s=_column(table, "time_s"),
+        heading_deg=heading_deg % 360, pitch_deg=_column(table, "pitch_deg"),
+        roll_deg=_column(table, "roll_deg"), quality=_column(table, "quality"))
+    devices = measurements.devices.iloc[kept_devices]
+    ends = Ends(
+        device_names=list(devices["device"]), receiver_names=list(receiver_names),
+        flight_names=list(flight_names), device_m=device_m,
+        anchors=frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist()),
+        boresight_deg=_column(devices, "azimuth_deg"), tilt_deg=_column(devices, "tilt_deg"),
+        flown=Flown.of(columns))
+    city = scene.city if scene is not None else None
+    links = Links(columns=columns, ends=ends, notes=tuple(notes),
+                  world=World(frequency_hz=frequency_hz, city=city, is_gain=is_gain))
     declared_db = None
     if scene is not None:
         declared_db = scene.config.gain_limit_db if is_gain else scene.config.radio.sensitivity_dbm
     limit_db, more = estimate_limits(links, declared_db)
-    return replace(links, limit_db=limit_db, notes=[*notes, *more])
+    return links.with_columns(limit_db=limit_db).with_notes(*more)
 
 
 def _frequency_hz(measurements: Measurements, scene: Scene | None) -> float:

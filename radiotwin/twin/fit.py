@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -102,7 +103,7 @@ def _usable(measurements: Measurements) -> Measurements:
     return measurements.select(~copied)
 
 
-def _warn(notes: list[str]) -> None:
+def _warn(notes: Sequence[str]) -> None:
     for note in notes:
         warnings.warn(note, stacklevel=3)
 

@@ -219,8 +219,8 @@ def _with_copies(links: Links) -> Links:
     rows = np.concatenate([np.arange(len(links)), *again])
     known = links.with_devices(np.nan_to_num(links.device_m)).select(rows)
     names = [f"{links.device_names[anchor]} (as if unknown)" for anchor in anchors]
-    return replace(known, device=device, device_m=np.vstack([links.device_m, height_m]),
-                   device_names=[*links.device_names, *names], known_los=None)
+    return known.of_devices(device, np.vstack([links.device_m, height_m]),
+                            [*links.device_names, *names], known.anchors)
 
 
 def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:

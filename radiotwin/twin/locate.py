@@ -85,10 +85,9 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
         notes.append(f"nothing is known of receivers {', '.join(strangers[:MAX_NAMED])}{others}: "
                      "they are taken for faultless ones")
     links = links.renumber_receivers([*model.receivers, *strangers])
-    links = replace(links, device_m=np.nan_to_num(links.device_m), known_los=None,
-                    # A few links do not tell how weak a level can be detected.
-                    limit_db=links.limit_db if twin.limit_db is None else
-                    np.full(len(links), twin.limit_db))
+    links = links.with_devices(np.nan_to_num(links.device_m))
+    if twin.limit_db is not None:  # a few links do not tell how weak a level can be detected
+        links = links.with_columns(limit_db=np.full(len(links), twin.limit_db))
     area_m = scene.config.extent.bounds if scene is not None else whole_area(model, links)
     with progress("locating", total=len(np.unique(links.device))) as advance:
         found = list(locate(model, links, area_m, lambda: advance(1)))

@@ -18,7 +18,7 @@ from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_folder, require_writable
 from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.io.inputs import parse_json, read_bytes, read_text, require_within
-from radiotwin.links import Links
+from radiotwin.links.links import Columns, Ends, Flown, Links, World
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB
 from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_channel
@@ -308,12 +308,16 @@ def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: lis
     """Refuse effects with another number of coefficients than they need, on a link or two."""
     n = max(len(devices), len(receivers), 2)
     row, nothing = np.arange(n), np.zeros(n)
+    columns = Columns(
+        level_db=np.full(n, -80.0), limit_db=np.full(n, -np.inf),
+        receiver_m=np.column_stack([100.0 + row, nothing, np.full(n, 30.0)]),
+        device=row % len(devices), receiver=row % max(len(receivers), 1), flight=row % 2,
+        time_s=row.astype(float), heading_deg=nothing)
     links = Links(
-        np.full(n, -80.0), np.full(n, -np.inf),
-        np.column_stack([100.0 + row, nothing, np.full(n, 30.0)]),
-        np.zeros((len(devices), 3)), row % len(devices), row % max(len(receivers), 1),
-        row % 2, row.astype(float), nothing, devices, receivers or ["any"], ["f0", "f1"], 2.4e9,
-        None, True, frozenset(range(len(devices))))
+        columns=columns, world=World(frequency_hz=2.4e9, city=None, is_gain=True),
+        ends=Ends(device_names=devices, receiver_names=receivers or ["any"],
+                  flight_names=["f0", "f1"], device_m=np.zeros((len(devices), 3)),
+                  anchors=frozenset(range(len(devices))), flown=Flown.of(columns)))
     for each in effects:
         if each.effect.needs_map or getattr(each.params, "exact", False):
             continue  # checked when it predicts

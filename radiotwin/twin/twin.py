@@ -30,8 +30,7 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, place
 from radiotwin.inference.gaussian import detection_probability
 from radiotwin.io.forms import Origin
-from radiotwin.links import Links
-from radiotwin.links.links import Prediction
+from radiotwin.links.links import Columns, Ends, Links, Prediction, World
 from radiotwin.maps.form import MapStream
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import ChannelModel
@@ -159,11 +158,12 @@ class Twin(Summarised):
             scene: the 3D map and the radio.
         """
         anchors = frozenset(i for i, each in enumerate(self.devices) if each.role == "anchor")
-        return Links.synthetic(
-            np.nan_to_num(self.device_m), device, receiver_m, limit_db=self.limit_db,
-            device_names=[each.device for each in self.devices],
-            frequency_hz=scene.config.radio.frequency_hz, city=scene.city,
-            is_gain=self.level == "gain_db", anchors=anchors)
+        return Links(
+            columns=Columns.unmeasured(receiver_m, device, self.limit_db),
+            ends=Ends(device_names=[each.device for each in self.devices],
+                      device_m=np.nan_to_num(self.device_m), anchors=anchors),
+            world=World(frequency_hz=scene.config.radio.frequency_hz, city=scene.city,
+                        is_gain=self.level == "gain_db"))
 
     def predict(self, links: Links) -> Prediction:
         """Return the levels that are expected of links.

@@ -256,7 +256,7 @@ def test_trees_of_a_stored_blend_know_the_azimuths_and_nobody_need_tell_them_aga
                   {"named_and_trees": forest}, {}, azimuths)
     arrays, settings = blend.state()
     again = Blend.from_state(arrays, settings, 6)
-    later = replace(links, boresight_deg=np.full(6, np.nan))  # a map's links declare nothing
+    later = links.with_ends(boresight_deg=np.full(6, np.nan))  # a map's links declare nothing
     zero, one = np.zeros(len(links)), np.ones(len(links))
     expected_db = forest.predict(link_features(links, receivers=False))
     np.testing.assert_allclose(again.apply(later, zero, one, zero)[0], expected_db, atol=1e-5)

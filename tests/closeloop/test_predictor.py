@@ -1,6 +1,5 @@
 """The final prediction: its weights, and that no held-out reading is in it."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,7 +58,7 @@ def test_no_reading_of_a_fold_changes_the_members_that_predict_it(open_ground):
     model, found = predicted(links)
     own = model.index == 2
     level_db = links.level_db + own * np.random.default_rng(0).normal(0, 9, len(links))
-    _, other = predicted(replace(links, level_db=level_db))
+    _, other = predicted(links.with_columns(level_db=level_db))
     np.testing.assert_allclose(found.members[own], other.members[own], atol=1e-6)
     assert not np.allclose(found.members[~own], other.members[~own])
 

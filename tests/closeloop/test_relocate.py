@@ -21,7 +21,7 @@ def misplaced(seed, device=1):
     model = fitted(table.assign(gain_db=table["gain_db"] + 8.0 * (table["receiver"] == "north")), ReceiverGainOffset())
 
     def moved(each):
-        unknown = replace(each.links, anchors=each.links.anchors - {device})
+        unknown = each.links.with_ends(anchors=each.links.anchors - {device})
         device_m = unknown.device_m.copy()
         device_m[device, :2] += WRONG_M
         built = FoldModel.build(unknown, each.channel, each.model.dof, device_m=device_m, train=each.train)

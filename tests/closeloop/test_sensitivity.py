@@ -70,7 +70,7 @@ def test_where_no_size_would_be_seen_there_is_none(nothing_hidden, sizes):
 
 def test_without_a_frequency_nothing_is_said_of_what_depends_on_it(nothing_hidden, sizes):
     view, hypotheses = nothing_hidden
-    unknown = replace(view.links, frequency_hz=np.nan)
+    unknown = replace(view.links, world=replace(view.links.world, frequency_hz=np.nan))
     found = sizes(replace(view, links=unknown), replace(hypotheses, links=unknown), "missing_obstacle",
                   "excess_attenuation")
     assert "missing_obstacle" not in found and 10 < found["excess_attenuation"] < np.inf
@@ -119,7 +119,7 @@ def test_a_first_or_last_flight_counts_only_where_there_is_no_other(nothing_hidd
 
 def test_flights_with_clocks_far_apart_still_have_episodes(nothing_hidden, sizes):
     view, hypotheses = nothing_hidden
-    late = replace(view.links, time_s=view.links.flight * 1e6 + view.links.time_s)
+    late = view.links.with_columns(time_s=view.links.flight * 1e6 + view.links.time_s)
     assert sizes(replace(view, links=late), replace(hypotheses, links=late), "episode")["episode"] < np.inf
 
 

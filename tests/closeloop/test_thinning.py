@@ -1,6 +1,5 @@
 """Samples of very many links."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,7 +44,7 @@ def test_every_flight_device_receiver_and_time_keeps_its_share(links, small_samp
 
 
 def test_a_sample_is_drawn_by_the_seed_without_repetition(links, small_sample):
-    numbered = replace(links, quality=np.arange(float(len(links))))
+    numbered = links.with_columns(quality=np.arange(float(len(links))))
     first, again, other = (thin_links(numbered, seed).quality for seed in (0, 0, 1))
     assert (first == again).all() and (np.diff(first) > 0).all()
     assert not np.array_equal(first, other)
@@ -53,7 +52,7 @@ def test_a_sample_is_drawn_by_the_seed_without_repetition(links, small_sample):
 
 def test_no_position_in_time_is_preferred(links, small_sample):
     """Rationale: every k-th link would always be of the same part of a regular flight."""
-    numbered = replace(links, quality=np.arange(float(len(links))))
+    numbered = links.with_columns(quality=np.arange(float(len(links))))
     drawn = np.concatenate([thin_links(numbered, seed).quality for seed in range(200)]).astype(int)
     often = np.bincount(drawn, minlength=len(links)) / 200
     assert often.mean() == pytest.approx(500 / len(links))

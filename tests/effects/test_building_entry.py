@@ -1,6 +1,5 @@
 """Loss on the way into buildings: the published distribution, and links with one end inside."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,7 +61,7 @@ def test_near_a_wall_it_is_a_matter_of_chance(indoors, make_links, view):
     effect = BuildingEntry()
     chance = -effect.term(links, effect.propose(view(links, np.zeros(60), 1.0))[0], None).columns[:, 0]
     np.testing.assert_allclose(chance, norm.cdf(depth_m, scale=4.0), atol=0.05)
-    exact = replace(links, receiver=np.full(60, -1))  # points of a map
+    exact = links.with_columns(receiver=np.full(60, -1))  # points of a map
     np.testing.assert_array_equal(effect.term(exact, effect.propose(view(links, np.zeros(60), 1.0))[0], None).columns[:, 0],
                                   -(depth_m > 0).astype(float))
     seen = make_links([[0.0, 40.0, 1.5]], [[60.0, 40.0, 1.5], [69.0, 33.0, 1.5]], city=indoors.city)

@@ -1,6 +1,5 @@
 """A fitted model of channel and effects, apart from its links."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -33,7 +32,7 @@ def test_a_class_that_nothing_was_learnt_of_has_the_scale_of_the_other(make_link
     receiver_m = np.column_stack([rng.uniform(-60, 200, 300), rng.uniform(-80, 80, 300), np.full(300, 45.0)])
     links = make_links([[0.0, 0, 20.0]], receiver_m, city=CityMap(wall.vertices, wall.faces))
     level_db = -60 - 30 * np.log10(links.distance_m / 10) - 15 * ~links.los + rng.normal(0, 3, len(links))
-    links = replace(links, level_db=level_db)
+    links = links.with_columns(level_db=level_db)
     learnt = links.los == learnt_in_sight
     assert 50 < learnt.sum() < 250
     channel = SegmentedLogDistance().fit(links.geometry, level_db, links.limit_db, 0)
@@ -54,6 +53,6 @@ def test_what_devices_have_in_common_is_not_underestimated_for_few_of_them(make_
         links = make_links(device_m, [[250.0, 250.0, 100.0 + 5 * i] for i in range(20)])
         level_db = -40 - 20 * np.log10(links.distance_m) + rng.normal(0, 1, devices)[links.device] + rng.normal(0, 1, len(links))
         channel = LogDistance(LogDistanceLine(-40.0, -2.0, 1.0))
-        model = FoldModel.build(replace(links, level_db=level_db), channel, 5.0)
+        model = FoldModel.build(links.with_columns(level_db=level_db), channel, 5.0)
         found.append(device_sd_db(Fit(np.zeros(model.level_columns.shape[1]), np.array([1.0]), 0.0, model)) ** 2)
     assert np.mean(found) == pytest.approx(1.0, abs=0.2)

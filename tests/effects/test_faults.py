@@ -1,6 +1,5 @@
 """Flights that disagree and episodes: found in worlds that are made here, and not where there is none."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ def flown(make_links, view):
         mean_db = -40 - 22 * np.log10(links.distance_m)
         links.level_db[:] = mean_db + rng.normal(0, NOISE_DB, len(links)) + change(links, rng)
         if hidden_share:  # without line of sight: far weaker, and as wrong as a map is
-            links = replace(links, known_los=rng.random(len(links)) >= hidden_share)
+            links = links.with_columns(known_los=rng.random(len(links)) >= hidden_share)
             links.level_db[~links.los] += rng.normal(0, HIDDEN_DB, (~links.los).sum())
         return view(links, mean_db, NOISE_DB)
     return make
@@ -230,4 +229,4 @@ def test_a_receiver_that_heard_one_reading_has_no_episode(make_links, view, seed
     level_db = mean_db + rng.normal(0, 3, len(links))
     level_db[far] = np.nan
     level_db[np.flatnonzero(far)[7]] = -118.7
-    assert Episode().propose(view(replace(links, level_db=level_db), mean_db, 3.0)) == []
+    assert Episode().propose(view(links.with_columns(level_db=level_db), mean_db, 3.0)) == []

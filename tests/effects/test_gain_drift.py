@@ -1,6 +1,5 @@
 """The shapes of a drift in time, and which of them is proposed for which receiver or device."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,7 +85,7 @@ def test_a_device_that_ages_or_has_changed_is_proposed_and_mapped_in_its_latest_
     (params,) = DeviceDrift().propose(view(heard, np.zeros(len(heard)), 1.0))
     assert list(params.devices) == [1] and params.devices[1].form == form
     # A map has no time: it is of the latest state.
-    timeless = replace(heard, time_s=np.full(len(heard), np.nan))
+    timeless = heard.with_columns(time_s=np.full(len(heard), np.nan))
     columns = DeviceDrift().term(timeless, params, None).columns
     mine = heard.device == 1
     np.testing.assert_allclose(columns[mine], [[shape(1998.0), 1.0]] * mine.sum(), atol=0.02)

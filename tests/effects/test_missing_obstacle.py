@@ -49,7 +49,7 @@ def test_a_narrow_building_is_proposed_with_its_shape_and_turn(make_links, view,
     lost_db = np.where(inside.any(axis=0), 16.0, 0.0)
     assert 40 < (lost_db > 0).sum() < len(links) / 3
     noise_db = np.random.default_rng(0).normal(0, 1.5, len(links))
-    residual = view(replace(links, level_db=noise_db - lost_db), np.zeros(len(links)), 1.5,
+    residual = view(links.with_columns(level_db=noise_db - lost_db), np.zeros(len(links)), 1.5,
                     level_at=lambda links, exact=False: np.zeros(len(links)))
 
     every = np.arange(len(links))
@@ -88,7 +88,7 @@ def test_a_search_begins_at_the_best_of_both_models_of_a_shadow(make_links, view
     lost_db = effect.term(links, effect.Params(box=hidden, by_class=True), level_at).offset_db
     assert lost_db.min() < -15 and (lost_db < -5).sum() > 30
     noise_db = np.random.default_rng(0).normal(0, 1.5, len(links))
-    residual = view(replace(links, level_db=noise_db + lost_db), np.zeros(len(links)), 1.5, level_at)
+    residual = view(links.with_columns(level_db=noise_db + lost_db), np.zeros(len(links)), 1.5, level_at)
     proposed = effect.propose(residual)
     assert {effect.kind(params) for params in proposed} == {False, True}
     every = np.arange(len(links))
@@ -118,7 +118,7 @@ def test_what_hides_devices_that_may_be_elsewhere_alone_is_refused(make_links, e
     links = make_links([[0.0, 0, 2.0], [5.0, -15.0, 2.0], [0.0, 80.0, 2.0]], receiver_m)
     params = effect.Params(box=Box(20.0, -5.0, 10.0, 20.0, 10.0, 0.0))  # before devices 0 and 1
     for known, refused in (({0, 1, 2}, False), ({2}, True), ({0}, False)):
-        why = effect.contradicted(params, replace(links, anchors=frozenset(known)))
+        why = effect.contradicted(params, links.with_ends(anchors=frozenset(known)))
         assert ("may be elsewhere" in (why or "")) == refused and bool(why) == refused
 
 
@@ -176,7 +176,7 @@ def test_along_paths_a_box_is_found_that_quick_levels_turned(make_links, seed):
     there = links.with_city(effect.corrected_map(city, effect.Params(box=true)))
     level_db = 10 * np.log10(path_gains(there.geometry) + 1e-13) + rng.normal(0, 1.0, len(links))
     channel = ImagePaths().fit(links.geometry, level_db, None)
-    model = FoldModel.build(replace(links, level_db=level_db), channel, 5.0)
+    model = FoldModel.build(links.with_columns(level_db=level_db), channel, 5.0)
     def fitted(box):
         return model.with_effects([model.apply(effect, effect.Params(box=box, exact=True))]).fit()
 
@@ -206,7 +206,7 @@ def test_where_a_building_was_found_no_other_is_proposed(make_links, view):
     share = (60.0 - start_m[:, 0]) / (links.receiver_m[:, 0] - start_m[:, 0])
     passes_m = start_m[:, 1] + share * (links.receiver_m[:, 1] - start_m[:, 1])
     lost_db = np.where(np.abs(passes_m) < 10, 16.0, 0.0)
-    residual = view(replace(links, level_db=-lost_db), np.zeros(len(links)), 1.5,
+    residual = view(links.with_columns(level_db=-lost_db), np.zeros(len(links)), 1.5,
                     level_at=lambda links, exact=False: np.zeros(len(links)))
     before = MissingObstacle().propose(residual)
     box = before[0].box

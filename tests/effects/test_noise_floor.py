@@ -1,6 +1,5 @@
 """The noise floor of one receiver, under a law of distance and under levels that are nearly known (paths)."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,7 +105,7 @@ def test_receivers_that_gain_nothing_by_a_floor_are_left_without(make_links):
 def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
     """As over a map: links with line of sight are far above the floor, and tell nothing of it."""
     los = flown.distance_m < 400
-    links = replace(flown, known_los=los, level_db=flown.level_db + 25.0 * los)
+    links = flown.with_columns(known_los=los, level_db=flown.level_db + 25.0 * los)
     index = np.arange(len(links)) // 25 % 5
     channel = KnownLevels(LogDistanceLine(-20.0, -3.0, 3.0))
     whole, *folds = (FoldModel.build(links.with_los(los), channel, 5.0, channel_db=channel.predict(links.geometry)[0]

@@ -1,6 +1,5 @@
 """Antennas and receivers against closed forms."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -93,7 +92,7 @@ def test_a_dipole_that_leans_across_loses_the_polarisation_only():
 def test_the_body_turns_with_heading_pitch_and_roll(make_links):
     """Flying east, nose 10° up; flying north, right wing 20° down."""
     links = make_links([[0.0, 0, 1.5]], np.ones((2, 3)), heading_deg=np.array([90.0, 0.0]))
-    links = replace(links, pitch_deg=np.array([10.0, 0.0]), roll_deg=np.array([0.0, 20.0]))
+    links = links.with_columns(pitch_deg=np.array([10.0, 0.0]), roll_deg=np.array([0.0, 20.0]))
     right, nose, top = np.moveaxis(links.receiver_axes, 1, 0)
     np.testing.assert_allclose(right, [towards(180, 0), towards(90, -20)], atol=1e-9)
     np.testing.assert_allclose(nose, [towards(90, 10), towards(0, 0)], atol=1e-9)
@@ -153,7 +152,7 @@ def test_directions_are_those_of_the_paths_or_the_straight_line_whichever_explai
     heard = np.degrees(np.arctan2(x, y)) if straight else np.degrees(np.arctan2(198 - x, y))  # mirrored at x = 99
     off_deg = (heard - 20 + 180) % 360 - 180
     level_db = rng.normal(0, 1, 600) - np.minimum(12 * (off_deg / 65) ** 2, 20)
-    heard = replace(links, level_db=level_db - level_db.mean())
+    heard = links.with_columns(level_db=level_db - level_db.mean())
     (params,) = SectorAntenna().propose(view(heard, np.zeros(600), 1.5))
     assert params.straight is straight
     if straight:  # off the wall they leave within 40 degrees, which does not tell an azimuth

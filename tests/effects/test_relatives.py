@@ -1,7 +1,6 @@
 """Sectors of one mast: what their residuals share is learnt, what they do not share is not."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,9 +11,9 @@ from radiotwin.effects.catalogue.declared_sectors import (
     own_sd_db,
     unheard_sd_db,
 )
-from radiotwin.links import Links
 from radiotwin.links.sites import antenna_of, relatives_of
 from radiotwin.twin.model.correlated_shadowing import Relatives, RelativesState
+from tests.worlds import synthetic_links
 
 MASTS_M = np.array([[100.0, 100, 25], [400, 300, 25]])
 # Two masts of two directions, two carriers of each; and a device by itself.
@@ -28,10 +27,8 @@ def links_of(rng, points=150, declared=True):
     device = np.repeat(np.arange(9), points)
     receiver_m = np.column_stack([rng.uniform(0, 500, (len(device), 2)), np.full(len(device), 1.5)])
     device_m = np.vstack([MASTS_M, [[250.0, 50, 10]]])[MAST]
-    links = Links.synthetic(device_m, device, receiver_m, device_names=[f"d{i}" for i in range(9)], limit_db=None,
-                               frequency_hz=3.6e9, city=None, is_gain=True, anchors=frozenset(range(9)))
-    links = replace(links, receiver=np.zeros(len(links), dtype=int))
-    return replace(links, boresight_deg=AZIMUTHS_DEG) if declared else links
+    links = synthetic_links(device_m, device, receiver_m, frequency_hz=3.6e9)
+    return links.with_ends(boresight_deg=AZIMUTHS_DEG) if declared else links
 
 
 def shadows(rng, links, group):
@@ -52,9 +49,9 @@ def test_relatives_are_the_carriers_of_an_antenna_or_else_the_sectors_of_a_mast(
     undeclared = links_of(np.random.default_rng(0), 1, declared=False)
     assert [relatives_of(undeclared, device, everyone) for device in (0, 5, 8)] == [[1, 2, 3], [4, 6, 7], []]
     # A device that was located, not declared, may be on the mast by mistake.
-    assert relatives_of(replace(undeclared, anchors=frozenset({0, 1, 4})), 0, everyone) == [1]
+    assert relatives_of(undeclared.with_ends(anchors=frozenset({0, 1, 4})), 0, everyone) == [1]
     # Azimuths of 30, 34 and 38 degrees are one group, whichever of them is asked for.
-    steps = replace(links, boresight_deg=np.array([30.0, 34, 38, 212, *AZIMUTHS_DEG[4:]]))
+    steps = links.with_ends(boresight_deg=np.array([30.0, 34, 38, 212, *AZIMUTHS_DEG[4:]]))
     assert [antenna_of(steps, device) for device in range(4)] == [[0, 1, 2], [0, 1, 2], [0, 1, 2], [3]]
 
 

@@ -1,14 +1,11 @@
 """How far errors are alike, and the pieces of evidence that follow from it, on fields that are known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from radiotwin.closeloop.crossfit import make_folds
 from radiotwin.closeloop.run import thin_piles
 from radiotwin.links import (
-    Links,
     correlation_length_m,
     evidence_blocks,
     places,
@@ -16,6 +13,7 @@ from radiotwin.links import (
     with_evidence,
 )
 from radiotwin.links.links import clocks_restart
+from tests.worlds import synthetic_links
 
 
 def flown(seed, length_m, noise_sd=0.5, flights=6, devices=3, slots=60, step_m=10.0, side_m=600.0, restart=False):
@@ -30,13 +28,12 @@ def flown(seed, length_m, noise_sd=0.5, flights=6, devices=3, slots=60, step_m=1
     apart_m = np.linalg.norm(place[:, None] - place[None], axis=2)
     root = np.linalg.cholesky(np.exp(-apart_m / length_m) + 1e-6 * np.eye(len(place)))
     z = (root @ rng.normal(size=(len(place), devices))).ravel() + noise_sd * rng.normal(size=len(place) * devices)
-    n, flight = len(z), np.repeat(np.arange(flights), slots * devices)
+    flight = np.repeat(np.arange(flights), slots * devices)
     time_s = np.repeat(np.tile(np.arange(slots), flights), devices) + (0 if restart else 200.0) * flight
     device_m = np.column_stack([rng.uniform(0, side_m, (devices, 2)), np.full(devices, 1.5)])
     receiver_m = np.repeat(np.column_stack([place, np.full(len(place), 50.0)]), devices, axis=0)
-    return Links(z, None, receiver_m, device_m, np.tile(np.arange(devices), len(place)), np.zeros(n, int), flight,
-                    time_s.astype(float), np.full(n, np.nan), [f"d{i}" for i in range(devices)], ["r0"],
-                    [f"f{i}" for i in range(flights)], 2.4e9, None, True, frozenset(range(devices)))
+    return synthetic_links(device_m, np.tile(np.arange(devices), len(place)), receiver_m, level_db=z, flight=flight,
+                           time_s=time_s)
 
 
 def usual(found):
@@ -73,8 +70,8 @@ def test_another_flight_and_receiver_over_the_same_ground_is_at_the_same_places(
     marked = with_evidence(once, once.level_db)
     both = once.select(np.tile(np.arange(len(once)), 2))
     second = np.arange(len(both)) >= len(once)
-    both = replace(both, flight=both.flight + 6 * second, receiver=second.astype(int), receiver_names=["r0", "r1"],
-                   flight_names=[f"f{i}" for i in range(12)], tracks=None, time_in_flight_s=None)
+    both = synthetic_links(both.device_m, both.device, both.receiver_m, level_db=both.level_db, time_s=both.time_s,
+                           flight=both.flight + 6 * second, receiver=second.astype(int))
     twice = with_evidence(both, both.level_db)
     count = {name: [len(np.unique(label(each))) for each in (marked, twice)]
              for name, label in (("places", places), ("pieces", evidence_blocks))}
@@ -111,7 +108,8 @@ def test_a_receiver_that_hovers_is_thinned_and_the_rest_stays():
 def test_three_places_at_which_a_receiver_hovers_have_folds():
     links = flown(3, 30.0, flights=3)
     place_m = np.array([[100.0, 100, 50], [300, 120, 50], [180, 400, 50]])[links.flight]
-    links = replace(links, receiver_m=place_m, tracks=None, known_los=None)
+    links = synthetic_links(links.device_m, links.device, place_m, level_db=links.level_db, flight=links.flight,
+                            time_s=links.time_s)
     folds = make_folds(links, 0)
     assert folds.count == 6 and np.bincount(folds.index).min() > 20
     assert len(np.unique(evidence_blocks(with_evidence(links, links.level_db)))) == 9  # three places, three devices

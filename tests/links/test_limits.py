@@ -1,13 +1,12 @@
 """Limits of detection by the readings, in links made by a law, shadowing and receivers of the test's own."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from radiotwin.links import Links
 from radiotwin.links.limits import estimate_limits, limits_to_explain
+from tests.worlds import synthetic_links
 
 DEVICES, REACH_M, STEP_M, SHADOWING_M = 5, 1500.0, 10.0, 50.0
 NEVER = -300.0
@@ -39,16 +38,14 @@ def fly(seed, limits_db=(-110.0, -110.0), n=4000, soft_db=0.0, lost=0.0, step_db
     level_db[rng.choice(len(level_db), odd, replace=False)] = -150.0
     if step_db:
         level_db = np.round(level_db / step_db) * step_db
-    count, unknown = len(level_db), np.full(len(level_db), np.nan)
-    return Links(level_db, np.full(count, -np.inf), receiver_m, device_m, device, receiver, np.zeros(count, int),
-                    np.arange(count, dtype=float), unknown, [f"d{i}" for i in range(DEVICES)],
-                    [f"r{i}" for i in range(len(limits_db))], ["f"], 2.4e9, None, True, frozenset(range(DEVICES)))
+    return synthetic_links(device_m, device, receiver_m, level_db=level_db, receiver=receiver,
+                           time_s=np.arange(len(level_db)))
 
 
 def estimated(links, declared_db=None):
     """Return limits of receivers, and notes."""
     limit_db, notes = estimate_limits(links, declared_db)
-    return replace(links, limit_db=limit_db).receiver_limits_db, notes
+    return links.with_columns(limit_db=limit_db).receiver_limits_db, notes
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -124,10 +121,10 @@ def test_the_uncertainty_covers_the_error_as_often_as_it_says():
 def test_effects_must_explain_a_deaf_receiver_and_lost_links_only():
     """Three receivers that hardly differ keep their limits; the one that stands out gets the usual one."""
     links = fly(1, (-112.0, -110.0, -111.0, -95.0), n=6000)
-    links = replace(links, limit_db=estimate_limits(links, None)[0])
+    links = links.with_columns(limit_db=estimate_limits(links, None)[0])
     before_db, after_db = links.receiver_limits_db, limits_to_explain(links).receiver_limits_db
     np.testing.assert_array_equal(before_db[:3], after_db[:3])
     assert before_db[3] == pytest.approx(-95.0, abs=1.0) and after_db[3] == pytest.approx(-111.0, abs=1.0)
     scattered = fly(2, (-120.0, -113.0, -106.0, -99.0), n=6000)
-    scattered = replace(scattered, limit_db=estimate_limits(scattered, None)[0])
+    scattered = scattered.with_columns(limit_db=estimate_limits(scattered, None)[0])
     np.testing.assert_array_equal(scattered.limit_db, limits_to_explain(scattered).limit_db)

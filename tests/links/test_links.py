@@ -8,7 +8,9 @@ import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.links import evidence_blocks, prepare_links
+from radiotwin.links.links import RESTART_NOTE
 from radiotwin.scene.citymap import CityMap
+from tests.worlds import synthetic_links
 
 
 def test_what_cannot_be_used_is_left_out_and_noted(open_ground):
@@ -47,9 +49,9 @@ def test_devices_of_other_frequencies_are_mentioned(open_ground):
     measurements = open_ground.measured(open_ground.fly(0))
     own_hz = float(measurements.devices["frequency_hz"].iloc[0]) if "frequency_hz" in measurements.devices else 2.4e9
     devices = measurements.devices.assign(frequency_hz=own_hz)
-    assert prepare_links(replace(measurements, devices=devices), None).notes == []
+    assert prepare_links(replace(measurements, devices=devices), None).notes == ()
     near = devices.assign(frequency_hz=np.where(np.arange(len(devices)) == 0, 1.05 * own_hz, own_hz))
-    assert prepare_links(replace(measurements, devices=near), None).notes == []
+    assert prepare_links(replace(measurements, devices=near), None).notes == ()
     two = devices.assign(frequency_hz=np.where(np.arange(len(devices)) == 0, 0.8e9, 2.6e9))
     (note,) = prepare_links(replace(measurements, devices=two), None).notes
     assert note.startswith("devices work at 0.8 to 2.6 GHz, and all are computed at 2.6 GHz")
@@ -64,7 +66,7 @@ def test_a_receiver_that_heard_once_is_not_stuck_and_equal_rows_without_a_time_a
     assert len(prepare_links(measurements, None)) == n - 1
     table["time_s"] = np.nan
     links = prepare_links(measurements, None)
-    assert len(links) == n and links.receiver_names == ["far", "r0", "r1"] and links.notes == []
+    assert len(links) == n and links.receiver_names == ["far", "r0", "r1"] and links.notes == ()
 
 
 def test_a_value_that_means_not_detected_becomes_blank(open_ground):
@@ -76,7 +78,7 @@ def test_a_value_that_means_not_detected_becomes_blank(open_ground):
     measurements.table.loc[lowest, "gain_db"] = -140.0
     links = prepare_links(measurements, None)
     assert np.isnan(links.level_db).sum() == blank.sum() + 300 and "-140" in " ".join(links.notes)
-    assert prepare_links(open_ground.measured(world), None).notes == []  # an ordinary tail stays
+    assert prepare_links(open_ground.measured(world), None).notes == ()  # an ordinary tail stays
 
 
 def test_directions_are_compass_bearings(open_ground):
@@ -104,14 +106,19 @@ def test_too_little_is_refused(open_ground):
         prepare_links(measurements.select(np.arange(len(measurements.table)) < 40), None)
 
 
-def test_buildings_in_the_way_are_measured_along_the_link(open_ground):
+def test_clocks_that_restart_in_each_flight_are_noted(open_ground):
+    world = open_ground.fly(0)
+    assert RESTART_NOTE not in prepare_links(open_ground.measured(world), None).notes
+    restarted = prepare_links(open_ground.measured(world, time_s=world.slot), None)
+    assert restarted.time_restarts and restarted.notes == (RESTART_NOTE,)
+
+
+def test_buildings_in_the_way_are_measured_along_the_link():
     """A wall 10 m thick and 30 m high, in the middle of links of 100 m that pass 20 m below its top and 10 m above."""
     city = trimesh.creation.box(extents=[10, 400, 30])
     city.apply_translation([0, 0, 15])
-    links = prepare_links(open_ground.measured(open_ground.fly(0)), None).select(np.arange(2))
-    links = replace(links, device_m=np.array([[-50.0, 0, 10], [-50, 0, 40]]), device=np.array([0, 1]),
-                    receiver_m=np.array([[50.0, 0, 10], [50, 0, 40]]), frequency_hz=2.4e9,
-                    city=CityMap(city.vertices, city.faces))
+    links = synthetic_links([[-50, 0, 10], [-50, 0, 40]], [0, 1], [[50, 0, 10], [50, 0, 40]],
+                            city=CityMap(city.vertices, city.faces))
     np.testing.assert_allclose(links.metres_inside, [10, 0], atol=0.01)
     wavelength_m = 299_792_458 / 2.4e9
     assert links.diffraction_parameter[0] == pytest.approx(20 * np.sqrt(2 / wavelength_m * 2 / 50), rel=0.01)

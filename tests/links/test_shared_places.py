@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from radiotwin.links import Links
 from radiotwin.links.sites import receiver_differences
+from tests.worlds import synthetic_links
 
 OFFSET_DB, SQUARE_M = -4.0, 100.0
 
@@ -32,10 +32,8 @@ def walked(seed, offset_db=OFFSET_DB, limit_db=-np.inf, devices=4):
                 rows.append((told_m, np.full(len(street_m), device), np.full(len(street_m), receiver), level_db))
     receiver_m, device, receiver, level_db = (np.concatenate(part) for part in zip(*rows))
     level_db = np.where(level_db < limit_db, np.nan, level_db)
-    n, unknown = len(level_db), np.full(len(level_db), np.nan)
-    return Links(level_db, np.full(n, limit_db), receiver_m, device_m, device, receiver, np.zeros(n, int), unknown,
-                    unknown, [f"d{i}" for i in range(devices)], ["A", "B"], ["walk"], 3.6e9, None, False,
-                    frozenset(range(devices)))
+    return synthetic_links(device_m, device, receiver_m, level_db=level_db, limit_db=limit_db, receiver=receiver,
+                           frequency_hz=3.6e9, is_gain=False)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -52,7 +52,7 @@ def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
     # A device that the loop found elsewhere is not where it was declared.
     moved = {device for each in model.whole.effects if isinstance(each.effect, DevicePositionError)
              for device in model.links.device[each.acts].tolist()}
-    known = replace(links, anchors=links.anchors - moved)
+    known = links.with_ends(anchors=links.anchors - moved)
     held_out = [known.select(model.index == number) for number in range(len(models))]
     area_m = scene.config.extent.bounds if scene is not None else whole_area(models[0], links)
     return calibrate_radii(models, held_out, area_m, loop.seed)

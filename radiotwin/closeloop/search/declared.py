@@ -52,16 +52,15 @@ def _take_best(result: SelectionResult, forms: list[Effect], block: np.ndarray, 
         tried.append(score)
         if extended is not None:
             passed.append((effect, score, extended))
-    notes = before.links.notes
     if passed:
         effect, best, extended = max(passed, key=lambda each: each[1].held_out_nats)
         result.keep(best, extended)
         result.scores += [replace(each, reason=each.reason or f"{effect.variant} gain more")
                           for each in tried if each is not best]
-        notes.append(f"{effect.variant} are part of the base: the RMSE on held-out links is "
-                     f"{best.rmse_db:.2f} dB, and {before.rmse_db():.2f} dB without them")
+        result.notes.append(f"{effect.variant} are part of the base: the RMSE on held-out links "
+                            f"is {best.rmse_db:.2f} dB, and {before.rmse_db():.2f} dB without them")
         return
     result.scores += tried
     if tried and forms[0].is_cause:
-        notes.append(f"{forms[0].variant} do not agree with the readings and are left out: "
-                     f"{tried[0].reason}")
+        result.notes.append(f"{forms[0].variant} do not agree with the readings and are left "
+                            f"out: {tried[0].reason}")

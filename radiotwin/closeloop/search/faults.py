@@ -114,7 +114,8 @@ def located_links(model: CrossFit, links: Links, base: Base) -> Links:
     known = np.isfinite(device_m).all(axis=1)
     device_m = np.where(known[:, None], device_m, links.device_m)
     anchors = frozenset(np.flatnonzero(known).tolist()) | links.anchors
-    return replace(links.with_devices(device_m), anchors=anchors, evidence=model.links.evidence)
+    links = links.with_devices(device_m).with_ends(anchors=anchors)
+    return links.with_columns(evidence=model.links.evidence)
 
 
 def _stands_out(model: CrossFit, candidate: Candidate | CandidateScore,

@@ -140,7 +140,7 @@ def with_moved_limits(model: CrossFit) -> CrossFit:
     if np.array_equal(limit_db, model.links.limit_db):
         return model
     return model.map(lambda fit: replace(
-        fit.model, links=replace(fit.links, limit_db=limit_db)).fit(fit))
+        fit.model, links=fit.links.with_columns(limit_db=limit_db)).fit(fit))
 
 
 @dataclass(eq=False)
@@ -153,6 +153,7 @@ class SelectionResult:
         scores: candidates, step by step, and effects that the data do not allow to be looked for.
             Of faults those kept and, once no more passed, the last ones refused; of effects beside
             another (pairs, more of a kind) those kept.
+        notes: what was found about effects that are declared, a sentence each.
         rivals: of each kept effect, names of those that the data cannot tell from it.
         steps: what each step's residual says, the first step first; the last is of what is left.
         explained: the model before any last resort.
@@ -163,6 +164,7 @@ class SelectionResult:
     model: CrossFit
     criteria: SelectionCriteria = field(default_factory=SelectionCriteria)
     scores: list[CandidateScore] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     rivals: list[list[str]] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     explained: CrossFit | None = None

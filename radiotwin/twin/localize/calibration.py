@@ -11,7 +11,7 @@ JASA 113).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -116,10 +116,9 @@ def misfit(model: EffectModel, own: Links, place: PositionEstimate) -> float:
     """
     device_m = np.array([[place.x_m, place.y_m, own.device_m[own.device[0], 2]]])
     known = len(model.device_m)
-    there = replace(own, device=np.full(len(own), known),
-                    device_m=np.vstack([model.device_m, device_m]), known_los=None,
-                    anchors=frozenset(), first_s=model.first_s,
-                    device_names=[f"device {i}" for i in range(known + 1)])
+    there = own.of_devices(np.full(len(own), known), np.vstack([model.device_m, device_m]),
+                           [f"device {i}" for i in range(known + 1)],
+                           frozenset()).since(model.first_s)
     fit = model.on_links(there)
     problem = fit.model.regression()
     residual_db, scale_db = problem.residual_db(fit), problem.predict(fit).scale_db

@@ -138,10 +138,9 @@ def _log_likelihood_at(model: EffectModel, own: Links, positions_m: np.ndarray) 
     candidates_m = np.column_stack([positions_m, height_m])
     known = len(model.device_m)
     # Effects count devices as the model does, so the candidates come after those that it knows.
-    every = replace(
-        own.select(np.tile(np.arange(n), cells)), device=known + np.repeat(np.arange(cells), n),
-        device_m=np.vstack([model.device_m, candidates_m]), known_los=None, anchors=frozenset(),
-        device_names=[f"device {i}" for i in range(known + cells)], first_s=model.first_s)
+    every = own.select(np.tile(np.arange(n), cells)).of_devices(
+        known + np.repeat(np.arange(cells), n), np.vstack([model.device_m, candidates_m]),
+        [f"device {i}" for i in range(known + cells)], frozenset()).since(model.first_s)
     fit = model.on_links(every)
     problem = fit.model.regression()
     nodes, weights = np.polynomial.hermite_e.hermegauss(NODES if sd_db > 0 else 1)

@@ -7,7 +7,7 @@ measurements and one far from them, found on held-out links by
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -114,7 +114,7 @@ class Blend:
         """Return links with the azimuths that were declared where this was fitted, no others."""
         boresight_deg = np.full(len(links.device_names), np.nan)
         boresight_deg[self.boresights_deg[:, 0].astype(int)] = self.boresights_deg[:, 1]
-        return replace(links, boresight_deg=boresight_deg)
+        return links.with_ends(boresight_deg=boresight_deg)
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return arrays by name, and settings that JSON can hold, for `from_state`."""

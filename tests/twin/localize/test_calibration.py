@@ -51,7 +51,7 @@ def test_radii_of_a_model_that_believes_too_much_hold_afterwards(open_ground):
 
 def test_without_anchors_nothing_is_known(open_ground):
     (fold, *_) = folds_of(open_ground, 3)
-    unknown = replace(fold, anchors=frozenset())
+    unknown = fold.with_ends(anchors=frozenset())
     found = calibrate_radii([overconfident(2.0)], [unknown], AREA_M, 0)
     assert found.radius_factor == 1.0 and np.isnan(found.typical_misfit)
 
@@ -60,7 +60,7 @@ def test_a_receiver_that_has_changed_shows_in_the_misfit(open_ground):
     model = overconfident(6.0)
     found = calibrate_radii([model] * 4, folds_of(open_ground, 5), AREA_M, 0)
     fold = folds_of(open_ground, 6)[0]
-    changed = replace(fold, level_db=fold.level_db + np.where(fold.receiver == 1, 25.0, 0.0))
+    changed = fold.with_columns(level_db=fold.level_db + np.where(fold.receiver == 1, 25.0, 0.0))
     misfits = [misfit(model, changed.select(changed.device == each.device), each)
                for each in locate(model, changed, AREA_M)]
     assert np.sqrt(np.median(misfits) / found.typical_misfit) > 1.2
@@ -69,7 +69,7 @@ def test_a_receiver_that_has_changed_shows_in_the_misfit(open_ground):
 def test_a_device_that_a_fold_never_heard_is_no_trial(open_ground):
     """Blanks alone locate nobody; one such device must not hide how well the others fit."""
     folds = folds_of(open_ground, 3)
-    deaf = [replace(fold, level_db=np.where(fold.device == 2, np.nan, fold.level_db)) for fold in folds]
+    deaf = [fold.with_columns(level_db=np.where(fold.device == 2, np.nan, fold.level_db)) for fold in folds]
     without = [fold.select(fold.device != 2) for fold in folds]
     found, expected = (calibrate_radii([overconfident(6.0)] * 4, each, AREA_M, 0) for each in (deaf, without))
     assert np.isfinite(found.typical_misfit) and found == expected

@@ -1,6 +1,5 @@
 """Devices are located by a channel with effects: where they are, how surely, and better than without the effects."""
 
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,7 +54,7 @@ def alone(open_ground, seed):
     world = open_ground.fly(seed)
     links = prepare_links(open_ground.measured(world), None)
     own = links.select(np.flatnonzero(links.device == 4)[::18])
-    return replace(own, device=np.zeros(40, int), device_m=world.device_m[4:], device_names=["d4"]), world.device_m[4]
+    return own.of_devices(np.zeros(40, int), world.device_m[4:], ["d4"], own.anchors), world.device_m[4]
 
 
 def test_effects_of_devices_that_the_file_does_not_list_do_not_matter(open_ground):
