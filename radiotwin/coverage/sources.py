@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkGeometry
+from radiotwin.links import LinkGeometry, link_geometry
 from radiotwin.links.links import Columns, Ends, Links, World
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import channel_named
@@ -74,6 +74,7 @@ class LawSource(GainSource):
                            "fit a twin with it and give that, or take raytrace, or a published "
                            "law, such as p1411, tr36777_umi, al_hourani_urban or cost231_wi")
         self._scene, self._transmitters = scene, transmitters
+        self._device_m = np.array([each.position_m for each in transmitters])
         self._laws = {frequency_hz: kind().fit(self._links(np.empty((0, 3)), frequency_hz, 0),
                                                np.empty(0), None)
                       for frequency_hz in {each.frequency_hz for each in transmitters}}
@@ -96,18 +97,13 @@ class LawSource(GainSource):
             rows = [row for row, each in enumerate(self._transmitters)
                     if each.frequency_hz == frequency_hz][:NOTED_TRANSMITTERS]
             device = np.repeat(rows, len(receiver_m))
-            device_m = np.array([self._transmitters[row].position_m for row in device])
-            links = LinkGeometry(device_m.reshape(-1, 3), np.tile(receiver_m, (len(rows), 1)),
-                                 np.ones(len(device), bool), device)
+            links = link_geometry(self._device_m, np.tile(receiver_m, (len(rows), 1)), device, None)
             found += law.outside(links) if len(links) else []
         return list(dict.fromkeys(found))
 
     def _links(self, receiver_m: np.ndarray, frequency_hz: float | None, row: int) -> LinkGeometry:
-        city = self._scene.city
-        device_m = np.broadcast_to(self._transmitters[row].position_m, receiver_m.shape)
-        los = city.line_of_sight(device_m, receiver_m) if len(receiver_m) else np.empty(0, bool)
-        return LinkGeometry(device_m, receiver_m, los, np.full(len(receiver_m), row), city,
-                            float(frequency_hz or np.nan))
+        return link_geometry(self._device_m, receiver_m, np.full(len(receiver_m), row),
+                             self._scene.city, float(frequency_hz or np.nan))
 
 
 class PathSource(GainSource):

@@ -1,13 +1,8 @@
-"""Checks of measured data: levels, names, positions, heights and receivers inside buildings.
+"""Checks of measured data: levels, names, units, positions and heights that are probably not meant.
 
-Checks of measured data: levels, names, positions and units that are probably not meant.
-
-Heights of receivers that were probably meant from another zero: the sea's, or the ground's.
-
-How probable it is that a receiver is inside a building, where its position is off by metres.
-
-A position inside a wall may be that of a phone on the pavement, and one on the pavement that of a
-phone behind the wall. So where positions come from satellites, a line on the map does not decide.
+A height may count from another zero: the sea's, or the ground's. A position inside a wall may be
+that of a phone on the pavement, and one on the pavement that of a phone behind the wall. So where
+positions come from satellites, a line on the map does not decide, but a probability does.
 """
 
 from collections.abc import Iterable, Sequence

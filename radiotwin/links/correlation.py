@@ -1,15 +1,9 @@
-"""The correlation length of a residual, from its variogram.
+"""How far apart two links still err alike: the correlation length of a residual.
 
-How far apart two links still err alike: the correlation length of a residual.
-
-From the variogram over the positions of the end that moves, within each pair of ends and flight, so
-that what a device or a receiver has in common does not count (`radiotwin.links.correlation`).
-
-Correlation length of a detrended residual, from its variogram.
-
-The empirical variogram is the robust one (Cressie and Hawkins 1980, 'Robust estimation of the
-variogram', Math. Geology 12), within each pair of ends and flight, after the level of each flight
-and the trends of each pair of ends are removed. Detrending removes long shadows, too, so that a
+It comes from the robust variogram (Cressie and Hawkins 1980, 'Robust estimation of the variogram',
+Math. Geology 12) over the positions of the end that moves, within each pair of ends and flight, so
+that what a device or a receiver has in common does not count. The level of each flight and the
+trends of each pair of ends are removed before. Detrending removes long shadows, too, so that a
 model variogram that ignored it would be biased to short lengths, by half for flights of a few
 lengths. So the model is an exponential field with a nugget (Gudmundson 1991, 'Correlation model for
 shadow fading in mobile radio systems') after the same projection, that of generalised increments

@@ -5,10 +5,8 @@ where it was lost whatever its level. The likelihood of a limit is that of the r
 which lie below it, and of the blanks, which a crude prediction of their levels puts below it (Tobin
 1958; the p-tobit of Deaton and Irish 1984). Width and share of lost links are averaged over.
 
-A crude prediction of every level: one slope over distance, a level for each end.
-
-It serves to tell how weak a link that was not detected probably was, before anything is fitted: no
-map, no line of sight, and devices whose position is unknown have no distance.
+The crude prediction has one slope over distance and a level for each end. It needs no map and no
+line of sight; devices whose position is unknown have no distance.
 """
 
 from dataclasses import dataclass

@@ -119,12 +119,12 @@ class LinkGeometry:
     def select(self, rows: np.ndarray | slice) -> LinkGeometry:
         """Return the links of a mask, a slice or an index array."""
         estimated = None if self.estimated is None else self.estimated[rows]
-        return LinkGeometry(self.device_m[rows], self.receiver_m[rows], self.los[rows],
-                            self.device[rows], self.city, self.frequency_hz, estimated)
+        return replace(self, device_m=self.device_m[rows], receiver_m=self.receiver_m[rows],
+                       los=self.los[rows], device=self.device[rows], estimated=estimated)
 
 
 def link_geometry(device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray,
-                  city: CityMap | None) -> LinkGeometry:
+                  city: CityMap | None, frequency_hz: float = np.nan) -> LinkGeometry:
     """Return links between listed devices and receivers, with line of sight from the map.
 
     Args:
@@ -132,6 +132,7 @@ def link_geometry(device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarr
         receiver_m: (n, 3) positions of the receivers [m].
         device: (n,) row of each link's device in `device_m`.
         city: 3D map; without one every link has line of sight.
+        frequency_hz: of the radio [Hz]; NaN where it is unknown.
 
     Returns:
         n links.
@@ -158,7 +159,7 @@ def link_geometry(device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarr
             f"the receiver's position in row {row} is {tuple(map(float, receiver_m[row]))}: x, y "
             "and z must be finite numbers [m]; fill it in or leave the row out")
     los = np.ones(len(receiver_m), bool) if city is None else city.line_of_sight(ends_m, receiver_m)
-    return LinkGeometry(ends_m, receiver_m, np.asarray(los, bool), device, city)
+    return LinkGeometry(ends_m, receiver_m, np.asarray(los, bool), device, city, frequency_hz)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,7 +1,4 @@
-"""Measured levels of links, and their devices: two tables, checked when they are read.
-
-Columns of measurements and of devices: what their cells may hold.
-"""
+"""Measured levels of links, and their devices: two tables, checked when they are read."""
 
 import os
 from collections.abc import Callable, Iterable

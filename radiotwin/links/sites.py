@@ -1,12 +1,8 @@
 """Links that share a place: masts with several devices, and places where several receivers were.
 
-Masts: devices that share one site, and those of them that look the same way.
-
-Differences between receivers, by readings of one device where both have been.
-
-There, distance, walls and the device are the same, so what differs is the receivers' own. A
-regression over all links does not see it so clearly: receivers that went to different places also
-differ by what a model does not know of these.
+At a place where two receivers read one device, distance, walls and the device are the same, so what
+differs is the receivers' own. A regression over all links does not see it so clearly: receivers
+that went to different places also differ by what a model does not know of these.
 """
 
 from __future__ import annotations

@@ -1,9 +1,4 @@
-"""Variables of a link: what a residual may depend on, and inputs of a regression without physics.
-
-Variables that a residual may depend on.
-
-Inputs of a regression without physics: position, geometry and angles of a link.
-"""
+"""What a residual may depend on, of a link, and inputs of a regression without physics."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""Collect what the figures of a close-loop draw, as plain arrays.
+"""Collect what the figures of a close-loop draw, and average residuals over bins of a variable.
 
 The figures read nothing else, so that they do not depend on how the loop fits its models.
-
-Average residuals over bins of a variable.
 """
 
 from collections.abc import Mapping
@@ -13,9 +11,8 @@ import numpy as np
 
 from radiotwin.closeloop.run import Loop, significant
 from radiotwin.effects.params import Parameter
-from radiotwin.links import evidence_blocks, residual_variables
+from radiotwin.links import Links, evidence_blocks, residual_variables
 from radiotwin.report.labels import variable_label
-from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.fold_model import Fit
 
 MAX_MEMBERS = 6  # devices or receivers with a panel of their own
@@ -25,45 +22,28 @@ MIN_LOS_LINKS = 300  # with fewer, links without line of sight are drawn, too
 MIN_LINKS = 6  # of a mean that is drawn
 
 
-@dataclass(frozen=True, eq=False)
-class LinkArrays:
-    """Measured links, n of them to k devices.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnLinks(Links):
+    """Links with the devices where a model has them, NaN where it has none, and what is drawn.
 
     Attributes:
-        level_db: (n,) measured gain [dB] or power [dBm]; NaN: not detected.
-        is_gain: whether the level is a gain.
-        receiver_m: (n, 3) receiver positions [m].
-        device_m: (k, 3) device positions of the model [m]; NaN where it has none.
-        anchor: (k,) whether a device's position is declared.
-        los: (n,) whether a link has line of sight.
         block: (n,) index of the block of links with a common error.
-        first_s: time of the first measurement [s]; NaN without times.
-        names: labels of the variables `device`, `receiver`, `flight` and `los`, by their index.
         variables: variable -> (n,) value; integers are an index into `names` or a map cell.
-        city: 3D map, where there is one.
     """
 
-    level_db: np.ndarray
-    is_gain: bool
-    receiver_m: np.ndarray
-    device_m: np.ndarray
-    anchor: np.ndarray
-    los: np.ndarray
     block: np.ndarray
-    first_s: float
-    names: dict[str, list[str]]
     variables: dict[str, np.ndarray]
-    city: CityMap | None
 
     @property
-    def level_unit(self) -> str:
-        """Return the unit of the level."""
-        return "dB" if self.is_gain else "dBm"
+    def names(self) -> dict[str, list[str]]:
+        """Labels of the variables `device`, `receiver`, `flight` and `los`, by their index."""
+        return {"device": self.device_names, "receiver": self.receiver_names,
+                "flight": self.flight_names, "los": ["without", "with"]}
 
     @property
     def ends_m(self) -> np.ndarray:
         """Return the (n, 2, 3) positions of device and receiver of each link [m]."""
-        return np.stack([self.device_m[self.variables["device"]], self.receiver_m], axis=1)
+        return np.stack([self.device_m[self.device], self.receiver_m], axis=1)
 
     def on_axis(self, name: str, value: np.ndarray) -> tuple[np.ndarray, str]:
         """Return a variable as it is drawn, and the label of its axis.
@@ -109,7 +89,7 @@ class EffectData:
     of_receiver: bool
     params: Mapping[str, Any]
     parameters: dict[str, Parameter]
-    links: LinkArrays
+    links: DrawnLinks
     without_db: np.ndarray
     with_db: np.ndarray
 
@@ -172,7 +152,7 @@ class LoopData:
         interpolated_db: (n,) held-out contribution of correlated shadowing [dB], where it is kept.
     """
 
-    links: LinkArrays
+    links: DrawnLinks
     base: str
     before_db: np.ndarray
     after_db: np.ndarray
@@ -205,19 +185,16 @@ def collect(loop: Loop) -> LoopData:
         interpolated_db)
 
 
-def _links(model: Fit, predicted_db: np.ndarray) -> LinkArrays:
+def _links(model: Fit, predicted_db: np.ndarray) -> DrawnLinks:
     links, device_m = model.links, model.links.device_m.copy()
     device_m[links.device[~model.usable]] = np.nan
-    return LinkArrays(
-        links.level_db, links.is_gain, links.receiver_m, device_m,
-        np.isin(np.arange(len(links.device_m)), list(links.anchors)), links.los,
-        evidence_blocks(links), links.first_s,
-        {"device": links.device_names, "receiver": links.receiver_names,
-         "flight": links.flight_names, "los": ["without", "with"]},
-        residual_variables(links, predicted_db), links.city)
+    drawn = links.with_devices(device_m).with_los(links.los)
+    return DrawnLinks(
+        columns=drawn.columns, ends=drawn.ends, world=drawn.world, block=evidence_blocks(links),
+        variables=residual_variables(links, predicted_db))
 
 
-def _effects(loop: Loop, links: LinkArrays) -> list[EffectData]:
+def _effects(loop: Loop, links: DrawnLinks) -> list[EffectData]:
     """Predict all links with and without each effect, by the model fitted to all links."""
     whole = loop.after.whole
     if not whole.effects:

@@ -13,7 +13,7 @@ from matplotlib.image import AxesImage
 
 from radiotwin.display import DIFFERENCE_COLOURS, GAIN_COLOURS, level_range_db, plain
 from radiotwin.maps.radiomap import RadioMap
-from radiotwin.report.closeloop_data import LinkArrays
+from radiotwin.report.closeloop_data import DrawnLinks
 from radiotwin.report.labels import MODELS
 from radiotwin.report.style import new_figure, save
 from radiotwin.scene import Scene
@@ -173,7 +173,7 @@ class MapBackground:
         scene: whose buildings are drawn; None: no 3D map.
     """
 
-    def __init__(self, links: LinkArrays, scene: Scene | None) -> None:
+    def __init__(self, links: DrawnLinks, scene: Scene | None) -> None:
         self.links = links
         device_m, receiver_m = links.ends_m[:, 0], links.receiver_m
         positions = np.unique(receiver_m[:, :2].round(), axis=0)
@@ -270,6 +270,6 @@ class MapBackground:
         if not self.receivers_move:
             return [("s", "black", "receiver", np.unique(links.receiver_m.round(), axis=0))]
         members = np.unique(links.variables["device"])
-        anchor = links.anchor[members]
+        anchor = np.isin(members, sorted(links.anchors))
         return [("^", "black", "device, declared", links.device_m[members[anchor]]),
                 ("o", "white", "device, located", links.device_m[members[~anchor]])]

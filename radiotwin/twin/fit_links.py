@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -112,9 +112,9 @@ def _known_links(links: Links, device_m: np.ndarray
                  ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
     """Return the m links of devices with a position in `device_m` (k, 3), levels and limits."""
     known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
-    geometry = link_geometry(device_m, links.receiver_m[known], links.device[known], links.city)
-    return replace(geometry, frequency_hz=links.frequency_hz), links.level_db[known], \
-        links.limit_db[known]
+    geometry = link_geometry(device_m, links.receiver_m[known], links.device[known], links.city,
+                             links.frequency_hz)
+    return geometry, links.level_db[known], links.limit_db[known]
 
 
 def _published(links: Links, device_m: np.ndarray, scene: Scene,
