@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter
 from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, place
 from radiotwin.io.forms import MAX_POSITION_M, Origin
+from radiotwin.links.checks import map_corners_m, outside_map
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 
@@ -85,9 +86,8 @@ def in_known_frame(measurements: Measurements, there: Origin | None, what: str) 
 def _refuse_off_map(measurements: Measurements, scene: Scene,
                     shift_m: tuple[float, float]) -> None:
     """Raise BadInput where a translation takes most receivers off the map."""
-    receiver_m = measurements.receiver_m
-    low_m, high_m = _bounds_m(scene)
-    outside = ((receiver_m[:, :2] < low_m) | (receiver_m[:, :2] > high_m)).any(axis=1)
+    low_m, high_m = map_corners_m(scene)
+    outside = outside_map(measurements.receiver_m, scene)
     if len(outside) and outside.mean() > MAX_OUTSIDE:
         raise BadInput(f"the shift by {shift_m[0]:g}, {shift_m[1]:g} m takes {outside.mean():.1%} "
                        f"of the links' receivers off the 3D map, which goes from ({low_m[0]:.0f}, "
@@ -104,8 +104,8 @@ def _require_fit(measurements: Measurements, scene: Scene) -> None:
     if len(receiver_m) > MAX_POINTS:
         every = np.linspace(0, len(receiver_m) - 1, MAX_POINTS).astype(int)
         receiver_m = receiver_m[every]
-    bounds_m = _bounds_m(scene)
-    inside, outside = (each.mean() for each in _misplaced(scene, bounds_m, receiver_m))
+    inside = scene.city.inside(receiver_m).mean()
+    outside = outside_map(receiver_m, scene).mean()
     if inside <= MAX_MISPLACED and outside <= MAX_MISPLACED:
         return
     unknown = [what for what, origin in (("the measurements", measurements.origin),
@@ -140,10 +140,9 @@ def best_shift(scene: Scene, receiver_m: np.ndarray) -> tuple[float, float] | No
     Returns:
         x, y to add [m]; None where no translation stands out.
     """
-    bounds_m = _bounds_m(scene)
-    reach_m = SEARCHED_M + 2 * COARSE_M
-    low_m = np.maximum(bounds_m[0], receiver_m[:, :2].min(axis=0) - reach_m)
-    high_m = np.minimum(bounds_m[1], receiver_m[:, :2].max(axis=0) + reach_m)
+    (low_m, high_m), reach_m = map_corners_m(scene), SEARCHED_M + 2 * COARSE_M
+    low_m = np.maximum(low_m, receiver_m[:, :2].min(axis=0) - reach_m)
+    high_m = np.minimum(high_m, receiver_m[:, :2].max(axis=0) + reach_m)
     if (low_m >= high_m).any():
         return None
     cell_m = max(FINE_M, float(np.sqrt(np.prod(high_m - low_m) / MAX_CELLS)))
@@ -170,16 +169,3 @@ def best_shift(scene: Scene, receiver_m: np.ndarray) -> tuple[float, float] | No
                     for east_m in steps_m for north_m in steps_m),
                    key=lambda shift_m: contrast(*shift_m))
     return best if contrast(*best) <= -MIN_CONTRAST else None
-
-
-def _bounds_m(scene: Scene) -> np.ndarray:
-    """Return the corners of the 3D map, (2, 2) [m]."""
-    corners_m = scene.city.vertices[:, :2]
-    return np.array([corners_m.min(axis=0), corners_m.max(axis=0)])
-
-
-def _misplaced(scene: Scene, bounds_m: np.ndarray,
-               receiver_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which receivers (n, 3) are inside buildings, and which off the map."""
-    outside = ((receiver_m[:, :2] < bounds_m[0]) | (receiver_m[:, :2] > bounds_m[1])).any(axis=1)
-    return scene.city.inside(receiver_m), outside

@@ -193,7 +193,7 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
         return list(notes.values())
     outside = outside_map(receiver_m, scene)
     if outside.mean() > MAX_OUTSIDE:
-        low, high, _ = _bounds_of(scene)
+        low, high = map_corners_m(scene)
         raise BadInput(
             f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, "
             f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
@@ -216,24 +216,30 @@ def unmapped_ends(receiver_m: np.ndarray, device_m: np.ndarray, scene: Scene) ->
     Returns:
         (n,) bool.
     """
-    low_m, high_m, roof_m = _bounds_of(scene)
+    low_m, high_m = map_corners_m(scene)
+    roof_m = _roof_m(scene)
     return np.any([((end_m[:, :2] < low_m) | (end_m[:, :2] > high_m)).any(axis=1)
                    & (end_m[:, 2] < roof_m) for end_m in (receiver_m, device_m)], axis=0)
 
 
-def _bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the corners of the map, and the height that nearly all its roofs are below [m]."""
+def map_corners_m(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the 3D map in the south-west and the north-east, (2,) each [m]."""
+    corners_m = scene.city.vertices[:, :2]
+    return corners_m.min(axis=0), corners_m.max(axis=0)
+
+
+def _roof_m(scene: Scene) -> float:
+    """Return the height that nearly all roofs of the map are below [m]."""
     vertices_m = scene.city.vertices
     built_m = vertices_m[vertices_m[:, 2] > GROUND_M, 2]
     if scene.city.terrain is not None:
         built_m = vertices_m[np.unique(scene.city.faces[~scene.city.terrain]), 2]
-    roof_m = float(np.quantile(built_m, ROOFS)) if len(built_m) else 0.0
-    return vertices_m[:, :2].min(axis=0), vertices_m[:, :2].max(axis=0), roof_m
+    return float(np.quantile(built_m, ROOFS)) if len(built_m) else 0.0
 
 
 def outside_map(receiver_m: np.ndarray, scene: Scene) -> np.ndarray:
     """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool."""
-    low, high, _ = _bounds_of(scene)
+    low, high = map_corners_m(scene)
     return np.any((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high), axis=1)
 
 
