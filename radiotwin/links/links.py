@@ -68,7 +68,10 @@ def _at_two_places(one: tuple[np.ndarray, np.ndarray],
 
 @dataclass(frozen=True, eq=False)
 class LinkGeometry:
-    """n links between a device and a receiver, as channel models see them.
+    """n links between a device and a receiver: all that a channel model may depend on.
+
+    It is asked for links that nobody measured, too: from candidates for the position of a device,
+    or from the other end. So it takes both ends of each link rather than `Links`.
 
     Attributes:
         device_m: (n, 3) position of each link's device [m].
@@ -199,7 +202,12 @@ class Columns:
 
     def __post_init__(self) -> None:
         if self.time_in_flight_s is None:
-            object.__setattr__(self, "time_in_flight_s", self._time_in_flight_s())
+            time_s = self.time_s
+            if not np.isnan(time_s).all():
+                first_s = np.full(self.track.max() + 1, np.inf)
+                np.minimum.at(first_s, self.track, np.where(np.isnan(time_s), np.inf, time_s))
+                time_s = time_s - first_s[self.track]
+            object.__setattr__(self, "time_in_flight_s", time_s)
 
     @classmethod
     def unmeasured(cls, receiver_m: np.ndarray, device: np.ndarray,
@@ -226,15 +234,8 @@ class Columns:
     def select(self, rows: np.ndarray | slice) -> Columns:
         """Return the links of a mask, a slice or an index array."""
         values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
-        return Columns(**{name: None if value is None else value[rows]
-                          for name, value in values.items()})
-
-    def _time_in_flight_s(self) -> np.ndarray:
-        if np.isnan(self.time_s).all():
-            return self.time_s
-        first = np.full(self.track.max() + 1, np.inf)
-        np.minimum.at(first, self.track, np.where(np.isnan(self.time_s), np.inf, self.time_s))
-        return self.time_s - first[self.track]
+        return Columns(**{name: value[rows] for name, value in values.items()
+                          if value is not None})
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
