@@ -77,7 +77,7 @@ def taken(measurements):
     return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.scores,
                            params=whole.effects[0].params if whole.effects else None, parameters=parameters,
                            variants=[each.effect.variant for each in whole.effects],
-                           note=(result.model.links.notes or [""])[-1])
+                           note=([*result.model.links.notes, *result.notes] or [""])[-1])
 
 
 @pytest.mark.parametrize("seed", SEEDS)
