@@ -66,7 +66,7 @@ def test_a_taken_name_is_refused(installed):
     assert register(Rural) is Rural and register(Rural) is Rural
     with pytest.raises(BadInput, match="rural.*another name"):
         register(type("OtherRural", (Rural,), {}))
-    with pytest.raises(BadInput, match=r"log_distance.*radiotwin\.channel\.log_distance"):
+    with pytest.raises(BadInput, match=r"log_distance.*radiotwin\.propagation\.laws\.log_distance"):
         register(type("Law", (Rural,), {"name": "log_distance"}))
     assert channel_named("log_distance") is LogDistance and channel_named("rural") is Rural
 

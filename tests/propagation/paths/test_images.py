@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from radiotwin.propagation.laws.followed_paths import path_gains
 from radiotwin.propagation.paths.candidates import CandidateSearch
 from radiotwin.propagation.paths.coefficients import slabs_of
-from radiotwin.propagation.paths.fields import VERTICAL
+from radiotwin.propagation.paths.fields import VERTICAL, path_gains
 from radiotwin.propagation.paths.images import Candidates, PathBuffer, find_paths
 from radiotwin.propagation.paths.wedges import LUEBBERS
 from radiotwin.scene.citymap import CONCRETE
