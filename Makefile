@@ -15,7 +15,7 @@ TESTS ?=
 EXTRAS := test
 CONSTRAINTS := constraints.txt
 
-FAST_TESTS := $(addprefix tests/,effects geo importing inference io links maps propagation report scene trace test_layout.py)
+FAST_TESTS := $(addprefix tests/,effects geo importing inference io links maps propagation scene test_layout.py)
 
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed

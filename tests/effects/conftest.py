@@ -8,7 +8,7 @@ import pytest
 import radiotwin as rt
 from radiotwin.closeloop.output.result_file import scores
 from radiotwin.effects.base import ResidualView
-from tests.worlds import make_links, open_ground
+from tests.worlds import make_links, open_ground, shortened
 
 __all__ = ["make_links", "open_ground"]
 
@@ -28,7 +28,8 @@ def view():
 def loop():
     """Close the loop over measurements without a map: names of the effects found, and the first one's parameters."""
     def run(measurements):
-        closed = rt.close_loop(measurements, base="log-distance")
+        with shortened():
+            closed = rt.close_loop(measurements, base="log-distance")
         return SimpleNamespace(error={"before": scores(closed.before), "after": scores(closed.after)},
                                names=[each.effect.name for each in closed.after.whole.effects],
                                first=(closed.parameters or [{}])[0])

@@ -39,6 +39,7 @@ def assert_equal(one, other):
         np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
 
 
+@pytest.mark.usefixtures("quick_report")
 def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, tmp_path):
     world = open_ground.fly(20)
     world.gain_db[world.receiver == 1] += 6.0
@@ -56,6 +57,7 @@ def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, tmp_pa
     assert_equal(twin.predict(faultless[0]), again.predict(faultless[1]))
 
 
+@pytest.mark.usefixtures("quick_report")
 def test_a_curve_that_only_describes_is_drawn_on_the_maps_of_a_stored_twin(open_ground, tmp_path):
     world = open_ground.fly(8)
     azimuth_deg = np.degrees(np.arctan2(world.offset_m[:, 0], world.offset_m[:, 1]))
