@@ -110,9 +110,9 @@ class LatticeConfig(Table):
     @field_validator("altitudes_m")
     @classmethod
     def _unique(cls, altitudes_m: list[float]) -> list[float]:
-        twice = _first_double(altitudes_m)
-        if twice is not None:
-            raise ValueError(f"{twice:g} is listed twice; every altitude must be unique")
+        for altitude_m, count in Counter(altitudes_m).items():
+            if count > 1:
+                raise ValueError(f"{altitude_m:g} is listed twice; every altitude must be unique")
         return altitudes_m
 
 
@@ -238,11 +238,6 @@ class SceneConfig(Table):
     def gain_limit_db(self) -> float:
         """Gain below which a link is not detected [dB]."""
         return self.radio.sensitivity_dbm - self.radio.tx_power_dbm
-
-
-def _first_double(values: list[float]) -> float | None:
-    counts = Counter(values)
-    return next((value for value in values if counts[value] > 1), None)
 
 
 _UNITS = {"m": "m", "hz": "Hz", "dbm": "dBm", "db": "dB", "deg": "degrees", "s": "s"}

@@ -168,12 +168,25 @@ def _require_few_meetings(rings: list) -> None:
         return
     sides = np.asarray(shapely.linestrings(np.concatenate(
         [np.stack([ring, [*ring[1:], ring[0]]], axis=1) for ring in rings])))
+    count_meetings(sides, SIDES_AT_ONCE,
+                   lambda count: VEGETATION_MEETINGS.check(count, "the vegetation"))
+
+
+def count_meetings(sides: np.ndarray, at_once: int, check: Callable[[int], None]) -> int:
+    """Count how often sides of rings meet others than those beside them.
+
+    Args:
+        sides: (n,) lines.
+        at_once: number of lines whose pairs are found at once; bounds the memory.
+        check: called with the count so far; raises an exception to end the search.
+    """
     tree, found = shapely.STRtree(sides), 0
-    for start in range(0, len(sides), SIDES_AT_ONCE):
-        part = sides[start:start + SIDES_AT_ONCE]
+    for start in range(0, len(sides), at_once):
+        part = sides[start:start + at_once]
         # Each meets itself and the two beside it; both of a pair find it
         found += max(tree.query(part, predicate="intersects").shape[1] - 3 * len(part), 0)
-        VEGETATION_MEETINGS.check(found // 2, "the vegetation")
+        check(found // 2)
+    return found // 2
 
 
 def _below(a_m: np.ndarray, b_m: np.ndarray,

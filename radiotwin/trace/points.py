@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -66,14 +65,11 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
 
     gains = (executor or Executor()).run(
         link_job(scene, settings, "tracing"), pieces,
-        KeptParts("gains", inputs, lambda found: ({"gain_db": found}, len(found)), _read_gains))
+        KeptParts("gains", inputs, lambda found: ({"gain_db": found}, len(found)),
+                  lambda arrays, count: arrays["gain_db"].reshape(count)))
     gain_db = np.empty((len(device_m), len(points_m)))
     gain_db[:, order] = np.concatenate([np.zeros(0), *gains]).reshape(gain_db.shape)
     return gain_db
-
-
-def _read_gains(arrays: dict[str, np.ndarray], count: Any) -> np.ndarray:
-    return arrays["gain_db"].reshape(count)
 
 
 def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | None = None,

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Generic
 
 from radiotwin.errors import BadInput, RunFailed
@@ -77,7 +78,8 @@ class Executor:
             cache: As of `run`.
         """
         if self.is_worth_it:
-            missing = deque(_Todo(piece, _nowhere) for piece in pieces if cache.get(piece) is None)
+            missing = deque(_Todo(piece, lambda result: None) for piece in pieces
+                            if cache.get(piece) is None)
             if missing:
                 with progress(job.description, len(missing)) as advance:
                     try:
@@ -107,7 +109,7 @@ class Executor:
         for place, piece in enumerate(pieces):
             found = kept.get(piece)
             if found is None:
-                missing.append(_Todo(piece, _into(results, place)))
+                missing.append(_Todo(piece, partial(results.__setitem__, place)))
             else:
                 results[place] = found[0]
         if missing:
@@ -265,16 +267,6 @@ class _Run(Generic[P, R]):
             return "Run it with fewer workers, or on a machine with more memory"
         return (f"A worker may take {_gigabytes(resources.memory_bytes)}; run it with fewer "
                 "workers on a machine with more memory, or with a lower quality")
-
-
-def _nowhere(result: Any) -> None:
-    return None
-
-
-def _into(results: list[Any], place: int) -> Callable[[Any], None]:
-    def deliver(result: Any) -> None:
-        results[place] = result
-    return deliver
 
 
 def _pickled(job: Job) -> bytes:

@@ -74,14 +74,6 @@ class NoCache:
         """Do nothing."""
 
 
-def _cannot(piece: object) -> None:
-    return None
-
-
-def _one(piece: object) -> int:
-    return 1
-
-
 @dataclass(frozen=True, eq=False)
 class Job(Generic[P, R]):
     """A pure function over pieces.
@@ -103,8 +95,8 @@ class Job(Generic[P, R]):
     description: str
     function: Callable[[P], R]
     resources: Resources = Resources()
-    size: Callable[[P], int] = _one
-    halve: Callable[[P], tuple[P, P] | None] = _cannot
+    size: Callable[[P], int] = lambda piece: 1
+    halve: Callable[[P], tuple[P, P] | None] = lambda piece: None
     join: Callable[[R, R], R] | None = None
 
 

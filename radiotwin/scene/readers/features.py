@@ -14,6 +14,7 @@ from shapely.geometry.base import BaseGeometry
 
 from radiotwin.io.budgets import CROSSINGS, OUTLINE_CORNERS, VERTICES
 from radiotwin.scene.checks import Problem, Severity, listed
+from radiotwin.scene.vegetation import count_meetings
 
 BUILDING_KEYS = ("building", "building:part")  # tags of OpenStreetMap
 _CHUNK = 256  # segments: bounds the pairs that are found at once
@@ -163,10 +164,5 @@ class OutlineBudget:
         points = [shapely.get_coordinates(ring) for ring in rings]
         ends = [np.stack([ring[:-1], ring[1:]], axis=1) for ring in points]
         segments: Any = shapely.linestrings(np.concatenate([np.zeros((0, 2, 2)), *ends]))
-        tree, found = shapely.STRtree(segments), 0
-        for start in range(0, len(segments), _CHUNK):
-            part = segments[start:start + _CHUNK]
-            # Each meets itself and the two beside it; both of a pair find it
-            found += max(tree.query(part, predicate="intersects").shape[1] - 3 * len(part), 0)
-            CROSSINGS.check(self.crossings + found // 2, subject)
-        return found // 2
+        return count_meetings(segments, _CHUNK,
+                              lambda count: CROSSINGS.check(self.crossings + count, subject))

@@ -222,12 +222,8 @@ def read_geopackage(path: Path, crs: str | None = None) -> MapFile:
                 found.features += part.features
                 found.left_out += part.left_out
     except (sqlite3.Error, shapely.errors.GEOSException, OverflowError) as error:
-        raise _unreadable(path, error) from None
+        raise BadInput(f"{path} is not a readable GeoPackage ({error}); export it again") from None
     return found
-
-
-def _unreadable(path: Path, reason: object) -> BadInput:
-    return BadInput(f"{path} is not a readable GeoPackage ({reason}); export it again")
 
 
 def _layers(database: sqlite3.Connection) -> list[tuple[str, str, int]]:
