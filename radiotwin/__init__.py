@@ -70,9 +70,10 @@ def __getattr__(name: str) -> Any:
 def _modules() -> dict[str, str]:
     """Return the module of each name, as the imports for type checkers above have it."""
     import ast  # when the first name is loaded, which takes longer
+    import inspect
+    import sys
 
-    with open(__file__, encoding="utf-8") as file:
-        tree = ast.parse(file.read())
+    tree = ast.parse(inspect.getsource(sys.modules[__name__]))
     block = next(node for node in tree.body if isinstance(node, ast.If))
     return {each.name: str(node.module) for node in block.body
             if isinstance(node, ast.ImportFrom) for each in node.names}

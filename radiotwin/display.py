@@ -33,7 +33,6 @@ RESIDUAL_COLOURS = "RdBu"  # of measured − predicted, red: less was measured t
 RESIDUAL_RANGE_DB = (2.0, 30.0)  # smallest and largest end of a colour scale
 MAX_CELL = 300  # characters of a cell; names come from strangers' files
 MAX_LINE = 200
-_NAMED = 5
 
 
 def new_axes(ax: Axes | None) -> Axes:
@@ -220,11 +219,11 @@ def count(number: int, noun: str) -> str:
     return f"{number:,} {noun}" + "s" * (number != 1)
 
 
-def some(names: Iterable[str]) -> str:
+def some(names: Iterable[str], most: int = 5) -> str:
     """Return the first names of a list, and how many there are."""
     names = [str(name) for name in names]
-    more = f", … ({len(names):,} in all)" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
+    more = f", … ({len(names):,} in all)" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def span(low: float, high: float, unit: str) -> str:

@@ -92,13 +92,12 @@ def require_plain(folder: Path) -> None:
                            f"{folder}: remove it")
 
 
-def check_input(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES) -> int:
+def check_input(path: Path | str, what: str = "file") -> int:
     """Check that a library may open a file: it exists, is regular, and is not too large.
 
     Args:
         path: of the file.
         what: it should be, for the message, such as `radio map (.nc)`.
-        budget: of its bytes.
 
     Returns:
         its size [bytes].
@@ -106,7 +105,7 @@ def check_input(path: Path | str, what: str = "file", budget: Budget = FILE_BYTE
     Raises:
         BadInput: it cannot be read.
     """
-    with open_input(path, what, budget) as file:
+    with open_input(path, what) as file:
         return os.fstat(file.fileno()).st_size
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from radiotwin.display import some
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import MAP_VALUES
 from radiotwin.maps.export.geotiff import write_geotiff
@@ -89,17 +90,12 @@ def select(radio_map: RadioMap | MapStream, devices: list[str] | None,
     known = set(names)
     for name in devices or []:
         if name not in known:
-            raise BadInput(f"device {name!r} is not in the map; it has {_some(names)}")
+            raise BadInput(f"device {name!r} is not in the map; it has {some(names, _NAMED)}")
     for altitude_m in altitudes_m or []:
         if altitude_m not in lattice.z_m:
             heights = [f"{z:g}" for z in lattice.z_m]
             raise BadInput(f"altitude {altitude_m:g} m is not in the map; it has "
-                           f"{_some(heights)} m")
+                           f"{some(heights, _NAMED)} m")
     if altitudes_m:
         lattice = replace(lattice, z_m=np.array(sorted(set(altitudes_m))))
     return radio_map.selected(list(dict.fromkeys(devices or names)), lattice)
-
-
-def _some(names: list[str]) -> str:
-    more = f", … ({len(names):,} in all)" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
