@@ -31,44 +31,36 @@ _MAX_PLACES = 1000  # of one device; one that moves all the time has no places
 MOVING_M = 1.0  # a device whose positions differ by more than this is not at rest
 
 
-@dataclass(frozen=True)
-class Frame:
-    """The local frame about an origin (see `radiotwin.geo`); heights are left as they are.
+def local_m(positions: pd.DataFrame, origin: Origin | None) -> np.ndarray:
+    """Convert positions to the local frame about an origin (see `radiotwin.geo`).
 
-    Attributes:
+    Args:
+        positions: any columns of `POSITION` [degrees, m], n rows.
         origin: None where all positions are local already.
+
+    Returns:
+        x, y, z [m], (n, 3); NaN where unknown.
     """
-
-    origin: Origin | None
-
-    def local_m(self, positions: pd.DataFrame) -> np.ndarray:
-        """Convert positions to the local frame.
-
-        Args:
-            positions: any columns of `POSITION` [degrees, m], n rows.
-
-        Returns:
-            x, y, z [m], (n, 3); NaN where unknown.
-        """
-        local_m = np.full((len(positions), 3), np.nan)
-        for axis, name in enumerate("xy"):
-            if name in positions:
-                local_m[:, axis] = positions[name]
-        ground_m = 0.0 if self.origin is None else self.origin.altitude_m
-        for name, zero_m in (("altitude", ground_m), ("z", 0.0), ("height", 0.0)):
-            if name in positions:  # the last one counts
-                height_m = positions[name].to_numpy(dtype=float) - zero_m
-                known = ~np.isnan(height_m)
-                local_m[known, 2] = height_m[known]
-        if self.origin is not None and "latitude" in positions:
-            known = positions[["latitude", "longitude"]].notna().all(axis=1).to_numpy()
-            local_m[known, 0], local_m[known, 1] = to_local(
-                self.origin, positions["longitude"][known], positions["latitude"][known])
-        return local_m
+    places_m = np.full((len(positions), 3), np.nan)
+    for axis, name in enumerate("xy"):
+        if name in positions:
+            places_m[:, axis] = positions[name]
+    ground_m = 0.0 if origin is None else origin.altitude_m
+    for name, zero_m in (("altitude", ground_m), ("z", 0.0), ("height", 0.0)):
+        if name in positions:  # the last one counts
+            height_m = positions[name].to_numpy(dtype=float) - zero_m
+            known = ~np.isnan(height_m)
+            places_m[known, 2] = height_m[known]
+    if origin is not None and "latitude" in positions:
+        known = positions[["latitude", "longitude"]].notna().all(axis=1).to_numpy()
+        places_m[known, 0], places_m[known, 1] = to_local(
+            origin, positions["longitude"][known], positions["latitude"][known])
+    return places_m
 
 
-def find_frame(declared: Origin | None, receivers: pd.DataFrame, devices: pd.DataFrame) -> Frame:
-    """Return the frame about the declared origin, or about the median of the receivers.
+def find_origin(declared: Origin | None, receivers: pd.DataFrame,
+                devices: pd.DataFrame) -> Origin | None:
+    """Return the declared origin, or the median of the receivers; None where all are local.
 
     Args:
         declared: origin from the settings.
@@ -79,7 +71,7 @@ def find_frame(declared: Origin | None, receivers: pd.DataFrame, devices: pd.Dat
         BadInput: some positions are local and some geographic, and no origin relates them.
     """
     if declared is not None:
-        return Frame(declared)
+        return declared
     geographic, local = (any(name in ends and ends[name].notna().any()
                              for ends in (receivers, devices)) for name in ("latitude", "x"))
     if geographic and local:
@@ -87,14 +79,14 @@ def find_frame(declared: Origin | None, receivers: pd.DataFrame, devices: pd.Dat
                        "the origin of the local frame: --origin LATITUDE,LONGITUDE,ALTITUDE, or "
                        "the crs of x and y")
     if not geographic:
-        return Frame(None)
+        return None
     of_receivers = "latitude" in receivers and receivers["latitude"].notna().any()
     known = receivers if of_receivers else devices
     first = known["longitude"].dropna().iloc[0]
     east = (known["longitude"] - first + 180) % 360 - 180  # so that the date line does no harm
     longitude = (first + east.median() + 180) % 360 - 180
-    return Frame(Origin(latitude_deg=round(float(known["latitude"].median()), ORIGIN_DECIMALS),
-                        longitude_deg=round(float(longitude), ORIGIN_DECIMALS)))
+    return Origin(latitude_deg=round(float(known["latitude"].median()), ORIGIN_DECIMALS),
+                  longitude_deg=round(float(longitude), ORIGIN_DECIMALS))
 
 
 def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
@@ -314,13 +306,13 @@ class PositionedLinks:
             heights are above the ground.
         devices: as in `devices.csv`: those of the links, in the order of their first ones.
         device_m: position of each link's device [m], (n, 3); NaN where unknown.
-        frame: of all positions.
+        origin: of the local frame; None where all positions were local already.
     """
 
     links: pd.DataFrame
     devices: pd.DataFrame
     device_m: np.ndarray
-    frame: Frame
+    origin: Origin | None
 
     def select(self, keep: np.ndarray, source: Source | None = None, tally: Tally | None = None,
                reason: str = "") -> "PositionedLinks":
@@ -339,7 +331,7 @@ class PositionedLinks:
             links = links[keep]
         devices = self.devices[self.devices["device"].isin(links["device"])]
         return PositionedLinks(links, devices.reset_index(drop=True), self.device_m[keep],
-                               self.frame)
+                               self.origin)
 
 
 def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
@@ -360,8 +352,8 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     links = _at_times(source, links, tables["device"])
     receivers = _positions(links, "", tables["receiver"], links["receiver"], settings.crs)
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
-    frame = find_frame(settings.origin, receivers, devices)
-    receiver_m, device_m = frame.local_m(receivers), frame.local_m(devices)
+    origin = find_origin(settings.origin, receivers, devices)
+    receiver_m, device_m = local_m(receivers, origin), local_m(devices, origin)
     del receivers, devices  # as much memory as the links themselves
     if settings.place_m:
         links = links.assign(device=_place_names(source, links, device_m, settings.place_m))
@@ -379,7 +371,7 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
         links, device_m = links[~unknown], device_m[~unknown]
     table = _device_table(source, links, device_m, tables["device"],
                           max(MOVING_M, 2 * (settings.place_m or 0.0)))
-    return PositionedLinks(links, table, device_m, frame)
+    return PositionedLinks(links, table, device_m, origin)
 
 
 def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end: str) -> None:

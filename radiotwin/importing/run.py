@@ -47,7 +47,7 @@ def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Ta
                 settings: Settings) -> dict[str, Any]:
     """Return the content of `import.json`; the readings kept and left out add up to those read."""
     table, devices = measurements.table, measurements.devices
-    origin = positioned.frame.origin
+    origin = positioned.origin
     time_s = table["time_s"].dropna() if "time_s" in table else pd.Series(dtype=float)
     return {
         "schema": SCHEMA, "files": logs.files,
@@ -207,12 +207,11 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
     if settings.average_m:
         on_progress("averaging")
         table = average(table, settings.average_m, settings.average)
-    measurements = _measurements(table, positioned.devices, logs.level_column,
-                                 positioned.frame.origin)
+    measurements = _measurements(table, positioned.devices, logs.level_column, positioned.origin)
     report = _make_report(logs, [*logs.notes, *notes], others, kept, tally, positioned,
                          measurements, settings)
     on_progress("writing")
-    used = settings.model_copy(update={"origin": positioned.frame.origin,
+    used = settings.model_copy(update={"origin": positioned.origin,
                                        "format": settings.format or logs.format})
     with atomic_folder(out) as folder:
         measurements.write(folder / ("measurements.csv.gz" if compress else "measurements.csv"))

@@ -88,18 +88,6 @@ class Source:
                            f"{'are' if several else 'is'} missing; the file has "
                            f"{listed(self.table.columns)}. Correct the mapping")
 
-    def text(self, spec: str, purpose: str) -> pd.Series:
-        """Return the cells as stripped texts, `""` where empty.
-
-        Args:
-            spec: name of a column, or `always VALUE`.
-            purpose: what they are needed for, for the message.
-
-        Raises:
-            BadInput: no such column.
-        """
-        return as_text(self.cells(spec, purpose))
-
     def names(self, spec: str, purpose: str) -> np.ndarray:
         """Return the cells as names, (n,) texts, `""` where empty; equal ones are one object.
 
