@@ -36,7 +36,7 @@ for name in ("greedy", "random"):
 
 # %%
 try:
-    from marl.parallel_env import HarvestEnv
+    from marl.interfaces import HarvestEnv
 except ImportError as error:
     print(error)
 else:

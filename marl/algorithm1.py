@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marl.checkpoint import NAME, save_checkpoint
+from marl.checkpoint import NAME, restored, save_checkpoint
 from marl.environment import Environment
 from marl.flights import Flights, Policy, evaluate, fly
 from marl.heuristics import HeuristicPolicy, waypoint_actions
 from marl.learner import Learner, make_learner
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy
-from marl.resume import has_checkpoint, restored
 from marl.settings import LearnerSettings, RunSettings, stream
 from radiotwin.errors import BadInput
 from radiotwin.links.measurements import Measurements
@@ -89,7 +88,7 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
     twin: Twin | None = None
     try:
         # A run that was stopped before its first checkpoint starts again.
-        if resume and folder and has_checkpoint(folder):
+        if resume and folder and (folder / NAME).exists():
             rows, blocks, reality.tables, twin = restored(folder / NAME, run, scene, learner)
             if twin is not None:
                 twin.save(folder / "twin")

@@ -1,6 +1,6 @@
 """The interface of a learner: prepare in a map, then give a policy that flies.
 
-To add a learner, subclass `Learner` in one file and add one line to `marl.registry.LEARNERS`
+To add a learner, subclass `Learner` in one file and add one line to `marl.settings.LEARNERS`
 (example in `docs/marl.md`).
 """
 
@@ -13,8 +13,7 @@ import numpy as np
 
 from marl.flights import Policy
 from marl.mission import Mission
-from marl.registry import learner_class
-from marl.settings import LearnerSettings, RunSettings
+from marl.settings import LearnerSettings, RunSettings, learner_class
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,8 @@ from marl.figures import choose_flight, draw_curve, draw_trajectories
 from marl.flights import evaluate, track_table
 from marl.learner import make_learner
 from marl.mission import Known, Mission, make_mission
-from marl.registry import learner_class
-from marl.settings import LearnerSettings, RunSettings, stream
-from marl.threads import check_sizes, keep_memory, limit_threads
+from marl.replicas import check_sizes, keep_memory, limit_threads
+from marl.settings import LearnerSettings, RunSettings, learner_class, stream
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import write_csv
 from radiotwin.io.content_hash import content_hash
@@ -35,7 +34,6 @@ TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "
               "raytrace": "ray-traced twin", "path-kriging": "twin of a map that may be wrong",
               "truth": "the truth"}
 BASELINES = ("planner", "greedy", "random")  # in every table
-_REST = "truth besides gain_db"
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,6 @@ class Session:
             except BadInput:
                 raise BadInput(f"{path} is not there or damaged, so there is nothing to resume in "
                                f"{self.out}; start the run without --resume") from None
-            before["world"].setdefault(_REST, world[_REST])  # runs of earlier versions lack it
             for group in config:
                 for name, value in config[group].items():
                     if before[group].get(name) == value:
@@ -185,7 +182,7 @@ def _world(scene: Scene, truth: RadioMap) -> dict[str, str]:
     rest |= {name: truth.dataset.attrs.get(name)
              for name in ("shadowing_share", "shadowing_length_m")}
     return {"city": scene.content_hash(), "scene.toml": declared, "truth": measured,
-            _REST: content_hash(rest)}
+            "truth besides gain_db": content_hash(rest)}
 
 
 class _Log:

@@ -1,23 +1,57 @@
 """Settings of a run and of learning, checked when they are given; each becomes an option.
 
-Random numbers: an independent stream for every purpose, all from one seed.
+With them: the names of the learners, which are the choices of `--algorithm`, and an independent
+stream of random numbers for every purpose, all from one seed.
 """
 
-from collections.abc import Callable
+import functools
+import importlib
+import inspect
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+import typer
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
 
-from marl.registry import LEARNERS, learner_class
 from radiotwin.errors import BadInput
+from radiotwin.runtime.command import with_options
 from radiotwin.scene.folder import published_scene
 
+LEARNERS: dict[str, Any] = {
+    "fedqmix": "marl.fedqmix.federation:FedQMIX",
+    "qmix": "marl.qmix:QMIX",
+    "iql": "marl.qmix:IQL",
+    "greedy": "marl.heuristics:Greedy",
+    "planner": "marl.planner:Planner",
+    "random": "marl.heuristics:Random",
+}
+"""Name -> `module:class`, or the class itself; each is a `marl.learner.Learner`."""
 PURPOSES = ("learning", "real flight", "decisions", "choice", "twin evaluation",
             "truth evaluation", "planning")
+Settings = TypeVar("Settings", bound=BaseModel)
+
+
+def learner_class(name: str) -> Any:
+    """Return the class of a learner.
+
+    Args:
+        name: a key of `LEARNERS`.
+
+    Raises:
+        BadInput: no learner has this name.
+    """
+    if name not in LEARNERS:
+        raise BadInput(f"algorithm {name!r} is unknown; allowed are {', '.join(LEARNERS)}")
+    found = LEARNERS[name]
+    if isinstance(found, str):
+        module, _, attribute = found.partition(":")
+        found = getattr(importlib.import_module(module), attribute)
+    return found
 
 
 class LearnerSettings(BaseModel):
@@ -170,3 +204,95 @@ def stream(seed: int, purpose: str, number: int = 0) -> np.random.Generator:
     """
     # Counted from 1, because numpy takes [1, 2, 0] for [1, 2].
     return np.random.default_rng([seed, PURPOSES.index(purpose) + 1, number + 1])
+
+
+def with_settings(*models: type[BaseModel], without: Collection[str] = (),
+                  ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorate a command: one option for each field of some settings.
+
+    The command gets them as one keyword `given`: field -> text, as `checked` takes it.
+
+    Args:
+        models: classes of settings.
+        without: fields that get no option.
+    """
+    fields = {name: field for model in models for name, field in model.model_fields.items()
+              if name not in without}
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(command)
+        def run(**options: Any) -> None:
+            given = {name: options.pop(name) for name in fields}
+            command(given={name: text for name, text in given.items() if text is not None},
+                    **options)
+
+        signature = inspect.signature(command)
+        own = [each for each in signature.parameters.values() if each.name != "given"]
+        return with_options(run, signature.replace(parameters=own),
+                            {name: (_option(name, field), None) for name, field in fields.items()})
+    return decorate
+
+
+def checked(given: Mapping[str, str], defaults: Settings) -> Settings:
+    """Return settings with the given values in place of the defaults.
+
+    Args:
+        given: field -> text from the command line; fields of other settings are ignored.
+        defaults: values of the fields that are not given.
+
+    Raises:
+        BadInput: with the option, the given value, and what is allowed.
+    """
+    values = {name: given[name] for name in type(defaults).model_fields if name in given}
+    try:
+        return type(defaults).model_validate(defaults.model_dump() | values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = str(first["loc"][0])
+        allowed = _allowed(type(defaults).model_fields[name])
+        raise BadInput(f"{_flag(name)} {str(first['input'])[:60]}: {first['msg']}; "
+                       f"allowed: {allowed}") from None
+
+
+def settings_of(given: Mapping[str, str]) -> tuple[RunSettings, LearnerSettings]:
+    """Return the settings of a command line: a preset, and what was given besides.
+
+    Raises:
+        BadInput: an impossible value, or values that do not go together.
+    """
+    preset = checked(given, RunSettings()).preset
+    run = checked(given, RunSettings(**RUNS[preset]))
+    learner = checked(given, PRESETS[preset])
+    check_together(run, learner)
+    return run, learner
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _option(name: str, field: FieldInfo) -> Any:
+    default = str(field.default).lower() if isinstance(field.default, bool) else field.default
+    text = field.description or ""
+    return Annotated[str | None, typer.Option(
+        _flag(name), metavar=_metavar(field), show_default=False,
+        help=f"{text[:1].upper()}{text[1:]} [{default}].")]
+
+
+def _metavar(field: FieldInfo) -> str:
+    if get_origin(field.annotation) is Literal:
+        return "|".join(get_args(field.annotation))
+    for choices in field.metadata:
+        if isinstance(choices, Choices):
+            return "|".join(choices.values())
+    names: dict[Any, str] = {bool: "true|false", int: "INTEGER", float: "NUMBER"}
+    return names.get(field.annotation, "PATH")
+
+
+def _allowed(field: FieldInfo) -> str:
+    signs = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
+    bounds = [f"{signs[name]} {limit:g}" for bound in field.metadata for name in signs
+              if (limit := getattr(bound, name, None)) is not None]
+    kinds = {"INTEGER": "a whole number", "NUMBER": "a number", "PATH": "a path"}
+    kind = kinds.get(_metavar(field), _metavar(field))
+    return " ".join([kind, ", ".join(bounds)]).strip()

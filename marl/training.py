@@ -7,8 +7,7 @@ import numpy as np
 import torch
 
 from marl.checkpoint import require_array, require_count, require_fields, require_generator
-from marl.environment import ACTION_COUNT, Environment, Frame, empty_frame
-from marl.features import observe
+from marl.environment import ACTION_COUNT, Environment, Frame, empty_frame, observe
 from marl.flights import Flights, fly
 from marl.mission import MAX_SNR_DB, Mission
 from marl.settings import LearnerSettings, stream

@@ -16,8 +16,7 @@ from marl.checkpoint import load_checkpoint
 from marl.fedqmix.client import Party, rounds_of
 from marl.fedqmix.federation import Weights
 from marl.fedqmix.session import federate
-from marl.fedqmix.settings import FederationSettings
-from marl.fedqmix.shared import Shared, write_app
+from marl.fedqmix.settings import FederationSettings, Shared, write_app
 from marl.settings import PRESETS, RunSettings
 from radiotwin import Scene, fly_survey
 from radiotwin.io.files import scratch_folder

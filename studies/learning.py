@@ -13,8 +13,7 @@ from marl.environment import Frame
 from marl.figures import LEVEL_STYLES, choose_flight, trajectories_figure
 from marl.flights import Flights
 from marl.mission import Known, make_mission
-from marl.registry import learner_class
-from marl.settings import PRESETS, RUNS, LearnerSettings, RunSettings
+from marl.settings import PRESETS, RUNS, LearnerSettings, RunSettings, learner_class
 from radiotwin import Scene, segmented_truth
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.cuda import torch_device

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.propagation.paths.candidates import candidate_search
-from radiotwin.propagation.paths.coefficients import slabs_of
 from radiotwin.propagation.paths.fields import VERTICAL
 from radiotwin.propagation.paths.images import PathBuffer
+from radiotwin.propagation.paths.interactions import slabs_of
 from radiotwin.propagation.paths.powers import PATH_CHUNK, WEDGES, clear_paths_gains
 from radiotwin.scene import Scene
 from radiotwin.trace.settings import SolverSettings

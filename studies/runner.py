@@ -154,7 +154,7 @@ class _RecordFile:
 
 def make_row(study: str, run: Run, name: str, seed: int, settings: dict) -> dict:
     """Run a row with one thread and return its record; numbers have four decimals."""
-    from marl.threads import keep_memory, limit_threads  # torch: not for --help
+    from marl.replicas import keep_memory, limit_threads  # torch: not for --help
 
     limit_threads(1)
     keep_memory()

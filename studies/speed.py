@@ -14,8 +14,7 @@ import torch
 from torch import nn
 from typing_extensions import override
 
-from marl.environment import ACTION_COUNT, Environment
-from marl.features import global_state, observe
+from marl.environment import ACTION_COUNT, Environment, global_state, observe
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy, random_actions
 from marl.mission import Known, Mission, make_mission

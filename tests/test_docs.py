@@ -24,7 +24,7 @@ def test_the_site_builds(tmp_path):
     assert result.returncode == 0, result.stderr
     reference = (tmp_path / "site" / "reference.html").read_text(encoding="utf-8")
     for name in ("radiotwin.twin.fit_twin", "radiotwin.twin.Twin.predict", "radiotwin.maps.radiomap.RadioMap.load",
-                 "radiotwin.closeloop.verdict.criteria.SelectionCriteria", "marl.parallel_env.HarvestEnv",
+                 "radiotwin.closeloop.verdict.criteria.SelectionCriteria", "marl.interfaces.HarvestEnv",
                  "radiotwin.scene.readers.build.build_scene_from_map"):
         assert f'id="{name}"' in reference
     results = (tmp_path / "site" / "results.html").read_text(encoding="utf-8")

@@ -11,8 +11,7 @@ from typing import Annotated
 import typer
 
 from marl.fedqmix.settings import EngineSettings, FederationSettings
-from marl.options import checked, settings_of, with_settings
-from marl.settings import LearnerSettings, RunSettings
+from marl.settings import LearnerSettings, RunSettings, checked, settings_of, with_settings
 from radiotwin.errors import BadInput
 from radiotwin.runtime.command import exit_status, with_output_options
 from radiotwin.runtime.console import say, show_warnings_plainly

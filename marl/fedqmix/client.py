@@ -1,9 +1,8 @@
 """One party of a federation: a scene, flights or measurements, and a replica that learns in them.
 
 It does what `marl.algorithm1` does, driven from outside: the mean of all replicas comes in, and the
-weights that it becomes here go out. Nothing else is returned.
-
-FedProx: a term of the loss that keeps a replica near the mean it set out from.
+weights of this one go out. Nothing else is returned. FedProx adds a term to the loss that keeps a
+replica near the mean that it started from.
 """
 
 import time
@@ -30,20 +29,23 @@ from marl.algorithm1 import (
 from marl.checkpoint import (
     NAME,
     Damaged,
+    check_rows,
+    check_table,
     load_checkpoint,
     refuse_damaged,
     require_count,
     require_fields,
+    require_number,
     save_checkpoint,
+    stored_twin,
 )
 from marl.fedqmix.federation import Weights, require_weights
 from marl.flights import evaluate
 from marl.learner import Setup
 from marl.mission import Known, Mission
 from marl.qmix import QMIX, QNetworks
-from marl.resume import check_rows, check_table, require_number, stored_twin
+from marl.replicas import check_sizes
 from marl.settings import LearnerSettings, RunSettings, stream
-from marl.threads import check_sizes
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_path

@@ -5,8 +5,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from typing_extensions import override
 
+from marl.fedqmix.settings import Shared
 from marl.learner import Setup
-from marl.qmix import QMIX
+from marl.mission import Mission
+from marl.qmix import QMIX, QNetworks
 from radiotwin.errors import BadInput
 
 Weights = dict[str, np.ndarray]
@@ -56,6 +58,17 @@ def require_weights(given: Mapping[str, np.ndarray], like: Weights) -> None:
                            "scenes of a federation have equal numbers of UAVs and devices")
         if not np.isfinite(array).all() or (name.startswith("square.") and (array < 0).any()):
             raise BadInput(f"weights {name} are not finite, or squares are negative")
+
+
+def initial_weights(shared: Shared) -> Weights:
+    """Return the weights that `FedQMIX` begins with, from the sizes alone."""
+    links = np.zeros((shared.uavs, shared.devices, 1, 1), np.float32)
+    each = np.zeros(shared.uavs, np.int64)
+    sizes = Mission(links, links, np.zeros((shared.uavs, 1, 1), np.int64),
+                    np.zeros((shared.uavs, 2), np.int64), each, each.astype(float),
+                    np.zeros(shared.devices), np.zeros((shared.devices, 2)), 1.0, 1.0, 0.0, 0.0,
+                    np.zeros(2), False)
+    return QNetworks(shared.learner, sizes, shared.run.seed).weights()
 
 
 class FedQMIX(QMIX):

@@ -1,9 +1,8 @@
 """A federation on this machine: Flower's processes, started, watched and ended.
 
 Either Flower's simulation engine, or a SuperLink and a SuperNode for each party as real processes.
-Both speak TLS on the loopback; real SuperNodes prove who they are, too.
-
-Keys and certificates of a federation on one machine: made for a run, worth nothing after it.
+Both speak TLS on the loopback; real SuperNodes prove who they are, too. Keys and certificates are
+made for a run, and are worth nothing after it.
 """
 
 import datetime
@@ -27,8 +26,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from marl.fedqmix.client import Party
-from marl.fedqmix.flower_client import PARTIES
-from marl.fedqmix.flower_server import DONE, FOLDER, WEIGHTS
+from marl.fedqmix.flower_app import DONE, FOLDER, PARTIES, WEIGHTS
 from radiotwin.errors import RunFailed
 from radiotwin.runtime.console import notice
 from radiotwin.runtime.processes import die_with_parent

@@ -9,13 +9,18 @@ from pathlib import Path
 import pandas as pd
 
 from marl.fedqmix.client import Client, Party, rounds_of
-from marl.fedqmix.federation import Weights, average
-from marl.fedqmix.settings import EngineSettings, FederationSettings, check_federation
-from marl.fedqmix.shared import Shared, initial_weights, write_app
+from marl.fedqmix.federation import Weights, average, initial_weights
+from marl.fedqmix.settings import (
+    EngineSettings,
+    FederationSettings,
+    Shared,
+    check_federation,
+    write_app,
+)
 from marl.figures import draw_curve
 from marl.mission import Known, make_mission
+from marl.replicas import check_sizes, keep_memory, limit_threads
 from marl.settings import LearnerSettings, RunSettings
-from marl.threads import check_sizes, keep_memory, limit_threads
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.io.files import atomic_file, is_temporary, scratch_folder
 from radiotwin.links.alignment import in_scene_frame

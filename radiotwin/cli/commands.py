@@ -3,10 +3,12 @@
 Heavy packages are imported inside the commands, so that `--help` answers at once.
 """
 
+from collections.abc import Callable
+
 import typer
 
 from radiotwin import __version__
-from radiotwin.cli import coverage, importing, loop, model, report, scenes, tools, world
+from radiotwin.cli import coverage, importing, model, scenes, tools
 from radiotwin.runtime.command import add_output_options
 from radiotwin.runtime.console import show_warnings_plainly
 
@@ -17,8 +19,15 @@ app = typer.Typer(
     help="Radio digital twins of cities, learnt from measurements. Build, trace and survey a "
          "scene; fit a twin to the measurements; map and compare it.")
 
-for module in (scenes, world, importing, model, coverage, loop, report, tools):
-    module.add_commands(app)
+COMMANDS: dict[str, Callable[..., None]] = {  # in the order of the help text
+    "build-scene": scenes.build_scene, "export-scene": scenes.export_scene,
+    "export": scenes.export, "trace": scenes.trace, "gains": scenes.gains, "paths": scenes.paths,
+    "survey": scenes.survey, "import": importing.import_, "fit": model.fit, "map": model.map_,
+    "compare": model.compare, "coverage": coverage.coverage, "close-loop": model.close_loop,
+    "locate": model.locate, "report": tools.report, "demo": tools.demo, "doctor": tools.doctor,
+    "cache": tools.cache}
+for name, command in COMMANDS.items():
+    app.command(name)(command)
 add_output_options(app)
 
 

@@ -25,11 +25,6 @@ if TYPE_CHECKING:
     from radiotwin.twin import Twin
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Add the commands of this module to the app."""
-    app.command("coverage")(coverage)
-
-
 def coverage(
     source: Annotated[Path, typer.Argument(
         metavar="SOURCE", help="Where gains are from: a twin's folder, a radio map (.nc, "

@@ -15,11 +15,6 @@ if TYPE_CHECKING:
     from radiotwin.importing.settings import Settings
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Add the commands of this module to the app."""
-    app.command("import")(import_)
-
-
 def import_(
     files: Annotated[list[Path], typer.Argument(
         metavar="FILES", help="Logs, folders of logs, or zip files of them: texts with columns "

@@ -1,17 +1,19 @@
-"""The commands that learn from measurements and judge the result: fit, map, compare."""
+"""The commands that learn from measurements: fit, map, compare, close-loop, locate."""
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from radiotwin.cli.options import (
+    MAX_SEED,
     Cluster,
     DeviceTable,
     FitSeed,
     MeasurementFile,
     OnlyDevices,
+    OptionalScene,
     SceneOption,
     Shift,
     Workers,
@@ -28,11 +30,6 @@ if TYPE_CHECKING:
     from radiotwin.twin.compare import Comparison
 
 
-def add_commands(app: typer.Typer) -> None:
-    """Add the commands of this module to the app."""
-    app.command("fit")(fit)
-    app.command("map")(map_)
-    app.command("compare")(compare)
 
 
 def fit(
@@ -199,3 +196,174 @@ def print_comparison(comparison: "Comparison") -> None:
     result("locations", comparison.locations.to_dict("records"))
     for title, columns, rows in comparison.tables():
         print_rows(title, columns, rows)
+
+
+def close_loop(
+    measurements: MeasurementFile,
+    scene: OptionalScene = None,
+    devices: DeviceTable = None,
+    base: Annotated[str, typer.Option(
+        help="Model whose residual is explained: twin, raytrace, log-distance; auto: the best of "
+             "them.")] = "auto",
+    hold_out: Annotated[str, typer.Option(
+        help="Unit of cross-validation: flight, block, quadrant, device; auto: flight if there are "
+             "enough, else block.")] = "auto",
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="Folder for closeloop.json, closeloop.html and figures.")
+        ] = Path("closeloop"),
+    write_scene: Annotated[Path | None, typer.Option(
+        metavar="DIR", help="Scene folder to write: SCENE with the missing obstacles and the "
+                            "antennas that were found, without the buildings that are gone, with "
+                            "roofs as high and anchors where they were found.")] = None,
+    shift: Shift = None,
+    seed: Annotated[int, typer.Option(
+        min=0, max=MAX_SEED, help="Seed of folds, fits and permutations.")] = 0,
+    workers: Workers = "auto",
+    cluster: Cluster = None,
+) -> None:
+    """Find the effects that a model lacks.
+
+    They are added to the model, and the error before and after is reported.
+    """
+    from radiotwin.closeloop.output.corrected_scene import (
+        check_corrected_target,
+        write_corrected_scene,
+    )
+    from radiotwin.closeloop.run import close_loop as run
+    from radiotwin.links.measurements import read_measurements
+    from radiotwin.report import (
+        check_closeloop_folder,
+        closeloop_summary,
+        write_closeloop_folder,
+    )
+    from radiotwin.runtime.console import progress
+    from radiotwin.runtime.execution import AUTO, open_executor
+    from radiotwin.runtime.pieces import keep_pieces
+    from radiotwin.scene import Scene
+    from radiotwin.twin.locate import NOT_BY_PATHS
+
+    data = read_measurements(measurements, devices)
+    world = Scene.load(scene) if scene else None
+    data = in_frame_of(world, data, shift)
+    keep_scene_apart(out, world)
+    check_closeloop_folder(out)
+    if write_scene is not None:
+        check_corrected_target(write_scene, world, out)
+    if base == "raytrace":
+        notice(f"the twin will follow paths, {NOT_BY_PATHS}")
+    inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
+    # Two workers are no faster than the threads of one process: they are for who asks for them.
+    some = "1" if workers == AUTO and cluster is None else workers
+    with keep_pieces() as pieces, open_executor(some, cluster, notice) as executor, \
+            progress("closing the loop", total=None) as advance:
+        loop = run(data, world, base, seed,
+                   lambda text: advance(1, "; ".join(filter(None, [text, pieces.progress]))),
+                   hold_out, executor=executor)
+        advance(1, "other models, and the combination of all")
+        report = write_closeloop_folder(loop, world, out, inputs=inputs,
+                                        title=f"Close-loop report of {measurements.name}")
+    notice(pieces.progress)
+    _print(report)
+    if base == "auto" and loop.base == "raytrace":
+        say(f"note: the twin's base is 'raytrace', {NOT_BY_PATHS}")
+    say(closeloop_summary(report))
+    say(f"wrote {out / 'closeloop.html'}")
+    if write_scene is not None and world is not None:
+        changes = write_corrected_scene(loop, world, write_scene)
+        say(f"wrote {write_scene}: {'; '.join(changes)}" if changes else
+            f"{write_scene} is not written: no building, roof, anchor or antenna was found to "
+            f"be wrong in {scene}")
+
+
+def _print(report: dict[str, Any]) -> None:
+    from radiotwin.report.labels import name_label
+
+    for note in report["notes"]:
+        say(f"note: {note}")
+    error = report["error"]
+    groups = [(name, both) for name, both in (("all", error), *error["by_los"].items())
+              if both["before"]["n"]]
+    rows = [[name, when, *(_number(both[when][key]) for key in ("rmse_db", "mae_db", "bias_db"))]
+            for name, both in groups for when in ("before", "after")]
+    rows += [[name_label(name), "", value["rmse_db"], float("nan"), float("nan")]
+             for name, value in report["baselines"].items()]
+    print_rows(
+        f"Error on held-out links (by {report['heldout']['by']}) [dB], base {report['base']}",
+        {"links": "left", "": "left", "RMSE": "right", "MAE": "right", "bias": "right"}, rows)
+    rows = [[effect["name"], name, *_estimate(estimate), estimate["unit"]]
+            for effect in report["effects"] for name, estimate in effect["parameters"].items()]
+    if rows:
+        print_rows("Added to the base", {
+            "effect": "left", "parameter": "left", "value": "right", "low": "right",
+            "high": "right", "unit": "left"}, rows)
+
+
+def _estimate(estimate: dict[str, Any]) -> list[float | str]:
+    """Return value and interval as the table shows them."""
+    from radiotwin.report.closeloop_words import is_reference
+
+    if is_reference(estimate):
+        return ["reference", float("nan"), float("nan")]
+    value, low, high = (_number(estimate[key]) for key in ("value", "low", "high"))
+    return [value if estimate.get("determined", True) else "not determined", low, high]
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else value
+
+
+def locate(
+    measurements: MeasurementFile,
+    twin: Annotated[Path, typer.Option(
+        help="Corrected twin: the folder twin of what close-loop wrote.")],
+    scene: OptionalScene = None,
+    devices: DeviceTable = None,
+    truth: Annotated[Path | None, typer.Option(
+        help="Table with columns device and x_m, y_m or latitude, longitude: true positions, "
+             "to report the errors.")] = None,
+    shift: Shift = None,
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="Table of the positions.")] = Path("located.csv"),
+) -> None:
+    """Locate unknown devices with a twin of close-loop, or of fit.
+
+    It works with or without a 3D map.
+    """
+    from radiotwin.io.cells import write_csv
+    from radiotwin.io.files import atomic_path, require_suffix, require_writable
+    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.links.measurements import read_measurements
+    from radiotwin.scene import Scene
+    from radiotwin.scene.folder import files_of
+    from radiotwin.twin import Twin
+    from radiotwin.twin.localize.without_map import MIN_LINKS
+    from radiotwin.twin.locate import (
+        check_can_locate,
+        locate_devices,
+        position_errors,
+        read_truth,
+    )
+
+    require_suffix(out, ".csv", ".csv.gz")
+    keep_inputs(out, measurements, devices or measurements.parent / "devices.csv", truth)
+    known, world = Twin.load(twin), Scene.load(scene) if scene else None
+    keep_inputs(out, *(files_of(world) if world else []))
+    check_can_locate(known, world)  # before a file is read that may be large
+    data = in_frame_of(world, read_measurements(measurements, devices), shift)
+    true = read_truth(truth, known.origin or data.origin) if truth else None
+    require_writable(out)
+    unknown = int((data.devices["role"] == "unknown").sum())
+    positions, notes = locate_devices(data, known, world)
+    for note in notes:
+        say(f"note: {note}")
+    with atomic_path(out) as temporary:
+        write_csv(positions, temporary)
+    if true is not None:
+        error = position_errors(positions, true)
+        print_rows("How far off [m]", {"devices": "right", "median": "right", "90 %": "right",
+                                       "within the 90 % radius": "right"},
+                   [[error["devices"], error["median_m"], error["ninety_m"],
+                     f"{error['within']:.0%}"]])
+    radii = f"half of the 90 % radii are below {positions['radius_m'].median():.0f} m" \
+        if len(positions) else f"each needs {MIN_LINKS} links and more"
+    say(f"wrote {out}: {len(positions)} of {unknown} unknown devices; {radii}")

@@ -1,6 +1,6 @@
-"""Files of a coverage prediction: tables, NetCDF, GeoTIFF, GeoPackage and KMZ.
+"""Files of a coverage prediction: tables, NetCDF, GeoTIFF, KMZ, and a GeoPackage.
 
-Coverage as vectors: a GeoPackage with the areas of each class, and the transmitters.
+The GeoPackage has the areas of each class as vectors, and the transmitters.
 """
 
 import io

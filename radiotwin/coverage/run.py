@@ -9,15 +9,15 @@ import xarray as xr
 from scipy.special import ndtri
 
 import radiotwin
-from radiotwin.coverage.areas import Area, area_records, class_lists
-from radiotwin.coverage.grid import CoverageGrid, ground_of
+from radiotwin.coverage.areas import Area, CoverageGrid, area_records, class_lists, ground_of
 from radiotwin.coverage.radio import (
+    Bounds,
+    CoverageSettings,
     ServerTally,
     location_probability,
     rate_bps,
     thermal_noise_dbm,
 )
-from radiotwin.coverage.settings import Bounds, CoverageSettings
 from radiotwin.coverage.sources import (
     GainSource,
     MapSource,

@@ -6,14 +6,15 @@ from radiotwin.report.closeloop_words import closeloop_summary
 from radiotwin.report.comparison import write_comparison_figures
 from radiotwin.report.coverage_figures import write_coverage_pictures
 from radiotwin.report.folders import (
+    Run,
     check_closeloop_folder,
     check_map_target,
     export_map,
+    read_run,
     write_closeloop_folder,
     write_comparison_folder,
 )
 from radiotwin.report.map_figures import write_picture
-from radiotwin.report.run_folder import Run, read_run
 from radiotwin.report.run_page import write_report
 
 __all__ = ["Run", "check_closeloop_folder", "check_map_target",

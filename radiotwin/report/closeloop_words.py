@@ -65,7 +65,7 @@ def cause_names(report: dict) -> list[str]:
 def is_sure(report: dict) -> bool:
     """Return whether each cause that was found has a probability of at least `SURE`.
 
-    Steps between flights have none; a report of version 0.1 has none at all.
+    Steps between flights have none.
     """
     return not report["posterior"] or all(
         (each.get("probability") or 0.0) >= SURE for each in _causes(report))
@@ -162,7 +162,7 @@ def probability(value: float | None) -> str:
 
 
 def _criteria(report: dict) -> dict[str, float]:
-    """Return the report's criteria; of version 0.1, today's."""
+    """Return the report's criteria, and today's in place of those that it lacks."""
     return SelectionCriteria().to_json() | report.get("criteria", {})
 
 

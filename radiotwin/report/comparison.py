@@ -1,11 +1,4 @@
-"""A comparison of models: its tables, its figures, and its part of a run's page.
-
-Read further models for a comparison, write its tables, and read them.
-
-Draw a comparison of models: maps, held-out links and located devices.
-
-Make the part of a run's page on a comparison of models.
-"""
+"""A comparison of models: its tables, its figures, and its part of a run's page."""
 
 import json
 import warnings
@@ -29,9 +22,8 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.maps.form import is_zarr
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report.html import Table, read_picture
-from radiotwin.report.labels import MODELS
+from radiotwin.report.labels import LOS_COLOUR, MODELS, NLOS_COLOUR, save
 from radiotwin.report.map_figures import model_maps_figure, panels, true_positions_m
-from radiotwin.report.style import LOS_COLOUR, NLOS_COLOUR, save
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 from radiotwin.scene.plot import draw_heights, height_grid

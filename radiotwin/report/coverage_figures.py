@@ -10,7 +10,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from radiotwin.coverage import Coverage
 from radiotwin.coverage.legends import Legend, drawn_rasters, file_stem, legend_of
-from radiotwin.report.style import new_figure, plain, save
+from radiotwin.report.labels import new_figure, plain, save
 from radiotwin.scene import Scene
 from radiotwin.scene.plot import height_grid
 

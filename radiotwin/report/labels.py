@@ -1,6 +1,15 @@
-"""Names of variables, effects, models and parameters as they are printed."""
+"""The look that all pages and figures share: printed names, colours, canvas and file."""
 
+import io
 import re
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from radiotwin.display import plain
+from radiotwin.io.files import atomic_file
 
 VARIABLES = {  # label and unit
     "distance_m": ("distance", "m"), "elevation_deg": ("elevation at the device", "°"),
@@ -63,6 +72,9 @@ MODELS = {"log_distance": "log-distance", "segmented_log_distance": "segmented l
 NAMES = MODELS | {"log_distance": "log-distance law", "raytrace": "ray tracer"}
 INTERPOLATIONS = ("correlated_shadowing", "unexplained_trend")
 """Effects that fit what is left without a cause."""
+LOS_COLOUR, NLOS_COLOUR = "#2a7f9e", "#d1495b"
+BEFORE, AFTER, FITTED, FOUND = "#c2571a", "#1f6f8b", "#22272c", "#7a0177"
+DPI = 110
 
 
 def name_label(name: str) -> str:
@@ -103,3 +115,36 @@ def _split_unit(name: str) -> tuple[str, str]:
         if name.endswith(suffix) and name != suffix:
             return name.removesuffix(suffix), unit
     return name, ""
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure that is drawn without a screen; sizes in inches."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, path: Path | str) -> None:
+    """Write a figure as a PNG file, completely or not at all."""
+    data = io.BytesIO()  # Pillow loses the reason of a write to a file that fails
+    figure.savefig(data, dpi=DPI, format="png")
+    with atomic_file(path) as file:
+        file.write(data.getbuffer())
+
+
+def hide_spines(ax: Axes) -> None:
+    """Draw the axes on two sides only."""
+    ax.spines[["top", "right"]].set_visible(False)
+
+
+def shorten(text: str, max_length: int = 14) -> str:
+    """Cut a name so that it fits under an axis."""
+    return plain(text, max_length)
+
+
+def draw_legend_below(figure: Figure, title: str = "") -> None:
+    """Put the legend of a figure's first axes below all axes; with a title alone it is a note."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    if handles or title:
+        figure.legend(handles, labels, title=title, loc="outside lower center", ncols=3,
+                      frameon=False)

@@ -25,7 +25,7 @@ from tests.fuzz.sandbox import resident_bytes
 
 MAX_S, MAX_BYTES = 20, 2 * 2**30
 HERE = Path(__file__).parents[1]
-STORED, CLOSELOOP_1 = HERE / "twin" / "stored", HERE / "closeloop" / "version_1" / "closeloop.json"
+STORED, CLOSELOOP = HERE / "twin" / "stored", HERE / "closeloop" / "sample" / "closeloop.json"
 SQUARE = [[8.001, 50.001], [8.002, 50.001], [8.002, 50.002], [8.001, 50.002], [8.001, 50.001]]
 SECRET = "only for its owner: 4711"
 SURVEY = "survey scene --truth segmented --flights 1 -o out.csv"

@@ -36,7 +36,7 @@ def survey(device_m, blocked=None, seed=0):
 def close_loop(run, tmp_path, monkeypatch, quick_report):
     """Run the command on tables: exit status, standard output and error. Pictures are drawn coarsely, and without the
     search for room between their parts, which would take longer than all else."""
-    monkeypatch.setattr("radiotwin.report.style.DPI", 30)
+    monkeypatch.setattr("radiotwin.report.labels.DPI", 30)
     monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: {})
 
     def close_loop(links, devices, arguments="", prepare=None):

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from tests.cli.strangers import (
-    CLOSELOOP_1,
+    CLOSELOOP,
     FIT,
     MAP,
     MAP_IN,
@@ -130,7 +130,7 @@ def run_folder(folder):
     (folder / "run").mkdir()
     for name in ("scene", "twin"):
         (folder / name).rename(folder / "run" / name)
-    shutil.copy(CLOSELOOP_1, folder / "run" / "closeloop.json")
+    shutil.copy(CLOSELOOP, folder / "run" / "closeloop.json")
     return folder / "run"
 
 

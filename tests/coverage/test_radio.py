@@ -3,8 +3,13 @@ import math
 import numpy as np
 import pytest
 
-from radiotwin.coverage.radio import ServerTally, location_probability, rate_bps, thermal_noise_dbm
-from radiotwin.coverage.settings import RateModel
+from radiotwin.coverage.radio import (
+    RateModel,
+    ServerTally,
+    location_probability,
+    rate_bps,
+    thermal_noise_dbm,
+)
 
 
 def test_thermal_noise_is_minus_174_dbm_a_hertz():

@@ -8,8 +8,7 @@ import pytest
 import shapely
 
 from radiotwin.coverage import CoverageSettings, Transmitter, predict_coverage
-from radiotwin.coverage.areas import Area, _covered
-from radiotwin.coverage.grid import CoverageGrid, ground_of
+from radiotwin.coverage.areas import Area, CoverageGrid, _covered, ground_of
 from radiotwin.errors import BadInput
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import coverage_figures
@@ -190,7 +189,7 @@ def test_blocks_do_not_change_the_result(build, twin_of, house, monkeypatch):
     scene = build(house(100, 100, 300, 200, 20), devices=devices)
     settings = CoverageSettings(step_m=20.0)
     whole = predict_coverage("p1411", scene, settings=settings)
-    monkeypatch.setattr("radiotwin.coverage.grid.BLOCK_CELLS", 120)
+    monkeypatch.setattr("radiotwin.coverage.areas.BLOCK_CELLS", 120)
     parts = predict_coverage("p1411", scene, settings=settings)
     assert whole.dataset.identical(parts.dataset) and whole.summary == parts.summary
 

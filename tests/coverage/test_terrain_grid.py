@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.coverage.grid import CoverageGrid, ground_of
+from radiotwin.coverage.areas import CoverageGrid, ground_of
 from radiotwin.scene.lattice import Lattice
 from tests.terrains import incline, terrain_map
 

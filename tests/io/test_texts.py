@@ -4,7 +4,7 @@ import pytest
 
 from radiotwin.display import plain
 from radiotwin.io.texts import MAX_TEXT, percent, shortly, shown, shown_data
-from radiotwin.report.style import shorten
+from radiotwin.report.labels import shorten
 
 
 @pytest.mark.parametrize("text, expected", [

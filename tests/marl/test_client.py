@@ -13,10 +13,14 @@ import marl.replicas
 from marl.algorithm1 import run_algorithm
 from marl.fedqmix import federation
 from marl.fedqmix.client import Client, Party, ProximalNetworks, rounds_of
-from marl.fedqmix.federation import average, require_weights
+from marl.fedqmix.federation import average, initial_weights, require_weights
 from marl.fedqmix.session import FederatedSession, federate
-from marl.fedqmix.settings import EngineSettings, FederationSettings, check_federation
-from marl.fedqmix.shared import Shared, initial_weights
+from marl.fedqmix.settings import (
+    EngineSettings,
+    FederationSettings,
+    Shared,
+    check_federation,
+)
 from marl.settings import PRESETS, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.maps.survey import fly_survey, segmented_truth

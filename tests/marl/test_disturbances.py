@@ -3,14 +3,13 @@
 import numpy as np
 import torch
 
-from marl.disturbances import Disturbance, DisturbedEnvironment
-from marl.environment import Environment
-from marl.features import observation_size
+from marl.environment import Environment, observation_size
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy
 from marl.mission import HOVER, NO_OP
 from marl.qmix import Agent
 from marl.training import AgentPolicy
+from studies.disturbed import Disturbance, DisturbedEnvironment
 
 
 def flown(mission, disturbance, flights=200):

@@ -4,8 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marl.environment import Environment
-from marl.features import global_state, observation_size, observe, state_size
+from marl.environment import Environment, global_state, observation_size, observe, state_size
 from marl.heuristics import random_actions
 
 

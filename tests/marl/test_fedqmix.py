@@ -13,7 +13,7 @@ import time
 import pytest
 
 from marl.checkpoint import load_checkpoint
-from marl.options import settings_of
+from marl.settings import settings_of
 from radiotwin.runtime import cuda
 
 SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "

@@ -25,20 +25,23 @@ from flwr.supercore.task_identity import TaskIdentity  # noqa: E402
 
 import marl.replicas  # noqa: E402
 from marl.checkpoint import load_checkpoint  # noqa: E402
-from marl.fedqmix import flower_client  # noqa: E402
+from marl.fedqmix import flower_app  # noqa: E402
 from marl.fedqmix.client import Party  # noqa: E402
-from marl.fedqmix.federation import average  # noqa: E402
-from marl.fedqmix.flower_records import arrays_of
+from marl.fedqmix.federation import average, initial_weights  # noqa: E402
+from marl.fedqmix.flower_app import Record, arrays_of, make_strategy  # noqa: E402
 from marl.fedqmix.flower_run import (  # noqa: E402
     Federation,
     Processes,
     free_port,
     make_node_key,  # noqa: E402
 )
-from marl.fedqmix.flower_server import Record, make_strategy  # noqa: E402
 from marl.fedqmix.session import FederatedSession, federate  # noqa: E402
-from marl.fedqmix.settings import EngineSettings, FederationSettings  # noqa: E402
-from marl.fedqmix.shared import Shared, initial_weights, write_app
+from marl.fedqmix.settings import (  # noqa: E402
+    EngineSettings,
+    FederationSettings,
+    Shared,
+    write_app,
+)
 from marl.settings import PRESETS, RunSettings  # noqa: E402
 from radiotwin.errors import RunFailed  # noqa: E402
 
@@ -184,20 +187,20 @@ def test_fedprox_sends_its_weight_and_parties_read_the_same(shared, tmp_path):
 @pytest.fixture
 def context(small_scene, shared, tmp_path, monkeypatch):
     monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 1)
-    monkeypatch.delenv(flower_client.PARTIES, raising=False)
+    monkeypatch.delenv(flower_app.PARTIES, raising=False)
     node = {"scene": str(small_scene.folder), "out": str(tmp_path / "party"), "number": 0, "truth": "segmented"}
     return Context(run_id=5, node_id=7, node_config=node, state=RecordDict(), run_config=flat(shared))
 
 
 def test_nothing_but_weights_and_counts_leaves_a_party(shared, context, small_scene):
-    trained = flower_client.app(asked(shared), context)
+    trained = flower_app.client_app(asked(shared), context)
     like = initial_weights(shared)
     assert trained.has_content() and set(trained.content) == {"arrays", "metrics"}
     assert dict(trained.content["metrics"]) == {"num-examples": 8}
     arrays = trained.content["arrays"]
     assert {name: (array.shape, array.dtype) for name, array in arrays.items()} == {
         name: (array.shape, "float64") for name, array in like.items()}
-    evaluated = flower_client.app(asked(shared, "evaluate"), context)
+    evaluated = flower_app.client_app(asked(shared, "evaluate"), context)
     assert set(evaluated.content) == {"metrics"} and dict(evaluated.content["metrics"]) == {"num-examples": 2}
     # Nothing stays in Flower's hands between messages either, and no text of the scene is in what is sent.
     assert not context.state
@@ -213,8 +216,8 @@ def test_nothing_but_weights_and_counts_leaves_a_party(shared, context, small_sc
 @pytest.mark.parametrize("change", [{"scene": "/nowhere/secret_place"}, {"number": -1}, {"other": "secret_place"}])
 def test_an_error_says_nothing_of_what_a_party_holds(change, shared, context, capfd):
     context.node_config.update(change)
-    reply = flower_client.app(asked(shared), context)
-    assert reply.has_error() and reply.error.reason == flower_client.ERROR_REASON
+    reply = flower_app.client_app(asked(shared), context)
+    assert reply.has_error() and reply.error.reason == flower_app.ERROR_REASON
     assert "BadInput" in capfd.readouterr().err  # the party itself is told
 
 

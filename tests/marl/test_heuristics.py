@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from marl.environment import Environment
-from marl.features import observe
+from marl.environment import Environment, observe
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy, greedy_actions, random_actions, waypoint_actions
 from marl.mission import EAST, HOVER, NO_OP, NORTH

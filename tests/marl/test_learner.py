@@ -9,10 +9,15 @@ import pytest
 
 from marl.algorithm1 import run_algorithm
 from marl.learner import Learner, make_learner
-from marl.options import settings_of
-from marl.registry import LEARNERS, learner_class
 from marl.session import Session
-from marl.settings import LearnerSettings, RunSettings, check_together
+from marl.settings import (
+    LEARNERS,
+    LearnerSettings,
+    RunSettings,
+    check_together,
+    learner_class,
+    settings_of,
+)
 from radiotwin.errors import BadInput
 from radiotwin.maps.survey import segmented_truth
 

@@ -5,7 +5,7 @@ import typer
 from pydantic import BaseModel, Field
 from typer.testing import CliRunner
 
-from marl.options import checked, with_settings
+from marl.settings import checked, with_settings
 from radiotwin.errors import BadInput
 
 

@@ -12,10 +12,9 @@ import marl.qmix
 from marl.environment import Environment, Frame
 from marl.flights import Flights, fly
 from marl.heuristics import HeuristicPolicy
-from marl.iql import IndependentNetworks
 from marl.learner import make_learner
 from marl.planner import Plan
-from marl.qmix import Agent, Mixer, QNetworks, td_lambda_targets
+from marl.qmix import Agent, IndependentNetworks, Mixer, QNetworks, td_lambda_targets
 from marl.settings import PRESETS, LearnerSettings, RunSettings
 
 SETTINGS = LearnerSettings(hidden=6, mixing_width=4, target_every=3, reward_scale=500.0)

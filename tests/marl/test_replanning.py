@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from marl.disturbances import Disturbance, DisturbedEnvironment
 from marl.environment import Environment
 from marl.flights import fly
 from marl.planner import PlanPolicy, plan
-from marl.replanning import ReplanPolicy
+from studies.disturbed import Disturbance, DisturbedEnvironment
+from studies.replanning import ReplanPolicy
 
 
 def policy(mission, linked, every=4, iterations=200):

@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from marl.algorithm1 import run_algorithm
-from marl.checkpoint import Damaged, load_checkpoint, save_checkpoint
+from marl.checkpoint import Damaged, _blocks, load_checkpoint, restored, save_checkpoint
 from marl.learner import make_learner
 from marl.mission import Known, make_mission
-from marl.resume import _blocks, restored
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.maps.survey import segmented_truth
@@ -95,7 +94,7 @@ def test_every_part_that_is_wrong_is_one_message(small_scene, stopped, tmp_path,
                 content = changed(state, path, new)
             except ValueError:
                 continue  # a table of columns of different lengths
-            monkeypatch.setattr("marl.resume.load_checkpoint", lambda path, content=content: content)
+            monkeypatch.setattr("marl.checkpoint.load_checkpoint", lambda path, content=content: content)
             number = isinstance(at(state, path), int | float) and isinstance(new, int | float)
             try:
                 restored(tmp_path / NAME, RUN, small_scene, learner)
@@ -117,14 +116,6 @@ def test_no_file_is_written_where_a_checkpoint_says(small_scene, stopped, tmp_pa
             execute(small_scene, tmp_path / "run")
         del state["twin"][name]
     assert [each.name for each in tmp_path.rglob("*")] == ["run", NAME]
-
-
-def test_a_pickled_checkpoint_of_before_is_refused_and_not_opened(small_scene, tmp_path):
-    content = {"format": 3, "state": {"twin": {str(tmp_path / "outside"): torch.zeros(4, dtype=torch.uint8)}}}
-    torch.save(content, tmp_path / "checkpoint.pt")
-    with pytest.raises(BadInput, match=r"checkpoint\.pt.*another version"):
-        execute(small_scene, tmp_path)
-    assert not (tmp_path / "outside").exists()
 
 
 def test_a_plan_that_leaves_the_map_is_refused(small_scene, stopped, tmp_path):

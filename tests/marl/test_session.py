@@ -51,16 +51,6 @@ def test_a_truth_that_differs_besides_its_gains_is_another(session, small_scene,
         session(True)._claim_folder(_world(small_scene, RadioMap(change(truth.dataset))))
 
 
-def test_a_run_of_an_earlier_version_is_checked_by_what_it_noted(begun, tmp_path):
-    path = tmp_path / "run" / "config.json"
-    config = json.loads(path.read_text())
-    del config["world"]["truth besides gain_db"]
-    path.write_text(json.dumps(config))
-    begun._claim_folder(WORLD)
-    with pytest.raises(BadInput, match="the truth has changed"):
-        begun._claim_folder(WORLD | {"truth": "d"})
-
-
 def test_a_truth_is_the_same_from_its_file(small_scene, tmp_path):
     truth = segmented_truth(small_scene)
     truth.save(tmp_path / "truth.nc")

@@ -2,9 +2,8 @@
 
 import pytest
 
-from marl.options import settings_of
-from marl.settings import LearnerSettings, RunSettings
-from marl.threads import check_sizes
+from marl.replicas import check_sizes
+from marl.settings import LearnerSettings, RunSettings, settings_of
 from radiotwin.errors import BadInput
 
 

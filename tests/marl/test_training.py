@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from marl.environment import Environment
-from marl.features import observation_size, observe
+from marl.environment import Environment, observation_size, observe
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy
-from marl.iql import IndependentNetworks
 from marl.mission import HOVER, Mission
-from marl.qmix import Agent, QNetworks
+from marl.qmix import Agent, IndependentNetworks, QNetworks
 from marl.settings import LearnerSettings
 from marl.training import AgentPolicy, Exploration, Replay, Trainer
 

@@ -28,12 +28,14 @@ from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.effects.catalogue.tilted_dipole import TiltedDipole
 from radiotwin.links.measurements import Measurements
 from radiotwin.report.closeloop_data import bin_index, bin_means, collect
-from radiotwin.report.closeloop_figures import dependence_figure, write_closeloop_figures
-from radiotwin.report.closeloop_maps import residual_map_figure
+from radiotwin.report.closeloop_figures import (
+    dependence_figure,
+    effect_figure,
+    write_closeloop_figures,
+)
 from radiotwin.report.closeloop_page import write_closeloop_page
-from radiotwin.report.effect_figures import effect_figure
-from radiotwin.report.map_figures import MapBackground
-from radiotwin.report.style import save
+from radiotwin.report.labels import save
+from radiotwin.report.map_figures import MapBackground, residual_map_figure
 
 
 def measured(device_m, receiver_m, index, odd=0.0):

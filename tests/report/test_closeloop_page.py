@@ -7,7 +7,7 @@ from io import BytesIO
 import pytest
 from matplotlib.figure import Figure
 
-from radiotwin.cli import loop
+from radiotwin.cli import model as loop
 from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
 from radiotwin.report.closeloop_words import (

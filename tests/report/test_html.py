@@ -22,7 +22,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import html, read_run, write_closeloop_page, write_report
 from radiotwin.report.html import Table
 
-VERSION_1 = Path(__file__).parents[1] / "closeloop" / "version_1" / "closeloop.json"
+SAMPLE = Path(__file__).parents[1] / "closeloop" / "sample" / "closeloop.json"
 ATTACK = ("""</script></title></style></textarea>--><script>window.pwned=1</script><img src=x onerror="window.pwned=2">"""
           """<svg onload=pwned=3><link rel=stylesheet href=URL/a.css><img src="URL/b.png">"><a href="javascript:pwned=4">"""
           """'"` onmouseover=pwned=5 autofocus onfocus=pwned=6 {{7*7}}${pwned=7}<!--<script>\\u003cimg """
@@ -84,7 +84,7 @@ def hostile(run_folder, server, tmp_path_factory):
         for column in set(table) & {"flight", "receiver", "device"}:
             table[column] = table[column].astype(str) + in_names
         table.to_csv(folder / name, index=False, quoting=csv.QUOTE_NONNUMERIC)
-    (folder / "closeloop.json").write_text(json.dumps(poisoned(json.loads(VERSION_1.read_text()), attack)))
+    (folder / "closeloop.json").write_text(json.dumps(poisoned(json.loads(SAMPLE.read_text()), attack)))
     figure = Figure()
     figure.savefig(folder / "waterfall.png")
     links = pd.DataFrame({name: np.arange(6.0) for name in ("time_s", *(

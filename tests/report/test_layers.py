@@ -8,9 +8,9 @@ import pytest
 
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import Run, read_run
-from radiotwin.report import viewer as city
-from radiotwin.report import viewer as layers
-from radiotwin.report.viewer import NOT_DETECTED, pack, pack_db
+from radiotwin.report import run_page as city
+from radiotwin.report import run_page as layers
+from radiotwin.report.run_page import NOT_DETECTED, pack, pack_db
 from radiotwin.twin import Twin, TwinDevice
 
 

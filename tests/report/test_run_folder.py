@@ -12,7 +12,7 @@ from radiotwin.errors import BadInput
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import read_run, write_report
 
-VERSION_1 = Path(__file__).parents[1] / "closeloop" / "version_1" / "closeloop.json"
+SAMPLE = Path(__file__).parents[1] / "closeloop" / "sample" / "closeloop.json"
 
 
 def test_everything_in_a_demos_folder_is_found(run_folder):
@@ -100,7 +100,7 @@ def test_what_a_link_leads_to_is_not_read(run_folder, tmp_path, name):
     """The same content is read where it lies in the folder, and refused where a link leads out of it."""
     elsewhere, folder = tmp_path / "elsewhere", tmp_path / "run"
     shutil.copytree(run_folder, elsewhere)
-    report = json.loads(VERSION_1.read_text())
+    report = json.loads(SAMPLE.read_text())
     for path in (elsewhere, elsewhere / "closeloop"):
         path.mkdir(exist_ok=True)
         (path / "closeloop.json").write_text(json.dumps(report))
@@ -174,7 +174,7 @@ def test_maps_have_a_budget(run_folder, tmp_path, monkeypatch):
 
 
 def test_a_close_loop_without_its_entries_is_bad_input(tmp_path):
-    (tmp_path / "closeloop.json").write_text('{"schema": "radiotwin.closeloop/1"}')
+    (tmp_path / "closeloop.json").write_text('{"schema": "radiotwin.closeloop/2"}')
     with pytest.raises(BadInput, match="closeloop.json is damaged"):
         write_report(read_run(tmp_path), tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()

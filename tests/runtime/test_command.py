@@ -194,7 +194,7 @@ sys.argv = ["radiotwin", "{command}", "--help"]
 
 
 @pytest.mark.parametrize("module, number, status", [("typer", "SIGINT", 130), ("rich.console", "SIGTERM", 143),
-                                                    ("radiotwin.cli.world", "SIGINT", 130)])
+                                                    ("radiotwin.cli.scenes", "SIGINT", 130)])
 def test_a_signal_while_the_command_is_loaded_is_one_line(module, number, status):
     program = AT_IMPORT.format(module=module, number=number, command="fit")
     done = subprocess.run([sys.executable, "-c", program + "from radiotwin.cli import main; main()"], text=True,

@@ -31,13 +31,13 @@ AS_GOOD = 1.02  # ratio of errors up to which one model is as good as another
 _WORDS = {"log_distance": "the log-distance law", "segmented_log_distance": "the segmented law",
           "regression_kriging": "kriging", "extra_trees": "a tree ensemble (ExtraTrees)",
           "hist_gradient_boosting": "gradient boosting (HistGradientBoosting)"}
-SCHEMA, SCHEMA_1 = "radiotwin.closeloop/2", "radiotwin.closeloop/1"
+SCHEMA = "radiotwin.closeloop/2"
 REMEDY = "run `radiotwin close-loop` again"
 MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
-# Parts that a report need not have, as version 0.1 had not.
+# Parts that a report need not have.
 ABSENT: dict[str, Any] = {"posterior": [], "detectable": [], "combination": [], "prediction": None,
                           "receivers_compared": []}
-# Of the interpolated rest, and of effects that version 0.1 wrote.
+# Of the interpolated rest.
 NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, "probability": None}
 
 
@@ -178,74 +178,34 @@ def write_report(report: dict[str, Any], path: Path) -> None:
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """Read a `closeloop.json` of this version or of version 0.1.
+    """Read a `closeloop.json`.
 
     Args:
         path: of the file.
 
     Returns:
-        its content as of this version; each field has the type of `ReportRecord`.
+        its content; each field has the type of `ReportRecord`.
 
     Raises:
         BadInput: it cannot be read, it is of another version, or it is damaged.
     """
-    return upgrade_report(read_record(path, "result of a close-loop (closeloop.json)"), path)
-
-
-def upgrade_report(report: dict[str, Any], source: object = "closeloop.json") -> dict[str, Any]:
-    """Return the content of a `closeloop.json` of this version or of version 0.1 as of this one.
-
-    Args:
-        report: content of the file.
-        source: where it is from; messages begin with it.
-
-    Raises:
-        BadInput: it is of neither, or damaged.
-    """
-    schema = report.get("schema")
-    if schema not in (SCHEMA, SCHEMA_1):
-        raise BadInput(f"{source}: schema is {repr(schema)[:60]}, this version reads {SCHEMA!r} "
-                       f"and {SCHEMA_1!r}; make the run again")
-    if schema == SCHEMA_1:
-        try:
-            report = _from_version_1(report)
-        except (KeyError, TypeError, AttributeError) as error:
-            raise BadInput(f"{source} is damaged ({type(error).__name__}: {error}); {REMEDY}"
-                           ) from None
-    return check_report(report, source)
+    return check_report(read_record(path, "result of a close-loop (closeloop.json)"), path)
 
 
 def check_report(report: dict[str, Any], source: object = "closeloop.json") -> dict[str, Any]:
-    """Return the content of a `closeloop.json` of this version with nothing but checked fields.
+    """Return the content of a `closeloop.json` with nothing but checked fields.
 
     Args:
         report: content of the file.
         source: where it is from; messages begin with it.
 
     Raises:
-        BadInput: a field is missing or has another type.
+        BadInput: it is of another version, or a field is missing or has another type.
     """
+    if report.get("schema") != SCHEMA:
+        raise BadInput(f"{source}: schema is {repr(report.get('schema'))[:60]}, this version reads "
+                       f"{SCHEMA!r}; make the run again")
     return validated(ReportRecord, ABSENT | report, source, REMEDY)
-
-
-def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
-    new_names = {"remarks": "notes", "structure_before": "dependences_before"}
-    new = {new_names.get(name, name): value for name, value in report.items()}
-    new["effects"] = [{("params" if name == "setting" else name): value
-                       for name, value in effect.items()}
-                      | NOT_KNOWN
-                      for effect in report["effects"]]
-    new["error"] = _with_new_bias(report["error"]) | {"combined": None}
-    new["baselines"] = _with_new_bias(report["baselines"])
-    return new | {"schema": SCHEMA, "criteria": {}} | ABSENT
-
-
-def _with_new_bias(value: Any) -> Any:
-    """Turn the sign of every bias: version 1 had measured minus predicted."""
-    if not isinstance(value, dict):
-        return value
-    return {name: -each if name == "bias_db" and each is not None else _with_new_bias(each)
-            for name, each in value.items()}
 
 
 def _step(step: Step) -> dict[str, Any]:

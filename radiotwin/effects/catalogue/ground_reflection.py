@@ -215,7 +215,7 @@ def two_ray_db(device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float
         roughness_m: standard deviation of the surface's height [m].
         ground_m: height of the plane [m].
     """
-    from radiotwin.propagation.paths.coefficients import (  # late: numba
+    from radiotwin.propagation.paths.interactions import (  # late: numba
         VACUUM_PERMITTIVITY_F_M,
         fresnel,
     )

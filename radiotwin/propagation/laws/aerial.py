@@ -1,25 +1,23 @@
-"""Published laws of links through the air: Al-Hourani et al. and 3GPP TR 36.777.
+"""Published laws of links through the air: Al-Hourani et al. [1, 2] and 3GPP TR 36.777 [3].
 
-Air-to-ground law of Al-Hourani et al.: free space, plus an excess loss by class and elevation.
+Al-Hourani: free space, plus an excess loss by class and elevation. The lower end is the terminal on
+the ground, the higher one the platform. The papers' platforms fly above all roofs; where a map says
+how high those are, the validity requires it. [1] has the probability of line of sight (Eq. 5), [2]
+the excess losses and their standard deviations, by frequency.
 
-[1] Al-Hourani, Kandeepan, Lardner, 'Optimal LAP altitude for maximum coverage', IEEE Wireless
-Communications Letters 3(6), 2014: the probability of line of sight (Eq. 5).
-[2] Al-Hourani, Kandeepan, Jamalipour, 'Modeling air-to-ground path loss for low altitude platforms
-in urban environments', IEEE GLOBECOM 2014: excess losses, and their standard deviations, by
-frequency.
+TR 36.777: a receiver above 22.5 m that is the higher end is an aerial terminal (Annex B) at its
+height. The lower end, a device near the ground, is where the report has a base station at 25 m
+(UMa) or 10 m (UMi). The formulas there do not contain the base station's height; the probability of
+line of sight was simulated for it, and is too high for a device in the street. Otherwise the higher
+end, such as a mast, is the base station of TR 38.901 [4] and the lower end its terminal, with an
+environment height of 1 m.
 
-The lower end is the terminal on the ground, the higher one the platform, as in the papers, whose
-platforms fly above all roofs; where a map says how high those are, that is asked for.
-
-3GPP TR 36.777 for aerial terminals, with TR 38.901 below its range of heights.
-
-A receiver above 22.5 m that is the higher end is the aerial terminal of TR 36.777 V15.0.0, Annex B,
-at its height. The lower end, a device near the ground, stands where the report has a base station
-at 25 m (UMa) or 10 m (UMi). The formulas there do not contain the base station's height; the
-probability of line of sight was simulated for it, and is too high for a device in the street.
-
-Otherwise the higher end, such as a mast, is the base station of TR 38.901 V16.1.0, Sec. 7.4, and
-the lower end its terminal, with an environment height of 1 m.
+[1] Al-Hourani, Kandeepan, Lardner, "Optimal LAP altitude for maximum coverage", IEEE Wireless
+    Communications Letters 3(6), 2014.
+[2] Al-Hourani, Kandeepan, Jamalipour, "Modeling air-to-ground path loss for low altitude platforms
+    in urban environments", IEEE GLOBECOM 2014.
+[3] 3GPP TR 36.777 V15.0.0.
+[4] 3GPP TR 38.901 V16.1.0, Sec. 7.4.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
 """The interface of every channel model, and checks of what one is fitted to and stored as.
 
-The interface of every channel model, and the checks of the links that one is fitted to.
-
-Checks of what a channel model is stored as: names, shapes, and numbers within wide bounds.
-
-The bounds are far beyond what is measured; within them, predictions are finite.
+The bounds of stored numbers are far beyond what is measured; within them, predictions are
+finite.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Powers and directions of the paths of links over the 3D map, each followed once.
 
-What a box in a known map would block: paths that are followed once, and held against each box.
-
-Nothing is followed anew: what a box itself reflects is missing, and paths that bend at its edges
-are there for the straight line only, as those of knife edges, which the caller adds.
+`KnownPaths` keeps the paths of links and tests each of them against a box, such as an unknown
+building. What the box itself reflects is missing. Paths that bend at its edges count for the
+straight line only, as those of knife edges, which the caller adds.
 """
 
 import time

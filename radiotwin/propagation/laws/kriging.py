@@ -1,8 +1,6 @@
-"""Regression kriging, and the Gaussian process that interpolates its residual.
+"""Regression kriging: the segmented log-distance law plus each device's interpolated residual.
 
-Regression kriging: the segmented log-distance law plus each device's interpolated residual.
-
-Interpolation of a law's residual: a Gaussian process over positions, one field a series.
+The interpolation is a Gaussian process over positions, one field for each series of links.
 """
 
 from __future__ import annotations

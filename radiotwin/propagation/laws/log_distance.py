@@ -1,9 +1,4 @@
-"""The log-distance law: one line for all links, or one with and one without line of sight.
-
-The log-distance law with one exponent for all links, the baseline that needs no map.
-
-The log-distance law with one line for links with line of sight and one for those without.
-"""
+"""The log-distance law: one line for all links, which needs no map, or one by class."""
 
 from __future__ import annotations
 

@@ -1,18 +1,11 @@
 """How wrong a 3D map seems to be: the shift of the whole, and errors of walls and roofs.
 
-How wrong a 3D map seems to be, from what measured levels leave of the paths over it.
-
 The whole map may be shifted, its surfaces may reflect and diffract otherwise than declared, and
-each wall and each roof may be off.
-
-How far a whole 3D map is shifted against what was measured over it.
-
-Sizes of the errors of a map's walls and roofs, from what paths over it leave of measured levels.
-
-A wrong wall or roof shows where a small shift of it changes the paths: next to the border of a
-shadow, hardly in the open. So the paths are followed over maps with errors of known sizes, and the
-sizes are sought whose changes go with the residuals' (maximum likelihood): the variance of a link
-is that of its class plus what errors of the map would do to it.
+each wall and each roof may be off. A wrong wall or roof shows where a small shift of it changes the
+paths: next to the border of a shadow, hardly in the open. So the paths are followed over maps with
+errors of known sizes, and the sizes are sought whose changes agree with the residuals (maximum
+likelihood): the variance of a link is that of its class plus what errors of the map would do to
+it.
 """
 
 from __future__ import annotations
@@ -26,12 +19,13 @@ from scipy.stats import ttest_1samp
 from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.base import require_names, require_number
-from radiotwin.propagation.laws.class_fit import LinkFit, links_as_one
 from radiotwin.propagation.laws.image_paths import (
     MAX_OFFSET_DB,
     ImagePaths,
+    LinkFit,
     Offsets,
     fit_offsets,
+    links_as_one,
     moved,
     paths_db,
 )

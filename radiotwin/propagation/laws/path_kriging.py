@@ -19,8 +19,14 @@ from radiotwin.propagation.laws.base import (
     require_names,
     require_number,
 )
-from radiotwin.propagation.laws.class_fit import DOF, fit_class, scale_db
-from radiotwin.propagation.laws.image_paths import DIFFUSE_DEFAULT, paths_db, stored_diffuse
+from radiotwin.propagation.laws.image_paths import (
+    DIFFUSE_DEFAULT,
+    DOF,
+    fit_class,
+    paths_db,
+    scale_db,
+    stored_diffuse,
+)
 from radiotwin.propagation.laws.kriging import RegressionKriging, ResidualField
 from radiotwin.propagation.laws.map_error import Found, MapError, estimate_map_error
 from radiotwin.scene.citymap import perturbed_map

@@ -1,17 +1,12 @@
 """Every channel model by name, and a fitted one as a safetensors file.
 
-Every channel model by name: the built-in ones, and what installed packages add.
-
 A package adds models under the entry-point group `radiotwin.channels`; a script adds one with
-`register`.
-
-A fitted channel model as one safetensors file: arrays and JSON, no code that loading runs.
+`register`. The file holds arrays and JSON, no code that loading runs.
 """
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 from safetensors.numpy import save
@@ -19,8 +14,7 @@ from safetensors.numpy import save
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import Limit
 from radiotwin.io.array_file import parse_arrays
-from radiotwin.io.files import atomic_file
-from radiotwin.io.inputs import parse_json, read_bytes
+from radiotwin.io.inputs import parse_json
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.aerial import (
     AlHouraniDenseUrban,
@@ -35,8 +29,8 @@ from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.propagation.laws.path_kriging import PathKriging
+from radiotwin.propagation.laws.published import P1411, WalfischIkegami, WalfischIkegamiMetropolitan
 from radiotwin.propagation.laws.segmented_nn import SegmentedNN
-from radiotwin.propagation.laws.urban import P1411, WalfischIkegami, WalfischIkegamiMetropolitan
 from radiotwin.runtime.pieces import kept
 from radiotwin.runtime.plugins import load_plugins
 
@@ -100,17 +94,6 @@ def channel_named(name: str) -> type[ChannelModel]:
     return models[name]
 
 
-def save_channel(model: ChannelModel, path: str | Path) -> None:
-    """Write a fitted model, so that `load_channel` returns one with equal predictions.
-
-    Args:
-        model: fitted.
-        path: file to write; replaced if it is there.
-    """
-    with atomic_file(path) as file:
-        file.write(encode_channel(model))
-
-
 def fit_once(kind: type[ChannelModel], links: LinkGeometry, level_db: np.ndarray,
              limit_db: Limit, seed: int) -> ChannelModel:
     """Fit a new model, or take it from an earlier run that was to fit the same.
@@ -129,22 +112,6 @@ def fit_once(kind: type[ChannelModel], links: LinkGeometry, level_db: np.ndarray
                 lambda: kind().fit(links, level_db, limit_db, seed), kind.state, kind.from_state)
 
 
-def load_channel(path: str | Path) -> ChannelModel:
-    """Read a model that `save_channel` wrote.
-
-    Args:
-        path: file to read.
-
-    Returns:
-        fitted model
-
-    Raises:
-        BadInput: the file is missing, damaged, of a model that is not installed, or of something
-            else.
-    """
-    return decode_channel(read_bytes(path, "channel model"), path)
-
-
 def encode_channel(model: ChannelModel, beside: dict[str, np.ndarray] | None = None) -> bytes:
     """Return a fitted model as the content of a safetensors file.
 
@@ -159,11 +126,6 @@ def encode_channel(model: ChannelModel, beside: dict[str, np.ndarray] | None = N
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, header)
 
 
-def decode_channel(data: bytes, source: object) -> ChannelModel:
-    """Return the model that `encode_channel` described; arguments as of `decode_both`."""
-    return decode_both(data, source)[0]
-
-
 def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np.ndarray]]:
     """Return the model that `encode_channel` described, and the arrays beside it.
 
@@ -172,7 +134,7 @@ def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np
         source: where it is from, for the message.
 
     Raises:
-        BadInput: as `load_channel`.
+        BadInput: it is damaged, of a model that is not installed, or of something else.
     """
     models = channel_models()
     try:

@@ -1,8 +1,6 @@
-"""The segmented law corrected by a small ensemble of neural networks.
+"""The segmented law, corrected by a small ensemble of networks where measurements support it.
 
-The segmented log-distance law, corrected by a neural network where measurements support it.
-
-A small ensemble of networks, trained together, each stopped early on links held out from it.
+The networks are trained together, and each is stopped early on links held out from it.
 """
 
 from __future__ import annotations

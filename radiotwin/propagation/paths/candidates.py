@@ -1,8 +1,10 @@
-"""Sequences of interactions that are tried: found by shooting rays, and ways to edges.
+"""Sequences of interactions that are tried from one device: facets by shooting rays, and edges.
 
-Sequences of interactions that are tried from one device.
-
-Ways from a device to the edges that it lights, directly or after reflections.
+A path of several reflections visits a sequence of facets. A city has too many sequences to try
+them all, so rays are shot from the device in all directions and reflected where they hit; the
+sequences that they visit are the candidates [1]. The paths themselves are then found by the image
+method, exactly. Facets that face the device, and their edges, are candidates whether a ray hits or
+not.
 
 A city has far more edges than a device sees. Points along each edge are therefore joined with the
 device, by way of the facets in between; an edge of which the device sees no such point is not
@@ -10,13 +12,7 @@ tried. Of the facets that are seen from an edge only those count which the cone 
 can reach: by Keller's law a receiver, or its image, decides where on the edge the ray bends, so
 the corners of a facet bound that place.
 
-Sequences of facets that rays visit, found by shooting and bouncing rays.
-
-A path of several reflections visits a sequence of facets. A city has too many sequences to try
-them all, so rays are shot from the device in all directions and reflected where they hit; the
-sequences that they visit are the candidates (Ling, Chou, Lee, "Shooting and bouncing rays", IEEE
-Trans. Antennas Propag. 37(2), 1989). The paths themselves are then found by the image method,
-exactly. Facets that face the device, and their edges, are candidates whether a ray hits or not.
+[1] Ling, Chou, Lee, "Shooting and bouncing rays", IEEE Trans. Antennas Propag. 37(2), 1989.
 """
 
 from collections import OrderedDict
@@ -28,7 +24,6 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from radiotwin.propagation.paths.clearance import clear_paths
 from radiotwin.propagation.paths.facets import (
     Edges,
     Facets,
@@ -41,10 +36,12 @@ from radiotwin.propagation.paths.images import (
     MAX_INTERACTIONS,
     Candidates,
     PathBuffer,
+    clear_paths,
     reflections_back,
     sequence_length,
     source_images,
 )
+from radiotwin.propagation.paths.interactions import around_edge
 from radiotwin.propagation.paths.pruning import cone_misses, lit_part
 from radiotwin.propagation.paths.surfaces import (
     ALONG,
@@ -57,7 +54,6 @@ from radiotwin.propagation.paths.surfaces import (
     pack,
 )
 from radiotwin.propagation.paths.two_edges import FacetEdges
-from radiotwin.propagation.paths.wedges import around_edge
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 

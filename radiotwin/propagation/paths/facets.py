@@ -1,23 +1,18 @@
 """Facets and edges of a triangulated city.
 
-Planar facets of a city: triangles of one material that share a segment and lie in one plane.
-
-Edges of a city that diffract: roof edges and corners of buildings.
-
-Faces of two materials form no edge. In Sionna RT, whose gains are the truth here, they belong to
-two meshes, and no ray is diffracted where two meshes meet; `build-scene --material` gives a
-building one material where its roof is to diffract.
-
-Around a segment the triangles that meet there are sorted by angle; an open sector of more than
-180 degrees between two of them is a wedge. This also holds where several buildings touch: a shared
-wall that is built over leaves no wedge.
-
-A triangulated city as a graph: which triangles meet along which segments.
-
 City models are rarely clean: corners are stored once per building, walls are cut into slices that
 do not end where those of the neighbour do (T-junctions), and slivers are left over. So corners
 closer than `WELD_M` become one, every side of a triangle is split at the corners that lie on it,
 and slivers are dropped; their neighbours then meet along the same short segments.
+
+A facet is triangles of one material that share a segment and lie in one plane. Around a segment the
+triangles that meet there are sorted by angle; an open sector of more than 180 degrees between two
+of them is an edge that diffracts. This also holds where several buildings touch: a shared wall that
+is built over leaves no edge.
+
+Faces of two materials form no edge. In Sionna RT, whose gains are the truth here, they belong to
+two meshes, and no ray is diffracted where two meshes meet; `build-scene --material` gives a
+building one material where its roof is to diffract.
 """
 
 from dataclasses import dataclass

@@ -1,18 +1,16 @@
-"""Power gain of a path: the field of its ray, followed from one interaction to the next.
+"""Power gain of a path, and its complex gain between vertically polarised antennas.
 
-Polarisation is followed even where the result is averaged over it: every vertical wall reflects
-the vertical polarisation more strongly than the horizontal one.
-
-Complex gain of a path between vertically polarised antennas.
+The field of the ray is followed from one interaction to the next. Polarisation is followed even
+where the result is averaged over it: every vertical wall reflects the vertical polarisation more
+strongly than the horizontal one.
 """
 
 import numpy as np
 
-from radiotwin.propagation.paths.coefficients import Slabs
 from radiotwin.propagation.paths.images import Candidates, PathBuffer, sequence_length
+from radiotwin.propagation.paths.interactions import Slabs, diffract, reflect
 from radiotwin.propagation.paths.surfaces import MATERIAL, Surfaces
 from radiotwin.propagation.paths.vectors import cross, dot
-from radiotwin.propagation.paths.wedges import diffract, reflect
 from radiotwin.runtime.compiled import njit
 
 VERTICAL, AVERAGE = 0, 1
@@ -32,7 +30,7 @@ def path_gains(
         slabs: materials of the map.
         polarisation: VERTICAL of both antennas; or AVERAGE over those of the transmitting one,
             where the receiving one takes in all.
-        wedge: LUEBBERS or SIONNA, see `radiotwin.propagation.paths.coefficients`.
+        wedge: LUEBBERS or SIONNA, see `radiotwin.propagation.paths.interactions`.
         buffer: the paths.
         rows: (m,) paths of the buffer to compute.
         gain: (m,) output, linear.

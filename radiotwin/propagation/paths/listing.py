@@ -1,11 +1,9 @@
-"""All paths between devices and points: each by itself, and as one NetCDF file.
-
-All paths between a scene's devices and any points, as one dataset and NetCDF file.
+"""All paths between a scene's devices and any points, as one dataset and NetCDF file.
 
 The paths are a contiguous ragged array of the CF conventions, section 9.3.3: those of the first
-link, then those of the second, and so on; `path_count` has their numbers.
-
-Each path between devices and receivers by itself: field, way, angles and interactions.
+link, then those of the second, and so on; `path_count` has their numbers. Each has its field, its
+way, its angles and its interactions. Each link has the spreads of delay, angle and Doppler, the K
+factor and the impulse response of its paths.
 """
 
 from collections.abc import Iterator
@@ -24,13 +22,10 @@ from radiotwin.errors import BadInput
 from radiotwin.io.budgets import PATHS, RESPONSE_VALUES, ROWS
 from radiotwin.io.files import atomic_file, require_suffix, require_writable
 from radiotwin.maps.form import CONVENTIONS
-from radiotwin.propagation.paths import statistics
 from radiotwin.propagation.paths.candidates import candidate_search
-from radiotwin.propagation.paths.clearance import found_clear
-from radiotwin.propagation.paths.coefficients import slabs_of
 from radiotwin.propagation.paths.fields import path_amplitudes
-from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer
-from radiotwin.propagation.paths.wedges import LUEBBERS
+from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
+from radiotwin.propagation.paths.interactions import LUEBBERS, slabs_of
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
@@ -53,6 +48,7 @@ _LONG_NAMES = {
     "tap_delay_s": "delay after the link's first path",
     "interaction_m": "points of interaction, from device to receiver (NaN: none)",
 }
+EDGE_TAPS = 16  # before the first and after the last path: a path between two taps rings that long
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,11 +288,11 @@ def _describe(dataset: xr.Dataset, parts: list[_Paths], frequency_hz: float,
     count = np.bincount(link, minlength=links)
     values: dict[str, Any] = {
         "path_count": (count, {"sample_dimension": "path", "long_name": "number of paths"}),
-        "gain_db": _db(statistics.sums(power, link, links)),
-        "coherent_gain_db": _db(np.abs(statistics.sums(amplitude, link, links)) ** 2),
+        "gain_db": _db(sums(power, link, links)),
+        "coherent_gain_db": _db(np.abs(sums(amplitude, link, links)) ** 2),
         "first_delay_s": np.where(count > 0, first_s, np.nan),
-        "rms_delay_spread_s": statistics.rms_spread(delay_s, power, link, links),
-        "k_factor_db": statistics.k_factor_db(power, kinds[:, 0] == NO_INTERACTION, link, links)}
+        "rms_delay_spread_s": rms_spread(delay_s, power, link, links),
+        "k_factor_db": k_factor_db(power, kinds[:, 0] == NO_INTERACTION, link, links)}
     of_paths: dict[str, np.ndarray] = {
         "link_of_path": link.astype(np.int32), "path_gain_db": path_gain_db,
         "phase_rad": np.angle(amplitude), "delay_s": delay_s}
@@ -306,14 +302,14 @@ def _describe(dataset: xr.Dataset, parts: list[_Paths], frequency_hz: float,
         elevation = np.arcsin(np.clip(way[:, 2], -1, 1))
         of_paths[f"{end}_azimuth_deg"] = np.degrees(azimuth) % 360
         of_paths[f"{end}_elevation_deg"] = np.degrees(elevation)
-        values[f"{end}_azimuth_spread_deg"] = statistics.angular_spread_deg(
+        values[f"{end}_azimuth_spread_deg"] = angular_spread_deg(
             azimuth, power, link, links)
-        values[f"{end}_zenith_spread_deg"] = statistics.angular_spread_deg(
+        values[f"{end}_zenith_spread_deg"] = angular_spread_deg(
             elevation, power, link, links)
         if end == "arrival" and velocity is not None:
-            shift_hz = statistics.doppler_hz(way, velocity, speed_of_light / frequency_hz)
+            shift_hz = doppler_hz(way, velocity, speed_of_light / frequency_hz)
             of_paths["doppler_hz"] = shift_hz
-            values["doppler_spread_hz"] = statistics.rms_spread(shift_hz, power, link, links)
+            values["doppler_spread_hz"] = rms_spread(shift_hz, power, link, links)
     for name, value in values.items():
         dataset[name] = ("link", *value) if isinstance(value, tuple) else ("link", value)
     for name, value in of_paths.items():
@@ -328,10 +324,10 @@ def _describe(dataset: xr.Dataset, parts: list[_Paths], frequency_hz: float,
     dataset["axis"] = "axis", np.array(list("xyz"), dtype=object)
     if bandwidth_hz is not None:
         excess_s = delay_s - first_s[link]
-        taps = statistics.tap_count(excess_s, bandwidth_hz)
+        taps = tap_count(excess_s, bandwidth_hz)
         RESPONSE_VALUES.check(links * taps, f"impulse responses of {links} links, {taps} taps each")
-        response = statistics.impulse_response(amplitude, excess_s, link, links, bandwidth_hz, taps)
-        dataset["tap_delay_s"] = "tap", (np.arange(taps) - statistics.EDGE_TAPS) / bandwidth_hz
+        response = impulse_response(amplitude, excess_s, link, links, bandwidth_hz, taps)
+        dataset["tap_delay_s"] = "tap", (np.arange(taps) - EDGE_TAPS) / bandwidth_hz
         for name, part in (("real", response.real), ("imaginary", response.imag)):
             dataset[f"response_{name}"] = ("link", "tap"), part, {
                 "long_name": f"{name} part of the band-limited impulse response"}
@@ -357,3 +353,117 @@ def _write(dataset: xr.Dataset, path: Path | str) -> None:
                                                             encoding=encoding)
     with atomic_file(path) as file:
         file.write(content.getbuffer())
+
+
+def sums(values: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
+    """Return the sum (links,) of real or complex values (p,) over the paths of each link.
+
+    Args:
+        values: (p,) of the paths.
+        link: (p,) row of each path's link.
+        links: number of links.
+    """
+    if np.iscomplexobj(values):
+        return sums(values.real, link, links) + 1j * sums(values.imag, link, links)
+    return np.bincount(link, weights=values, minlength=links)
+
+
+def rms_spread(values: np.ndarray, power: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
+    """Return the power-weighted standard deviation of a quantity over the paths of each link.
+
+    Of delays this is the RMS delay spread (Rappaport, "Wireless Communications", 2nd ed., 2002, eq.
+    5.35), of Doppler shifts the RMS Doppler spread.
+
+    Args:
+        values: (p,) of the paths.
+        power: (p,) linear.
+        link: (p,) row of each path's link.
+        links: number of links.
+
+    Returns:
+        (links,) in the unit of `values`; NaN where there is no path.
+    """
+    total = sums(power, link, links)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = sums(power * values, link, links) / total
+        return np.sqrt(sums(power * (values - mean[link]) ** 2, link, links) / total)
+
+
+def angular_spread_deg(angle_rad: np.ndarray, power: np.ndarray, link: np.ndarray, links: int
+                       ) -> np.ndarray:
+    """Return the circular angular spread of each link (3GPP TR 38.901, Annex A.1).
+
+    Args:
+        angle_rad: (p,) azimuths or zeniths [rad].
+        power: (p,) linear.
+        link: (p,) row of each path's link.
+        links: number of links.
+
+    Returns:
+        (links,) [degrees]; NaN where there is no path.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        resultant = np.abs(sums(power * np.exp(1j * angle_rad), link, links)) \
+            / sums(power, link, links)
+        return np.degrees(np.sqrt(-2 * np.log(np.clip(resultant, 1e-300, 1))))
+
+
+def k_factor_db(power: np.ndarray, direct: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
+    """Return the power of the direct path over that of all others [dB].
+
+    Args:
+        power: (p,) linear.
+        direct: (p,) bool: the path has no interaction.
+        link: (p,) row of each path's link.
+        links: number of links.
+
+    Returns:
+        (links,); NaN where there is no direct path, or no other.
+    """
+    first, rest = sums(power * direct, link, links), sums(power * ~direct, link, links)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where((first > 0) & (rest > 0), 10 * np.log10(first / rest), np.nan)
+
+
+def doppler_hz(arrival: np.ndarray, velocity_m_s: np.ndarray, wavelength_m: float) -> np.ndarray:
+    """Return the Doppler shifts (p,) of paths to a moving receiver, positive where it approaches.
+
+    Args:
+        arrival: (p, 3) unit vectors from the receiver along the paths.
+        velocity_m_s: (3,) of the receiver [m/s].
+        wavelength_m: of the carrier [m].
+    """
+    return arrival @ velocity_m_s / wavelength_m
+
+
+def tap_count(excess_s: np.ndarray, bandwidth_hz: float) -> int:
+    """Return the number of taps that hold paths of these excess delays, (p,) [s]."""
+    return 2 * EDGE_TAPS + 1 + int(np.ceil(float(excess_s.max(initial=0.0)) * bandwidth_hz))
+
+
+def impulse_response(amplitude: np.ndarray, excess_s: np.ndarray, link: np.ndarray, links: int,
+                     bandwidth_hz: float, taps: int) -> np.ndarray:
+    """Return the band-limited impulse response of each link, sampled at the bandwidth.
+
+    Tap l of an ideal low-pass is the sum of a sinc(l - B τ) over the paths (Tse and Viswanath,
+    "Fundamentals of Wireless Communication", 2005, eq. 2.34). Tap `EDGE_TAPS` is at the excess
+    delay 0; those before and after hold the ringing of the low-pass.
+
+    Args:
+        amplitude: (p,) complex, with the phase of the carrier over the whole delay.
+        excess_s: (p,) delays after the link's first path [s].
+        link: (p,) row of each path's link, ascending.
+        links: number of links.
+        bandwidth_hz: B [Hz].
+        taps: number of taps, see `tap_count`.
+
+    Returns:
+        (links, taps) complex.
+    """
+    response = np.zeros((links, taps), dtype=complex)
+    at = np.arange(taps) - EDGE_TAPS
+    bounds = np.searchsorted(link, np.arange(links + 1))
+    for row, (first, end) in enumerate(zip(bounds[:-1], bounds[1:])):
+        shape = np.sinc(at - bandwidth_hz * excess_s[first:end, None])
+        response[row] = amplitude[first:end] @ shape
+    return response

@@ -9,12 +9,10 @@ from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.candidates import DEVICE_RAYS, CandidateSearch, candidate_search
-from radiotwin.propagation.paths.clearance import found_clear
-from radiotwin.propagation.paths.coefficients import Slabs, slabs_of
 from radiotwin.propagation.paths.fields import AVERAGE, VERTICAL, path_gains
-from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer
+from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
+from radiotwin.propagation.paths.interactions import LUEBBERS, SIONNA, Slabs, slabs_of
 from radiotwin.propagation.paths.two_edges import paths_over_two_edges, two_edge_gains
-from radiotwin.propagation.paths.wedges import LUEBBERS, SIONNA
 from radiotwin.runtime.console import progress
 from radiotwin.scene.citymap import CityMap
 
@@ -106,7 +104,7 @@ def path_powers(
         polarisation: `vertical` of both antennas, or `average` over all.
         depth: maximum number of interactions of a path, 1 to 6.
         wedge: coefficient of diffraction: `luebbers`, reciprocal and exact for conductors; or
-            `sionna`, that of Sionna RT. See `radiotwin.propagation.paths.coefficients`.
+            `sionna`, that of Sionna RT. See `radiotwin.propagation.paths.interactions`.
         rays: shot from each device to find what paths of several interactions visit.
 
     Returns:

@@ -17,12 +17,11 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from radiotwin.propagation.paths.coefficients import Slabs
 from radiotwin.propagation.paths.facets import expand
 from radiotwin.propagation.paths.fields import VERTICAL, send, vertical
+from radiotwin.propagation.paths.interactions import Slabs, around_edge, diffract
 from radiotwin.propagation.paths.surfaces import ALONG, LENGTH, NORMAL_0, NORMAL_N, START, Surfaces
 from radiotwin.propagation.paths.vectors import cross, dot
-from radiotwin.propagation.paths.wedges import around_edge, diffract
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 

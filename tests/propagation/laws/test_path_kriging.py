@@ -11,7 +11,7 @@ from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.map_error import MapError, estimate_map_error
 from radiotwin.propagation.laws.path_kriging import PathKriging
-from radiotwin.propagation.laws.registry import decode_channel, encode_channel
+from radiotwin.propagation.laws.registry import decode_both, encode_channel
 from radiotwin.scene.citymap import CityMap
 
 DEVICES_M = np.array([[45.0, 42.0, 1.5], [100.0, 155.0, 1.5], [160.0, 60.0, 1.5]])
@@ -121,7 +121,7 @@ def test_paths_over_the_true_map_are_relied_on_and_a_map_of_another_place_is_not
 def test_what_is_read_predicts_the_same(judged):
     model, held, _ = judged[0]["wrong"]
     data = encode_channel(model)
-    again = decode_channel(data, "test")
+    again, _ = decode_both(data, "test")
     for one, other in zip(model.predict(held), again.predict(held)):
         np.testing.assert_array_equal(one, other)
     assert encode_channel(again) == data
@@ -130,7 +130,7 @@ def test_what_is_read_predicts_the_same(judged):
 def test_a_damaged_file_is_refused():
     model = PathKriging()
     model.kriging.law = model.kriging.law.from_state({"lines": np.array([[-30.0, -2.0, 2.0]] * 2)}, {"borrowed": None})
-    assert decode_channel(encode_channel(model), "test").weight.tolist() == [1.0, 1.0]
+    assert decode_both(encode_channel(model), "test")[0].weight.tolist() == [1.0, 1.0]
     model.weight = np.array([2.0, 0.0])
     with pytest.raises(BadInput, match="not a whole channel model"):
-        decode_channel(encode_channel(model), "test")
+        decode_both(encode_channel(model), "test")

@@ -12,12 +12,11 @@ from radiotwin.errors import BadInput
 from radiotwin.propagation.laws import (
     channel_models,
     channel_named,
-    load_channel,
     register,
     registry,
-    save_channel,
 )
 from radiotwin.propagation.laws.log_distance import LogDistance
+from radiotwin.propagation.laws.registry import decode_both, encode_channel
 
 
 class Rural(LogDistance):
@@ -57,9 +56,9 @@ def test_a_broken_one_warns_and_the_rest_works(installed, world, tmp_path):
     first, second = (str(each.message) for each in warned)
     assert "broken" in first and "no_such_module" in first and "no_model" in second
     data = world(0, 100)
-    save_channel(Rural().fit(data.links, data.level_db, None), tmp_path / "channel.safetensors")
+    stored = encode_channel(Rural().fit(data.links, data.level_db, None))
     with pytest.warns(UserWarning):
-        assert type(load_channel(tmp_path / "channel.safetensors")) is Rural
+        assert type(decode_both(stored, "test")[0]) is Rural
 
 
 def test_a_taken_name_is_refused(installed):
@@ -93,10 +92,10 @@ def test_the_model_of_the_guide_works(installed, world, tmp_path):
     assert model.parameters == pytest.approx([-40.0, 2.0], abs=0.3)
     mean_db, sd_db = model.predict(data.links)
     assert np.abs(mean_db - data.mean_db).max() < 0.3 and mean_db.shape == sd_db.shape == (1000,)
-    save_channel(model, tmp_path / "channel.safetensors")
-    loaded = load_channel(tmp_path / "channel.safetensors")
+    stored = encode_channel(model)
+    loaded, _ = decode_both(stored, "test")
     np.testing.assert_array_equal(loaded.predict(data.links), model.predict(data.links))
     installed()
     registry._registered.clear()
     with pytest.raises(BadInput, match="free_space"):
-        load_channel(tmp_path / "channel.safetensors")
+        decode_both(stored, "test")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import modfresnelm
 
-from radiotwin.propagation.paths.coefficients import (
+from radiotwin.propagation.paths.interactions import (
     face_sines,
     fresnel,
     reflection,

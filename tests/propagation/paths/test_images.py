@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from radiotwin.propagation.paths.candidates import CandidateSearch
-from radiotwin.propagation.paths.coefficients import slabs_of
 from radiotwin.propagation.paths.fields import VERTICAL, path_gains
 from radiotwin.propagation.paths.images import Candidates, PathBuffer, find_paths
-from radiotwin.propagation.paths.wedges import LUEBBERS
+from radiotwin.propagation.paths.interactions import LUEBBERS, slabs_of
 from radiotwin.scene.citymap import CONCRETE
 
 WAVE_NUMBER = 2 * np.pi * 2.4e9 / 299_792_458.0

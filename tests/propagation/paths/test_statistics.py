@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.propagation.paths.statistics import (
+from radiotwin.propagation.paths.listing import (
     EDGE_TAPS,
     angular_spread_deg,
     doppler_hz,

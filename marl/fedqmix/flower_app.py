@@ -1,40 +1,144 @@
-"""The ServerApp: means of weights by Flower's strategies, after a check of what parties sent.
+"""The Flower App: parties that train when they are asked, and a coordinator that makes the means.
 
-It writes into the folder that the environment variable `RADIOTWIN_FEDERATION` names.
+The ClientApp sends weights and counts. What its party holds is named in `--node-config` of the
+party's own SuperNode; in Flower's simulation engine, which has no such thing, it is in the file
+that the environment variable `RADIOTWIN_PARTIES` names.
+
+The ServerApp checks what parties sent, makes means of weights by Flower's strategies, and writes
+into the folder that the environment variable `RADIOTWIN_FEDERATION` names.
 """
 
 import json
 import os
 import time
-from collections.abc import Iterable
+import traceback
+from collections.abc import Callable, Iterable
 from logging import INFO, WARNING
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from flwr.app import ArrayRecord, Context, Message, MessageType, MetricRecord, RecordDict
+from flwr.app import (
+    Array,
+    ArrayRecord,
+    Context,
+    Error,
+    Message,
+    MessageType,
+    MetricRecord,
+    RecordDict,
+)
+from flwr.clientapp import ClientApp
 from flwr.common import log
 from flwr.serverapp import Grid, ServerApp
 from flwr.serverapp.strategy import FedAvg, FedAvgM, FedProx
 
 from marl.checkpoint import save_checkpoint
-from marl.fedqmix.client import rounds_of
-from marl.fedqmix.federation import Weights, require_weights, weighted_mean
-from marl.fedqmix.flower_records import arrays_of, weights_of
-from marl.fedqmix.shared import Shared, initial_weights
+from marl.fedqmix.client import Client, Party, rounds_of
+from marl.fedqmix.federation import Weights, initial_weights, require_weights, weighted_mean
+from marl.fedqmix.settings import Shared
+from marl.replicas import keep_memory, limit_threads
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_file, atomic_path
+from radiotwin.io.inputs import read_json
+from radiotwin.runtime.cuda import torch_device
 from radiotwin.runtime.processes import die_with_parent
 
+PARTIES = "RADIOTWIN_PARTIES"
+ERROR_CODE = 2  # of Flower: the ClientApp raised an exception
+ERROR_REASON = "the party could not do it; its own log says why"
+_NEEDED, _OPTIONAL = ("scene", "out", "number"), ("truth", "measurements", "device")
 FOLDER = "RADIOTWIN_FEDERATION"
 WEIGHTS, ROUNDS, DONE = "weights", "rounds.csv", "done.json"
 
-app = ServerApp()
+client_app, server_app = ClientApp(), ServerApp()
 
 
-@app.main()
+def arrays_of(weights: Weights) -> ArrayRecord:
+    """Return weights as Flower sends them.
+
+    In double precision: Flower averages in the precision of what it gets, and the mean in single
+    precision would be another one than `marl.fedqmix.federation.average`, after rounding.
+    """
+    return ArrayRecord({name: Array(array.astype(np.float64)) for name, array in weights.items()})
+
+
+def weights_of(message: Message) -> Weights:
+    """Return the weights in a message, in single precision."""
+    [record] = message.content.array_records.values()
+    return {name: np.asarray(array.numpy(), np.float32) for name, array in record.items()}
+
+
+@client_app.train()
+def train(message: Message, context: Context) -> Message:
+    """Train for a round from the mean, and reply with weights and the number of episodes."""
+    def work(client: Client) -> RecordDict:
+        number = message.content.config_records["config"]["server-round"]
+        if type(number) is not int:
+            raise BadInput("the round's number is missing")
+        weights, episodes = client.train(number, weights_of(message))
+        return RecordDict({"arrays": arrays_of(weights), "metrics": _count(episodes)})
+
+    return _reply(message, context, work)
+
+
+@client_app.evaluate()
+def evaluate(message: Message, context: Context) -> Message:
+    """Evaluate the last mean for the party's own log, and reply with the number of flights."""
+    def work(client: Client) -> RecordDict:
+        return RecordDict({"metrics": _count(client.finish(weights_of(message)))})
+
+    return _reply(message, context, work)
+
+
+def party_of(context: Context) -> Party:
+    """Return what this node's party holds.
+
+    Raises:
+        BadInput: something is missing or unknown in its configuration.
+    """
+    given: dict[str, Any] = dict(context.node_config)
+    if PARTIES in os.environ:
+        given = read_json(os.environ[PARTIES])[int(given["partition-id"])]
+    missing = [name for name in _NEEDED if name not in given]
+    odd = [name for name in given if name not in _NEEDED + _OPTIONAL]
+    if missing or odd:
+        raise BadInput(f"node-config: {(missing or odd)[0]} is {'missing' if missing else 'odd'}; "
+                       f"needed are {', '.join(_NEEDED)}; allowed are {', '.join(_OPTIONAL)}")
+    if type(given["number"]) is not int or not 0 <= given["number"] < 10_000:
+        raise BadInput(f"node-config: number={given['number']}; allowed are 0 to 9999, another one "
+                       "for every party")
+    measurements = given.get("measurements")
+    # A folder for every Flower run: the next one begins anew.
+    folder = Path(str(given["out"])) / f"run-{context.run_id}"
+    return Party(Path(str(given["scene"])), folder, given["number"],
+                 str(given.get("truth", "traced")), Path(measurements) if measurements else None,
+                 torch_device(str(given.get("device", "cpu"))))
+
+
+def _reply(message: Message, context: Context, work: Callable[[Client], RecordDict]) -> Message:
+    try:
+        if PARTIES not in os.environ:
+            # One that outlives its killed SuperNode would write over what the next one does.
+            die_with_parent(os.getppid())
+        limit_threads(1)
+        keep_memory()
+        shared = Shared.of(context.run_config)
+        client = Client(shared.run, shared.learner, party_of(context), shared.proximal_mu)
+        return Message(work(client), reply_to=message)
+    except Exception:
+        # Flower would send the text of the exception, which may name files and values.
+        traceback.print_exc()
+        return Message(Error(ERROR_CODE, ERROR_REASON), reply_to=message)
+
+
+def _count(number: int) -> MetricRecord:
+    return MetricRecord({"num-examples": number})
+
+
+@server_app.main()
 def main(grid: Grid, context: Context) -> None:
     """Run all rounds, then have each party evaluate its policy for itself."""
     die_with_parent(os.getppid())  # Flower's own end waits for a SuperLink that is no more

@@ -1,0 +1,228 @@
+"""The mission as environments for other libraries of learners: PettingZoo's and Gymnasium's.
+
+`HarvestEnv` has an agent for each UAV; in `CentralEnv` and `CentralVectorEnv` one learner decides
+for all UAVs.
+"""
+
+from typing import Any
+
+import numpy as np
+from typing_extensions import override
+
+from marl.environment import (
+    ACTION_COUNT,
+    Environment,
+    global_state,
+    observation_size,
+    observe,
+    safe_actions,
+    state_size,
+)
+from marl.mission import NO_OP, Mission
+
+try:
+    import gymnasium
+    from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+    from pettingzoo import ParallelEnv
+except ImportError as error:
+    raise ImportError("marl.interfaces needs Gymnasium and PettingZoo; install them with "
+                      "`pip install 'radiotwin[rl]'`") from error
+
+Arrays = dict[str, np.ndarray]
+
+
+class HarvestEnv(ParallelEnv[str, Arrays, int]):
+    """One flight of all UAVs; the numbers are those of `marl.environment.Environment`.
+
+    Observation: `observation`, float32 as in `marl.environment.observe`, and `action_mask`, (6,)
+    int8, which is also in `infos`. Actions: hover, north, west, south, east, no-op; one that is not
+    feasible is replaced (`safe_actions`), and `infos[agent]["replaced"]` says so. Reward: data
+    units that the UAV itself collected in the slot; the sum over UAVs is the team's reward. A UAV
+    terminates with an empty battery, which is at its terminal.
+
+    Args:
+        mission: of `make_mission`.
+        names: of the agents, one for each UAV [uav0, uav1, …].
+    """
+
+    metadata = {"name": "radiotwin_harvest_v0", "render_modes": []}
+
+    def __init__(self, mission: Mission, names: list[str] | None = None) -> None:
+        self.mission = mission
+        self.possible_agents = list(names or [f"uav{u}" for u in range(mission.uavs)])
+        if len(set(self.possible_agents)) != mission.uavs:
+            raise ValueError(f"names = {names}: {mission.uavs} different names are needed, one for "
+                             "each UAV")
+        self.agents: list[str] = []
+        space = Dict({
+            "observation": Box(-np.inf, np.inf, (observation_size(mission),), np.float32),
+            "action_mask": Box(0, 1, (ACTION_COUNT,), np.int8)})
+        self.observation_spaces = {agent: Dict(space.spaces) for agent in self.possible_agents}
+        self.action_spaces = {agent: Discrete(ACTION_COUNT) for agent in self.possible_agents}
+        self.state_space = Box(-np.inf, np.inf, (state_size(mission),), np.float32)
+        self._rng: np.random.Generator | None = None
+
+    @override
+    def observation_space(self, agent: str) -> Dict:
+        return self.observation_spaces[agent]
+
+    @override
+    def action_space(self, agent: str) -> Discrete:
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict | None = None,
+              ) -> tuple[dict[str, Arrays], dict[str, dict[str, Any]]]:
+        """Take off; see `pettingzoo.ParallelEnv`.
+
+        Args:
+            seed: of the shadowing; None goes on with the random numbers of the flights before.
+            options: not used.
+        """
+        if seed is not None or self._rng is None:
+            self._rng = np.random.default_rng(seed)
+        self._environment = Environment(self.mission, 1, self._rng)
+        self._environment.reset()
+        self.agents = self.possible_agents[:]
+        return self._seen(self.agents, replaced=np.zeros(self.mission.uavs, dtype=bool))
+
+    def step(self, actions: dict[str, int]) -> tuple[
+            dict[str, Arrays], dict[str, float], dict[str, bool], dict[str, bool],
+            dict[str, dict[str, Any]]]:
+        """Fly one slot; see `pettingzoo.ParallelEnv`.
+
+        Args:
+            actions: one for each agent that still flies.
+        """
+        flying = self.agents
+        wanted = np.array([[actions[agent] if agent in flying else NO_OP
+                            for agent in self.possible_agents]])
+        action = safe_actions(wanted, observe(self.mission, self._environment.frame)[1])
+        collected = self._environment.step(action)[0]
+        landed = self._environment.frame.battery[0] == 0
+        number = {agent: u for u, agent in enumerate(self.possible_agents)}
+        rewards = {agent: float(collected[number[agent]]) for agent in flying}
+        terminations = {agent: bool(landed[number[agent]]) for agent in flying}
+        self.agents = [agent for agent in flying if not terminations[agent]]
+        observations, infos = self._seen(flying, replaced=(action != wanted)[0])
+        return observations, rewards, terminations, dict.fromkeys(flying, False), infos
+
+    def state(self) -> np.ndarray:
+        """Return the (state_size,) float32 state for a mixer."""
+        return global_state(self.mission, self._environment.frame)[0]
+
+    def _seen(self, agents: list[str], replaced: np.ndarray,
+              ) -> tuple[dict[str, Arrays], dict[str, dict[str, Any]]]:
+        observation, mask = observe(self.mission, self._environment.frame)
+        observations, infos = {}, {}
+        for u, agent in enumerate(self.possible_agents):
+            if agent in agents:
+                observations[agent] = {"observation": observation[0, u],
+                                       "action_mask": mask[0, u].astype(np.int8)}
+                infos[agent] = {"action_mask": mask[0, u].astype(np.int8),
+                                "replaced": bool(replaced[u])}
+        return observations, infos
+
+
+def spaces(mission: Mission) -> tuple[Dict, MultiDiscrete]:
+    """Return the spaces of one flight.
+
+    The observation has `state`, and `observation` and `action_mask` of every UAV; the action is
+    one for every UAV.
+    """
+    uavs, size = mission.uavs, observation_size(mission)
+    return Dict({"state": Box(-np.inf, np.inf, (state_size(mission),), np.float32),
+                 "observation": Box(-np.inf, np.inf, (uavs, size), np.float32),
+                 "action_mask": Box(0, 1, (uavs, ACTION_COUNT), np.int8)}), \
+        MultiDiscrete([ACTION_COUNT] * uavs)
+
+
+class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
+    """E flights side by side; the numbers are those of `marl.environment.Environment`.
+
+    Reward: data units that all UAVs of a flight collected in the slot. A flight terminates with
+    all batteries empty; the step after that begins it anew, whatever the action
+    (`AutoresetMode.NEXT_STEP`). Actions that are not feasible are replaced (`safe_actions`);
+    `infos["replaced"]`, (E, U) bool, says which.
+
+    Args:
+        mission: of `make_mission`.
+        num_envs: E.
+    """
+
+    def __init__(self, mission: Mission, num_envs: int = 1) -> None:
+        self.mission, self.num_envs = mission, num_envs
+        self.metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP, "render_modes": []}
+        self.single_observation_space, self.single_action_space = spaces(mission)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
+              ) -> tuple[Arrays, dict[str, Any]]:
+        """Take off with all flights; see `gymnasium.vector.VectorEnv`.
+
+        Args:
+            seed: of the shadowing of all flights; None goes on with the random numbers of those
+                before.
+            options: not used.
+        """
+        if seed is not None or self._np_random is None:
+            self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
+        self._environment = Environment(self.mission, self.num_envs, self._np_random)
+        self._environment.reset()
+        self._over = np.zeros(self.num_envs, dtype=bool)
+        return self._seen()
+
+    def step(self, actions: np.ndarray,
+             ) -> tuple[Arrays, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Fly one slot with actions (E, U); see `gymnasium.vector.VectorEnv`."""
+        environment, anew = self._environment, self._over
+        wanted = np.where(anew[:, None], NO_OP, actions)
+        action = safe_actions(wanted, observe(self.mission, environment.frame)[1])
+        reward = environment.step(action).sum(axis=1, dtype=float)
+        if anew.any():
+            environment.reset(anew)
+        self._over = environment.done
+        seen, infos = self._seen()
+        infos["replaced"] = action != wanted
+        return seen, reward, self._over.copy(), np.zeros(self.num_envs, dtype=bool), infos
+
+    def _seen(self) -> tuple[Arrays, dict[str, Any]]:
+        frame = self._environment.frame
+        observation, mask = observe(self.mission, frame)
+        mask = mask.astype(np.int8)
+        return {"state": global_state(self.mission, frame), "observation": observation,
+                "action_mask": mask}, {"action_mask": mask.copy()}
+
+
+class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
+    """One flight; as `CentralVectorEnv`, but a flight that is over waits for `reset`.
+
+    Args:
+        mission: of `make_mission`.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(self, mission: Mission) -> None:
+        self._flights = CentralVectorEnv(mission)
+        self.observation_space, self.action_space = spaces(mission)  # type: ignore[assignment]
+
+    @override
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None,
+              ) -> tuple[Arrays, dict[str, Any]]:
+        super().reset(seed=seed)
+        # The generator that Gymnasium seeds is the one that is drawn from.
+        self._flights._np_random = self.np_random
+        seen, infos = self._flights.reset()
+        return _first(seen), _first(infos)
+
+    @override
+    def step(self, action: np.ndarray) -> tuple[Arrays, float, bool, bool, dict[str, Any]]:
+        seen, reward, terminated, _, infos = self._flights.step(np.asarray(action)[None])
+        return _first(seen), float(reward[0]), bool(terminated[0]), False, _first(infos)
+
+
+def _first(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {name: value[0] for name, value in values.items()}
