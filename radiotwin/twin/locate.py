@@ -12,6 +12,7 @@ from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, prepare_links
 from radiotwin.links.alignment import in_known_frame
+from radiotwin.links.links import Columns, Ends, World
 from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
@@ -120,11 +121,12 @@ def _by_channel(twin: Twin, links: Links) -> EffectModel:
     channel, known = twin.channel.trend, np.isfinite(twin.device_m).all(axis=1)
     rows = np.unique(np.linspace(0, len(links) - 1, MAX_PROBES).astype(int))
     device = np.flatnonzero(known)[np.arange(len(rows)) % known.sum()]
-    probes = Links.synthetic(
-        np.nan_to_num(twin.device_m), device, links.receiver_m[rows],
-        device_names=[each.device for each in twin.devices], limit_db=twin.limit_db,
-        frequency_hz=links.frequency_hz, city=links.city, is_gain=links.is_gain,
-        anchors=frozenset()).geometry
+    probes = Links(
+        columns=Columns.unmeasured(links.receiver_m[rows], device, twin.limit_db),
+        ends=Ends(device_names=[each.device for each in twin.devices],
+                  device_m=np.nan_to_num(twin.device_m), anchors=frozenset()),
+        world=World(frequency_hz=links.frequency_hz, city=links.city, is_gain=links.is_gain),
+    ).geometry
     sd_db, group = channel.predict(probes)[1], channel.error_group(probes)
     usual_db = [np.median(sd_db[group == each] if (group == each).any() else sd_db)
                 for each in range(channel.error_groups(probes))]
