@@ -89,6 +89,7 @@ def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_p
     assert status == 2 and "--resume" in err
 
 
+@pytest.mark.slow
 def test_a_learner_may_train_in_a_twin_that_follows_paths(small_scene, tmp_path):
     scene = shutil.copytree(small_scene.folder, tmp_path / "scene") / "scene.toml"
     text = scene.read_text()
