@@ -17,7 +17,6 @@ from radiotwin import BadInput, Loop, Measurements, close_loop, make_report, rea
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.twin.localize import calibrate_radii, locate, whole_area
-from radiotwin.twin.model.effect_model import EffectModel
 from radiotwin.twin.model.fold_model import Fit
 from studies.closeloop import counted, summary
 from studies.runner import Study
@@ -129,7 +128,7 @@ def locate_held_out(loop: Loop, model: CrossFit) -> dict[str, dict]:
     Returns:
         By flight (a fold each), of at most 150 devices, and of all.
     """
-    models = [EffectModel.of(fold) for fold in model.folds]
+    models = [fold.learnt for fold in model.folds]
     folds = [loop.links.select(model.index == index) for index in range(len(models))]
     area_m, rng, rows = whole_area(models[0], loop.links), np.random.default_rng(0), []
     for index, (learnt, fold) in enumerate(zip(models, folds)):
@@ -139,7 +138,8 @@ def locate_held_out(loop: Loop, model: CrossFit) -> dict[str, dict]:
         asked = fold.select(np.isin(fold.device, chosen))
         for found in locate(replace(learnt, **vars(known)), asked, area_m):
             away_m = loop.links.device_m[found.device, :2] - (found.x_m, found.y_m)
-            rows.append((fold.flight_names[fold.flight[0]], np.hypot(*away_m), found.radius_m))
+            rows.append((fold.flight_names[fold.flight[0]], np.hypot(*away_m),
+                         found.credible_radius_m))
     located = pd.DataFrame(rows, columns=["flight", "error_m", "radius_m"])
     by_day = {day: own for day, own in located.groupby("flight", sort=False)} | {"all": located}
     return {day: {"devices": len(own), "median_m": round(own["error_m"].median()),

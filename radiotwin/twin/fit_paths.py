@@ -1,7 +1,4 @@
-"""Fitting a twin that follows paths over the 3D map.
-
-Fitting a twin that follows paths over a 3D map which may be wrong.
-"""
+"""Fitting a twin that follows paths over the 3D map, as it is or with allowance for its errors."""
 
 from __future__ import annotations
 
@@ -35,7 +32,6 @@ from radiotwin.twin.localize import (
 )
 from radiotwin.twin.localize.along_paths import CREDIBLE, MAX_DEVICES
 from radiotwin.twin.localize.estimate import TwinDevice
-from radiotwin.twin.model.effect_model import EffectModel
 from radiotwin.twin.model.fold_model import FoldModel
 from radiotwin.twin.twin import Twin
 
@@ -86,7 +82,7 @@ def fit_along_paths(links: Links, scene: Scene, seed: int, start: Twin | None,
         warnings.warn(f"{unknown} devices are unknown, and paths are followed to locate "
                       f"{MAX_DEVICES} at most: they are where a law of distance and line of sight "
                       "has them", stacklevel=4)
-    return replace(twin, fitted=EffectModel.of(fit))
+    return replace(twin, fitted=fit.learnt)
 
 
 def fit_paths(links: Links, scene: Scene, law: Twin, relocation: Relocation) -> Twin:

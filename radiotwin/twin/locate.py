@@ -16,8 +16,8 @@ from radiotwin.links.links import Columns, Ends, World
 from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
-from radiotwin.twin.localize import PositionEstimate, locate, misfit, whole_area
-from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.localize import DeviceEstimate, locate, misfit, whole_area
+from radiotwin.twin.model.fold_model import EffectModel
 from radiotwin.twin.twin import Twin
 
 NOT_BY_PATHS = ("and following paths from every position where a device may be takes too long: "
@@ -98,11 +98,12 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
                      f"{widening:.1f} times as large as those of the known devices that the twin "
                      "was learnt from: receivers or surroundings have changed since, or what was "
                      "learnt holds less where these devices are; radii are that much wider")
-        found = [replace(each, radius_m=widening * each.radius_m) for each in found]
+        found = [replace(each, credible_radius_m=widening * each.credible_radius_m)
+                 for each in found]
     table = pd.DataFrame({"device": [links.device_names[each.device] for each in found],
                           "x_m": [each.x_m for each in found], "y_m": [each.y_m for each in found],
-                          "radius_m": [each.radius_m for each in found],
-                          "links": [each.links for each in found]})
+                          "radius_m": [each.credible_radius_m for each in found],
+                          "links": [each.n_links for each in found]})
     table = table.round(1)
     if measurements.origin is not None:
         east_deg, north_deg = to_geographic(measurements.origin, table["x_m"], table["y_m"])
@@ -136,7 +137,7 @@ def _by_channel(twin: Twin, links: Links) -> EffectModel:
                        links.first_s, 0.0)
 
 
-def _widening(model: EffectModel, links: Links, found: list[PositionEstimate]) -> float:
+def _widening(model: EffectModel, links: Links, found: list[DeviceEstimate]) -> float:
     """Return how much larger residuals are than they were at home; 1 where they are much alike."""
     if np.isnan(model.typical_misfit) or not found:
         return 1.0

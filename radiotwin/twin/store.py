@@ -1,13 +1,13 @@
 """Twins as folders: `twin.json`, and the channel in a file of its own.
 
-The content of `twin.json`, typed and bounded: the bounds are far beyond what is measured.
+The content of `twin.json` is typed and bounded; the bounds are far beyond what is measured.
 """
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -25,8 +25,10 @@ from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_ch
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.blend import Blend
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
-from radiotwin.twin.model.effect_model import EffectModel, Unheard
-from radiotwin.twin.model.fold_model import FittedEffect
+from radiotwin.twin.model.fold_model import EffectModel, FittedEffect, Unheard
+
+if TYPE_CHECKING:
+    from radiotwin.twin.twin import Twin
 
 SCHEMA = "radiotwin.twin/2"
 CHANNEL_FILE = "channel.safetensors"
@@ -57,7 +59,7 @@ class DeviceRecord(_Strict):
     second_mode: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)] | None
 
 
-class EffectRecord(_Strict):
+class FittedEffectRecord(_Strict):
     """A fitted effect; `params` are checked by the effect's own `Params`."""
 
     name: str
@@ -80,7 +82,7 @@ class FittedRecord(_Strict):
     level_coefficients: Annotated[list[_Decibels], Field(min_length=2, max_length=4)]
     scale_db: Annotated[list[_SdDb], Field(min_length=1, max_length=2)]
     dof: Annotated[float, Field(gt=2, le=1e6)]
-    effects: list[EffectRecord]
+    effects: list[FittedEffectRecord]
     receivers: list[_Name]
     first_s: Seconds | None
     device_sd_db: Annotated[float, Field(ge=0, le=MAX_SD_DB)]
@@ -142,43 +144,29 @@ class TwinRecord(_Strict):
         return provenance
 
 
-def write_twin(folder: Path | str, channel: ChannelModel, devices: list[TwinDevice], level: str,
-               limit_db: float | None, provenance: dict, fitted: EffectModel | None) -> None:
-    """Write a twin's folder, whole or not at all.
-
-    Args:
-        folder: to write; a twin that is in it is replaced.
-        channel: fitted.
-        devices: in the order of the measurements' `devices.csv`.
-        level: `gain_db`, or `rssi_dbm` where transmit power is unknown.
-        limit_db: level below which receivers do not detect [dB]; None where it was not known.
-        provenance: measurements, scene, seed and version that made it.
-        fitted: levels, effects and errors fitted upon the channel, if there are any.
+def write_twin(folder: Path | str, twin: Twin) -> None:
+    """Write a twin's folder, whole or not at all; a twin that is in it is replaced.
 
     Raises:
         BadInput: the folder exists and is not a twin's.
     """
     folder = Path(folder)
     check_twin_target(folder)
-    record, content = encode_twin(channel, devices, level, limit_db, provenance, fitted)
+    record, content = encode_twin(twin)
     with atomic_folder(folder) as temporary:
         (temporary / CHANNEL_FILE).write_bytes(content)
         (temporary / TWIN_FILE).write_text(record, encoding="utf-8")
 
 
-def encode_twin(channel: ChannelModel, devices: list[TwinDevice], level: str,
-                limit_db: float | None, provenance: dict,
-                fitted: EffectModel | None) -> tuple[str, bytes]:
-    """Return the contents of a twin's two files: the record, and the channel.
-
-    The arguments are those of `write_twin`.
-    """
+def encode_twin(twin: Twin) -> tuple[str, bytes]:
+    """Return the contents of a twin's two files: the record, and the channel."""
+    fitted = twin.fitted
     beside = fitted.blend.state()[0] if fitted and fitted.blend else None
-    record = {"schema": SCHEMA, "channel": {"model": channel.name, "file": CHANNEL_FILE},
-              "level": level, "limit_db": limit_db,
-              "devices": [_device_record(device) for device in devices],
-              "fitted": _fitted_record(fitted) if fitted else None, "provenance": provenance}
-    return json.dumps(record, indent=1, allow_nan=False), encode_channel(channel, beside)
+    record = {"schema": SCHEMA, "channel": {"model": twin.channel.name, "file": CHANNEL_FILE},
+              "level": twin.level, "limit_db": twin.limit_db,
+              "devices": [_device_record(device) for device in twin.devices],
+              "fitted": _fitted_record(fitted) if fitted else None, "provenance": twin.provenance}
+    return json.dumps(record, indent=1, allow_nan=False), encode_channel(twin.channel, beside)
 
 
 def read_twin(folder: Path | str) -> dict[str, Any]:

@@ -1,7 +1,4 @@
-"""The twin: a channel, the positions of all devices, and effects and errors fitted upon them.
-
-Draw where a twin has its devices.
-"""
+"""The twin: a channel, the positions of all devices, and effects and errors fitted upon them."""
 
 from __future__ import annotations
 
@@ -41,8 +38,7 @@ from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.plot import MARKS, draw_outlines
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
-from radiotwin.twin.model.effect_model import EffectModel
-from radiotwin.twin.model.fold_model import FittedEffect
+from radiotwin.twin.model.fold_model import EffectModel, FittedEffect
 from radiotwin.twin.store import decode_twin, encode_twin, read_twin, write_twin
 
 if TYPE_CHECKING:
@@ -237,8 +233,7 @@ class Twin(Summarised):
         Raises:
             BadInput: the folder exists and is not a twin's.
         """
-        write_twin(folder, self.channel, self.devices, self.level, self.limit_db, self.provenance,
-                   self.fitted)
+        write_twin(folder, self)
 
     @classmethod
     def load(cls, folder: Path | str) -> Twin:
@@ -302,8 +297,7 @@ class Twin(Summarised):
 
     def encode(self) -> tuple[str, bytes]:
         """Return the contents of the twin's two files: the record, and the channel."""
-        return encode_twin(self.channel, self.devices, self.level, self.limit_db, self.provenance,
-                           self.fitted)
+        return encode_twin(self)
 
     @classmethod
     def decode(cls, record: str, channel: bytes, source: object) -> Twin:

@@ -12,7 +12,6 @@ from radiotwin.closeloop.predict.predictor import CombinedPrediction
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
 from radiotwin.twin.model.blend import FORESTS
-from radiotwin.twin.model.effect_model import EffectModel
 from radiotwin.twin.twin import Twin
 from tests.worlds import fly, measured
 
@@ -33,7 +32,7 @@ def blended():
         model.held_out_mean_db, ["named", *FORESTS, "segmented_log_distance", "regression_kriging"], weights,
         np.zeros((len(links), 5)), np.linspace(0, 1, len(links)))
     blend = make_blend(model, prediction, 0)
-    fitted = replace(EffectModel.of(model.whole), blend=blend)
+    fitted = replace(model.whole.learnt, blend=blend)
     return SimpleNamespace(links=links, model=model, prediction=prediction, twin=replace(model.twin, fitted=fitted))
 
 

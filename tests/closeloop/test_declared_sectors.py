@@ -27,7 +27,6 @@ from radiotwin.links.variables import link_features
 from radiotwin.report.closeloop_figures import waterfall_figure
 from radiotwin.twin.model.blend import Blend
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
-from radiotwin.twin.model.effect_model import EffectModel
 from radiotwin.twin.model.uncertainty import estimates, linearise
 
 MASTS_M = np.array([[150.0, 200.0, 25.0], [420.0, 330.0, 25.0]])
@@ -278,7 +277,7 @@ def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
     for number, (fold, field) in enumerate(zip(model.folds, fields[1:])):
         own = model.index == number
         assert fold.links.device[own].min() == fold.links.device[own].max()
-        twin = replace(EffectModel.of(fold), shadowing=field).predict(links.select(own))
+        twin = replace(fold.learnt, shadowing=field).predict(links.select(own))
         np.testing.assert_allclose(mean_db[own], twin.mean_db, atol=1e-6)
         left = field.at(links.select(own))[1]
         t_sd = np.sqrt(model.whole.model.dof / (model.whole.model.dof - 2))

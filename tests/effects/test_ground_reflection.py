@@ -9,8 +9,7 @@ from radiotwin.effects.catalogue.lock_loss import LockLoss
 from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin import Twin, TwinDevice
-from radiotwin.twin.model.effect_model import EffectModel
-from radiotwin.twin.model.fold_model import FittedEffect
+from radiotwin.twin.model.fold_model import EffectModel, FittedEffect
 
 FREQUENCY_HZ = 2.4e9
 

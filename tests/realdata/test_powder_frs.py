@@ -7,7 +7,6 @@ from scipy.stats import wilcoxon
 
 from radiotwin import close_loop, make_report
 from radiotwin.twin.localize import locate, whole_area
-from radiotwin.twin.model.effect_model import EffectModel
 from studies.closeloop_real import floor_errors_db, permuted
 
 pytestmark = pytest.mark.slow
@@ -53,7 +52,7 @@ def test_transmitters_of_days_that_are_held_out_are_located_better(loop):
     def errors_m(model) -> np.ndarray:
         off_m = []
         for number, fold in enumerate(model.folds):
-            day, learnt = loop.links.select(model.index == number), EffectModel.of(fold)
+            day, learnt = loop.links.select(model.index == number), fold.learnt
             devices = np.random.default_rng(0).permutation(np.unique(day.device))[:DEVICES_A_DAY]
             asked = day.select(np.isin(day.device, devices))
             off_m += [np.hypot(*(loop.links.device_m[each.device, :2] - (each.x_m, each.y_m)))

@@ -17,7 +17,7 @@ from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin import locate as module
-from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.model.fold_model import EffectModel
 
 LIMIT_DB, GATEWAYS, PACKETS = -115.0, 30, 3
 

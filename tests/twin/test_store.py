@@ -15,8 +15,7 @@ from radiotwin.effects import catalogue
 from radiotwin.effects.catalogue.roof_heights import Roof
 from radiotwin.errors import BadInput
 from radiotwin.twin import Twin, check_twin_target, fit_twin
-from radiotwin.twin.model.effect_model import EffectModel
-from radiotwin.twin.model.fold_model import FittedEffect
+from radiotwin.twin.model.fold_model import EffectModel, FittedEffect
 
 STORED = Path(__file__).parent / "stored"
 NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)

@@ -11,7 +11,7 @@ from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin.compare import predict
-from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.model.fold_model import EffectModel
 
 LINE = LogDistanceLine(-40.0, -2.5, 2.0)
 

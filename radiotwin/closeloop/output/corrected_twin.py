@@ -12,7 +12,6 @@ from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import RadiusCalibration, calibrate_radii, whole_area
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
-from radiotwin.twin.model.effect_model import EffectModel
 from radiotwin.twin.twin import Twin
 
 
@@ -30,7 +29,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     shadowing = model.shadowing[0] if model.shadowing else None
     if shadowing is None and needs_rest(loop.prediction):
         shadowing = CorrelatedShadowing.fit(model.whole, loop.seed)
-    fitted = replace(EffectModel.of(model.whole),
+    fitted = replace(model.whole.learnt,
                      **vars(_calibration(loop, scene)), shadowing=shadowing,
                      blend=make_blend(model, loop.prediction, loop.seed))
     provenance: dict[str, Any] = {"links": len(model.links),
@@ -48,7 +47,7 @@ def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
     model, links = loop.for_twin, loop.links
     if model.whole.channel.follows_paths:  # which locates nothing: `check_can_locate`
         return RadiusCalibration()
-    models = [EffectModel.of(fold).for_positions() for fold in model.folds]
+    models = [fold.learnt.for_positions() for fold in model.folds]
     # A device that the loop found elsewhere is not where it was declared.
     moved = {device for each in model.whole.effects if isinstance(each.effect, DevicePositionError)
              for device in model.links.device[each.acts].tolist()}

@@ -16,8 +16,7 @@ from radiotwin.effects.arrays import subsample
 from radiotwin.links import Links
 from radiotwin.twin.localize import position_log_likelihood
 from radiotwin.twin.localize.estimate import TwinDevice
-from radiotwin.twin.model.effect_model import EffectModel
-from radiotwin.twin.model.fold_model import Fit, FoldModel
+from radiotwin.twin.model.fold_model import EffectModel, Fit, FoldModel
 
 RADII_M = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)  # of circles around a position, that are tried
 DIRECTIONS = 12
@@ -119,7 +118,7 @@ def _located_anew(fit: Fit, links: Links, mine: np.ndarray,
 
 def _relocated(fit: Fit, unknown: list[int]) -> FoldModel:
     """Return one model with its devices moved, by its training links."""
-    learnt, model = EffectModel.of(fit), fit.model
+    learnt, model = fit.learnt, fit.model
     device_m = model.links.device_m.copy()
     for device in unknown:
         rows = np.flatnonzero(model.train & (model.links.device == device))

@@ -10,12 +10,11 @@ from radiotwin.twin.localize.estimate import (
 )
 from radiotwin.twin.localize.on_map import localize
 from radiotwin.twin.localize.without_map import (
-    PositionEstimate,
     locate,
     position_log_likelihood,
     whole_area,
 )
 
-__all__ = ["DeviceEstimate", "LocalizeSettings", "PositionEstimate", "RadiusCalibration",
-           "Relocation", "TwinDevice", "calibrate_radii", "localize", "locate", "misfit",
-           "position_log_likelihood", "read_device", "whole_area"]
+__all__ = ["DeviceEstimate", "LocalizeSettings", "RadiusCalibration", "Relocation", "TwinDevice",
+           "calibrate_radii", "localize", "locate", "misfit", "position_log_likelihood",
+           "read_device", "whole_area"]

@@ -4,8 +4,7 @@ A law with two classes of links takes one just behind an edge, a few decibels be
 for one with it, and moves a device in a narrow street to where it would have line of sight. Paths
 tell the two apart, and take long. So the likelihood of each position is that of some of the
 device's links, by the law in all cells around, by paths in the best of these and downhill of them.
-
-Followed paths, as arrays that can be kept.
+The powers along paths that were followed are kept for other parts of the same links.
 """
 
 from __future__ import annotations

@@ -17,14 +17,14 @@ import numpy as np
 
 from radiotwin.effects.arrays import subsample
 from radiotwin.links import Links
+from radiotwin.twin.localize.estimate import DeviceEstimate
 from radiotwin.twin.localize.without_map import (
     CREDIBLE,
     MIN_LINKS,
     Area,
-    PositionEstimate,
     PositionPosterior,
 )
-from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.model.fold_model import EffectModel
 
 POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)  # of the likelihood, that are tried
 MAX_TRIALS, MAX_TRIALS_WITH_MAP = 100, 24  # positions; over a map each takes seconds
@@ -77,7 +77,7 @@ def calibrate_radii(models: list[EffectModel], held_out: list[Links], area_m: Ar
 
     def ratios(power: float) -> np.ndarray:
         estimates = [each.estimate(power) for each in found]
-        return np.array([np.hypot(each.x_m - x_m, each.y_m - y_m) / each.radius_m
+        return np.array([np.hypot(each.x_m - x_m, each.y_m - y_m) / each.credible_radius_m
                          for each, (x_m, y_m) in zip(estimates, truth_m, strict=True)])
 
     power = 1.0
@@ -109,12 +109,12 @@ def radius_factor(ratios: np.ndarray) -> float:
     return max(float(np.sqrt(square / (PRIOR_TRIALS + len(ratios)))), 1.0)
 
 
-def misfit(model: EffectModel, own: Links, place: PositionEstimate) -> float:
+def misfit(model: EffectModel, own: Links, place: DeviceEstimate) -> float:
     """Return the mean square of residuals over their scale, of the links of a located device.
 
     The device's own level, as far as it may have one, counts as no misfit.
     """
-    device_m = np.array([[place.x_m, place.y_m, own.device_m[own.device[0], 2]]])
+    device_m = np.array([[place.x_m, place.y_m, place.z_m]])
     known = len(model.device_m)
     there = own.of_devices(np.full(len(own), known), np.vstack([model.device_m, device_m]),
                            [f"device {i}" for i in range(known + 1)],

@@ -72,7 +72,8 @@ class DeviceEstimate:
 
     Attributes:
         device: its index.
-        x_m, y_m: mean over the heaviest mode of the posterior [m].
+        x_m, y_m: mean over the heaviest mode of the posterior, or the position of least expected
+            distance [m].
         z_m: height, as given [m].
         credible_radius_m: radius about the position that holds 90 % of the posterior, second modes
             included [m].
@@ -80,7 +81,7 @@ class DeviceEstimate:
             posterior; None: there is none.
         n_detected: measurements that were detected.
         n_links: all measurements.
-        design_effect: number of links that count as one; 1: independent.
+        design_effect: number of links that count as one in the radius; 1: independent.
         located: False where the data do not determine the position: the device was never detected,
             or 90 % of the posterior cover half the map or more. Position and radius are then the
             best estimate from the links that were not detected, or NaN and infinity without any.

@@ -1,6 +1,4 @@
-"""Log-likelihood of device positions given the measurements.
-
-Correction for correlated residuals: how many of a device's links count as one.
+"""Log-likelihood of device positions given the measurements, and how many links count as one.
 
 A channel model that is wrong in one street is wrong in the same way at every position along it.
 Multiplying the likelihoods of all links as if they were independent then claims too small a

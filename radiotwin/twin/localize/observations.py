@@ -1,6 +1,7 @@
-"""Measurements merged over repeats: one entry for each device and receiver position.
+"""Measurements merged over repeats, and what a channel predicts of very many positions.
 
-Predictions of very many links: looked up in a table where the channel allows it.
+There is one entry for each device and receiver position. Predictions are looked up in a table where
+the channel allows it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Positions of unknown devices from the levels that receivers at known positions measured.
 
-Search space: where devices may be, and the likelihood of their data over the whole map.
-
-Particle swarm search for the most likely positions, all swarms of all devices in one batch.
+The likelihood of a device's data is scanned over all of the map where it may be. Particle swarms,
+of all devices in one batch, then search for the most likely positions.
 """
 
 from __future__ import annotations

@@ -15,7 +15,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from radiotwin.links import Links
-from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.localize.estimate import DeviceEstimate
+from radiotwin.twin.model.fold_model import EffectModel
 
 COARSE_CELLS, MAX_FINE_CELLS, MAX_SPLIT = 1500, 640, 4
 HELD = 0.999  # of the probability, by the coarse cells that are split
@@ -29,24 +30,6 @@ Area = tuple[float, float, float, float]
 """West, east, south and north end of where devices may be [m]."""
 
 
-@dataclass(frozen=True)
-class PositionEstimate:
-    """Where a device may be.
-
-    Attributes:
-        device: row of the links' devices.
-        x_m, y_m: position of least expected distance [m].
-        radius_m: around it, of 90 % of the probability [m].
-        links: that were used.
-    """
-
-    device: int
-    x_m: float
-    y_m: float
-    radius_m: float
-    links: int
-
-
 @dataclass(frozen=True, eq=False)
 class PositionPosterior:
     """Likelihood of the links of one device over the cells where nearly all probability is.
@@ -57,7 +40,8 @@ class PositionPosterior:
         width_m: their width [m].
         log_likelihood: (c,) of the links.
         apart_m: (c, c) distance between cells [m].
-        links: that were used.
+        z_m: height of the device [m].
+        n_detected, n_links: links that were detected, and all.
     """
 
     device: int
@@ -65,7 +49,9 @@ class PositionPosterior:
     width_m: float
     log_likelihood: np.ndarray
     apart_m: np.ndarray
-    links: int
+    z_m: float
+    n_detected: int
+    n_links: int
 
     @classmethod
     def of(cls, model: EffectModel, own: Links, area_m: Area, power: float
@@ -74,22 +60,25 @@ class PositionPosterior:
         coarse_m, width_m = _grid(area_m)
         coarse = position_log_likelihood(model, own, coarse_m)
         cells_m, width_m = _finer(coarse, power, coarse_m, width_m)
-        return cls(int(own.device[0]), cells_m, width_m,
-                   position_log_likelihood(model, own, cells_m), cdist(cells_m, cells_m), len(own))
+        device = int(own.device[0])
+        return cls(device, cells_m, width_m, position_log_likelihood(model, own, cells_m),
+                   cdist(cells_m, cells_m), float(own.device_m[device, 2]),
+                   int(np.isfinite(own.level_db).sum()), len(own))
 
-    def estimate(self, power: float) -> PositionEstimate:
+    def estimate(self, power: float) -> DeviceEstimate:
         """Return the position by the likelihood as it is, and the radius by its power."""
         best = int((self.apart_m @ _share(self.log_likelihood)).argmin())
         order = np.argsort(self.apart_m[best])
         cumulated = np.cumsum(_share(power * self.log_likelihood)[order])
         reached = int(np.searchsorted(cumulated, CREDIBLE))
         radius_m = self.apart_m[best][order[min(reached, len(order) - 1)]] + self.width_m / 2
-        return PositionEstimate(self.device, float(self.cells_m[best, 0]),
-                                float(self.cells_m[best, 1]), float(radius_m), self.links)
+        x_m, y_m = self.cells_m[best].tolist()
+        return DeviceEstimate(self.device, x_m, y_m, self.z_m, float(radius_m), None,
+                              self.n_detected, self.n_links, 1 / power, True)
 
 
 def locate(model: EffectModel, links: Links, area_m: Area,
-           on_progress: Callable[[], None] = lambda: None) -> Iterator[PositionEstimate]:
+           on_progress: Callable[[], None] = lambda: None) -> Iterator[DeviceEstimate]:
     """Locate the devices of some links, whatever position the links have them at but for height.
 
     Args:
@@ -106,7 +95,7 @@ def locate(model: EffectModel, links: Links, area_m: Area,
         if len(own) >= MIN_LINKS:
             power = model.likelihood_power
             found = PositionPosterior.of(model, own, area_m, power).estimate(power)
-            yield replace(found, radius_m=model.radius_factor * found.radius_m)
+            yield replace(found, credible_radius_m=model.radius_factor * found.credible_radius_m)
         on_progress()
 
 

@@ -3,17 +3,15 @@
 A Gaussian process over the position of the end that moves, one field for each of the ends that do
 not (the exponential model of shadowing, Gudmundson 1991, Electronics Letters 27), and beside it an
 error of each receiver in each field. What was measured of a device's relatives, on the same mast,
-comes first: their signals pass the same buildings. It has no physical cause: it says that the rest
-of the error has a position. It is no candidate among the effects, because it would fit part of
+comes first: sectors of one mast look over the same city. It has no physical cause: it says that the
+rest of the error has a position. It is no candidate among the effects, because it would fit part of
 whatever they stand for.
-
-The residual of a device's relatives: sectors of one mast look over the same city.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -22,7 +20,9 @@ from radiotwin.links import Links
 from radiotwin.links.sites import antenna_of, relatives_of
 from radiotwin.propagation.laws.kriging import MIN_POINTS, ResidualField
 from radiotwin.runtime.pieces import kept
-from radiotwin.twin.model.fold_model import Fit
+
+if TYPE_CHECKING:
+    from radiotwin.twin.model.fold_model import Fit
 
 MIN_SD = 1e-6  # of a residual that is nothing
 LEAST_SHARED_SD = 0.1  # of what relatives say, in error scales: less is nearly nothing

@@ -1,7 +1,4 @@
-"""Finding the parameters of one more effect: proposals, a search, exact levels.
-
-Varying the numbers of one more effect for a better fit to the training links.
-"""
+"""Finding the parameters of one more effect: proposals, a search over its numbers, exact levels."""
 
 from __future__ import annotations
 

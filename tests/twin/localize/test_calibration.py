@@ -10,7 +10,7 @@ from radiotwin.links import prepare_links
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin.localize import calibrate_radii, locate, misfit
 from radiotwin.twin.localize.calibration import radius_factor
-from radiotwin.twin.model.effect_model import EffectModel
+from radiotwin.twin.model.fold_model import EffectModel
 
 AREA_M = (-100.0, 600.0, -100.0, 600.0)
 
@@ -44,7 +44,7 @@ def test_radii_of_a_model_that_believes_too_much_hold_afterwards(open_ground):
     corrected, inside, before = replace(model, **vars(found)), [], []
     for fold in folds_of(open_ground, 4):
         for radii, with_model in ((inside, corrected), (before, model)):
-            radii += [np.hypot(*(fold.device_m[each.device, :2] - (each.x_m, each.y_m))) <= each.radius_m
+            radii += [np.hypot(*(fold.device_m[each.device, :2] - (each.x_m, each.y_m))) <= each.credible_radius_m
                       for each in locate(with_model, fold, AREA_M)]
     assert np.mean(before) < 0.7 and np.mean(inside) >= 0.75  # 20 positions: 0.9 +- 2 * 0.07
 

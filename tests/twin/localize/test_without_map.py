@@ -10,8 +10,7 @@ from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.links import prepare_links
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin.localize.without_map import locate
-from radiotwin.twin.model.effect_model import EffectModel
-from radiotwin.twin.model.fold_model import FittedEffect
+from radiotwin.twin.model.fold_model import EffectModel, FittedEffect
 from tests.worlds import shortened
 
 AREA_M = (-200.0, 700.0, -200.0, 700.0)
@@ -20,7 +19,7 @@ AREA_M = (-200.0, 700.0, -200.0, 700.0)
 def errors_m(model, links, truth_m):
     """Return distance to the true position and radius of each device."""
     found = locate(model, links, AREA_M)
-    return np.array([[np.hypot(each.x_m - truth_m[each.device, 0], each.y_m - truth_m[each.device, 1]), each.radius_m]
+    return np.array([[np.hypot(each.x_m - truth_m[each.device, 0], each.y_m - truth_m[each.device, 1]), each.credible_radius_m]
                      for each in found])
 
 
@@ -62,7 +61,7 @@ def test_effects_of_devices_that_the_file_does_not_list_do_not_matter(open_groun
     offsets = FittedEffect(DeviceGainOffset(), DeviceGainOffset.Params(members=[0, 1, 2], offsets_sd_db=0.5),
                            np.array([9.0, -9.0, 9.0]))
     (found,) = locate(model_of(Counting(), offsets), links, AREA_M)
-    assert np.hypot(found.x_m - true_m[0], found.y_m - true_m[1]) <= found.radius_m < 40
+    assert np.hypot(found.x_m - true_m[0], found.y_m - true_m[1]) <= found.credible_radius_m < 40
 
 
 def test_few_links_at_once_find_the_same_position(open_ground, monkeypatch):
@@ -73,7 +72,7 @@ def test_few_links_at_once_find_the_same_position(open_ground, monkeypatch):
         found += list(locate(model, links, AREA_M))
         assert max(model.channel.asked) <= most
     assert (found[1].x_m, found[1].y_m) == pytest.approx((found[0].x_m, found[0].y_m))
-    assert found[1].radius_m == pytest.approx(found[0].radius_m)
+    assert found[1].credible_radius_m == pytest.approx(found[0].credible_radius_m)
 
 
 @pytest.mark.slow
@@ -82,7 +81,7 @@ def test_what_is_known_of_receivers_brings_devices_nearer_and_the_radii_hold_nin
     world.gain_db[world.receiver == 1] += 12.0
     with shortened():
         loop = close_loop(open_ground.measured(world), base="log-distance")
-    before, after = (EffectModel.of(each.whole) for each in (loop.before, loop.after))
+    before, after = (each.whole.learnt for each in (loop.before, loop.after))
     rng, results = np.random.default_rng(0), {"before": [], "after": []}
     for _ in range(12):
         part = few_links(loop.links, rng, 20)

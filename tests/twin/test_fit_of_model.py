@@ -11,8 +11,7 @@ from radiotwin.effects.catalogue.roof_heights import RoofHeights
 from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.scene.citymap import CityMap
-from radiotwin.twin.model.effect_model import EffectModel, device_sd_db
-from radiotwin.twin.model.fold_model import Fit, FittedEffect, FoldModel
+from radiotwin.twin.model.fold_model import EffectModel, Fit, FittedEffect, FoldModel, device_sd_db
 
 
 def test_positions_are_sought_without_what_follows_paths_or_many_maps():
@@ -40,7 +39,7 @@ def test_a_class_that_nothing_was_learnt_of_has_the_scale_of_the_other(make_link
     fit = fold.fit()
     assert fit.scale_db[0] == fit.scale_db[1] == pytest.approx(2.3, abs=0.6)  # of Student's t with 5 degrees
     alone = FoldModel.build(links.select(learnt), channel, 5.0)
-    assert np.isfinite(EffectModel.of(alone.fit()).predict(links).mean_db).all()
+    assert np.isfinite(alone.fit().predict(links).mean_db).all()
 
 
 @pytest.mark.parametrize("devices", [3, 6])
