@@ -12,7 +12,7 @@ from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, prepare_links
 from radiotwin.links.alignment import in_known_frame
-from radiotwin.links.links import Columns, Ends, World
+from radiotwin.links.links import Columns, Ends
 from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
@@ -126,8 +126,7 @@ def _by_channel(twin: Twin, links: Links) -> EffectModel:
         columns=Columns.unmeasured(links.receiver_m[rows], device, twin.limit_db),
         ends=Ends(device_names=[each.device for each in twin.devices],
                   device_m=np.nan_to_num(twin.device_m), anchors=frozenset()),
-        world=World(frequency_hz=links.frequency_hz, city=links.city, is_gain=links.is_gain),
-    ).geometry
+        world=links.world).geometry
     sd_db, group = channel.predict(probes)[1], channel.error_group(probes)
     usual_db = [np.median(sd_db[group == each] if (group == each).any() else sd_db)
                 for each in range(channel.error_groups(probes))]
