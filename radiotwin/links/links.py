@@ -405,11 +405,6 @@ class Links:
         known_db = np.sort(self.receiver_limits_db[np.isfinite(self.receiver_limits_db)])
         return float(known_db[(len(known_db) - 1) // 2]) if len(known_db) else None
 
-    @cached_property
-    def absolute_time_s(self) -> np.ndarray:
-        """(n,) `time_s` where flights can be compared by it [s]; NaN where clocks restart."""
-        return np.full(len(self), np.nan) if self.time_restarts else self.time_s
-
     @property
     def has_boresights(self) -> bool:
         """Whether the azimuth of any device's antenna is declared."""

@@ -45,7 +45,8 @@ VARIABLES: dict[str, Callable[[Links, np.ndarray], np.ndarray]] = {
     "body_azimuth_deg": lambda links, _: links.body_azimuth_deg,
     "heading_deg": lambda links, _: links.heading_deg,
     "time_in_flight_s": lambda links, _: links.time_in_flight_s,
-    "time_s": lambda links, _: links.absolute_time_s,
+    "time_s": lambda links, _: (np.full(len(links), np.nan) if links.time_restarts
+                                else links.time_s),
     "flight": lambda links, _: links.flight,
     "altitude_m": lambda links, _: links.receiver_m[:, 2],
     "receiver": lambda links, _: links.receiver,
