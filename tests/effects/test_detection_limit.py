@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from radiotwin.effects.catalogue import detection_limit
 from radiotwin.effects.catalogue.detection_limit import DetectionLimit
 
 DECLARED_DB, SCALE_DB = -120.0, 3.0
@@ -49,7 +50,7 @@ def test_a_receiver_that_reads_far_weaker_levels_has_no_such_limit(seen, monkeyp
     links.level_db[np.random.default_rng(1).permutation(weak)[6:]] = np.nan
     assert np.nanmin(links.level_db[links.receiver == 1]) < -113.0 and len(weak) > 60
     assert DetectionLimit().propose(given) == []
-    monkeypatch.setattr("radiotwin.effects.catalogue.detection_limit.contradict_limit", lambda *_: False)
+    monkeypatch.setattr(detection_limit, "contradict_limit", lambda *_: False)
     assert DetectionLimit().propose(given)  # that is what forbids it
 
 
