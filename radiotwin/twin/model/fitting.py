@@ -206,7 +206,7 @@ def along_paths(fit: Fit, without: Fit) -> Fit:
     return found or fit
 
 
-def prepare_additions(fits: Sequence[Fit], effects: Sequence[Effect], executor: Executor,
+def prepare_additions(without: Sequence[Fit], effects: Sequence[Effect], executor: Executor,
                       like: Any = None) -> None:
     """Compute what `add_effect` will be asked, on the workers of an executor.
 
@@ -214,18 +214,18 @@ def prepare_additions(fits: Sequence[Fit], effects: Sequence[Effect], executor: 
     has them, equal to the bit. Where no parts are kept, nothing is done.
 
     Args:
-        fits: k of them.
-        effects: to be added to each of them.
+        without: k fits, to each of which the effects are added.
+        effects: one at a time.
         executor: where it runs.
         like: as of `add_effect`.
     """
     if not executor.is_worth_it or not keeps():
         return
-    pieces = [(fit, effect) for fit in range(len(fits)) for effect in range(len(effects))]
+    pieces = [(fit, effect) for fit in range(len(without)) for effect in range(len(effects))]
     parts: KeptParts[tuple[int, int], Piece | None] = KeptParts(
-        "effect", lambda piece: (fits[piece[0]], effects[piece[1]], like),
+        "effect", lambda piece: (without[piece[0]], effects[piece[1]], like),
         lambda found: found, lambda arrays, content: (arrays, content))
-    function = _Addition(list(fits), list(effects), like)
+    function = _Addition(list(without), list(effects), like)
     # A worker holds links, map and models as this process does, and no more.
     memory_bytes = max(WORKER_BYTES, resident_bytes(os.getpid()))
     job: Job[tuple[int, int], Piece | None] = Job("fitting effects", function,
@@ -237,12 +237,12 @@ def prepare_additions(fits: Sequence[Fit], effects: Sequence[Effect], executor: 
 class _Addition:
     """Adds effects to fits, by the number of each; arguments as of `prepare_additions`."""
 
-    fits: list[Fit]
+    without: list[Fit]
     effects: list[Effect]
     like: Any
 
     def __call__(self, piece: tuple[int, int]) -> Piece | None:
-        fit, effect = self.fits[piece[0]], self.effects[piece[1]]
+        fit, effect = self.without[piece[0]], self.effects[piece[1]]
         return _write_addition(_best_addition(fit, effect, self.like))
 
 
