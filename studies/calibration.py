@@ -5,7 +5,7 @@ those of the two traced cities whose maps are right within a survey's error (`te
 the others of which are left for the studies `hidden` and `null`; and campaigns over open ground.
 
     python -m studies calibration --resume      # rows: the loop on each case
-    python -m studies.calibration           # rows -> radiotwin/closeloop/search/calibration.json
+    python -m studies.calibration           # rows -> radiotwin/closeloop/verdict/calibration.json
 """
 
 import json
@@ -13,8 +13,8 @@ import warnings
 from pathlib import Path
 
 from radiotwin import close_loop
-from radiotwin.closeloop.search import posterior
-from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.closeloop.search.trials import Trial
+from radiotwin.closeloop.verdict import posterior
 from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
 from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
 from radiotwin.io.files import atomic_path
@@ -65,11 +65,11 @@ def candidates_of(seed: int, settings: dict) -> dict:
         "named": [each.effect.name for each in loop.after.whole.effects
                   if not each.effect.is_declared],
         "candidates": [[*_row(score), score.name in right or _is_wrong_map(score, nuisance)]
-                       for score in loop.selection.scores if score.features],
-        "steps": [[max([0.0, *(score.nats for score in loop.selection.scores if score.features
+                       for score in loop.found.log.trials if score.features],
+        "steps": [[max([0.0, *(score.nats for score in loop.found.log.trials if score.features
                                and score.step == step.number)]),
                    step.best_unnamed, step.rest_db, step.noise_db]
-                  for step in loop.selection.steps]}
+                  for step in loop.found.steps]}
 
 
 def _case(family: str, number: str) -> Case | ForeignCase | OpenCase:
@@ -78,7 +78,7 @@ def _case(family: str, number: str) -> Case | ForeignCase | OpenCase:
     return case(family, int(number)) if number else foreign_case(family)
 
 
-def _is_wrong_map(score: CandidateScore, nuisance: dict | None) -> bool:
+def _is_wrong_map(score: Trial, nuisance: dict | None) -> bool:
     """Return whether a building of a candidate is missing or gone, though nobody hid it."""
     if isinstance(score.params, MissingObstacle.Params):
         x_m, y_m = score.params.box.x_m, score.params.box.y_m
@@ -89,7 +89,7 @@ def _is_wrong_map(score: CandidateScore, nuisance: dict | None) -> bool:
     return nuisance is not None and by_mistake_of_the_map(score.name, x_m, y_m, nuisance)
 
 
-def _row(score: CandidateScore) -> list:
+def _row(score: Trial) -> list:
     return [score.step, score.name, score.passed, list(score.features),
             score.gain_by_fold.round(2).tolist(), round(score.p_value, 6)]
 

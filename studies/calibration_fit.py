@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from marl.figures import COLOURS
-from radiotwin.closeloop.search import posterior
+from radiotwin.closeloop.verdict import posterior
 from studies.tables import make_panels, markdown
 
 PHYSICS = ("wall_reflection", "diffraction")  # in every traced world

@@ -17,8 +17,8 @@ import trimesh
 
 from radiotwin import Measurements, Scene, close_loop, make_report
 from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
-from radiotwin.closeloop.search.declared import take_declared
-from radiotwin.closeloop.search.selection import SelectionResult
+from radiotwin.closeloop.search.declared import add_declared
+from radiotwin.closeloop.search.stages import SearchInputs, search
 from radiotwin.effects.registry import catalogue
 from radiotwin.links import prepare_links
 from radiotwin.scene.citymap import CityMap
@@ -97,10 +97,10 @@ def base_rmse_db(measurements: Measurements, scene: Scene, base: str, hold_out: 
     """Return the held-out error of a base with what belongs to it [dB]."""
     links = prepare_links(measurements, scene)
     folds = make_folds(links, 0, hold_out)
-    model = cross_validate(links, make_bases(scene, 0)[base], folds, training_parts(links, folds))
-    selection = SelectionResult(model)
-    take_declared(selection, [effect() for effect in catalogue()], 0, lambda _: None)
-    return selection.model.rmse_db()
+    kind = make_bases(scene, 0)[base]
+    model = cross_validate(links, kind, folds, training_parts(links, folds))
+    inputs = SearchInputs(links, kind, folds, tuple(effect() for effect in catalogue()))
+    return search(model, [add_declared], inputs).model.rmse_db()
 
 
 def with_true_city(scene: Scene, effect: dict) -> Scene:

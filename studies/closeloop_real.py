@@ -102,7 +102,7 @@ def permuted(measurements: Measurements, seed: int) -> Measurements:
 
 def explained(loop: Loop) -> CrossFit:
     """Return the model with the named effects, without interpolation of the rest."""
-    return loop.selection.explained or loop.after
+    return loop.explained
 
 
 def turned_rmse_db(loop: Loop) -> float:

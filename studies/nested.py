@@ -1,7 +1,7 @@
 """Is evidence what it claims to be? Laplace's approximation against nested sampling: `nested`.
 
 Ten campaigns over open ground with something hidden in them, plain to see or less. For each the
-evidence that `close-loop` weighs (radiotwin/closeloop/search/hypotheses.py), and that of nested
+evidence that `close-loop` weighs (radiotwin/closeloop/verdict/hypotheses.py), and that of nested
 sampling over the effect's numbers and the two variances of the rest: exact levels at every draw,
 dense matrices, and a library of its own (dynesty; Speagle 2020, MNRAS 493). `pip install
 dynesty==3.1.0`.
@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, solve_triangular
 from scipy.spatial.distance import cdist
 
 from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
-from radiotwin.closeloop.search.hypotheses import Hypotheses
+from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 from radiotwin.effects.base import Effect
 from radiotwin.effects.catalogue.body_shadowing import BodyShadowing
 from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset

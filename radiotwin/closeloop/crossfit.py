@@ -1,10 +1,7 @@
-"""A base model of all links and of each fold's others: the bases, the folds, and both together.
+"""A base with effects, fitted to all links and, for each fold, to all links outside it.
 
-One model of all links and one of each fold's others, side by side.
-
-Which links are held out together.
-
-The models whose residual is examined: kinds of twin that can be fitted to any of the links.
+Folds say which links are held out together. A base is a kind of twin that can be fitted to any of
+the links; its residual on held-out links is what effects have to explain.
 """
 
 from __future__ import annotations
@@ -441,6 +438,20 @@ def cross_validate(links: Links, base: Base, folds: Folds,
         models.append(FoldModel.build(links, fitted.channel, dof, device_m=base.device_m(fitted),
                                       train=folds.index != number))
     return CrossFit(whole.fit(), tuple(each.fit() for each in models), folds.index, twin)
+
+
+def best_base(models: dict[str, CrossFit]) -> str:
+    """Return the base with the least held-out error of the links that all can predict.
+
+    One that cannot locate the devices that are hard to predict does not win by that. Of several
+    without a link in common, the one that predicts most.
+    """
+    known = {name: np.isfinite(model.links.level_db - model.held_out_mean_db)
+             for name, model in models.items()}
+    in_common = np.all(list(known.values()), axis=0)
+    if not in_common.any():
+        return max(known, key=lambda name: known[name].sum())
+    return min(models, key=lambda name: models[name].rmse_db(in_common))
 
 
 def _with_evidence(links: Links, whole: FoldModel) -> Links:

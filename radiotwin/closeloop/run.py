@@ -1,13 +1,10 @@
-"""The loop: residual, dependences, effects one by one, and the error before and after, held out.
-
-Fewer links where more say nothing new: piles at one place, and samples of very many.
-"""
+"""The loop: fit a base, look at its residual, search for effects, and compare held-out errors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -16,90 +13,41 @@ from radiotwin.closeloop.crossfit import (
     CrossFit,
     Folds,
     LogDistanceBase,
+    best_base,
     cross_validate,
     make_bases,
     make_folds,
     training_parts,
 )
 from radiotwin.closeloop.predict.predictor import CombinedPrediction, combined_prediction
-from radiotwin.closeloop.search.declared import take_declared
-from radiotwin.closeloop.search.faults import drop_idle_faults, select_change_points, select_faults
-from radiotwin.closeloop.search.posterior import NONE, OTHER
+from radiotwin.closeloop.search.causes import add_causes
+from radiotwin.closeloop.search.declared import add_declared
+from radiotwin.closeloop.search.faults import add_changes, add_faults, drop_idle_faults
 from radiotwin.closeloop.search.relocate import relocate_devices
-from radiotwin.closeloop.search.selection import SelectionResult, add_shadowing, forward_selection
+from radiotwin.closeloop.search.rest import add_shadowing, add_trends
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.intervals import effect_parameters, effect_size_db
-from radiotwin.closeloop.verdict.residual_tests import ResidualDependence, residual_dependences
+from radiotwin.closeloop.verdict.posterior import verdict_without_effect
+from radiotwin.closeloop.verdict.residual_tests import (
+    ResidualDependence,
+    dependences,
+    noise_floor_db,
+    significant,
+)
 from radiotwin.closeloop.verdict.sensitivity import Detectable, detectable
 from radiotwin.display import Summarised, Summary, count, some
-from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
 from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue
 from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
-from radiotwin.links import Links, prepare_links, residual_variables
+from radiotwin.links import Links, prepare_links
 from radiotwin.links.checks import refuse_misplaced_anchors
-from radiotwin.links.correlation import moving_end_m, pair_of_ends
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.links.measurements import Measurements
+from radiotwin.links.thinning import thin_links
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
-
-PLACE_M = 5.0  # side of a square of ground that counts as one place
-PILE, MIN_PILE = 5, 20  # times the usual number of readings at one place is a pile; and at least
-MIN_SURPLUS = 0.05  # share of all links in piles, to thin them
-MAX_LINKS = 120_000  # up to which all are used
-SAMPLE_LINKS = 60_000  # of more: takes minutes
-
-
-def thin_piles(links: Links) -> Links:
-    """Return links of which no place has far more than the others have, with a note.
-
-    A receiver that hovers reads one and the same error many times. What a place (of one pair of
-    ends, on one flight) has beyond `PILE` times the usual number is left out, evenly in time.
-
-    Args:
-        links: n links.
-    """
-    cell = np.floor(moving_end_m(links)[:, :2] / PLACE_M).astype(np.int64)
-    keys = np.column_stack([cell, pair_of_ends(links), links.flight])
-    order = np.lexsort((np.arange(len(links)), links.time_s, *keys.T))
-    starts = np.flatnonzero(np.r_[True, np.diff(keys[order], axis=0).any(axis=1)])
-    count = np.diff(np.r_[starts, len(links)])
-    most = max(PILE * float(np.median(count)), MIN_PILE)
-    if np.maximum(count - most, 0).sum() < MIN_SURPLUS * len(links):
-        return links
-    share = np.repeat(np.minimum(most / count, 1.0), count)
-    place = np.arange(len(links)) - np.repeat(starts, count)
-    kept = np.sort(order[np.floor((place + 1) * share) > np.floor(place * share)])
-    note = (f"receivers stayed at {(count > most).sum():,} places, where "
-            f"{len(links) - len(kept):,} of {len(links):,} links are left out, evenly in time: "
-            f"readings at one place err alike and count as one; {most:.0f} of them are used")
-    return links.select(kept).with_notes(note)
-
-
-def thin_links(links: Links, seed: int) -> Links:
-    """Return the links, or a sample of very many, with a note that says so.
-
-    The links of each flight, device and receiver are taken in the order of their times, and of as
-    many as go into the sample once, one is drawn. So all flights, devices, receivers, times and
-    blanks have the share that they have of all links, and means over the sample are not biased.
-
-    Args:
-        links: n links.
-        seed: of the draw.
-    """
-    links = thin_piles(links)
-    n = len(links)
-    if n <= MAX_LINKS:
-        return links
-    order = np.lexsort((np.arange(n), links.time_s, links.receiver, links.device, links.flight))
-    first = np.arange(SAMPLE_LINKS + 1) * n // SAMPLE_LINKS
-    rows = np.sort(order[np.random.default_rng(seed).integers(first[:-1], first[1:])])
-    note = (f"of {n:,} links {len(rows):,} are used, drawn evenly from all flights, devices, "
-            f"receivers and times, as above {MAX_LINKS:,} the loop would take hours; errors, "
-            "evidence and residuals are those of the sample")
-    return links.select(rows).with_notes(note)
 
 
 @dataclass(eq=False, repr=False)
@@ -111,7 +59,9 @@ class Loop(Summarised):
         links: that were used: all, or a sample of very many.
         folds: how they were held out.
         before: the base alone, with what is declared.
-        selection: base and effects.
+        explained: base and named effects, without trends and interpolation of the rest.
+        found: base and effects, and the log of all trials.
+        criteria: thresholds that decided.
         dependences_before, dependences_after: of the held-out residual.
         seed: of what is still to be drawn.
         noise_floor_db: from links measured twice at one position; NaN where there are none.
@@ -122,7 +72,9 @@ class Loop(Summarised):
     links: Links
     folds: Folds
     before: CrossFit
-    selection: SelectionResult
+    explained: CrossFit
+    found: SearchState
+    criteria: SelectionCriteria
     dependences_before: list[ResidualDependence]
     dependences_after: list[ResidualDependence]
     seed: int
@@ -132,7 +84,7 @@ class Loop(Summarised):
     @property
     def after(self) -> CrossFit:
         """Base and effects."""
-        return self.selection.model
+        return self.found.model
 
     @cached_property
     def for_twin(self) -> CrossFit:
@@ -147,34 +99,16 @@ class Loop(Summarised):
              if not any(each.effect is other for other in dropped)]).fit())
 
     @property
-    def criteria(self) -> SelectionCriteria:
-        """Thresholds that decided."""
-        return self.selection.criteria
-
-    @property
     def remaining(self) -> list[ResidualDependence]:
         """Dependences that are left."""
         return significant(self.dependences_after, self.criteria)
 
     @property
     def verdict(self) -> str:
-        """`effect`, `none`, `unexplained` or `undecided`.
-
-        Without a named effect: `unexplained` where a cause without a name is the likeliest, or more
-        than `max_rest_db` belongs to places; `none` where nothing is the likeliest by far. Of the
-        first step; last resorts have no part in it.
-        """
-        if any(each.effect.is_cause and not each.effect.is_declared
-               for each in self.after.whole.effects):
-            return "effect"
-        if not self.selection.steps:
-            return "undecided"
-        step = self.selection.steps[0]
-        likeliest = max(step.probabilities, key=lambda name: step.probabilities[name])
-        if likeliest == OTHER or step.rest_db > self.criteria.max_rest_db:
-            return "unexplained"
-        sure = step.probabilities[NONE] >= self.criteria.min_probability
-        return "none" if sure else "undecided"
+        """`effect` where a cause was named; else `none`, `unexplained` or `undecided`."""
+        named = any(each.effect.is_cause and not each.effect.is_declared
+                    for each in self.after.whole.effects)
+        return "effect" if named else verdict_without_effect(self.found.steps, self.criteria)
 
     @property
     def _summary(self) -> Summary:
@@ -194,7 +128,7 @@ class Loop(Summarised):
     @cached_property
     def detectable(self) -> list[Detectable]:
         """How large effects would have had to be, to be named."""
-        left = self.selection.looked_at
+        left = self.found.looked_at
         if left is None:
             return []
         model, hypotheses = left
@@ -211,13 +145,6 @@ class Loop(Summarised):
         """Of each kept effect, see `effect_size_db`."""
         return [effect_size_db(self.after, number)
                 for number in range(len(self.after.whole.effects))]
-
-
-def significant(dependences: list[ResidualDependence],
-                criteria: SelectionCriteria) -> list[ResidualDependence]:
-    """Return those that are not chance and strong enough to matter."""
-    return [each for each in dependences if each.p_value <= criteria.max_dependence_p_value
-            and each.effect_db >= criteria.min_dependence_db]
 
 
 def close_loop(measurements: Measurements, scene: Scene | None = None, base: str = "auto",
@@ -256,75 +183,28 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     names = [base]
     if base == "auto":
         names = ["log-distance"] if scene is None else ["twin", "raytrace"]
-    executor = executor or Executor()
     bases = make_bases(scene, seed)
     models, parts = {}, training_parts(links, folds)
     for name in names:
         on_progress(f"fitting the base {name}")
         models[name] = cross_validate(links, bases[name], folds, parts)
     best = best_base(models)
-    selection = SelectionResult(models[best], criteria, executor=executor)
-    candidates = [effect() for effect in catalogue()
-                  if not (effect.in_paths and models[best].whole.channel.follows_paths)]
-    effects = take_declared(selection, candidates, seed, on_progress)
-    before = selection.model
+    effects = tuple(effect() for effect in catalogue()
+                    if not (effect.in_paths and models[best].whole.channel.follows_paths))
+    inputs = SearchInputs(links, bases[best], folds, effects, criteria, seed,
+                          executor or Executor(), on_progress)
+    declared = search(models[best], [add_declared], inputs)
     on_progress("looking at the residual")
-    dependences_before = _dependences(before, seed)
-    select_faults(selection, effects, links, bases[best], seed, on_progress)
-    select_change_points(selection, links, bases[best], folds, seed, on_progress)
-    forward_selection(selection, [effect for effect in effects if not effect.within_flights], seed,
-                      on_progress)
-    drop_idle_faults(selection)
+    before = after = dependences(declared.model, seed)
+    found = search(declared, [add_faults, add_changes, add_causes, drop_idle_faults], inputs)
     on_progress("unknown devices again, beside the effects")
     anew = make_bases(scene, seed)[best]  # which remembers no earlier position
-    selection.model = relocate_devices(selection.model, links, anew)
-    selection.explained = selection.model
+    explained = relocate_devices(found.model, links, anew)
     on_progress("looking at what is left")
-    dependences_after = dependences_before
-    if selection.model is not before:
-        dependences_after = _dependences(selection.model, seed)
-    left = significant(dependences_after, criteria)
-    if left:
-        values = residual_variables(selection.model.links, selection.model.held_out_mean_db)
-        trends = [UnexplainedTrend(each.variable) for each in left
-                  if values[each.variable].dtype.kind == "f"]  # a curve needs an order
-        forward_selection(selection, [*trends[:criteria.max_trends]], seed, on_progress)
-        on_progress("correlated_shadowing")
-        add_shadowing(selection, seed)
-    return Loop(best, links, folds, before, selection, dependences_before, dependences_after,
-                seed, _noise_floor_db(all_links, criteria), measurements.origin)
-
-
-def best_base(models: dict[str, CrossFit]) -> str:
-    """Return the base with the least held-out error of the links that all can predict.
-
-    One that cannot locate the devices that are hard to predict does not win by that. Of several
-    without a link in common, the one that predicts most.
-    """
-    known = {name: np.isfinite(model.links.level_db - model.held_out_mean_db)
-             for name, model in models.items()}
-    in_common = np.all(list(known.values()), axis=0)
-    if not in_common.any():
-        return max(known, key=lambda name: known[name].sum())
-    return min(models, key=lambda name: models[name].rmse_db(in_common))
-
-
-def _dependences(model: CrossFit, seed: int) -> list[ResidualDependence]:
-    mean_db = model.held_out_mean_db
-    residual_db = np.where(model.unforeseen, np.nan, model.links.level_db - mean_db)
-    return residual_dependences(model.links, residual_db, model.held_out_reading[1], mean_db, seed)
-
-
-def _noise_floor_db(links: Links, criteria: SelectionCriteria) -> float:
-    """Return the standard deviation of one measurement [dB], from repeats at one position."""
-    place = np.round(np.column_stack([links.receiver_m, links.device, links.receiver]), 1)
-    group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
-    seen = np.isfinite(links.level_db)
-    count = np.bincount(group[seen], minlength=group.max() + 1)
-    sums = np.bincount(group[seen], weights=links.level_db[seen], minlength=len(count))
-    mean = sums / np.maximum(count, 1)
-    again = seen & (count[group] > 1)
-    freedom = int((count[count > 1] - 1).sum())
-    if freedom < criteria.min_repeats_for_noise:
-        return float("nan")
-    return float(np.sqrt(((links.level_db - mean[group])[again] ** 2).sum() / freedom))
+    if explained is not declared.model:
+        after = dependences(explained, seed)
+    left = [each.variable for each in significant(after, criteria)]
+    found = search(replace(found, model=explained),
+                   [partial(add_trends, variables=left), add_shadowing] if left else [], inputs)
+    return Loop(best, links, folds, declared.model, explained, found, criteria, before, after, seed,
+                noise_floor_db(all_links, criteria), measurements.origin)

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from radiotwin.closeloop.run import Loop, significant
+from radiotwin.closeloop.run import Loop
+from radiotwin.closeloop.verdict.residual_tests import significant
 from radiotwin.effects.params import Parameter
 from radiotwin.links import Links, evidence_blocks, residual_variables
 from radiotwin.report.labels import variable_label
@@ -180,7 +181,7 @@ def collect(loop: Loop) -> LoopData:
     return LoopData(
         links, loop.base, loop.before.held_out_mean_db, model.held_out_mean_db,
         model is not loop.before,
-        [score.name for score in loop.selection.scores if score.kept][in_base:],
+        [trial.name for trial in loop.found.log.kept][in_base:],
         [each.variable for each in dependences or before[:3]], _effects(loop, links),
         interpolated_db)
 

@@ -2,8 +2,8 @@
 
 from collections import Counter
 
-from radiotwin.closeloop.search.posterior import NONE, OTHER
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.posterior import NONE, OTHER
 from radiotwin.io.texts import moment
 from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, variable_label
 

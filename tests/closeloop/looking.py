@@ -1,7 +1,7 @@
 """Evidence in a world over open ground."""
 
 from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
-from radiotwin.closeloop.search.hypotheses import Hypotheses
+from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 from radiotwin.links import prepare_links
 
 

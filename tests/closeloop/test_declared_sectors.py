@@ -15,8 +15,8 @@ import radiotwin as rt
 from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
 from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.predict.baselines import EXTRA_TREES, grow_trees
-from radiotwin.closeloop.search.declared import take_declared
-from radiotwin.closeloop.search.selection import SelectionResult
+from radiotwin.closeloop.search.declared import add_declared
+from radiotwin.closeloop.search.stages import SearchInputs, search
 from radiotwin.effects.base import GainEffect
 from radiotwin.effects.catalogue.declared_sectors import DeclaredSectors
 from radiotwin.effects.catalogue.sector_antenna import SectorPattern
@@ -66,14 +66,13 @@ def taken(measurements):
     """Return the base log-distance, a device held out, with what is declared, the score and the notes."""
     links = prepare_links(measurements, None)
     folds = make_folds(links, 0, "device")
-    base = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
-    result = SelectionResult(base)
-    others = take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
-    assert len(others) == sum(not effect.is_declared for effect in BUILT_IN)
+    kind = make_bases(None, 0)["log-distance"]
+    base = cross_validate(links, kind, folds, training_parts(links, folds))
+    result = search(base, [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
     whole, parameters = result.model.whole, {}
     for each, estimate in zip(whole.effects, estimates(linearise(whole)), strict=True):
         parameters |= each.effect.parameters(links, each.params, estimate)
-    return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.scores,
+    return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.log.trials,
                            params=whole.effects[0].params if whole.effects else None, parameters=parameters,
                            variants=[each.effect.variant for each in whole.effects],
                            note=([*result.model.links.notes, *result.notes] or [""])[-1])
@@ -238,13 +237,13 @@ class All(Half):
 def test_of_two_forms_held_out_links_choose(forms):
     links = prepare_links(network(5), None)
     folds = make_folds(links, 0, "device")
-    result = SelectionResult(cross_validate(links, make_bases(None, 0)["log-distance"], folds,
-                                            training_parts(links, folds)))
-    assert take_declared(result, [form() for form in forms], 0, lambda _: None) == []
+    kind = make_bases(None, 0)["log-distance"]
+    model = cross_validate(links, kind, folds, training_parts(links, folds))
+    result = search(model, [add_declared], SearchInputs(links, kind, folds, tuple(form() for form in forms)))
     [effect] = result.model.whole.effects
     assert effect.effect.variant == "all of it"
-    assert [each.reason for each in result.scores if not each.kept] == ["all of it gain more"]
-    assert [each.kept for each in result.scores].count(True) == 1
+    assert [each.reason for each in result.log.trials if not each.kept] == ["all of it gain more"]
+    assert len(result.log.kept) == 1
 
 
 def test_trees_of_a_stored_blend_know_the_azimuths_and_nobody_need_tell_them_again():
@@ -267,8 +266,9 @@ def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
     """The rest counts in units of what heard sectors scatter by, however uncertain the level of an unheard one is."""
     links = prepare_links(network(8), None)
     folds = make_folds(links, 0, "device")
-    result = SelectionResult(cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds)))
-    take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
+    kind = make_bases(None, 0)["log-distance"]
+    base = cross_validate(links, kind, folds, training_parts(links, folds))
+    result = search(base, [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
     fields = [CorrelatedShadowing.fit(each, 0) for each in result.model.each]
     model = result.model.with_shadowing(fields)
     mean_db, scale_db = model.held_out_reading

@@ -16,8 +16,8 @@ from radiotwin.closeloop.crossfit import (
     training_parts,
 )
 from radiotwin.closeloop.search.faults import _without, drop_idle_faults, with_effect
-from radiotwin.closeloop.search.scoring import CandidateScore
-from radiotwin.closeloop.search.selection import SelectionResult
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState
+from radiotwin.closeloop.search.trials import Trial
 from radiotwin.effects.base import Term
 from radiotwin.effects.catalogue.episode import Episode
 from radiotwin.effects.catalogue.faulty_flight import FaultyFlight
@@ -136,14 +136,14 @@ def test_two_of_a_kind_that_a_fold_found_in_another_order_are_not_swapped(effect
 def test_a_step_that_other_effects_explain_is_taken_back(step_db):
     links = prepare_links(campaign(4, loss_db=0.0, step_db=step_db), None)
     folds = make_folds(links, 0, "flight")
-    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
-    result = SelectionResult(model)
+    base = make_bases(None, 0)["log-distance"]
+    model = cross_validate(links, base, folds, training_parts(links, folds))
     step = ReceiverDrift.Params(receivers={0: Drift("step", 600.0)})
-    result.keep(CandidateScore("receiver_drift", step=0), with_effect(model, ReceiverDrift(True), step))
-    drop_idle_faults(result)
+    found = SearchState(model).keep(Trial("receiver_drift"), with_effect(model, ReceiverDrift(True), step))
+    result = drop_idle_faults(found, SearchInputs(links, base, folds, ()))
     stays = step_db > 0
-    assert len(result.model.whole.effects) == len(result.rivals) == stays
-    assert result.scores[0].kept == stays
+    assert result.step == len(result.log.kept) == stays
+    assert found.step == len(found.log.kept) == 1
     assert [len(fold.effects) for fold in result.model.folds] == [stays] * 5
 
 
@@ -155,14 +155,15 @@ def test_a_fault_that_its_own_search_would_not_find_beside_the_others_is_taken_b
     table.loc[lower, "gain_db"] -= 5.0
     links = prepare_links(measurements, None)
     folds = make_folds(links, 0, "flight")
-    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
+    base = make_bases(None, 0)["log-distance"]
+    model = cross_validate(links, base, folds, training_parts(links, folds))
     episode = Episode.Params(receiver=0, flight=None, start_s=BEGIN_S, end_s=END_S, start_within_s=(BEGIN_S - 1, BEGIN_S),
                              end_within_s=(END_S, END_S + 1), form="loss", frequency_hz=2.4e9)
-    result = SelectionResult(model)
-    result.keep(CandidateScore("episode", step=0), with_effect(model, Episode(), episode))
-    assert model.whole.objective - result.model.whole.objective > result.criteria.min_training_gain_nats
-    drop_idle_faults(result)
-    assert len(result.model.whole.effects) == result.scores[0].kept == (not always)
+    inputs = SearchInputs(links, base, folds, ())
+    found = SearchState(model).keep(Trial("episode"), with_effect(model, Episode(), episode))
+    assert model.whole.objective - found.model.whole.objective > inputs.criteria.min_training_gain_nats
+    result = drop_idle_faults(found, inputs)
+    assert result.step == len(result.log.kept) == (not always)
 
 
 def test_what_there_is_one_of_is_the_same_wherever_a_fold_finds_it():

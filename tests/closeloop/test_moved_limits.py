@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
-from radiotwin.closeloop.search.selection import SelectionResult, forward_selection
+from radiotwin.closeloop.search.causes import add_causes
+from radiotwin.closeloop.search.stages import SearchInputs, search
 from radiotwin.effects.catalogue.detection_limit import DetectionLimit
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.links import prepare_links
@@ -25,8 +26,9 @@ def test_one_fault_has_one_name(open_ground, off_db, limit_moves, named):
     world.limit_db = -np.inf
     links = limits_to_explain(prepare_links(open_ground.measured(world), None))
     folds = make_folds(links, 0)
-    result = SelectionResult(cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds)))
-    forward_selection(result, [ReceiverGainOffset(), DetectionLimit()], 0, lambda _: None)
+    base = LogDistanceBase(None, 0)
+    model = cross_validate(links, base, folds, training_parts(links, folds))
+    result = search(model, [add_causes], SearchInputs(links, base, folds, (ReceiverGainOffset(), DetectionLimit())))
     assert [each.effect.name for each in result.model.whole.effects] == named
     used_db = [float(np.median(result.model.whole.model.limit_db[links.receiver == receiver])) for receiver in (0, 1)]
     assert used_db == pytest.approx([LIMIT_DB, LIMIT_DB + 6.0 * limit_moves], abs=1.0)

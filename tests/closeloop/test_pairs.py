@@ -3,7 +3,8 @@
 import pytest
 
 from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
-from radiotwin.closeloop.search.selection import SelectionResult, forward_selection
+from radiotwin.closeloop.search.causes import add_causes
+from radiotwin.closeloop.search.stages import SearchInputs, search
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
@@ -19,15 +20,15 @@ def selected(open_ground):
             world.device_m[device, 0] += east_m
         links = prepare_links(open_ground.measured(world), None)
         folds = make_folds(links, 0)
-        model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-        result = SelectionResult(model, SelectionCriteria(min_probability=min_probability))
-        forward_selection(result, [DevicePositionError(), ReceiverGainOffset()], 0, lambda _: None)
-        return result
+        base = LogDistanceBase(None, 0)
+        model = cross_validate(links, base, folds, training_parts(links, folds))
+        return search(model, [add_causes], SearchInputs(links, base, folds, (DevicePositionError(), ReceiverGainOffset()),
+                                                        SelectionCriteria(min_probability=min_probability)))
     return run
 
 
 def best_alone(result):
-    return max(score.probability for score in result.scores if score.probability == score.probability)
+    return max(trial.probability for trial in result.log.trials if trial.probability == trial.probability)
 
 
 def test_two_anchors_of_which_none_is_probable_alone_are_named_together(selected):
@@ -35,9 +36,9 @@ def test_two_anchors_of_which_none_is_probable_alone_are_named_together(selected
     needed = best_alone(selected(moved_m, 1.0)) + 0.005
     result = selected(moved_m, needed)
     assert {each.params.device for each in result.model.whole.effects} == set(moved_m)
-    kept = [score for score in result.scores if score.kept]
-    assert len(kept) == len(result.rivals) == 2 and {score.reason for score in kept} == {""}
-    assert all(score.probability >= needed for score in kept)
+    kept = result.log.kept
+    assert len(kept) == 2 and {trial.reason for trial in kept} == {""}
+    assert all(trial.probability >= needed for trial in kept)
 
 
 def test_one_anchor_has_no_second_beside_it(selected):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from radiotwin.closeloop.search.posterior import NONE, OTHER, features, judge, probability_of
-from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.posterior import NONE, OTHER, features, judge, probability_of
 from radiotwin.closeloop.verdict.sensitivity import needed_nats
 from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
 from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
@@ -69,7 +69,7 @@ def test_evidence_is_that_of_all_numbers_an_effect_may_have(open_ground, monkeyp
     model, hypotheses = looked_at(open_ground, seed, change)
     found = add_effect(model.whole, effect)
     by_laplace = hypotheses.of_named(found)
-    monkeypatch.setattr("radiotwin.closeloop.search.hypotheses._slopes",
+    monkeypatch.setattr("radiotwin.closeloop.verdict.hypotheses._slopes",
                         lambda fit: Columns(np.zeros((int(fit.train.sum()), 0)), np.zeros(0)))
     applied = found.effects[-1]
     varied = effect.variation(applied.params)
@@ -106,7 +106,7 @@ def test_noise_is_told_from_a_rest_that_belongs_to_places(open_ground):
 
 def test_probabilities_sum_to_one_and_a_weak_candidate_is_refused(open_ground):
     model, hypotheses = looked_at(open_ground, 5)
-    scores = [CandidateScore(name, passed=True, nll_gain=10 * nats, rmse_db=model.rmse_db() * 0.99, rmse_fall=0.01, evidence_nats=nats,
+    scores = [Trial(name, passed=True, nll_gain=10 * nats, rmse_db=model.rmse_db() * 0.99, rmse_fall=0.01, evidence_nats=nats,
                              gain_by_fold=np.full(4, nats / 4)) for name, nats in (("foliage", 3.0), ("interference", 2.0))]
     judged, step = judge(scores, model, hypotheses, CRITERIA)
     assert set(step.probabilities) == {"foliage", "interference", NONE, OTHER}
@@ -119,7 +119,7 @@ def test_probabilities_sum_to_one_and_a_weak_candidate_is_refused(open_ground):
 def test_what_makes_links_blank_has_no_rival_among_what_changes_levels(open_ground):
     """Its evidence is of held-out links only, as no residual of a level shows it."""
     model, hypotheses = looked_at(open_ground, 5)
-    lost, offset = (CandidateScore(name, passed=True, nll_gain=nats, rmse_db=model.rmse_db(), evidence_nats=evidence,
+    lost, offset = (Trial(name, passed=True, nll_gain=nats, rmse_db=model.rmse_db(), evidence_nats=evidence,
                                    gain_by_fold=np.full(4, nats / 4))
                     for name, nats, evidence in (("lock_loss", 30.0, np.nan), ("foliage", 90.0, 80.0)))
     alone, beside = (judge(scores, model, hypotheses, CRITERIA)[0][0] for scores in ([lost], [lost, offset]))

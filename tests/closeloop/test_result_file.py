@@ -42,9 +42,9 @@ def test_each_effect_has_its_own_name_and_a_score_that_was_kept(open_ground, mon
     loop = close_loop(open_ground.measured(world).select(world.slot % 4 == 0), base="log-distance")
     (only,) = make_report(loop)["effects"]
     assert only["name"] == loop.after.whole.effects[0].effect.name == "receiver_gain_offset"
-    scores = [replace(each, kept=False) for each in loop.selection.scores]
+    refused = loop.found.log.supersede(*(each.refuse("") for each in loop.found.log.kept))
     with pytest.raises(ValueError, match="zip"):
-        make_report(replace(loop, selection=replace(loop.selection, scores=scores)))
+        make_report(replace(loop, found=replace(loop.found, log=refused)))
 
 
 @pytest.mark.usefixtures("quick_report")

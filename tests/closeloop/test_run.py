@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.crossfit import CrossFit
+from radiotwin.closeloop.crossfit import CrossFit, best_base
 from radiotwin.closeloop.output.result_file import make_report
-from radiotwin.closeloop.run import best_base, close_loop
+from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 
 pytestmark = pytest.mark.usefixtures("short_report")

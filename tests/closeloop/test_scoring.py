@@ -53,7 +53,7 @@ def fitted(moved, evidence_nats, effect=DevicePositionError):
     model, channel = moved
     hypotheses = SimpleNamespace(of_named=lambda *_: evidence_nats)
     channel.followed = 0
-    return fit_candidate(model, effect(), 0, SelectionCriteria(), hypotheses), channel.followed
+    return fit_candidate(model, effect(), SelectionCriteria(), hypotheses), channel.followed
 
 
 def test_paths_are_followed_whatever_quick_levels_say(moved):
@@ -78,7 +78,7 @@ def test_links_of_devices_that_are_nowhere_do_not_speak_against_anything(moved):
     lost = SimpleNamespace(links=model.links, whole=replace(model.whole, model=replace(
         model.whole.model, usable=model.links.device == 0)))
     effect = OfUsable()
-    assert isinstance(fit_candidate(lost, effect, 0, SelectionCriteria(), None), Candidate)
+    assert isinstance(fit_candidate(lost, effect, SelectionCriteria(), None), Candidate)
     assert effect.asked == {0}
 
 
@@ -106,5 +106,5 @@ def test_a_building_that_was_found_is_in_the_map_that_the_next_is_held_against(m
         applied = [whole.apply(MissingObstacle(), MissingObstacle.Params(box=box)) for box in found]
         base = whole.with_effects(applied).fit()
         over = SimpleNamespace(whole=base, links=base.links)
-        refused = fit_candidate(over, effect, 0, SelectionCriteria(), None)
+        refused = fit_candidate(over, effect, SelectionCriteria(), None)
         assert refused.reason == "it is noted" and effect.heights_m == [pytest.approx(height_m)]

@@ -5,13 +5,11 @@ import numpy as np
 import pytest
 
 from radiotwin.closeloop.crossfit import CrossFit
-from radiotwin.closeloop.search.selection import fit_candidate, score_candidate
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.search.scoring import fit_candidate, score_candidate
+from radiotwin.closeloop.search.stages import SearchInputs
 from radiotwin.effects.catalogue.noise_floor import NoiseFloor
 from radiotwin.inference.gaussian import LogDistanceLine
-from radiotwin.links import evidence_blocks
 from radiotwin.propagation.laws.log_distance import LogDistance
-from radiotwin.runtime.execution import Executor
 from radiotwin.twin.model.fitting import add_effect, refine
 from radiotwin.twin.model.fold_model import FoldModel
 
@@ -111,9 +109,9 @@ def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
     whole, *folds = (FoldModel.build(links.with_los(los), channel, 5.0, channel_db=channel.predict(links.geometry)[0]
                                      + 25.0 * los, train=index != number).fit() for number in range(-1, 5))
     model = CrossFit(whole, tuple(folds), index, None)
-    criteria = SelectionCriteria()
-    candidate = fit_candidate(model, NoiseFloor(), 0, criteria)
-    score, extended = score_candidate(model, candidate, evidence_blocks(links), 20, 0, 0, criteria, Executor())
+    inputs = SearchInputs(links, None, None, ())
+    candidate = fit_candidate(model, NoiseFloor(), inputs.criteria)
+    score, extended = score_candidate(model, candidate, 20, inputs)
     assert score.reason == "" and extended is not None
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from radiotwin.closeloop.crossfit import make_folds
-from radiotwin.closeloop.run import thin_piles
 from radiotwin.links import (
     correlation_length_m,
     evidence_blocks,
@@ -13,6 +12,7 @@ from radiotwin.links import (
     with_evidence,
 )
 from radiotwin.links.links import clocks_restart
+from radiotwin.links.thinning import thin_piles
 from tests.worlds import synthetic_links
 
 

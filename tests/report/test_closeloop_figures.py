@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from radiotwin.closeloop.output.result_file import make_report
-from radiotwin.closeloop.run import Loop, close_loop
-from radiotwin.closeloop.search.selection import SelectionResult
+from radiotwin.closeloop.run import close_loop
+from radiotwin.closeloop.search.stages import SearchState
 from radiotwin.effects.catalogue.body_shadowing import BodyShadowing
 from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
 from radiotwin.effects.catalogue.detection_limit import DetectionLimit
@@ -74,8 +74,7 @@ def loop():
 
 def with_model(loop, model):
     """Return a loop that found something else."""
-    return Loop(loop.base, loop.links, loop.folds, loop.before, SelectionResult(model), loop.dependences_before, [],
-                loop.seed)
+    return dataclasses.replace(loop, explained=model, found=SearchState(model), dependences_after=[])
 
 
 def with_effect(model, effect, params):

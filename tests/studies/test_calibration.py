@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.closeloop.search.trials import Trial
 from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
 from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
 from studies import calibration, calibration_fit
@@ -64,5 +64,5 @@ def test_a_building_is_right_where_the_map_is_wrong_and_nowhere_else():
     for params, right in ((new(box=(12.0, 9.0, 10.0, 10.0, 20.0, 0.0)), True), (new(box=(110.0, 5.0, 10.0, 10.0, 20.0, 0.0)), False),
                           (gone(building=0, centre_m=(110.0, 9.0, 20.0)), True), (gone(building=0, centre_m=(10.0, 5.0, 20.0)), False)):
         name = "missing_obstacle" if isinstance(params, new) else "removed_obstacle"
-        assert calibration._is_wrong_map(CandidateScore(name, params=params), nuisance) is right
-        assert not calibration._is_wrong_map(CandidateScore(name, params=params), None)
+        assert calibration._is_wrong_map(Trial(name, params=params), nuisance) is right
+        assert not calibration._is_wrong_map(Trial(name, params=params), None)

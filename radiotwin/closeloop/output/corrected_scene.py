@@ -1,10 +1,7 @@
 """The declared scene corrected by what the loop found.
 
-Boxes are added, buildings taken out, roofs raised and lowered, anchors moved, antennas declared.
-
-Sector antennas that the loop found, as antennas that a scene declares.
-
-`buildings.csv` of a corrected scene: without what is gone, with roofs as estimated.
+Boxes are added, buildings taken out, roofs raised and lowered, anchors moved, and sector antennas
+declared. `buildings.csv` is without the buildings that are gone, and has roofs as estimated.
 """
 
 from dataclasses import replace

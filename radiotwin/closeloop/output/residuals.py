@@ -1,7 +1,4 @@
-"""Held-out residuals of a close-loop, as an object that is drawn and saved.
-
-The held-out residuals of all links of a close-loop, before and after.
-"""
+"""Held-out residuals of all links of a close-loop, before and after, to be drawn and saved."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The result of the loop as `closeloop.json`: all that the page and the terminal show.
-
-Say which model predicts best, and whether a plain one would do.
-"""
+"""The result of the loop as `closeloop.json`: all that the page and the terminal show."""
 
 from __future__ import annotations
 
@@ -16,8 +13,8 @@ from radiotwin.closeloop.crossfit import CrossFit, without_quality
 from radiotwin.closeloop.output.result_schema import ReportRecord
 from radiotwin.closeloop.predict.blending import held_out_coverage
 from radiotwin.closeloop.run import Loop
-from radiotwin.closeloop.search.posterior import Step
-from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.closeloop.search.trials import Trial
+from radiotwin.closeloop.verdict.posterior import Step
 from radiotwin.effects.params import Parameter
 from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_path
@@ -76,31 +73,31 @@ def compare_with_baselines(error: dict[str, Any],
 
 def make_report(loop: Loop) -> dict[str, Any]:
     """Return the content of `closeloop.json`; numbers that are not known are null."""
-    selection = loop.selection
-    kept = [score for score in selection.scores if score.kept]
-    named = [score for score in kept if score.name != SHADOWING]
+    kept = loop.found.log.kept
+    named = [trial for trial in kept if trial.name != SHADOWING]
     effects = [{"name": each.effect.name, "variant": each.effect.variant, "rank": rank,
                 "uses": list(each.effect.uses), "is_declared": each.effect.is_declared,
                 "params": each.params.model_dump(mode="json"),
                 "parameters": {name: parameter.record() for name, parameter in parameters.items()},
                 "size_db": size.record(),
-                "confused_with": list(each.effect.confused_with), "indistinguishable_from": rivals,
-                "probability": score.probability,
-                "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value,
-                             "evidence_nats": score.evidence_nats}}
-               for rank, (score, each, parameters, size, rivals) in enumerate(
+                "confused_with": list(each.effect.confused_with),
+                "indistinguishable_from": list(trial.rivals),
+                "probability": trial.probability,
+                "evidence": {"heldout_nll_gain": trial.nll_gain, "p_value": trial.p_value,
+                             "evidence_nats": trial.evidence_nats}}
+               for rank, (trial, each, parameters, size) in enumerate(
                    zip(named, loop.after.whole.effects, loop.parameters, loop.sizes_db,
-                       selection.rivals, strict=True), start=1)]
+                       strict=True), start=1)]
     if loop.after.shadowing:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
-    candidates = [{"name": score.name, "variant": score.variant, "step": score.step + 1,
-                   "heldout_rmse_db": score.rmse_db,
-                   "heldout_nll_gain": score.nll_gain, "p_value": score.p_value, "kept": score.kept,
-                   "reason": score.reason, "passed": score.passed,
-                   "evidence_nats": score.evidence_nats, "features": list(score.features),
-                   "probability": score.probability,
-                   "devices": list(score.devices), "receivers": list(score.receivers)}
-                  for score in selection.scores]
+    candidates = [{"name": trial.name, "variant": trial.variant, "step": trial.step + 1,
+                   "heldout_rmse_db": trial.rmse_db,
+                   "heldout_nll_gain": trial.nll_gain, "p_value": trial.p_value, "kept": trial.kept,
+                   "reason": trial.reason, "passed": trial.passed,
+                   "evidence_nats": trial.evidence_nats, "features": list(trial.features),
+                   "probability": trial.probability,
+                   "devices": list(trial.devices), "receivers": list(trial.receivers)}
+                  for trial in loop.found.log.trials]
     links = loop.after.links
     error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),
                              "noise_floor_db": loop.noise_floor_db}
@@ -120,7 +117,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
     return _for_json({
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
-        "posterior": [_step(each) for each in selection.steps],
+        "posterior": [_step(each) for each in loop.found.steps],
         "detectable": [vars(each) for each in loop.detectable],
         "receivers_compared": [_difference(each, links) for each in receiver_differences(links)],
         "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
@@ -130,7 +127,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "dependences_before": [vars(each) for each in loop.dependences_before],
         "remaining": {"structured": bool(loop.remaining),
                       "drivers": [vars(each) for each in loop.remaining]},
-        "criteria": loop.criteria.to_json(), "notes": [*links.notes, *loop.selection.notes]})
+        "criteria": loop.criteria.to_json(), "notes": [*links.notes, *loop.found.notes]})
 
 
 def scores(model: CrossFit, rows: np.ndarray | None = None) -> dict[str, float]:
@@ -223,7 +220,7 @@ def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:
             "pairs": found.pairs, "places": found.places}
 
 
-def _shadowing(score: CandidateScore, model: CrossFit, rank: int) -> dict[str, Any]:
+def _shadowing(trial: Trial, model: CrossFit, rank: int) -> dict[str, Any]:
     field, relatives = model.shadowing[0].field, model.shadowing[0].relatives
     sd_db = model.shadowing[0].relative_sd * float(model.whole.scale_db.mean())
     numbers = {"length_m": (field.length_m, "m"), "share": (field.share, "of the variance"),
@@ -231,11 +228,11 @@ def _shadowing(score: CandidateScore, model: CrossFit, rank: int) -> dict[str, A
     if relatives is not None:
         share = float(np.mean(list(relatives.passed_on.values())))
         numbers["relatives_share"] = share, "of their residual"
-    return {"name": score.name, "variant": "", "rank": rank, "params": {},
+    return {"name": trial.name, "variant": "", "rank": rank, "params": {},
             "parameters": {name: {"value": value, "low": np.nan, "high": np.nan, "unit": unit}
                            for name, (value, unit) in numbers.items()},
             "confused_with": [], "indistinguishable_from": [],
-            "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}} | NOT_KNOWN
+            "evidence": {"heldout_nll_gain": trial.nll_gain, "p_value": trial.p_value}} | NOT_KNOWN
 
 
 def _groups(links: Links) -> dict[str, dict[str, np.ndarray]]:

@@ -1,23 +1,20 @@
-"""Faults at certain times: flights, episodes and bursts, which other flights cannot show.
+"""Faults and changes in time, which a flight that is held out cannot show.
 
-Held out by flight, what happens on one flight is never learnt. So these candidates are scored on
-devices that are held out, which the same receiver read at the same times; where there are few
-devices, on blocks of ground that are held out in all flights at once. They come before all other
-candidates, or these would explain the faulty readings by walls and positions.
-
-Changes between flights: a held-out flight cannot show them, positions in all flights can.
+Held out by flight, what happens on one flight is never learnt. So faults (of a flight, episodes,
+bursts) are scored on devices that are held out, which the same receiver read at the same times;
+where there are few devices, on blocks of ground that are held out in all flights at once. They come
+before all other candidates, or these would explain the faulty readings by walls and positions.
 
 Where a receiver or a device changed after its first flight, that flight held out leaves nothing
-that shows it, and the others held out are predicted well by each other. So these candidates are
-scored on blocks of ground that are held out in all flights at once, with the effects that were
-found already. A warm-up over the first flight and ageing change the level between flights, too:
-the form is the one that explains most. Positions cannot tell a change from flights that differ
-anyhow, so it must also be larger than flights of all receivers, or all devices, differ.
+that shows it, and the others held out are predicted well by each other. So changes between flights
+are scored on blocks of ground, with the effects that were found already. A warm-up over the first
+flight and ageing change the level between flights, too: the form is the one that explains most.
+Positions cannot tell a change from flights that differ anyhow, so it must also be larger than
+flights of all receivers, or all devices, differ.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -34,78 +31,64 @@ from radiotwin.closeloop.crossfit import (
     same_effects,
     training_parts,
 )
-from radiotwin.closeloop.search.posterior import judge
 from radiotwin.closeloop.search.scoring import (
     Candidate,
-    CandidateScore,
     fit_and_score,
     fit_candidate,
     score_candidate,
     with_candidate,
 )
-from radiotwin.closeloop.search.selection import SelectionResult
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState
+from radiotwin.closeloop.search.trials import Trial
+from radiotwin.closeloop.verdict.criteria import (
+    MIN_HELD_OUT_DEVICES,
+    MIN_SHARED,
+    SelectionCriteria,
+)
 from radiotwin.closeloop.verdict.intervals import effect_size_db, why_not_borne_out
+from radiotwin.closeloop.verdict.posterior import judge
 from radiotwin.effects.base import DetectionEffect, Effect
 from radiotwin.effects.catalogue.gain_drift import DeviceDrift, ReceiverDrift
-from radiotwin.links import Links, evidence_blocks
+from radiotwin.links import Links
 from radiotwin.links.correlation import devices_move
 from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel
 
-MIN_SHARED = 0.5  # of a fault's links, on which what is held against it, or the same, acts
-MIN_DEVICES = 4  # of known position, to hold some of them out
 
-
-def select_change_points(result: SelectionResult, links: Links, base: Base, folds: Folds,
-                         seed: int, on_progress: Callable[[str], None]) -> None:
-    """Add changes in time to a model whose folds are flights, one by one, until none passes.
-
-    Args:
-        result: is extended.
-        links: n links.
-        base: of the model.
-        folds: of the model.
-        seed: of folds and permutations.
-        on_progress: called with what is being done.
-    """
+def add_changes(state: SearchState, inputs: SearchInputs) -> SearchState:
+    """Add changes between flights, where flights are held out, one by one until none passes."""
     for effect in (ReceiverDrift(between_flights=True), DeviceDrift(between_flights=True)):
-        if folds.by == "flight" and not effect.unavailable(links):
-            _select_one_kind(result, effect, links, base, seed, on_progress)
+        if inputs.folds.by == "flight" and not effect.unavailable(inputs.links):
+            state = _with_one_kind(state, effect, inputs)
+    return state
 
 
-def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrift, links: Links,
-                     base: Base, seed: int, on_progress: Callable[[str], None]) -> None:
+def _with_one_kind(state: SearchState, effect: ReceiverDrift | DeviceDrift,
+                   inputs: SearchInputs) -> SearchState:
     """Add changes of receivers, or of devices."""
-    criteria = result.criteria
-    first = fit_candidate(result.model, effect, 0, criteria)
-    if not _stands_out(result.model, first, criteria):
-        return
-    on_progress(f"{effect.name}, held out by block")
-    links = located_links(result.model, links, base)
-    folds = make_folds(links, seed, "block")
-    model = cross_validate(links, base, folds, training_parts(links, folds))
-    for each in result.model.whole.effects:
-        model = with_effect(model, each.effect, each.params)
-    block = evidence_blocks(model.links)
-    while not result.is_full:
-        step = len(result.model.whole.effects)
-        candidate = fit_candidate(model, effect, step, criteria)
-        if isinstance(candidate, CandidateScore) or not _stands_out(model, candidate, criteria):
-            return
-        score, extended = score_candidate(model, candidate, block, 1, step, seed, criteria,
-                                          result.executor)
+    criteria = inputs.criteria
+    first = fit_candidate(state.model, effect, criteria)
+    if not _stands_out(state.model, first, criteria):
+        return state
+    inputs.on_progress(f"{effect.name}, held out by block")
+    links = located_links(state.model, inputs.links, inputs.base)
+    model = _in_other_folds(state.model, links, inputs.base,
+                            make_folds(links, inputs.seed, "block"))
+    while not state.is_full(criteria):
+        candidate = fit_candidate(model, effect, criteria)
+        if isinstance(candidate, Trial) or not _stands_out(model, candidate, criteria):
+            return state
+        trial, extended = score_candidate(model, candidate, 1, inputs)
         if extended is None:
-            result.scores.append(score)
-            return
-        why = why_not_borne_out(effect_size_db(extended, step))
+            return state.refuse(trial)
+        why = why_not_borne_out(effect_size_db(extended, state.step))
         if why:
-            result.scores.append(replace(score, passed=False, reason=why))
-            return
+            return state.refuse(trial.refuse(why, passed=False))
         model = extended
         params = candidate.whole.effects[-1].params
-        there = replace(candidate, whole=with_effect(result.model, effect, params).whole)
-        # When it was, a flight that is held out does not tell.
-        result.keep(score, with_candidate(result.model, there, result.executor))
+        there = replace(candidate, whole=with_effect(state.model, effect, params).whole)
+        # A flight that is held out does not tell when the change was.
+        state = state.keep(trial, with_candidate(state.model, there, inputs.executor))
+    return state
 
 
 def located_links(model: CrossFit, links: Links, base: Base) -> Links:
@@ -118,7 +101,7 @@ def located_links(model: CrossFit, links: Links, base: Base) -> Links:
     return links.with_columns(evidence=model.links.evidence)
 
 
-def _stands_out(model: CrossFit, candidate: Candidate | CandidateScore,
+def _stands_out(model: CrossFit, candidate: Candidate | Trial,
                 criteria: SelectionCriteria) -> bool:
     """Return whether a change is larger than flights of all receivers, or all devices, differ.
 
@@ -162,56 +145,40 @@ def with_effect(model: CrossFit, effect: Effect, params: Any) -> CrossFit:
     return model.map(lambda fit: fit.with_effects([*fit.effects, fit.model.apply(effect, params)]))
 
 
-def select_faults(result: SelectionResult, effects: list[Effect], links: Links, base: Base,
-                  seed: int, on_progress: Callable[[str], None]) -> None:
-    """Add the effects that act at certain times, one after the other, until none passes.
-
-    Args:
-        result: is extended.
-        effects: candidates; those that are not `within_flights` are passed over.
-        links: n links.
-        base: of the model.
-        seed: of folds and permutations.
-        on_progress: called with what is being done.
-    """
-    timed = [effect for effect in effects
-             if effect.within_flights and not effect.unavailable(result.model.links)]
-    model: CrossFit | None = None
-    while timed and not result.is_full:
-        step, refused = len(result.model.whole.effects), []
-        hypotheses = result.hypotheses(seed)
-        fitted = [fit_candidate(result.model, effect, step, result.criteria, hypotheses)
-                  for effect in timed]
-        fitted = _against_lasting(fitted, effects, step, result)
+def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
+    """Add effects that act at certain times, one after the other, until none passes."""
+    timed = [effect for effect in inputs.undeclared
+             if effect.within_flights and not effect.unavailable(state.model.links)]
+    criteria, model = inputs.criteria, None
+    while timed and not state.is_full(criteria):
+        step = state.step
+        state, hypotheses = state.look(inputs.seed)
+        fitted = [fit_candidate(state.model, effect, criteria, hypotheses) for effect in timed]
+        fitted = _against_lasting(fitted, state, inputs)
         candidates = [each for each in fitted if isinstance(each, Candidate)]
-        refused += [each for each in fitted if isinstance(each, CandidateScore)]
-        kept = None
+        refused = [each for each in fitted if isinstance(each, Trial)]
         for candidate in sorted(candidates, key=lambda each: -each.gain):
-            on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
-            model = model or _within_flights(result, links, base, seed)
-            score, extended = fit_and_score(model, candidate.effect, evidence_blocks(model.links),
-                                            len(timed), step, seed, result.criteria,
-                                            result.executor)
+            inputs.on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
+            model = model or _within_flights(state.model, inputs)
+            trial, extended = fit_and_score(model, candidate.effect, len(timed), inputs)
             if extended is not None:
-                score = replace(score, evidence_nats=candidate.evidence)
-                score = judge([score], model, hypotheses, result.criteria)[0][0]
-            if extended is not None and not score.reason:
-                size_db = effect_size_db(extended, step)
-                why = why_not_borne_out(size_db)
-                score = replace(score, passed=not why, reason=why)
-            if extended is not None and not score.reason:
-                kept = candidate
-                model = extended
-                result.keep(score, _adopted(result.model, candidate))
-                break
-            refused.append(score)
-        if kept is None:
-            result.scores += refused
-            return
+                trial = replace(trial, evidence_nats=candidate.evidence)
+                trial = judge([trial], model, hypotheses, criteria)[0][0]
+                if not trial.reason:
+                    why = why_not_borne_out(effect_size_db(extended, step))
+                    trial = replace(trial, passed=not why, reason=why)
+                if not trial.reason:
+                    model = extended
+                    state = state.keep(trial, _adopted(state.model, candidate))
+                    break
+            refused.append(trial)
+        else:
+            return state.refuse(*refused)
+    return state
 
 
-def _against_lasting(faults: list[Candidate | CandidateScore], effects: list[Effect], step: int,
-                     result: SelectionResult) -> list[Candidate | CandidateScore]:
+def _against_lasting(faults: list[Candidate | Trial], state: SearchState,
+                     inputs: SearchInputs) -> list[Candidate | Trial]:
     """Return faults, or why one is none: an effect that lasts explains as much of all links.
 
     A receiver that has changed reads less from then on, and so it does in the window that ends
@@ -219,22 +186,22 @@ def _against_lasting(faults: list[Candidate | CandidateScore], effects: list[Eff
     """
     rivals = {name for each in faults if isinstance(each, Candidate)
               for name in each.effect.confused_with}
-    fitted = [fit_candidate(result.model, effect, step, result.criteria) for effect in effects
-              if effect.name in rivals and not effect.within_flights
-              and not effect.unavailable(result.model.links)]
+    fitted = [fit_candidate(state.model, effect, inputs.criteria)
+              for effect in inputs.undeclared if effect.name in rivals
+              and not effect.within_flights and not effect.unavailable(state.model.links)]
     lasting = [each for each in fitted if isinstance(each, Candidate)]
-    return [_unless_outdone(each, lasting, step) if isinstance(each, Candidate) else each
+    return [_unless_outdone(each, lasting, state.step) if isinstance(each, Candidate) else each
             for each in faults]
 
 
 def _unless_outdone(fault: Candidate, lasting: list[Candidate],
-                    step: int) -> Candidate | CandidateScore:
+                    step: int) -> Candidate | Trial:
     here = _acts(fault)
     rival = next((each for each in lasting if each.effect.name in fault.effect.confused_with
                   and each.gain >= fault.gain and _acts(each)[here].mean() >= MIN_SHARED), None)
     if rival is None:
         return fault
-    return CandidateScore(fault.effect.name, step=step, variant=fault.effect.variant, reason=(
+    return Trial(fault.effect.name, step=step, variant=fault.effect.variant, reason=(
         f"{rival.effect.name} explains as much: {rival.gain:.0f} nats of the links that it is "
         f"fitted to, and this {fault.gain:.0f}"))
 
@@ -246,33 +213,31 @@ def _acts(candidate: Candidate) -> np.ndarray:
     return blanks | applied.acts
 
 
-def drop_idle_faults(result: SelectionResult) -> None:
-    """Take back what the effects that were found later explain: an emitter is no episode.
+def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
+    """Take back faults and changes that effects found later explain: an emitter is no episode.
 
-    Faults and steps in time come first, and are held against no other effect.
-
-    Args:
-        result: is changed where one gains nothing any more on the links that it is fitted to, or
-            where its search would not find it beside the others.
+    They come first, when no other effect is there to compare them with. One is taken back if it
+    gains nothing any more on the links that it is fitted to, or if its search would not find it
+    beside the others.
     """
-    for number in reversed(range(len(result.model.whole.effects))):
-        whole, applied = result.model.whole, result.model.whole.effects[number]
+    for number in reversed(range(state.step)):
+        model, whole = state.model, state.model.whole
+        applied = whole.effects[number]
         timed = applied.effect.within_flights or isinstance(applied.effect,
                                                             ReceiverDrift | DeviceDrift)
         if not timed:
             continue
-        alone = whole.model.with_effects([each for each in whole.effects
-                                          if each is not applied]).fit()
-        gain = alone.objective - whole.objective
-        if gain >= result.criteria.min_training_gain_nats and _is_found(applied, alone):
+        others = whole.model.with_effects([each for each in whole.effects
+                                           if each is not applied]).fit()
+        gain = others.objective - whole.objective
+        if gain >= inputs.criteria.min_training_gain_nats and _is_found(applied, others):
             continue
         folds = [_without(each.model, same_effects(whole, each)[number]).fit()
-                 for each in result.model.folds]
-        result.model = result.model.extended(alone, folds)
-        kept = [i for i, score in enumerate(result.scores) if score.kept][number]
-        result.scores[kept] = replace(result.scores[kept], kept=False,
-                                      reason="what was found later explains it")
-        del result.rivals[number]
+                 for each in model.folds]
+        taken_back = state.log.kept[number].refuse("what was found later explains it", rivals=())
+        state = replace(state, model=model.extended(others, folds),
+                        log=state.log.supersede(taken_back))
+    return state
 
 
 def _is_found(applied: AppliedEffect, without: Fit) -> bool:
@@ -294,19 +259,22 @@ def _without(model: FoldModel, place: int | None) -> FoldModel:
                                if number != place])
 
 
-def _within_flights(result: SelectionResult, links: Links, base: Base,
-                    seed: int) -> CrossFit:
-    """Return the model as it is, fitted to folds that leave part of each flight."""
-    links = located_links(result.model, links, base)
-    folds = _folds(links, seed)
-    model = cross_validate(links, base, folds, training_parts(links, folds))
-    for each in result.model.whole.effects:
-        model = with_effect(model, each.effect, each.params)
-    return model
+def _within_flights(model: CrossFit, inputs: SearchInputs) -> CrossFit:
+    """Return a model fitted to folds that leave part of each flight."""
+    links = located_links(model, inputs.links, inputs.base)
+    return _in_other_folds(model, links, inputs.base, _folds(links, inputs.seed))
+
+
+def _in_other_folds(model: CrossFit, links: Links, base: Base, folds: Folds) -> CrossFit:
+    """Return the base with a model's effects as they are, fitted to other folds."""
+    other = cross_validate(links, base, folds, training_parts(links, folds))
+    for each in model.whole.effects:
+        other = with_effect(other, each.effect, each.params)
+    return other
 
 
 def _folds(links: Links, seed: int) -> Folds:
-    by_device = len(links.anchors & set(links.device.tolist())) >= MIN_DEVICES
+    by_device = len(links.anchors & set(links.device.tolist())) >= MIN_HELD_OUT_DEVICES
     return make_folds(links, seed, "device" if by_device and not devices_move(links) else "block")
 
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from radiotwin.closeloop.crossfit import Base, CrossFit
+from radiotwin.closeloop.verdict.criteria import MAX_LOSS_NATS
 from radiotwin.effects.arrays import subsample
 from radiotwin.links import Links
 from radiotwin.twin.localize import position_log_likelihood
@@ -24,7 +25,6 @@ ROUNDS = 3  # of moves
 MAX_LINKS = 300  # of a device
 MIN_LINKS = 10
 MIN_MOVE_M = 2.0  # along paths, which put a device to about a metre
-MAX_LOSS_NATS = 0.01  # a link, of those that could be predicted before, where more can be now
 
 
 def relocate_devices(model: CrossFit, links: Links, base: Base

@@ -1,29 +1,23 @@
-"""A candidate fitted to all links and to each fold's others, and what held-out links say of it.
-
-Which devices and receivers a fitted effect belongs to, to be named in the report.
-"""
+"""Fit a candidate to all links and to each fold's others, and score it on held-out links."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from radiotwin.closeloop.crossfit import CrossFit
-from radiotwin.closeloop.search.hypotheses import Hypotheses, is_judged_by_levels
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.search.stages import SearchInputs
+from radiotwin.closeloop.search.trials import Trial
+from radiotwin.closeloop.verdict.criteria import MIN_FOLD_GAIN, MIN_MOVED, SelectionCriteria
+from radiotwin.closeloop.verdict.hypotheses import Hypotheses, is_judged_by_levels
 from radiotwin.effects.base import Effect
-from radiotwin.effects.params import EffectParams
 from radiotwin.inference.held_out import cross_fit_p_value, sign_flip_p_value
-from radiotwin.links import Links
+from radiotwin.links import Links, evidence_blocks
 from radiotwin.runtime.execution import Executor
 from radiotwin.twin.model.fitting import add_effect, along_paths, prepare_additions
 from radiotwin.twin.model.fold_model import Fit, FittedEffect
-
-# Of the fold where a candidate moves likelihoods most (and of all folds, for links with line of
-# sight), and of the fold where it gains or loses most.
-MIN_MOVED, MIN_SHARE = 0.05, 0.1
 
 
 def ends_of(fitted: FittedEffect, links: Links) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -59,64 +53,6 @@ def _names(indices: list[int], names: Sequence[str]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class CandidateScore:
-    """A candidate of one step, and what held-out links say of it.
-
-    Attributes:
-        name: of the effect.
-        kept: whether it was added.
-        reason: why not; empty where it was.
-        nll_gain: held-out likelihood gained [nats]; NaN where it was not tried.
-        rmse_db: held-out RMSE with it [dB].
-        rmse_fall: logarithm of the held-out RMSE without it over that with it, on links of which
-            their fold could know.
-        p_value: of no gain, links that err alike counted as one, corrected for the candidates.
-        step: number of effects that were there before.
-        gain_by_fold: (folds,) `nll_gain` of each fold over the number of links that count as one;
-            empty where it was not tried.
-        evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
-            it was not looked at.
-        passed: whether held-out links support it, however probable it is.
-        features: (6,) what its probability depends on, see `radiotwin.closeloop.search.posterior`;
-        empty
-            where it was not tried.
-        probability: that it is there.
-        params: as fitted to all links; None where it was not tried.
-        variant: of the effect.
-        devices: names of those that `params` belong to, see `ends_of`.
-        receivers: the same of receivers.
-    """
-
-    name: str
-    kept: bool = False
-    reason: str = ""
-    nll_gain: float = np.nan
-    rmse_db: float = np.nan
-    rmse_fall: float = 0.0
-    p_value: float = np.nan
-    step: int = 0
-    gain_by_fold: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    evidence_nats: float = np.nan
-    passed: bool = False
-    features: tuple[float, ...] = ()
-    probability: float = np.nan
-    params: EffectParams | None = None
-    variant: str = ""
-    devices: tuple[str, ...] = ()
-    receivers: tuple[str, ...] = ()
-
-    @property
-    def held_out_nats(self) -> float:
-        """Gain on held-out links, those that err alike counted as one [nats]."""
-        return float(self.gain_by_fold.sum())
-
-    @property
-    def nats(self) -> float:
-        """Evidence beside a correlated rest; on held-out links where residuals do not show it."""
-        return self.evidence_nats if np.isfinite(self.evidence_nats) else self.held_out_nats
-
-
-@dataclass(frozen=True, eq=False)
 class Candidate:
     """An effect fitted to all links, and how much likelier they are with it [nats].
 
@@ -129,19 +65,17 @@ class Candidate:
     evidence: float = np.nan
 
 
-def fit_candidate(model: CrossFit, effect: Effect, step: int,
-                  criteria: SelectionCriteria, hypotheses: Hypotheses | None = None,
-                  ) -> Candidate | CandidateScore:
-    """Fit a candidate to all links; return a score with the reason if that refuses it already.
+def fit_candidate(model: CrossFit, effect: Effect, criteria: SelectionCriteria,
+                  hypotheses: Hypotheses | None = None) -> Candidate | Trial:
+    """Fit a candidate to all links; return a trial with the reason if that refuses it already.
 
     Args:
         model: without it.
         effect: that is tried.
-        step: number of effects that are there.
         criteria: that decide.
         hypotheses: about what the model lacks; None: not to be looked at.
     """
-    refused = CandidateScore(effect.name, step=step, variant=effect.variant)
+    refused = Trial(effect.name, step=len(model.whole.effects), variant=effect.variant)
     whole = add_effect(model.whole, effect)
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
@@ -166,38 +100,32 @@ def fit_candidate(model: CrossFit, effect: Effect, step: int,
     return Candidate(effect, whole, gain, hypotheses.of_named(whole))
 
 
-def score_candidate(model: CrossFit, candidate: Candidate, block: np.ndarray, tried: int,
-                    step: int, seed: int, criteria: SelectionCriteria, executor: Executor,
-                    ) -> tuple[CandidateScore, CrossFit | None]:
+def score_candidate(model: CrossFit, candidate: Candidate, tried: int,
+                    inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
     """Fit a candidate to each fold's training links, and score it on the others.
 
     Args:
         model: without it.
         candidate: fitted to all links.
-        block: (n,) piece of evidence of each link.
         tried: number of candidates, that the p-value is corrected for.
-        step: number of effects that are there.
-        seed: of permutations.
-        criteria: that decide.
-        executor: where folds are fitted.
+        inputs: of the search.
 
     Returns:
-        the score, and the model with it; None where it does not pass.
+        the trial, and the model with it; None where it does not pass.
     """
     fitted = FittedEffect(candidate.effect, candidate.whole.effects[-1].params,
                           candidate.whole.coefficients_of(-1))
     devices, receivers = ends_of(fitted, model.links)
-    extended = with_candidate(model, candidate, executor)
-    score = CandidateScore(candidate.effect.name, step=step, evidence_nats=candidate.evidence,
-                           params=fitted.params, variant=candidate.effect.variant, devices=devices,
-                           receivers=receivers)
-    score = score_model(model, extended, score, block, tried, seed, criteria,
-                        nlos_only=candidate.effect.nlos_only)
-    return score, None if score.reason else extended
+    extended = with_candidate(model, candidate, inputs.executor)
+    trial = Trial(candidate.effect.name, step=len(model.whole.effects), params=fitted.params,
+                  evidence_nats=candidate.evidence, variant=candidate.effect.variant,
+                  devices=devices, receivers=receivers)
+    trial = score_model(model, extended, trial, evidence_blocks(model.links), tried, inputs,
+                        candidate.effect.nlos_only)
+    return trial, None if trial.reason else extended
 
 
-def with_candidate(model: CrossFit, candidate: Candidate,
-                   executor: Executor) -> CrossFit:
+def with_candidate(model: CrossFit, candidate: Candidate, executor: Executor) -> CrossFit:
     """Return a model with a candidate; a fold has it as its own training links show it."""
     effect, like = candidate.effect, candidate.whole.effects[-1].params
     prepare_additions(model.folds, [effect], executor, like)
@@ -205,29 +133,26 @@ def with_candidate(model: CrossFit, candidate: Candidate,
                                             for fold in model.folds])
 
 
-def fit_and_score(model: CrossFit, effect: Effect, block: np.ndarray, tried: int,
-                  step: int, seed: int, criteria: SelectionCriteria, executor: Executor,
-                  hypotheses: Hypotheses | None = None,
-                  ) -> tuple[CandidateScore, CrossFit | None]:
+def fit_and_score(model: CrossFit, effect: Effect, tried: int, inputs: SearchInputs,
+                  hypotheses: Hypotheses | None = None) -> tuple[Trial, CrossFit | None]:
     """Return `score_candidate` of `fit_candidate`; of one that is refused, no model."""
-    candidate = fit_candidate(model, effect, step, criteria, hypotheses)
-    if isinstance(candidate, CandidateScore):
+    candidate = fit_candidate(model, effect, inputs.criteria, hypotheses)
+    if isinstance(candidate, Trial):
         return candidate, None
-    return score_candidate(model, candidate, block, tried, step, seed, criteria, executor)
+    return score_candidate(model, candidate, tried, inputs)
 
 
-def score_model(model: CrossFit, extended: CrossFit, score: CandidateScore,
-                block: np.ndarray | None, tried: int, seed: int, criteria: SelectionCriteria,
-                nlos_only: bool = False) -> CandidateScore:
+def score_model(model: CrossFit, extended: CrossFit, trial: Trial, block: np.ndarray | None,
+                tried: int, inputs: SearchInputs, nlos_only: bool = False) -> Trial:
     """Return what held-out links say of an extended model; with the reason where it is refused.
 
     Without pieces of evidence `block` (n,) the gain may hang on a few positions.
     """
-    gain = model.held_out_nll - extended.held_out_nll
+    gain, criteria = model.held_out_nll - extended.held_out_nll, inputs.criteria
     known, los = np.isfinite(gain), model.links.los
     usable = known & ~model.unforeseen
     if not usable.any():
-        return replace(score, reason="no held-out link can be judged with it")
+        return replace(trial, reason="no held-out link can be judged with it")
     design_effect = model.whole.view.design_effect
 
     def by_fold(rows: np.ndarray) -> np.ndarray:
@@ -241,10 +166,10 @@ def score_model(model: CrossFit, extended: CrossFit, score: CandidateScore,
     # A receiver, or a device, is not in every fold.
     moved = np.bincount(model.index[usable], np.abs(gain[usable]), len(model.folds))
     touched = (moved >= MIN_MOVED * moved.max()) \
-        & (np.abs(shares) >= MIN_SHARE * np.abs(shares).max())
+        & (np.abs(shares) >= MIN_FOLD_GAIN * np.abs(shares).max())
     few_p = 0.0
     if block is not None:
-        few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), seed)
+        few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), inputs.seed)
     los_p, moved_los = 0.0, np.abs(gain[usable & los]).sum()
     # What is weak, as an emitter's power is, leaves links with line of sight as they are.
     if not los.all() and not nlos_only and moved_los > MIN_MOVED * moved.sum():
@@ -272,7 +197,7 @@ def score_model(model: CrossFit, extended: CrossFit, score: CandidateScore,
     elif los_p > criteria.max_los_p_value:
         reason = ("links with line of sight, where the base is surest, do not support it "
                   f"(p = {los_p:.2g})")
-    return replace(score, reason=reason, passed=not reason, nll_gain=total,
+    return replace(trial, reason=reason, passed=not reason, nll_gain=total,
                    rmse_db=extended.rmse_db(known), rmse_fall=_fall(before_db, after_db),
                    p_value=p_value, gain_by_fold=shares)
 

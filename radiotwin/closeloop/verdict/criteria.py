@@ -6,6 +6,19 @@ from dataclasses import asdict, dataclass, fields, replace
 
 from radiotwin.errors import BadInput
 
+# Of single judgements, which no caller sets.
+# Share of the gain or loss in the fold where a candidate moves likelihoods most, for another fold
+# to vote; and of all folds, for links with line of sight to do.
+MIN_MOVED = 0.05
+MIN_FOLD_GAIN = 0.1  # share of the largest gain or loss of a fold, for another fold to vote
+MIN_FIRST_SHARE = 0.5  # of `min_probability`, for another effect to be tried beside a candidate
+MAX_SECONDS = 2  # effects that are tried beside it
+MIN_RIVAL_SHARE = 0.5  # of what the best gains, for several of a kind to be tried in its place
+SAME_DB = 1.5  # between what a receiver's limit and its readings are off, to be one fault
+MIN_SHARED = 0.5  # of a fault's, on which its rival acts, or the same fault found again
+MIN_HELD_OUT_DEVICES = 4  # of known position, to hold some of them out where a fault is judged
+MAX_LOSS_NATS = 0.01  # a held-out link, where devices that are located anew can predict more links
+
 
 @dataclass(frozen=True)
 class SelectionCriteria:
@@ -19,7 +32,7 @@ class SelectionCriteria:
             the folds. Saves time: one that gains less cannot gain `min_gain_nats`
             on held-out links.
         min_probability: that a cause is there, to be named; it is told with the name: more probable
-            than not (`radiotwin.closeloop.search.posterior`).
+            than not (`radiotwin.closeloop.verdict.posterior`).
         max_rest_db: standard deviation of what belongs to places and has no name, for
             "none" to be said.
         min_gain_nats: on held-out links. Calibrated.

@@ -1,18 +1,17 @@
-"""Intervals of the parameters of effects that still hold when some of the data are left out.
+"""Intervals of an effect's parameters and of its size, which hold when data are left out.
 
-Of each parameter the wider of two intervals: from the curvature of the likelihood and the scores of
-places and flights (`radiotwin.twin.model.uncertainty`), and from its values in the models that were
-fitted without one fold each (delete-a-group jackknife; Efron and Tibshirani 1993, 'An introduction
-to the bootstrap', Sec. 11.5), for which everything, the base as well, was fitted again. A fold
-whose other links do not tell a parameter, such as that of the flight on which something happened,
-has only the prior's value of it, and does not count.
+The interval of a parameter is the wider of two: from the curvature of the likelihood and the scores
+of places and flights (`radiotwin.twin.model.uncertainty`), and from its values in the models that
+were fitted without one fold each (delete-a-group jackknife; Efron and Tibshirani 1993, 'An
+introduction to the bootstrap', Sec. 11.5), for which everything, the base as well, was fitted
+again. A fold whose other links do not tell a parameter, such as that of the flight on which
+something happened, has only the prior's value of it, and does not count.
 
-Size of an effect in decibels, by links that took no part in finding it.
-
-Of each held-out link: what the effect changes in the prediction, once all else has been fitted
-again without it, against what the link lacks without it. The slope of that regression is 1 where
-the effect is as it was fitted, and 0 where there is no such thing (the calibration slope of Cox
-1958, 'Two further applications of a model for binary regression', Biometrika 45).
+The size of an effect in decibels is that of held-out links. What the effect changes in the
+prediction, once all else has been fitted again without it, is compared with what the link lacks
+without it. The slope of that regression is 1 where the effect is as it was fitted, and 0 where
+there is no such thing (the calibration slope of Cox 1958, 'Two further applications of a model
+for binary regression', Biometrika 45).
 """
 
 from __future__ import annotations

@@ -1,10 +1,12 @@
-"""Dependences of the residual: one permutation test for each variable."""
+"""What the residual still depends on, one permutation test for each variable; and its noise."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from radiotwin.closeloop.crossfit import CrossFit
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.inference.dependence import Series, holm, levels_of, permutation_p_value
 from radiotwin.links import Links, residual_variables
 from radiotwin.runtime.pieces import kept
@@ -26,6 +28,20 @@ class ResidualDependence:
     variable: str
     p_value: float
     effect_db: float
+
+
+def dependences(model: CrossFit, seed: int) -> list[ResidualDependence]:
+    """Test the held-out residual of a model, without links on which an unforeseen fault acts."""
+    mean_db = model.held_out_mean_db
+    residual_db = np.where(model.unforeseen, np.nan, model.links.level_db - mean_db)
+    return residual_dependences(model.links, residual_db, model.held_out_reading[1], mean_db, seed)
+
+
+def significant(dependences: list[ResidualDependence],
+                criteria: SelectionCriteria) -> list[ResidualDependence]:
+    """Return those that are not chance and strong enough to matter."""
+    return [each for each in dependences if each.p_value <= criteria.max_dependence_p_value
+            and each.effect_db >= criteria.min_dependence_db]
 
 
 def residual_dependences(links: Links, residual_db: np.ndarray, scale_db: np.ndarray,
@@ -82,3 +98,18 @@ def _tested(links: Links, residual_db: np.ndarray, scale_db: np.ndarray, mean_db
     corrected = holm(np.array([p_value for p_value, _, _ in found]))
     return [ResidualDependence(name, float(p_value), effect_db)
             for p_value, (_, name, effect_db) in zip(corrected, found, strict=True)]
+
+
+def noise_floor_db(links: Links, criteria: SelectionCriteria) -> float:
+    """Return the standard deviation of one measurement [dB], from repeats at one position."""
+    place = np.round(np.column_stack([links.receiver_m, links.device, links.receiver]), 1)
+    group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
+    seen = np.isfinite(links.level_db)
+    count = np.bincount(group[seen], minlength=group.max() + 1)
+    sums = np.bincount(group[seen], weights=links.level_db[seen], minlength=len(count))
+    mean = sums / np.maximum(count, 1)
+    again = seen & (count[group] > 1)
+    freedom = int((count[count > 1] - 1).sum())
+    if freedom < criteria.min_repeats_for_noise:
+        return float("nan")
+    return float(np.sqrt(((links.level_db - mean[group])[again] ** 2).sum() / freedom))

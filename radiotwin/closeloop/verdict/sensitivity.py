@@ -1,11 +1,11 @@
 """How large an effect would have had to be, to be seen in these measurements.
 
-For each family a typical pattern is laid beside what the base may be wrong in
-(`radiotwin.closeloop.search.hypotheses`): the size at which the expected evidence makes it probable
-enough to be named. A search has conditions of its own, as that devices agree or that flights differ
-little: so the pattern is also laid into the residual, larger and larger until the effect's search
-proposes what explains it. What was not named and is smaller may be there. Only what was looked for
-in these links is asked, and a size counts only within what its effect allows.
+For each family a typical pattern is laid beside what the base may be wrong in (`hypotheses`): the
+size at which the expected evidence makes it probable enough to be named. A search has conditions of
+its own, as that devices agree or that flights differ little: so the pattern is also laid into the
+residual, larger and larger until the effect's search proposes what explains it. What was not named
+and is smaller may be there. Only what was looked for in these links is asked, and a size counts
+only within what its effect allows.
 
 Changes that a typical effect of each family makes, over the links that were measured.
 """
@@ -19,9 +19,9 @@ from itertools import product
 import numpy as np
 from scipy.optimize import brentq
 
-from radiotwin.closeloop.search.hypotheses import Hypotheses
-from radiotwin.closeloop.search.posterior import features, probability_of
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.hypotheses import Hypotheses
+from radiotwin.closeloop.verdict.posterior import features, probability_of
 from radiotwin.effects.arrays import ends_above_ground
 from radiotwin.effects.base import GainEffect, ResidualView, Term
 from radiotwin.effects.boxes import Box, buildings, cross

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import run as thinning
 from radiotwin.closeloop.output.result_file import make_report
-from radiotwin.closeloop.run import close_loop, thin_links
-from radiotwin.links import prepare_links
+from radiotwin.closeloop.run import close_loop
+from radiotwin.links import prepare_links, thinning
+from radiotwin.links.thinning import thin_links
 
 
 @pytest.fixture

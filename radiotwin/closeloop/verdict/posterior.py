@@ -21,9 +21,9 @@ import numpy as np
 from scipy.special import expit
 
 from radiotwin.closeloop.crossfit import CrossFit
-from radiotwin.closeloop.search.hypotheses import Hypotheses
-from radiotwin.closeloop.search.scoring import CandidateScore
+from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 
 LEAST_RATIO = 0.2  # of what belongs to places to noise; less is none
 NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
@@ -55,8 +55,8 @@ class Step:
         return max([0.0, *self.unnamed_nats.values()])
 
 
-def judge(scores: Sequence[CandidateScore], model: CrossFit, hypotheses: Hypotheses,
-          criteria: SelectionCriteria) -> tuple[list[CandidateScore], Step]:
+def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
+          criteria: SelectionCriteria) -> tuple[list[Trial], Step]:
     """Return a step's scores with their probabilities, and what the step says.
 
     Args:
@@ -91,6 +91,26 @@ def judge(scores: Sequence[CandidateScore], model: CrossFit, hypotheses: Hypothe
                                                               noise_db))
 
 
+def verdict_without_effect(steps: Sequence[Step], criteria: SelectionCriteria) -> str:
+    """Return `none`, `unexplained` or `undecided`, where no cause was named.
+
+    It is `unexplained` where a cause without a name is the likeliest, or more than `max_rest_db`
+    belongs to places; `none` where it is probable that nothing is hidden. The first step decides:
+    descriptions of the rest have no part in it.
+
+    Args:
+        steps: what the residual says; none where no cause was looked for.
+        criteria: that decide.
+    """
+    if not steps:
+        return "undecided"
+    first = steps[0]
+    likeliest = max(first.probabilities, key=lambda name: first.probabilities[name])
+    if likeliest == OTHER or first.rest_db > criteria.max_rest_db:
+        return "unexplained"
+    return "none" if first.probabilities[NONE] >= criteria.min_probability else "undecided"
+
+
 def features(nats: tuple[float, float, float], rmse_fall: float, rest_over_noise: float,
              is_another_kind: bool) -> tuple[float, ...]:
     """Return what a candidate's probability depends on, (6,).
@@ -106,7 +126,7 @@ def features(nats: tuple[float, float, float], rmse_fall: float, rest_over_noise
             float(np.log(max(rest_over_noise, LEAST_RATIO))), float(is_another_kind))
 
 
-def probability_of_all(scores: Sequence[CandidateScore], other: float, before: CrossFit,
+def probability_of_all(scores: Sequence[Trial], other: float, before: CrossFit,
                        rest_over_noise: float) -> float:
     """Return the probability that several effects are there, from what they explain together.
 
@@ -132,7 +152,7 @@ def probability_of(name: str, values: tuple[float, ...]) -> float:
     return float(expit(weights["intercept"] + own + np.dot(weights["weights"], values)))
 
 
-def _probabilities(scores: Sequence[CandidateScore], unnamed: float, rest_db: float,
+def _probabilities(scores: Sequence[Trial], unnamed: float, rest_db: float,
                    noise_db: float) -> dict[str, float]:
     found: dict[str, float] = {}
     for score in scores:

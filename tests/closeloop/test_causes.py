@@ -14,13 +14,17 @@ from radiotwin.closeloop.crossfit import (
     training_parts,
 )
 from radiotwin.closeloop.run import close_loop
-from radiotwin.closeloop.search import posterior, selection
-from radiotwin.closeloop.search.posterior import Step
-from radiotwin.closeloop.search.scoring import CandidateScore, score_model
-from radiotwin.closeloop.search.selection import Passed, SelectionResult, forward_selection
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.search import causes
+from radiotwin.closeloop.search.causes import Tried, forward_selection
+from radiotwin.closeloop.search.scoring import score_model
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState
+from radiotwin.closeloop.search.trials import Trial, TrialLog
+from radiotwin.closeloop.verdict import posterior
+from radiotwin.closeloop.verdict.posterior import Step
 from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.links import prepare_links
+
+INPUTS = SearchInputs(None, None, None, ())
 
 
 def test_an_offset_that_no_fold_has_links_enough_for_is_not_kept(open_ground):
@@ -30,7 +34,7 @@ def test_an_offset_that_no_fold_has_links_enough_for_is_not_kept(open_ground):
     few = (world.receiver == 0) & (world.device < 2) & (world.slot % 11 == 5)
     assert np.bincount(world.device[few]).tolist() == [30, 30]
     loop = close_loop(open_ground.measured(world).select(few), base="log-distance")
-    (offset,) = [score for score in loop.selection.scores if score.name == "device_gain_offset"]
+    (offset,) = [score for score in loop.found.log.trials if score.name == "device_gain_offset"]
     assert not offset.kept and "gains 0 nats on held-out links" in offset.reason
 
 
@@ -40,7 +44,7 @@ def test_a_candidate_that_no_held_out_link_can_judge_is_refused(open_ground):
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
     extended = model.extended(model.whole, model.folds)
     extended.held_out_nll = np.full(len(links), np.nan)
-    score = score_model(model, extended, CandidateScore("device_gain_offset"), None, 1, 0, SelectionCriteria())
+    score = score_model(model, extended, Trial("device_gain_offset"), None, 1, INPUTS)
     assert "no held-out link" in score.reason
 
 
@@ -57,7 +61,7 @@ def test_folds_that_a_candidate_does_not_act_on_do_not_vote(open_ground, gains, 
     six.held_out_nll = model.held_out_nll
     extended = six.extended(six.whole, six.folds)
     extended.held_out_nll = model.held_out_nll - per_link
-    score = score_model(six, extended, CandidateScore("lock_loss"), None, 1, 0, SelectionCriteria())
+    score = score_model(six, extended, Trial("lock_loss"), None, 1, INPUTS)
     assert ("folds" in score.reason) == (not passes)
 
 
@@ -75,7 +79,7 @@ def test_links_with_line_of_sight_are_asked_if_it_moves_them(open_ground, in_sig
     six.held_out_nll = model.held_out_nll
     extended = six.extended(six.whole, six.folds)
     extended.held_out_nll = model.held_out_nll - per_link
-    score = score_model(six, extended, CandidateScore("interference"), None, 1, 0, SelectionCriteria())
+    score = score_model(six, extended, Trial("interference"), None, 1, INPUTS)
     assert ("line of sight" in score.reason) == (not passes)
 
 
@@ -87,14 +91,14 @@ def test_what_an_improbable_candidate_has_outdone_is_asked_as_well(open_ground, 
     measurements = open_ground.measured(world)
     loop = close_loop(measurements, base="log-distance")
     assert [each.effect.name for each in loop.after.whole.effects][:1] == ["receiver_gain_offset"]
-    outdone = {score.name for score in loop.selection.scores if score.step == 0 and "gains more on" in score.reason}
+    outdone = {score.name for score in loop.found.log.trials if score.step == 0 and "gains more on" in score.reason}
     believed = posterior.probability_of
     monkeypatch.setattr(posterior, "probability_of", lambda name, values: (
         0.1 if name == "receiver_gain_offset" else believed(name, values)))
     again = close_loop(measurements, base="log-distance")
-    first = [score for score in again.selection.scores if score.step == 0 and score.name != "unexplained_trend"]
+    first = [score for score in again.found.log.trials if score.step == 0 and score.name != "unexplained_trend"]
     assert outdone and outdone <= {score.name for score in first if score.gain_by_fold.size}
-    assert len(first) == len([score for score in loop.selection.scores if score.step == 0])  # none twice
+    assert len(first) == len([score for score in loop.found.log.trials if score.step == 0])  # none twice
 
 
 MODEL = SimpleNamespace(whole=SimpleNamespace(effects=[]))
@@ -102,60 +106,57 @@ MODEL = SimpleNamespace(whole=SimpleNamespace(effects=[]))
 
 def passed(name, nats, step=0, repeatable=False):
     """A candidate that gains on held-out links, of a model that nothing is asked of."""
-    score = CandidateScore(name, step=step, passed=True, gain_by_fold=np.array([nats]), rmse_db=4.0)
-    return Passed(SimpleNamespace(name=name, repeatable=repeatable), score, MODEL)
+    trial = Trial(name, step=step, passed=True, gain_by_fold=np.array([nats]), rmse_db=4.0)
+    return Tried(SimpleNamespace(name=name, repeatable=repeatable), trial, MODEL)
 
 
 @pytest.mark.usefixtures("short_report")
 def test_what_may_be_nothing_at_all_is_not_named(open_ground, monkeypatch):
     world = open_ground.fly(3)
     world.gain_db[world.receiver == 1] += 6.0
-    measured = selection.effect_size_db
+    measured = causes.effect_size_db
 
     def uncertain(model, number):
         size_db = measured(model, number)
         assert size_db.low > 0
         return replace(size_db, low=size_db.value - 20.0, high=size_db.value + 20.0)
 
-    monkeypatch.setattr(selection, "effect_size_db", uncertain)
+    monkeypatch.setattr(causes, "effect_size_db", uncertain)
     monkeypatch.setattr("radiotwin.closeloop.run.catalogue", lambda: [ReceiverGainOffset, DeviceGainOffset])
     loop = close_loop(open_ground.measured(world), base="log-distance")
     assert loop.verdict != "effect" and not [each for each in loop.after.whole.effects if each.effect.is_cause]
-    (score, *_) = [each for each in loop.selection.scores if each.name == "receiver_gain_offset"]
+    (score, *_) = [each for each in loop.found.log.trials if each.name == "receiver_gain_offset"]
     assert not score.kept and "may show nothing of it: 3.0 dB (-17.0 to 23.0)" in score.reason
 
 
 @pytest.fixture
 def keep_best(monkeypatch):
     """Function that keeps the best of some candidates; `several` is what is found of one kind."""
-    def run(result, candidates, step, several=None, improbable=()):
+    def run(state, tried, several=()):
         for name, stand_in in (("_settled", lambda model: model),
                                ("_on_one_mast", lambda _: 0), ("_several", lambda *_: several)):
-            monkeypatch.setattr(selection, name, stand_in)
-        supported = [*candidates, *improbable]
-        result.scores += [each.score for each in supported]
-        selection._keep_best(result, candidates, supported, None, None, 0, step, lambda _: None)
-        return result
+            monkeypatch.setattr(causes, name, stand_in)
+        return causes._keep_best(state, tried, None, INPUTS).log
     return run
 
 
 def test_what_was_kept_stays_kept_where_the_number_of_a_step_comes_twice(keep_best):
     """A fault was taken back, so that the step of the effect after it is that of the next one, too."""
-    fault = CandidateScore("episode", reason="what was found later explains it")
-    kept = CandidateScore("foliage", kept=True, step=1, passed=True)
-    result = keep_best(SelectionResult(MODEL, scores=[fault, kept], rivals=[[]]), [passed("unexplained_trend", 30.0, 1)], 1)
-    assert [(each.name, each.kept, each.reason) for each in result.scores] == [
+    fault = Trial("episode", reason="what was found later explains it")
+    kept = Trial("foliage", kept=True, step=1, passed=True)
+    model = SimpleNamespace(whole=SimpleNamespace(effects=[None]))
+    log = keep_best(SearchState(model, TrialLog().record(fault, kept)), [passed("unexplained_trend", 30.0, 1)])
+    assert [(each.name, each.kept, each.reason) for each in log.trials] == [
         ("episode", False, fault.reason), ("foliage", True, ""), ("unexplained_trend", True, "")]
 
 
 @pytest.mark.parametrize(("second", "rivals"), [(None, ["missing_obstacle"]), (8.0, ["device_gain_offset"]), (60.0, [])])
 def test_several_of_a_kind_are_told_from_another_effect_by_what_they_gain_together(keep_best, second, rivals):
     offset, tower = passed("device_gain_offset", 64.0), passed("missing_obstacle", 60.0, repeatable=True)
-    two = second and [(tower.score, MODEL), (passed("missing_obstacle", second, 1).score, MODEL)]
-    result = keep_best(SelectionResult(MODEL), [offset, tower], 0, two)
-    assert result.rivals == [rivals] + [[]] * bool(second)
-    assert [each.name for each in result.scores if each.kept] == (["missing_obstacle"] * 2 if second else
-                                                                 ["device_gain_offset"])
+    two = [tower, passed("missing_obstacle", second, 1)] if second else []
+    log = keep_best(SearchState(MODEL), [offset, tower], two)
+    assert [list(each.rivals) for each in log.kept] == [rivals] + [[]] * bool(second)
+    assert [each.name for each in log.kept] == (["missing_obstacle"] * 2 if second else ["device_gain_offset"])
 
 
 @pytest.mark.parametrize(("nats", "chance", "kept"), [(61.0, 0.9, ["foliage", "foliage"]), (61.0, 0.6, ["device_gain_offset"]),
@@ -164,29 +165,25 @@ def test_groves_of_which_one_is_improbable_beside_an_offset_are_named_where_all_
         keep_best, monkeypatch, nats, chance, kept):
     """An offset of each of six devices gains 64 nats, and each of two groves `nats`."""
     offset, grove = passed("device_gain_offset", 64.0), passed("foliage", nats, repeatable=True)
-    offset, grove = (replace(each, score=replace(each.score, probability=probability, reason=reason))
+    offset, grove = (replace(each, trial=replace(each.trial, probability=probability, reason=reason))
                      for each, probability, reason in ((offset, 0.7, ""), (grove, 0.2, "it is not probable enough")))
-    two = [(grove.score, MODEL), (replace(grove.score, step=1, reason=""), MODEL)]
+    two = [grove, replace(grove, trial=replace(grove.trial, step=1, reason=""))]
     asked = []
-    monkeypatch.setattr(selection, "probability_of_all", lambda *what: asked.append(what) or chance)
-    result = SelectionResult(MODEL, steps=[Step(0, {}, 3.0, 1.0, {})])
-    result = keep_best(result, [offset], 0, two, [grove])
-    assert [each.name for each in result.scores if each.kept] == kept
-    assert all(each.probability == (chance if each.name == "foliage" else 0.7) and not each.reason
-               for each in result.scores if each.kept)
+    monkeypatch.setattr(causes, "probability_of_all", lambda *what: asked.append(what) or chance)
+    log = keep_best(SearchState(MODEL, steps=(Step(0, {}, 3.0, 1.0, {}),)), [offset, grove], two)
+    assert [each.name for each in log.kept] == kept
+    assert all(each.probability == (chance if each.name == "foliage" else 0.7) and not each.reason for each in log.kept)
     if nats < 32:  # even two of them gain less
         assert not asked
     else:
-        ((scores, other, model, ratio),) = asked
-        assert len(scores) == 2 and other == 64.0 and model is MODEL and ratio == 3.0
+        ((trials, other, model, ratio),) = asked
+        assert len(trials) == 2 and other == 64.0 and model is MODEL and ratio == 3.0
 
 
 def test_without_a_candidate_there_is_no_step():
     """What is left may depend on variables that have no order, such as flights, of which no curve can be tried."""
-    result = SelectionResult(MODEL, scores=[CandidateScore("foliage", kept=True)], rivals=[["interference"]])
-    before = replace(result)
-    forward_selection(result, [], 0, lambda _: pytest.fail("something is being done"))
-    assert vars(result) == vars(before)
+    state = SearchState(MODEL, TrialLog().record(Trial("foliage", kept=True, rivals=("interference",))))
+    assert forward_selection(state, [], INPUTS) is state
 
 
 def test_what_gains_nothing_is_no_part_of_the_base_either(open_ground):
@@ -195,15 +192,15 @@ def test_what_gains_nothing_is_no_part_of_the_base_either(open_ground):
     folds = make_folds(links, 0)
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
     same = model.extended(model.whole, model.folds)
-    score = score_model(model, same, CandidateScore("roof_heights"), None, 1, 0, SelectionCriteria().of_no_claim)
+    score = score_model(model, same, Trial("roof_heights"), None, 1, replace(INPUTS, criteria=INPUTS.criteria.of_no_claim))
     assert score.nll_gain == 0 and not score.passed and "gains nothing" in score.reason
 
 
 def test_of_two_effects_of_one_name_the_one_that_is_probable_beside_another_is_kept(monkeypatch):
-    monkeypatch.setattr(selection, "_settled", lambda model: model)
-    sector, dipole = (CandidateScore("antenna_pattern", variant=variant, passed=True) for variant in ("", "dipole"))
-    result = SelectionResult(MODEL, scores=[sector, dipole])
-    other = CandidateScore("foliage", passed=True)
-    selection._keep_together(result, [Passed(None, dipole, None), Passed(None, other, None)], 0)
-    assert [(each.name, each.variant, each.kept) for each in result.scores] == [
+    monkeypatch.setattr(causes, "_settled", lambda model: model)
+    sector, dipole = (Tried(variant, Trial("antenna_pattern", variant=variant, passed=True), None)
+                      for variant in ("", "dipole"))
+    other = Tried("grove", Trial("foliage", passed=True), None)
+    log = causes._keep_together(SearchState(MODEL), [sector, dipole], [dipole, other]).log
+    assert [(each.name, each.variant, each.kept) for each in log.trials] == [
         ("antenna_pattern", "", False), ("antenna_pattern", "dipole", True), ("foliage", "", True)]

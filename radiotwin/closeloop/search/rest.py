@@ -1,0 +1,45 @@
+"""Describe the rest that no cause explains: trends over a variable, and a field over the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from radiotwin.closeloop.search.causes import forward_selection
+from radiotwin.closeloop.search.scoring import score_model
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState
+from radiotwin.closeloop.search.trials import Trial
+from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
+from radiotwin.links import residual_variables
+from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
+from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
+
+
+def add_trends(state: SearchState, inputs: SearchInputs, variables: Sequence[str]) -> SearchState:
+    """Add curves over variables that the residual depends on.
+
+    Args:
+        state: with all causes.
+        inputs: of the search.
+        variables: names, the strongest first.
+    """
+    values = residual_variables(state.model.links, state.model.held_out_mean_db)
+    trends = [UnexplainedTrend(name) for name in variables
+              if values[name].dtype.kind == "f"]  # a curve needs an order
+    return forward_selection(state, trends[:inputs.criteria.max_trends], inputs)
+
+
+def add_shadowing(state: SearchState, inputs: SearchInputs) -> SearchState:
+    """Interpolate the rest over the ground; keep that if it predicts held-out links better."""
+    inputs.on_progress(SHADOWING)
+    model = state.model
+    fields = [CorrelatedShadowing.fit(each, inputs.seed) for each in model.each]
+    # If what a field learnt does not return on held-out flights, its mean may be right though its
+    # certainty is not.
+    for tried in (fields, [replace(each, certain=False) for each in fields]):
+        extended = model.with_shadowing(tried)
+        trial = score_model(model, extended, Trial(SHADOWING, step=state.step), None, 1, inputs,
+                            nlos_only=True)
+        if not trial.reason:
+            return replace(state, model=extended, log=state.log.record(trial.keep()))
+    return state.refuse(trial)

@@ -1,0 +1,132 @@
+"""Trials of effects, and the log of them that the verdict and every page read.
+
+A trial never changes. Where a later judgement changes what is said of it, a new trial with its
+number supersedes it: `TrialLog.trials` has the last word on each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from radiotwin.effects.params import EffectParams
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """An effect that was tried beside a model, and what held-out links say of it.
+
+    Attributes:
+        name: of the effect.
+        kept: whether it was added.
+        reason: why not; empty where it was.
+        nll_gain: held-out likelihood gained [nats]; NaN where it was not tried.
+        rmse_db: held-out RMSE with it [dB].
+        rmse_fall: logarithm of the held-out RMSE without it over that with it, on links of which
+            their fold could know.
+        p_value: of no gain, links that err alike counted as one, corrected for the candidates.
+        step: number of effects that were there before.
+        gain_by_fold: (folds,) `nll_gain` of each fold over the number of links that count as one;
+            empty where it was not tried.
+        evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
+            it was not looked at.
+        passed: whether held-out links support it, however probable it is.
+        features: (6,) what its probability depends on, see `radiotwin.closeloop.verdict.posterior`;
+            empty where it was not tried.
+        probability: that it is there.
+        params: as fitted to all links; None where it was not tried.
+        variant: of the effect.
+        devices: names of those that `params` belong to, see `ends_of`.
+        receivers: the same of receivers.
+        rivals: of a kept effect, names of those that the data cannot tell from it.
+        number: its place in the log; None before it is in one.
+    """
+
+    name: str
+    kept: bool = False
+    reason: str = ""
+    nll_gain: float = np.nan
+    rmse_db: float = np.nan
+    rmse_fall: float = 0.0
+    p_value: float = np.nan
+    step: int = 0
+    gain_by_fold: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    evidence_nats: float = np.nan
+    passed: bool = False
+    features: tuple[float, ...] = ()
+    probability: float = np.nan
+    params: EffectParams | None = None
+    variant: str = ""
+    devices: tuple[str, ...] = ()
+    receivers: tuple[str, ...] = ()
+    rivals: tuple[str, ...] = ()
+    number: int | None = None
+
+    @property
+    def held_out_nats(self) -> float:
+        """Gain on held-out links, those that err alike counted as one [nats]."""
+        return float(self.gain_by_fold.sum())
+
+    @property
+    def nats(self) -> float:
+        """Evidence beside a correlated rest; on held-out links where residuals do not show it."""
+        return self.evidence_nats if np.isfinite(self.evidence_nats) else self.held_out_nats
+
+    @property
+    def is_open(self) -> bool:
+        """Whether nothing speaks against it, though it was not kept."""
+        return not self.kept and not self.reason
+
+    def keep(self, **changes: Any) -> Trial:
+        """Return the same trial as one whose effect was added to the model."""
+        return replace(self, kept=True, reason="", **changes)
+
+    def refuse(self, reason: str, **changes: Any) -> Trial:
+        """Return the same trial as one whose effect was left out, or taken back."""
+        return replace(self, kept=False, reason=reason, **changes)
+
+
+@dataclass(frozen=True, eq=False)
+class TrialLog:
+    """Everything that was said of any trial, in order.
+
+    Attributes:
+        words: trials; of several with one number the last counts.
+    """
+
+    words: tuple[Trial, ...] = ()
+
+    @cached_property
+    def trials(self) -> list[Trial]:
+        """The last word on each trial, in the order in which they were recorded."""
+        return list({each.number: each for each in self.words}.values())
+
+    @property
+    def kept(self) -> list[Trial]:
+        """Trials whose effects are in the model, in the order of its effects."""
+        return [each for each in self.trials if each.kept]
+
+    def of_step(self, step: int) -> list[Trial]:
+        """Return the trials beside a model with `step` effects."""
+        return [each for each in self.trials if each.step == step]
+
+    def record(self, *trials: Trial) -> TrialLog:
+        """Return the log with further trials, which get their numbers here."""
+        first = len(self.trials)
+        return TrialLog((*self.words, *(replace(each, number=number)
+                                        for number, each in enumerate(trials, start=first))))
+
+    def supersede(self, *trials: Trial) -> TrialLog:
+        """Return the log with a later word on trials that are in it.
+
+        Raises:
+            ValueError: a trial that was never recorded.
+        """
+        known = range(len(self.trials))
+        unknown = [each.name for each in trials if each.number not in known]
+        if unknown:
+            raise ValueError(f"trials of {', '.join(unknown)} are not in the log: record them")
+        return TrialLog((*self.words, *trials))
