@@ -21,7 +21,7 @@ def test_antennas_are_named_first_and_look_where_they_do(loop):
 
 def test_named_effects_take_a_quarter_of_the_error_and_interpolation_more_of_the_rest(loop):
     assert 11.0 < loop.before.rmse_db() < 13.5
-    assert loop.selection.explained.rmse_db() <= 9.3  # version 0.1 had 8.8, with a mast moved by 109 m, which is right
+    assert loop.explained.rmse_db() <= 9.3  # version 0.1 had 8.8, with a mast moved by 109 m, which is right
     assert loop.after.rmse_db() <= 6.4
 
 
