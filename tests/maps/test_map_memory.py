@@ -20,10 +20,10 @@ from pathlib import Path
 from radiotwin.maps.export import geotiff
 from radiotwin.coverage import CoverageSettings, predict_coverage
 from radiotwin.maps.radiomap import RadioMap
-from radiotwin.report import export_map, read_run, run_folder, viewer
+from radiotwin.report import export_map, folders, read_run, run_page
 from radiotwin.scene import Scene
 
-run_folder.OVERVIEW_LINKS = 500_000
+folders.OVERVIEW_LINKS = 500_000
 geotiff._WHOLE_VALUES, geotiff.GDAL_OPTIONS["GDAL_CACHEMAX"] = 0, 2**23
 
 def peak_bytes():  # of this program; getrusage has that of the one which started it, too
@@ -38,7 +38,7 @@ def work(folder):
         found = predict_coverage(radio_map, scene, settings=CoverageSettings(tx_power_dbm=20.0))
         assert found.summary["cells"] > 0
     run = read_run(folder, folder / "scene")
-    assert viewer.map_layers(run) and set(run.maps) == {"again", "map"}
+    assert run_page.map_layers(run) and set(run.maps) == {"again", "map"}
 
 work(Path(sys.argv[1]))  # what libraries take is not the map's
 before = peak_bytes()
