@@ -9,7 +9,7 @@ import pandas as pd
 
 from radiotwin.closeloop.crossfit import make_folds
 from radiotwin.closeloop.output.residuals import rmse_db
-from radiotwin.effects.catalogue.sector_antenna import SectorPattern, sector_pattern_db
+from radiotwin.effects.antennas import SectorPattern, sector_pattern_db
 from radiotwin.links import Links, prepare_links
 from radiotwin.links.checks import SURE, chance_inside
 from radiotwin.propagation.laws.followed_paths import interaction_gains

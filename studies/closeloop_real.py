@@ -15,7 +15,7 @@ import pandas as pd
 
 from radiotwin import BadInput, Loop, Measurements, close_loop, make_report, read_measurements
 from radiotwin.closeloop.crossfit import CrossFit
-from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
+from radiotwin.effects.antennas import SectorEffect
 from radiotwin.twin.localize import calibrate_radii, locate, whole_area
 from radiotwin.twin.model.fold_model import Fit
 from studies.closeloop import counted, summary
@@ -110,7 +110,7 @@ def turned_rmse_db(loop: Loop) -> float:
     def turned(fit: Fit) -> Fit:
         effects = []
         for each in fit.effects:
-            if isinstance(each.effect, SectorAntenna):
+            if isinstance(each.effect, SectorEffect):
                 devices = {device: pattern.model_copy(
                     update={"azimuth_deg": pattern.azimuth_deg + 180.0})
                     for device, pattern in each.params.devices.items()}

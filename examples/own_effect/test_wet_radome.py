@@ -1,13 +1,18 @@
-"""The wet radome, fitted to links that were made with one; nothing needs to be installed."""
+"""The wet radome and the crane, in links that were made with one; nothing needs to be installed."""
 
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from radiotwin.closeloop.search.posterior import features, probability_of
 
 import radiotwin as rt
 from radiotwin.effects import register
+from radiotwin.effects.base import ResidualView
+from radiotwin.links import prepare_links
+from radiotwin.report.closeloop_words import closeloop_summary
+from radiotwin.report.labels import parameter_label, parameter_labels
 
 START_S, END_S, LOSS_DB = 400.0, 800.0, 4.0
 
@@ -55,3 +60,32 @@ def test_without_rain_nothing_is_found(effect):
     report = rt.make_report(rt.close_loop(made(0.0), base="log-distance"))
     assert report["verdict"] == "none"
     assert effect.name in {candidate["name"] for candidate in report["candidates"]}
+    (seen,) = [each for each in report["detectable"] if each["name"] == effect.name]
+    assert 0.1 < seen["size"] < LOSS_DB, "a loss of 4 dB would have been seen"
+
+
+def test_what_pages_say_of_it(effect):
+    assert parameter_label("loss_db", parameter_labels(effect.name)) == "loss of the wet antennas"
+    undecided = {"posterior": [{"step": 1, "rest_db": None, "probabilities": [
+        {"name": effect.name, "probability": 0.6}]}], "verdict": "undecided", "candidates": [],
+        "effects": []}
+    assert "To settle it: repeat the flight in dry weather" in closeloop_summary(undecided)
+    values = features((20.0, 20.0, 20.0), 0.1, 1.0, False)
+    assert probability_of(effect.name, values) == probability_of("episode", values)
+
+
+def test_a_crane_has_a_place(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    from crane import Crane
+    links = prepare_links(made(0.0), None)
+    crane, params = Crane(), Crane.Params(place_m=(200.0, 200.0))
+    through = crane.term(links, params, None).columns[:, 0] < 0
+    assert 10 < through.sum() < 0.2 * len(links) and crane.reach(links, params)[through].all()
+    residual_db = np.random.default_rng(1).normal(0, 2, len(links)) - 9.0 * through
+    view = ResidualView(links, residual_db, np.full(len(links), 2.0), links.level_db - residual_db,
+                        None)
+    (found,) = crane.propose(view)
+    assert np.hypot(*np.subtract(found.place_m, params.place_m)) < 25
+    assert all(pattern.change_db.min() == -1 for pattern in crane.typical_patterns(view))
+    assert crane.mark(links, found).text == "crane"
+    assert len(crane.correction(links, found).boxes) == 1

@@ -4,12 +4,15 @@ Wet antennas add a loss of their own to that of the rain on the path (Leijnse et
 'Microwave link rainfall estimation', Advances in Water Resources 31).
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
 from radiotwin.effects import EffectParams, Estimate, GainEffect, Parameter, Term
 from radiotwin.effects.base import LevelAt, ResidualView
+from radiotwin.effects.patterns import Pattern
 from radiotwin.links import Links
 
 
@@ -19,6 +22,9 @@ class WetRadome(GainEffect):
     name = "wet_radome"
     of_receiver = True  # a map is of the levels that arrive, not of readings
     confused_with = ("receiver_drift",)
+    calibrated_like = "episode"  # nobody has traced wet antennas
+    settled_by = "repeat the flight in dry weather"
+    parameter_labels = {"loss_db": "loss of the wet antennas"}
 
     class Params(EffectParams):
         """One episode of rain."""
@@ -46,6 +52,13 @@ class WetRadome(GainEffect):
     @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
         return None if coefficients[0] > 0 else "rain would have to amplify"
+
+    @override
+    def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        start_s, end_s = np.nanquantile(view.links.time_s, [0.45, 0.55])
+        rain = self.Params(start_s=start_s, end_s=end_s)
+        yield Pattern("receiver", "dB", "during a tenth of the time",
+                      self.term(view.links, rain, view.level_at).columns[:, 0], high=10.0)
 
     @override
     def parameters(self, links: Links, params: Params,

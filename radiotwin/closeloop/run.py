@@ -133,7 +133,7 @@ class Loop(Summarised):
             return []
         model, hypotheses = left
         return detectable(model.whole.view, hypotheses, self.criteria,
-                          model.whole.model.effect_names)
+                          [effect() for effect in catalogue()], model.whole.model.effect_names)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:

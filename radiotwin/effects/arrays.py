@@ -1,7 +1,4 @@
-"""Small helpers that many effects share.
-
-Powers and decibels.
-"""
+"""Small helpers that many effects share: ends of links, members, powers and curves."""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -121,3 +118,38 @@ def add_power(level_db: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.n
     first = np.maximum(np.exp(level_db * NEPERS), MIN_POWER)
     total = first + power
     return np.log(total) / NEPERS, first / total
+
+
+def curve_columns(value: np.ndarray, knots: int, circular: bool) -> np.ndarray:
+    """Return columns (n, ≤ knots) of a curve over values (n,), 0 where they are unknown."""
+    places = curve_knots(value[np.isfinite(value)], knots, circular)
+    return curve_basis(value, np.array(places), circular)
+
+
+def curve_knots(value: np.ndarray, count: int, circular: bool) -> list[float]:
+    """Return knots round the circle, or at evenly spaced quantiles of the values."""
+    if circular:
+        return (np.arange(count) * 360.0 / count).tolist()
+    return np.unique(np.quantile(value, (np.arange(count) + 0.5) / count)).tolist()
+
+
+def curve_basis(value: np.ndarray, knots: np.ndarray, circular: bool) -> np.ndarray:
+    """Return the piecewise linear basis (n, knots) of values (n,).
+
+    It is constant beyond the outer knots, and zero where the value is unknown.
+    """
+    known = np.isfinite(value)
+    filled = np.where(known, value, knots[0])
+    if circular:
+        position = filled % 360 / 360 * len(knots)
+        left = np.floor(position).astype(int) % len(knots)
+        right, share = (left + 1) % len(knots), position % 1
+    else:
+        position = np.interp(filled, knots, np.arange(len(knots)))
+        left = np.minimum(np.floor(position).astype(int), len(knots) - 1)
+        right, share = np.minimum(left + 1, len(knots) - 1), position - left
+    hats = np.zeros((len(value), len(knots)))
+    rows = np.arange(len(value))
+    np.add.at(hats, (rows, left), 1 - share)
+    np.add.at(hats, (rows, right), share)
+    return hats * known[:, None]

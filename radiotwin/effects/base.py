@@ -1,4 +1,4 @@
-"""Base classes of effects: causes that change levels, proposed from residuals and fitted.
+"""The contract of effects: causes that change levels, proposed from residuals and fitted.
 
 An effect belongs to one stage. In this order a level passes through them:
 
@@ -8,17 +8,17 @@ An effect belongs to one stage. In this order a level passes through them:
     limit      below which level a link is blank
     detection  which links are blank, or weaker, now and then whatever their level
 
-`docs/add-an-effect.md` is the guide for authors.
-
-Training links and their residual, as effects see them.
+What an effect sees of the training links is a `ResidualView`. All that the loop and the pages ask
+of an effect is a method or an attribute here, with a default; `docs/add-an-effect.md` lists them.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
@@ -30,13 +30,15 @@ from radiotwin.effects.params import (
     Variation,
     quantities,
 )
+from radiotwin.effects.places import Correction, Mark
 from radiotwin.inference.student import Losses
 from radiotwin.links import Links, design_effect, evidence_blocks
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from radiotwin.effects.patterns import Pattern
     from radiotwin.scene.citymap import CityMap
-
-
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +89,20 @@ class Term:
         return cls(np.zeros(n), np.zeros((n, 0)), np.zeros(0), inputs)
 
 
+class Change(NamedTuple):
+    """A change in time of one receiver or device.
+
+    Attributes:
+        end: (n,) index of the receiver, or the device, of each link.
+        member: the one that changed.
+        when_s: from when on it is otherwise [s].
+    """
+
+    end: np.ndarray
+    member: int
+    when_s: float
+
+
 class Effect(ABC):
     """One effect of the catalogue. Subclass one of the stages below, not this.
 
@@ -113,6 +129,12 @@ class Effect(ABC):
         always_exact: whether `exact` may be asked of every candidate, not only of what is kept.
         uses: columns of the measurements that it reads and that no map has, such as `quality`.
         needs_map: whether its term needs the 3D map.
+        settled_by: what to measure, to settle whether it is there; "the device" is replaced by the
+            device's name.
+        parameter_labels: printed names of reported parameters (without the member), where those
+            made from their own names do not do.
+        calibrated_like: name of the effect whose calibration it takes where it has none of its own,
+            because it has not been traced; "" = it is judged as effects are on the whole.
     """
 
     name: ClassVar[str]
@@ -133,6 +155,19 @@ class Effect(ABC):
     always_exact: ClassVar[bool] = False
     uses: ClassVar[tuple[str, ...]] = ()
     needs_map: ClassVar[bool] = False
+    settled_by: ClassVar[str] = ""
+    parameter_labels: ClassVar[Mapping[str, str]] = {}
+    calibrated_like: ClassVar[str] = ""
+
+    @property
+    def label(self) -> str:
+        """Printed name."""
+        return self.name.replace("_", " ")
+
+    @classmethod
+    def of_variant(cls, variant: str) -> Effect | None:
+        """Return the effect in the form that a twin's file names; None if it has no such form."""
+        return cls() if variant == cls.variant else None
 
     def unavailable(self, links: Links) -> str | None:
         """Return why the data do not allow this effect to be looked for; None where they do.
@@ -188,6 +223,28 @@ class Effect(ABC):
         """Return whether a map, which has neither receivers nor times, is drawn with it."""
         return not self.of_receiver
 
+    def between_flights(self) -> Effect | None:
+        """Return the effect as one that changes between flights; None: it is no change in time.
+
+        Held-out flights do not show such a change, so it is looked for in a search of its own.
+        """
+        return None
+
+    def change(self, links: Links, params: Any) -> Change | None:
+        """Return what changed, and when; None: it is no change in time."""
+        return None
+
+    def reading_offsets_db(self, params: Any, coefficients: np.ndarray) -> dict[int, float]:
+        """Return how much more receivers read than others, by index [dB]; by default nothing.
+
+        A receiver hears the same signals, so its limit of detection moves with its readings.
+
+        Args:
+            params: fitted.
+            coefficients: (q,) of the columns of its term.
+        """
+        return {}
+
     def reach(self, links: Links, params: Any) -> np.ndarray | None:
         """Return which (n,) links similar parameters may act on; None for any."""
         return None
@@ -227,6 +284,25 @@ class Effect(ABC):
                                        Allowed(each["low"], each["high"]))
                 for (name, each), sd in zip(quantities(self.Params).items(), estimate.params_sd,
                                             strict=True)}
+
+    def mark(self, links: Links, params: Any) -> Mark | None:
+        """Return how maps mark where it is; None where it has no place."""
+        return None
+
+    def correction(self, links: Links, params: Any) -> Correction:
+        """Return what it says of the declared scene, to be corrected; by default nothing.
+
+        A device that it moves is not where it was declared.
+        """
+        return Correction()
+
+    def typical_patterns(self, view: ResidualView) -> Iterable[Pattern]:
+        """Return what typical effects of this kind would change, over the links of a view.
+
+        From each follows the least size that would have been found; by default there is none, and
+        nothing is said of what was not found.
+        """
+        return ()
 
     def like(self, params: Any, other: Any) -> Any:
         """Return the same cause in the form closest to other parameters of this effect.

@@ -1,9 +1,4 @@
-"""Boxes that obstruct links, and the buildings of a 3D map.
-
-Boxes that obstruct links, and where in a city they would explain missing power.
-
-The buildings of a 3D map: their faces, positions, and standard deviations of their heights.
-"""
+"""Boxes that obstruct links, where they would explain missing power, and buildings of a 3D map."""
 
 from functools import lru_cache
 from typing import Annotated, NamedTuple
@@ -66,6 +61,15 @@ class Box(NamedTuple):
         sides = (self.length_m, self.width_m)[::-1 if quarters % 2 else 1]
         return self._replace(length_m=sides[0], width_m=sides[1],
                              turn_deg=self.turn_deg + 90.0 * quarters)
+
+    @property
+    def outline_m(self) -> np.ndarray:
+        """(5, 2) corners from above, the last one like the first [m]."""
+        turn = np.radians(self.turn_deg)
+        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * 0.5 * (
+            self.length_m, self.width_m)
+        rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        return corners @ rotation + (self.x_m, self.y_m)
 
 
 def grid_around(box: Box, margin_m: float, count: int) -> tuple[np.ndarray, np.ndarray]:

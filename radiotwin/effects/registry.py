@@ -30,7 +30,7 @@ from radiotwin.effects.catalogue.roof_heights import RoofHeights
 from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.effects.catalogue.tilted_dipole import TiltedDipole
 from radiotwin.effects.catalogue.uncertain_sight import UncertainSight
-from radiotwin.effects.catalogue.unexplained_trend import ON_MAPS, OVER, UnexplainedTrend
+from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
 from radiotwin.errors import BadInput
 from radiotwin.runtime.plugins import load_plugins
 
@@ -42,6 +42,7 @@ BUILT_IN: tuple[type[Effect], ...] = (
     ReceiverClockOffset, MissingObstacle, RemovedObstacle, BuildingEntry, Foliage,
     MappedVegetation, WallReflection, Diffraction, GroundReflection, Interference, LockLoss,
     FaultyFlight, Episode, RoofHeights, UncertainSight)
+LAST_RESORTS: tuple[type[Effect], ...] = (UnexplainedTrend,)  # no candidates: they fit anything
 
 _registered: list[type[Effect]] = []
 
@@ -74,20 +75,27 @@ def catalogue() -> tuple[type[Effect], ...]:
     return (*BUILT_IN, *_registered)
 
 
+def trend_over(variable: str) -> Effect:
+    """Return the last resort: a curve over a variable of `residual_variables`."""
+    return UnexplainedTrend(variable)
+
+
+def effects_named(name: str) -> list[type[Effect]]:
+    """Return all forms of an effect; none where no such effect is installed."""
+    return [effect for effect in (*catalogue(), *LAST_RESORTS) if effect.name == name]
+
+
 def effect_named(name: str, variant: str) -> Effect:
     """Return a new instance of an effect.
 
     Raises:
         BadInput: no such effect is installed, or one that describes the same otherwise.
     """
-    over = variant.removeprefix(OVER)
-    if name == UnexplainedTrend.name and over in ON_MAPS:
-        return UnexplainedTrend(over)
-    named = [effect for effect in catalogue() if effect.name == name]
+    named = effects_named(name)
     for effect in named:
-        if effect.variant == variant:
-            return effect()
-    if named:
+        if (found := effect.of_variant(variant)) is not None:
+            return found
+    if not set(named) <= set(LAST_RESORTS):
         raise BadInput(f"the twin has the effect {name!r} as another version of radiotwin "
                        "described it, with other parameters; run `radiotwin close-loop` again")
     known = ", ".join(sorted({effect.name for effect in catalogue()}))

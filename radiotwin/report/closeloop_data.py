@@ -12,6 +12,7 @@ import numpy as np
 from radiotwin.closeloop.run import Loop
 from radiotwin.closeloop.verdict.residual_tests import significant
 from radiotwin.effects.params import Parameter
+from radiotwin.effects.places import Mark
 from radiotwin.links import Links, evidence_blocks, residual_variables
 from radiotwin.report.labels import variable_label
 from radiotwin.twin.model.fold_model import Fit
@@ -72,11 +73,12 @@ class EffectData:
 
     Attributes:
         name: name in the catalogue.
-        figure: kind of figure that the effect asks for; empty: chosen by name and stage.
+        figure: kind of figure that the effect asks for; empty: chosen by stage.
         stage: stage of the model that the effect acts in.
         nlos_only: whether it acts on links without line of sight only.
         of_receiver: whether it belongs to a receiver.
         params: nonlinear parameters.
+        mark: how maps mark where it is; None: it has no place.
         parameters: printed parameters with their 90 % intervals.
         links: measured links.
         without_db: (n,) predicted level without the effect [dB].
@@ -89,6 +91,7 @@ class EffectData:
     nlos_only: bool
     of_receiver: bool
     params: Mapping[str, Any]
+    mark: Mark | None
     parameters: dict[str, Parameter]
     links: DrawnLinks
     without_db: np.ndarray
@@ -208,7 +211,7 @@ def _effects(loop: Loop, links: DrawnLinks) -> list[EffectData]:
         effect = applied.effect
         effects.append(EffectData(
             effect.name, effect.figure, effect.stage, effect.nlos_only, effect.of_receiver,
-            dict(applied.params), parameters, links,
+            dict(applied.params), effect.mark(whole.links, applied.params), parameters, links,
             np.where(whole.usable, without_db, np.nan), with_db))
     return effects
 

@@ -28,12 +28,13 @@ from radiotwin.report.labels import (
     AFTER,
     BEFORE,
     FITTED,
-    INTERPOLATIONS,
     effect_picture,
     hide_spines,
+    interpolations,
     name_label,
     new_figure,
     parameter_label,
+    parameter_labels,
     save,
     shorten,
 )
@@ -46,6 +47,7 @@ from radiotwin.report.map_figures import (
     residual_map_figure,
 )
 from radiotwin.scene import Scene
+from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 
 EFFECT_BINS = 24
 MAX_BARS = 40
@@ -172,7 +174,7 @@ def interval_figure(effect: EffectData, background: MapBackground) -> Figure:
     members = [name.partition("[")[2].removesuffix("]") for name, _ in chosen]
     ax.set_yticks(range(len(chosen)), [shorten(member, 24) for member in members])
     ax.axvline(0, color="0.4", linewidth=0.8)
-    label = parameter_label(chosen[0][0].partition("[")[0])
+    label = parameter_label(chosen[0][0].partition("[")[0], parameter_labels(effect.name))
     ax.set(xlabel=f"{label}, with 90 % interval [{chosen[0][1].unit}]",
            ylim=(-0.7, len(chosen) - 0.3))
     hide_spines(ax)
@@ -300,7 +302,7 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
         save(effect_figure(effect, background), folder / effect_picture(rank, effect.name))
     if data.interpolated_db is not None:
         save(contribution_map_figure(data.interpolated_db, background),
-             folder / effect_picture(len(data.effects) + 1, "correlated_shadowing"))
+             folder / effect_picture(len(data.effects) + 1, SHADOWING))
 
 
 def waterfall_figure(report: dict) -> Figure:
@@ -316,7 +318,8 @@ def waterfall_figure(report: dict) -> Figure:
     declared = sum(effect.get("is_declared", False) for effect in report["effects"])
     kept = kept[declared:]  # what is declared comes first: it is part of the base
     levels = [before, *(rmse_db for _, rmse_db in kept)]
-    steps = [(name_label(name), name in INTERPOLATIONS) for name, _ in kept]
+    without_cause = interpolations()
+    steps = [(name_label(name), name in without_cause) for name, _ in kept]
     if kept and abs(levels[-1] - after) > MIN_STEP_DB:
         levels.append(after)
         steps.append(("joint refit", False))

@@ -9,11 +9,12 @@ from radiotwin.display import count
 from radiotwin.report import closeloop_words as words
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (
-    INTERPOLATIONS,
     effect_picture,
+    interpolations,
     join_names,
     name_label,
     parameter_label,
+    parameter_labels,
     variable_label,
 )
 
@@ -127,12 +128,14 @@ def _cards(report: dict) -> list[tuple[str, str]]:
 def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
     """Return the effects grouped by their heading."""
     sections: dict[str, list[dict]] = {}
+    interpolated = interpolations()
     for effect in report["effects"][:MAX_EFFECTS]:
         name, label = effect["name"], name_label(effect["name"])
-        heading = ("Interpolated, not explained" if name in INTERPOLATIONS else
+        heading = ("Interpolated, not explained" if name in interpolated else
                    "Part of the base" if effect.get("is_declared") else
                    "Effects found")
-        rows = [[parameter_label(key), _value(p), _interval(p), p["unit"]]
+        labels = parameter_labels(name)
+        rows = [[parameter_label(key, labels), _value(p), _interval(p), p["unit"]]
                 for key, p in effect["parameters"].items()]
         sections.setdefault(heading, []).append({
             "rank": effect["rank"], "name": name, "label": label, "evidence": _evidence(effect),

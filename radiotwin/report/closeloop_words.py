@@ -4,8 +4,9 @@ from collections import Counter
 
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER
+from radiotwin.effects.registry import effects_named
 from radiotwin.io.texts import moment
-from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, variable_label
+from radiotwin.report.labels import interpolations, join_names, name_label, variable_label
 
 MAX_NAMED = 4  # variables or effects in a sentence
 MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance
@@ -16,26 +17,6 @@ LIKELY = 0.05  # a cause that is less probable is not worth a word
 DATES_S = 1e9, 4e9  # times from 2001 to 2096; no other number of seconds is as large
 BADGES = {"effect": "found: ", "none": "no cause found", "unexplained": "unexplained",
           "undecided": "undecided"}
-SETTLES = {
-    "antenna_pattern": "fly around the device at one distance and one height",
-    "body_shadowing": "fly the same track in both directions",
-    "device_drift": "return to the same places at other times",
-    "device_gain_offset": "measure the device's power next to it, with line of sight",
-    "device_position_error": "fly past the device on two sides, close by, or survey it again",
-    "episode": "repeat the flight in dry weather",
-    "excess_attenuation": "measure at much longer distances with line of sight",
-    "faulty_flight": "repeat that flight with a receiver that was compared with another",
-    "foliage": "fly low on both sides of the suspected place",
-    "ground_reflection": "vary the height over open ground",
-    "interference": "listen with the devices switched off",
-    "missing_obstacle": "fly low on both sides of the suspected place",
-    "receiver_clock_offset": "fly one track forth and back",
-    "receiver_drift": "return to the same places at other times",
-    "receiver_gain_offset": "let the receivers measure side by side",
-    "receiver_position_error": "fly one track forth and back",
-    "receiver_saturation": "approach a device with line of sight",
-    "removed_obstacle": "fly low on both sides of the suspected building",
-}
 
 
 def closeloop_summary(report: dict) -> str:
@@ -48,7 +29,7 @@ def closeloop_summary(report: dict) -> str:
             "undecided": _undecided}[report["verdict"]](report)
     text += next((f" {_side_by_side(each)}." for each in _largest_first(report)
                   if _differ(each["difference_db"])), "")
-    interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
+    interpolated = _has_interpolation(report)
     if interpolated:
         text += (" Interpolation of what remains, which explains nothing, brings the RMSE to "
                  f"{number(report['error']['after']['rmse_db'])} dB.")
@@ -176,8 +157,13 @@ def _counts(dependence: dict, report: dict) -> bool:
 
 def _causes(report: dict) -> list[dict]:
     """Return the effects that were found and explain something."""
+    interpolated = interpolations()
     return [each for each in report["effects"]
-            if each["name"] not in INTERPOLATIONS and not each.get("is_declared")]
+            if each["name"] not in interpolated and not each.get("is_declared")]
+
+
+def _has_interpolation(report: dict) -> bool:
+    return not interpolations().isdisjoint(each["name"] for each in report["effects"])
 
 
 def _largest_first(report: dict) -> list[dict]:
@@ -205,9 +191,10 @@ def _side_by_side(found: dict) -> str:
 
 def _effect(report: dict) -> str:
     error, causes = report["error"], cause_names(report)
+    without_cause = interpolations()
     explained = [each["heldout_rmse_db"] for each in report["candidates"]
-                 if each["kept"] and each["name"] not in INTERPOLATIONS]
-    interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
+                 if each["kept"] and each["name"] not in without_cause]
+    interpolated = _has_interpolation(report)
     after = explained[-1] if explained and interpolated else error["after"]["rmse_db"]
     found = _causes(report)
     it = "it" if len(found) == 1 else "them"  # one kind may have been found twice
@@ -291,15 +278,25 @@ def _undecided(report: dict) -> str:
     if step is None:
         return text
     text += f" Likeliest: {_likely(step['probabilities'])}."
-    advice = [_settles(each["name"], step["step"], report) for each in step["probabilities"]
-              if (each["probability"] or 0) >= LIKELY and each["name"] in SETTLES]
+    likely = [each["name"] for each in step["probabilities"]
+              if (each["probability"] or 0) >= LIKELY]
+    advice = list(filter(None, (_settles(name, step["step"], report) for name in likely)))
     if advice:
         text += f" To settle it: {'; '.join(dict.fromkeys(advice[:2]))}."
     return f"{text} {_sizes(report)}".strip()
 
 
 def _settles(name: str, step: int, report: dict) -> str:
-    """Say what would settle whether an effect is there, and of which device or receiver."""
+    """Say what would settle whether an effect is there, and of which device or receiver.
+
+    Of several forms of an effect, such as a device's antenna and a receiver's, that of the ends
+    which it was looked for in. Empty where nothing is known.
+    """
+    forms = effects_named(name)
+    texts = {each.of_receiver: each.settled_by for each in reversed(forms) if each.settled_by}
+    if not texts:
+        return ""
+    first = next(each.settled_by for each in forms if each.settled_by)
     tried = [each for each in report["candidates"]
              if each["name"] == name and each["step"] == step]
     best: dict = max(tried, key=lambda each: each.get("probability") or 0.0, default={})
@@ -309,13 +306,11 @@ def _settles(name: str, step: int, report: dict) -> str:
             continue
         shown = ", ".join(names[:MAX_NAMED]) + " and others" * (len(names) > MAX_NAMED)
         who = f"{end}{'s' * (len(names) > 1)} {shown}"
-        # The antenna of a receiver turns with it.
-        turns = name == "antenna_pattern" and end == "receiver"
-        text = SETTLES["body_shadowing" if turns else name]
+        text = texts.get(end == "receiver", first)
         if end == "device" and len(names) == 1 and "the device" in text:
             return text.replace("the device", who)
         return f"{text} ({who})"
-    return SETTLES[name]
+    return first
 
 
 def _likely(probabilities: list[dict]) -> str:

@@ -2,6 +2,7 @@
 
 import io
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -9,7 +10,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from radiotwin.display import plain
+from radiotwin.effects.registry import LAST_RESORTS, catalogue, effects_named
 from radiotwin.io.files import atomic_file
+from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 
 VARIABLES = {  # label and unit
     "distance_m": ("distance", "m"), "elevation_deg": ("elevation at the device", "°"),
@@ -25,39 +28,16 @@ VARIABLES = {  # label and unit
     "place_of_ray": ("position of the link's midpoint", ""),
     "place_of_receiver": ("receiver position", ""),
 }
-PARAMETERS = {
+PARAMETERS = {  # of any effect; what only one has, is in its `parameter_labels`
     "x_m": "x, east", "y_m": "y, north", "turn_deg": "orientation", "offset_db": "offset",
-    "gain_db": "gain", "warm_up_db": "excess at switch-on",
-    "warm_up_each_flight_db": "excess at take-off", "ageing_db": "change from first to last",
-    "step_db": "step", "step_time_s": "time of the step", "time_constant_s": "time constant",
-    "azimuth_deg": "boresight", "azimuth_offset_deg": "common error of the azimuths",
-    "tilt_offset_deg": "common error of the tilts",
-    "front_to_back_db": "front-to-back ratio", "tilt_deg": "tilt",
-    "vertical_beamwidth_deg": "vertical beamwidth", "beamwidth_deg": "beamwidth",
-    "lean_azimuth_deg": "azimuth of the tilt, from the heading",
-    "body_depth_db": "loss through the body", "body_azimuth_deg": "body, from the heading",
-    "body_elevation_deg": "body, up from the deck",
-    "body_width_deg": "body, across, to half its loss", "entry_loss_db": "building entry loss",
-    "scatter_sd_db": "standard deviation from place to place",
-    "contrast_db": "difference of both classes, by their scatter",
-    "loss_without_sight_db": "loss where a link may have no line of sight",
-    "gain_with_sight_db": "gain where it may have one",
-    "limit": "limit of detection", "floor": "noise floor", "saturation_level": "saturation level",
-    "strength_db": "strength relative to theory",
+    "gain_db": "gain", "azimuth_deg": "boresight", "front_to_back_db": "front-to-back ratio",
+    "tilt_deg": "tilt", "vertical_beamwidth_deg": "vertical beamwidth",
+    "beamwidth_deg": "beamwidth",
     "specific_attenuation_db_km": "specific attenuation",
     "specific_attenuation_db_m": "specific attenuation", "greatest_loss_db": "maximum loss",
-    "scale_height_m": "scale height (1/e)",
-    "scattered_db": "scattered power, relative to free space", "strength": "strength",
-    "roughness_m": "ground roughness", "ground_m": "ground height",
-    "lost_share": "share lost", "drop_db": "level without lock, lower by",
-    "rise_and_fall_db": "peak-to-peak variation",
-    "level_at_100_m": "level at 100 m",
-    "over_a_device_db": "power over a device's", "length_m": "length", "width_m": "width",
-    "height_m": "height", "share": "share that belongs to places",
+    "scattered_db": "scattered power, relative to free space", "length_m": "length",
+    "width_m": "width", "height_m": "height", "share": "share that belongs to places",
     "receiver_share": "share that belongs to a receiver", "sigma_db": "standard deviation",
-    "true_minus_given_x_m": "true − given position, east",
-    "true_minus_given_y_m": "true − given position, north",
-    "true_minus_given_z_m": "true − given height",
 }
 SUFFIXES = {"_db_km": "dB/km", "_db_m": "dB/m", "_deg": "°", "_db": "dB", "_dbm": "dBm",
             "_m": "m", "_s": "s"}
@@ -70,8 +50,6 @@ MODELS = {"log_distance": "log-distance", "segmented_log_distance": "segmented l
           "al_hourani_high_rise": "Al-Hourani high-rise", "p1411": "ITU-R P.1411",
           "cost231_wi": "COST 231 W-I"}
 NAMES = MODELS | {"log_distance": "log-distance law", "raytrace": "ray tracer"}
-INTERPOLATIONS = ("correlated_shadowing", "unexplained_trend")
-"""Effects that fit what is left without a cause."""
 LOS_COLOUR, NLOS_COLOUR = "#2a7f9e", "#d1495b"
 BEFORE, AFTER, FITTED, FOUND = "#c2571a", "#1f6f8b", "#22272c", "#7a0177"
 DPI = 110
@@ -80,6 +58,13 @@ DPI = 110
 def name_label(name: str) -> str:
     """Return the printed name of an effect or a base: `receiver_drift` -> `receiver drift`."""
     return NAMES.get(name, name.replace("_", " "))
+
+
+def interpolations() -> frozenset[str]:
+    """Return the names of what fits a residual without a cause."""
+    found = (each.name for each in (*catalogue(), *LAST_RESORTS)
+             if not each.is_cause and not each.is_declared)
+    return frozenset({SHADOWING, *found})
 
 
 def effect_picture(rank: int, name: str) -> str:
@@ -95,10 +80,21 @@ def variable_label(name: str) -> tuple[str, str]:
     return stem.replace("_", " "), unit
 
 
-def parameter_label(name: str) -> str:
-    """Return the label of a parameter with its member: `tilt_deg[uav1]` -> `tilt (uav1)`."""
+def parameter_labels(effect: str) -> dict[str, str]:
+    """Return the labels of parameters of an effect of that name, where they have their own."""
+    return PARAMETERS | {name: label for each in reversed(effects_named(effect))
+                         for name, label in each.parameter_labels.items()}
+
+
+def parameter_label(name: str, labels: Mapping[str, str] = PARAMETERS) -> str:
+    """Return the label of a parameter with its member: `tilt_deg[uav1]` -> `tilt (uav1)`.
+
+    Args:
+        name: as `closeloop.json` has it.
+        labels: of parameters without their members, see `parameter_labels`.
+    """
     stem, bracket, member = name.partition("[")
-    label = PARAMETERS.get(stem) or _split_unit(stem)[0].replace("_", " ")
+    label = labels.get(stem) or _split_unit(stem)[0].replace("_", " ")
     return f"{label} ({member.removesuffix(']')})" if bracket else label
 
 

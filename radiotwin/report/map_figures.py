@@ -1,6 +1,5 @@
 """Maps: gains over the outlines of buildings, and residuals, levels and effects of a close-loop."""
 
-from collections.abc import Callable
 from pathlib import Path
 from textwrap import fill
 
@@ -20,7 +19,6 @@ from radiotwin.display import (
     plain,
     residual_range_db,
 )
-from radiotwin.effects.boxes import buildings
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report.closeloop_data import DrawnLinks, EffectData, LoopData
 from radiotwin.report.labels import (
@@ -53,8 +51,6 @@ MAX_MARKS = 80  # more devices or receivers would hide the map
 MARGIN_M = 30.0  # around the links of an enlarged part
 ROUND_STEPS = (1, 1.5, 2, 3, 4, 5, 7, 10)
 HALO = [withStroke(linewidth=2.5, foreground="white")]
-Label = tuple[str, np.ndarray]
-"""Text beside a marker, and its position (2,) [m]."""
 MAX_RAYS = 1500
 MIN_CONTRIBUTION_DB = 0.5  # links that an effect changes by less are not drawn
 RESIDUAL_LABEL = "measured − predicted [dB]"
@@ -299,59 +295,21 @@ class MapBackground:
 
 def mark(ax: Axes, effect: EffectData) -> None:
     """Draw an effect that has a position, with its name; others are left out."""
-    for field, draw in MARKERS.items():
-        label = draw(ax, effect) if field in effect.params else None
-        if label is not None:
-            _draw_label(ax, *label)
-            return
-
-
-def _mark_box(ax: Axes, effect: EffectData) -> Label:
-    """Outline a box: centre x, y, length, width, height [m] and counter-clockwise turn [deg]."""
-    x_m, y_m, length_m, width_m, height_m, turn_deg = effect.params["box"]
-    turn = np.radians(turn_deg)
-    corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * 0.5 * (length_m, width_m)
-    rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    outline_m = corners @ rotation + (x_m, y_m)
-    ax.plot(outline_m[:, 0], outline_m[:, 1], color=FOUND, linewidth=2, zorder=5)
-    return f"{name_label(effect.name)}\n{height_m:.0f} m high", np.array((x_m, y_m))
-
-
-def _mark_building(ax: Axes, effect: EffectData) -> Label | None:
-    """Fill a building that is gone."""
-    city = effect.links.city
-    if city is None:
-        return None
-    faces = city.faces[buildings(city)[0] == effect.params["building"]]
-    ax.add_collection(PolyCollection(city.vertices[faces][..., :2], facecolors=FOUND,
-                                     edgecolors="none", alpha=0.6, zorder=5), autolim=False)
-    return "removed building", effect.params["centre_m"][:2]
-
-
-def _mark_move(ax: Axes, effect: EffectData) -> Label | None:
-    """Draw an arrow from the given to the estimated position of a device."""
-    if "device" not in effect.params:
-        return None
-    device, move_m = effect.params["device"], effect.params["move_m"][:2]
-    given_m = effect.links.device_m[device, :2]
-    estimate_m = given_m + move_m
-    ax.annotate("", tuple(estimate_m), tuple(given_m), zorder=6, arrowprops={
-        "arrowstyle": "->", "color": FOUND, "linewidth": 2, "shrinkA": 0, "shrinkB": 4})
-    ax.plot(*estimate_m, "*", color=FOUND, markersize=13, markeredgecolor="white", zorder=7)
-    name = plain(effect.links.names["device"][device])
-    return f"{name} is\n{np.hypot(*move_m):.0f} m away", estimate_m
-
-
-def _mark_point(ax: Axes, effect: EffectData) -> Label:
-    """Draw a cross."""
-    position_m = effect.params["place_m"][:2]
-    ax.plot(*position_m, "X", color=FOUND, markersize=11, markeredgecolor="white", zorder=6)
-    return name_label(effect.name), position_m
-
-
-MARKERS: dict[str, Callable[[Axes, EffectData], Label | None]] = {
-    "box": _mark_box, "building": _mark_building, "move_m": _mark_move, "place_m": _mark_point}
-"""By the parameter that holds the position."""
+    found = effect.mark
+    if found is None:
+        return
+    if found.outline_m is not None:
+        ax.plot(found.outline_m[:, 0], found.outline_m[:, 1], color=FOUND, linewidth=2, zorder=5)
+    elif found.faces_m is not None:
+        ax.add_collection(PolyCollection([*found.faces_m], facecolors=FOUND, edgecolors="none",
+                                         alpha=0.6, zorder=5), autolim=False)
+    elif found.from_m is not None:
+        ax.annotate("", tuple(found.at_m), tuple(found.from_m), zorder=6, arrowprops={
+            "arrowstyle": "->", "color": FOUND, "linewidth": 2, "shrinkA": 0, "shrinkB": 4})
+        ax.plot(*found.at_m, "*", color=FOUND, markersize=13, markeredgecolor="white", zorder=7)
+    else:
+        ax.plot(*found.at_m, "X", color=FOUND, markersize=11, markeredgecolor="white", zorder=6)
+    _draw_label(ax, "\n".join(plain(line) for line in found.text.split("\n")), found.at_m)
 
 
 def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:

@@ -17,9 +17,9 @@ from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.predict.baselines import EXTRA_TREES, grow_trees
 from radiotwin.closeloop.search.declared import add_declared
 from radiotwin.closeloop.search.stages import SearchInputs, search
+from radiotwin.effects.antennas import SectorPattern
 from radiotwin.effects.base import GainEffect
 from radiotwin.effects.catalogue.declared_sectors import DeclaredSectors
-from radiotwin.effects.catalogue.sector_antenna import SectorPattern
 from radiotwin.effects.registry import BUILT_IN
 from radiotwin.links import prepare_links
 from radiotwin.links.measurements import Measurements

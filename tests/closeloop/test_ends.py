@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from radiotwin.closeloop.search.scoring import ends_of
+from radiotwin.effects.antennas import SectorPattern
 from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
 from radiotwin.effects.catalogue.foliage import Foliage
 from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
-from radiotwin.effects.catalogue.sector_antenna import SectorAntenna, SectorPattern
+from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.links import prepare_links
 from radiotwin.twin.model.fold_model import FittedEffect
 

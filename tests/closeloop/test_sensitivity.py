@@ -7,15 +7,13 @@ import pytest
 
 from radiotwin.closeloop.output.result_file import _for_json
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
-from radiotwin.closeloop.verdict.sensitivity import (
-    MIN_LINKS,
-    detectable,
-    median_azimuth_deg,
-    needed_nats,
-    typical_patterns,
-)
+from radiotwin.closeloop.verdict.sensitivity import detectable, needed_nats
+from radiotwin.effects import GainEffect, catalogue
 from radiotwin.effects.catalogue.faulty_flight import FaultyFlight
+from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
 from radiotwin.effects.catalogue.position_errors import MIN_MOVE_M
+from radiotwin.effects.catalogue.sector_antenna import median_azimuth_deg
+from radiotwin.effects.patterns import MIN_LINKS, Pattern
 from tests.closeloop.looking import looked_at
 
 CRITERIA = SelectionCriteria()
@@ -38,18 +36,18 @@ def nothing_hidden(seen):
 @pytest.fixture
 def sizes(monkeypatch):
     """`sizes(view, hypotheses, *names)`: of those families only, and of two members, as searches take their time."""
-    monkeypatch.setattr("radiotwin.closeloop.verdict.sensitivity.MAX_MEMBERS", 2)
+    monkeypatch.setattr("radiotwin.effects.patterns.MAX_MEMBERS", 2)
 
     def make(view, hypotheses, *names, criteria=CRITERIA):
-        monkeypatch.setattr("radiotwin.closeloop.verdict.sensitivity.typical_patterns", lambda view: (
-            each for each in typical_patterns(view) if each.effect.name in names))
-        return {each.name: each.size for each in detectable(view, hypotheses, criteria)}
+        effects = [effect() for effect in catalogue() if effect.name in names]
+        return {each.name: each.size for each in detectable(view, hypotheses, criteria, effects)}
     return make
 
 
 def test_every_family_that_was_looked_for_has_a_size_within_what_it_may_have(nothing_hidden):
     view, hypotheses = nothing_hidden
-    found = {each.name: each.size for each in detectable(view, hypotheses, CRITERIA)}
+    found = {each.name: each.size for each in detectable(view, hypotheses, CRITERIA,
+                                                       [effect() for effect in catalogue()])}
     assert {"receiver_gain_offset", "device_gain_offset", "faulty_flight", "episode", "excess_attenuation"} <= set(found)
     assert all(size > 0 for size in found.values())
     assert view.links.city is None and np.isfinite(view.links.frequency_hz)
@@ -92,7 +90,7 @@ def test_the_size_of_a_fault_is_one_that_its_search_finds(nothing_hidden, sizes,
     """Flights must differ little for one to stand out, however much evidence an offset would bring."""
     view, hypotheses = nothing_hidden
     usual_db = sizes(view, hypotheses, "faulty_flight")["faulty_flight"]
-    (pattern,) = [each for each in typical_patterns(view) if each.effect is FaultyFlight][:1]
+    pattern = next(FaultyFlight().typical_patterns(view))
     injected = replace(view, residual_db=view.residual_db + pattern.of_size_db(1.3 * usual_db))
     (params,) = FaultyFlight().propose(injected)
     row = np.flatnonzero(pattern.change_db)[0]
@@ -107,13 +105,12 @@ def test_the_size_of_a_fault_is_one_that_its_search_finds(nothing_hidden, sizes,
 
 def test_a_first_or_last_flight_counts_only_where_there_is_no_other(nothing_hidden):
     view, _ = nothing_hidden
-    flights = {int(view.links.flight[np.flatnonzero(each.change_db)[0]]) for each in typical_patterns(view)
-               if each.effect is FaultyFlight}
+    flights = {int(view.links.flight[np.flatnonzero(each.change_db)[0]]) for each in FaultyFlight().typical_patterns(view)}
     assert flights and not flights & {0, view.links.flight.max()}
     two = np.isin(view.links.flight, [0, 1])
     few = view.__class__(view.links.select(two), view.residual_db[two], view.scale_db[two], view.mean_db[two],
                          view.level_at)
-    patterns = [each for each in typical_patterns(few) if each.effect is FaultyFlight]
+    patterns = list(FaultyFlight().typical_patterns(few))
     assert patterns and all((each.change_db != 0).sum() >= MIN_LINKS for each in patterns)
 
 
@@ -125,10 +122,25 @@ def test_flights_with_clocks_far_apart_still_have_episodes(nothing_hidden, sizes
 
 def test_what_hides_links_hides_those_that_pass_it_low(nothing_hidden):
     view, _ = nothing_hidden
-    hidden = [each.change_db != 0 for each in typical_patterns(view) if each.effect.name == "missing_obstacle"]
+    hidden = [each.change_db != 0 for each in MissingObstacle().typical_patterns(view)]
     assert hidden and all(MIN_LINKS <= each.sum() < 0.5 * len(view.links) for each in hidden)
     low = view.links.offset_m[:, 2] / view.links.distance_m
     assert all(low[each].mean() <= low.mean() + 0.1 for each in hidden)
+
+
+def test_an_effect_of_ones_own_has_a_size_that_would_have_been_seen_and_a_kind_of_its_own_is_last(nothing_hidden):
+    class Hum(GainEffect):
+        name = "hum"
+
+        def gain_db(self, links, params):
+            return np.where(links.receiver == 1, -3.0, 0.0)
+
+        def typical_patterns(self, view):
+            return [Pattern("hum", "dB", "of one receiver", self.gain_db(view.links, None) / 3)]
+
+    view, hypotheses = nothing_hidden
+    *_, last = detectable(view, hypotheses, CRITERIA, [Hum(), FaultyFlight()])
+    assert (last.name, last.pattern) == ("hum", "of one receiver") and 0 < last.size < np.inf
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 270.0])

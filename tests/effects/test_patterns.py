@@ -6,13 +6,10 @@ import pytest
 import trimesh
 from pydantic import ValidationError
 
+from radiotwin.effects.antennas import SectorPattern, sector_pattern_db
 from radiotwin.effects.catalogue.noise_floor import NoiseFloor, floored
 from radiotwin.effects.catalogue.receiver_saturation import ReceiverSaturation, _compress
-from radiotwin.effects.catalogue.sector_antenna import (
-    SectorAntenna,
-    SectorPattern,
-    sector_pattern_db,
-)
+from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.effects.catalogue.tilted_dipole import TiltedDipole, dipole_gain
 from radiotwin.scene.citymap import CityMap
 

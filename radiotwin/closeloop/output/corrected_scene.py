@@ -1,9 +1,10 @@
 """The declared scene corrected by what the loop found.
 
-Boxes are added, buildings taken out, roofs raised and lowered, anchors moved, and sector antennas
-declared. `buildings.csv` is without the buildings that are gone, and has roofs as estimated.
+Boxes are added, buildings taken out, roofs raised and lowered, anchors moved, antennas declared;
+`buildings.csv` lists the buildings that are left, with the heights as estimated.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,20 +15,12 @@ from pydantic import ValidationError
 
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.boxes import Box, building_extents_m, buildings
-from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
-from radiotwin.effects.catalogue.position_errors import DevicePositionError
-from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
-from radiotwin.effects.catalogue.roof_heights import Roof, RoofHeights, surely_off
-from radiotwin.effects.catalogue.sector_antenna import (
-    SectorAntenna,
-    SectorPattern,
-    sector_pattern_db,
-)
+from radiotwin.effects.places import Correction, FoundAntenna, RaisedRoof
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import as_numbers, read_cells, write_csv
 from radiotwin.io.files import atomic_folder, require_writable
 from radiotwin.io.inputs import is_within, require_within
-from radiotwin.links import site_of
+from radiotwin.links import Links
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, write_config
@@ -46,20 +39,8 @@ CLEARANCE_M = 0.5  # between walls and positions that are known to be outside [m
 MAX_SHIFT_M = 60.0  # by which a device is moved out of a building [m]
 
 
-def found_antennas(loop: Loop) -> dict[str, SectorPattern]:
-    """Return device -> pattern of the sector antennas that were found.
-
-    Args:
-        loop: whose accepted effects are looked at.
-    """
-    names = loop.after.whole.links.device_names
-    return {names[device]: pattern for each in loop.after.whole.effects
-            if isinstance(each.effect, SectorAntenna)
-            for device, pattern in each.params.devices.items()}
-
-
-def with_antennas(config: SceneConfig, loop: Loop,
-                  scene: Scene) -> tuple[SceneConfig, dict[str, SectorPattern], list[str]]:
+def with_antennas(config: SceneConfig, found: Sequence[Correction], links: Links,
+                  scene: Scene) -> tuple[SceneConfig, dict[str, FoundAntenna], list[str]]:
     """Return a scene's configuration with the antennas that were found.
 
     An anchor of the measurements that the scene does not declare is declared with its antenna, if
@@ -67,54 +48,56 @@ def with_antennas(config: SceneConfig, loop: Loop,
 
     Args:
         config: to add them to.
-        loop: that found them.
+        found: corrections with them.
+        links: of the loop that found them.
         scene: that it was run with.
 
     Returns:
-        the configuration, file in the scene's folder -> pattern, and a sentence for each.
+        the configuration, file in the scene's folder -> antenna, and a sentence for each.
     """
-    links, devices = loop.after.whole.links, {each.device: each for each in config.devices}
+    devices = {each.device: each for each in config.devices}
+    antennas = {links.device_names[device]: antenna for each in found
+                for device, antenna in each.antennas.items()}
     bounds, files, changes = config.extent.bounds, {}, []
-    for name, pattern in found_antennas(loop).items():
+    for name, antenna in antennas.items():
         x_m, y_m, z_m = links.device_m[links.device_names.index(name)].tolist()
         device = devices.get(name)
         if device is None:
             within = bounds[0] <= x_m <= bounds[1] and bounds[2] <= y_m <= bounds[3]
             if not within or scene.city.inside(np.array([[x_m, y_m, z_m]]))[0]:
-                changes.append(f"{name} has a sector antenna, and is not in the scene: it stands "
+                changes.append(f"{name} has a {antenna.kind}, and is not in the scene: it stands "
                                "outside the extent or in a building")
                 continue
             try:
                 device = DeviceConfig(device=name, x_m=round(x_m, 2), y_m=round(y_m, 2),
                                       z_m=round(z_m, 2), role="anchor")
             except ValidationError:  # measurements may call and place a device as they like
-                changes.append(f"{name!r} has a sector antenna, and is not in the scene: scene.toml"
+                changes.append(f"{name!r} has a {antenna.kind}, and is not in the scene: scene.toml"
                                " has devices above z = 0, whose names are of letters, digits and "
                                "_.+-")
                 continue
         others = {Path(each.antenna).stem.lower() for each in devices.values()
                   if each.antenna is not None and each.device != name}
         file = f"{ANTENNAS}/{unique_name(f'found_{safe_name(name)}', others)}.csv"
-        azimuth_deg = round(pattern.azimuth_deg % 360, DECIMALS)
+        azimuth_deg = round(antenna.azimuth_deg % 360, DECIMALS)
         devices[name] = device.model_copy(update={
             "antenna": file, "azimuth_deg": azimuth_deg, "tilt_deg": None})
-        files[file] = pattern
-        changes.append(f"{name} has a sector antenna that looks to {azimuth_deg:.0f}° and is "
-                       f"{pattern.beamwidth_deg:.0f}° wide")
+        files[file] = antenna
+        changes.append(f"{name} has a {antenna.kind} that looks to {azimuth_deg:.0f}° and is "
+                       f"{antenna.beamwidth_deg:.0f}° wide")
     return config.model_copy(update={"devices": list(devices.values())}), files, changes
 
 
-def write_antenna(pattern: SectorPattern, path: Path) -> None:
+def write_antenna(antenna: FoundAntenna, path: Path) -> None:
     """Write a pattern about its own boresight, with its tilt, as lossless: its mean power is 1.
 
     Args:
-        pattern: as it was found; what the data did not determine is as it was fitted.
+        antenna: as it was found; what the data did not determine is as it was fitted.
         path: `.csv`, as `radiotwin.scene.antennas.read_pattern` reads it.
     """
     elevation, azimuth = (axis.ravel() for axis in np.meshgrid(ELEVATION_DEG, AZIMUTH_DEG,
                                                                indexing="ij"))
-    ahead = pattern.model_copy(update={"azimuth_deg": 0.0})
-    gain_db = sector_pattern_db(azimuth, elevation, ahead)
+    gain_db = antenna.gain_db(azimuth, elevation)
     weight = np.cos(np.radians(elevation))
     mean = (weight @ 10 ** (gain_db / 10)) / weight.sum()
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -123,14 +106,13 @@ def write_antenna(pattern: SectorPattern, path: Path) -> None:
         "gain_dbi": np.round(gain_db - 10 * np.log10(mean), DECIMALS)}), path)
 
 
-def stretch(roof: Roof, base_m: float) -> float:
+def stretch(roof: RaisedRoof, base_m: float) -> float:
     """Return how much taller a building that stands on `base_m` is than on the map, a ratio."""
-    off_m = roof.true_offset_m
-    return 1.0 + off_m / max(roof.height_m - base_m, abs(off_m))
+    return 1.0 + roof.by_m / max(roof.height_m - base_m, abs(roof.by_m))
 
 
 def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[str],
-                        roofs: list[Roof], base_m: np.ndarray) -> pd.DataFrame | None:
+                        roofs: list[RaisedRoof], base_m: np.ndarray) -> pd.DataFrame | None:
     """Return the table of a scene's buildings as they are after the correction.
 
     Args:
@@ -161,7 +143,7 @@ def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[
         for row in np.flatnonzero(table["shape"].isin(shapes_of[roof.building])):
             raised_m = own_m + stretch(roof, own_m) * (top_m[row] - own_m)
             table.loc[row, ["top_m", "height_from", "height_sd_m"]] = [
-                f"{raised_m:.3f}", SOURCE, f"{max(roof.offset_sd_m, MIN_SD_M):.1f}"]
+                f"{raised_m:.3f}", SOURCE, f"{max(roof.sd_m, MIN_SD_M):.1f}"]
     return table
 
 
@@ -202,33 +184,33 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     Raises:
         BadInput: the folder cannot be written or holds something else, or the result is no scene.
     """
-    effects = loop.after.whole.effects
+    links = loop.after.whole.links
+    found = [each.effect.correction(links, each.params) for each in loop.after.whole.effects]
     label, centres_m = buildings(scene.city)
-    gone = [each.params.building for each in effects if isinstance(each.effect, RemovedObstacle)]
+    gone = [building for each in found for building in each.gone]
     keep = ~np.isin(label, gone)
     city = scene.city.without(~keep) if keep.any() else None
-    config, moves = _moved(loop, scene, city)
+    config, moves = _moved(found, links, scene, city)
     free_m = np.array([*((d.x_m, d.y_m, d.z_m) for d in config.devices),
                        *((x_m, y_m, scene.altitude_m(x_m, y_m, uav.altitude_m))
                          for uav in config.uavs
                          for x_m, y_m in ((uav.start_x_m, uav.start_y_m),
                                           (uav.terminal_x_m, uav.terminal_y_m)))])
-    boxes = [_pulled_back(Box(*each.params.box), free_m.reshape(-1, 3) - [
-                 0.0, 0.0, float(scene.city.ground_height_m(*each.params.box[:2]))])
-             for each in effects if isinstance(each.effect, MissingObstacle)]
+    boxes = [_pulled_back(box, free_m.reshape(-1, 3) - [
+                 0.0, 0.0, float(scene.city.ground_height_m(*box[:2]))])
+             for each in found for box in each.boxes]
     changes = [f"a box of {box.length_m:.0f} x {box.width_m:.0f} m, {box.height_m:.0f} m high, "
                f"stands at ({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
     above_m = centres_m[:, 2] - scene.city.ground_height_m(*centres_m[:, :2].T)
     changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(
         *centres_m[building, :2], above_m[building]) for building in gone]
-    roofs = [roof for each in effects if isinstance(each.effect, RoofHeights)
-             for roof in surely_off(each.params.roofs) if roof.building not in gone]
+    roofs = [roof for each in found for roof in each.roofs if roof.building not in gone]
     changes += [f"the roof at ({roof.x_m:.0f}, {roof.y_m:.0f}) m is "
-                f"{above_m[roof.building] + roof.true_offset_m:.1f} m high, and "
+                f"{above_m[roof.building] + roof.by_m:.1f} m high, and "
                 f"{above_m[roof.building]:.1f} m on the map"
                 for roof in roofs]
-    config, antennas, found = with_antennas(config, loop, scene)
-    changes += moves + found
+    config, antennas, declared = with_antennas(config, found, links, scene)
+    changes += moves + declared
     if not changes:
         return []
     check_target(folder, CONTENT)
@@ -242,22 +224,21 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
         if table is not None:
             write_csv(table, temporary / "buildings.csv")
         scene.copy_antennas(temporary)
-        for file, pattern in antennas.items():
-            write_antenna(pattern, temporary / file)
+        for file, antenna in antennas.items():
+            write_antenna(antenna, temporary / file)
         write_config(config.model_copy(update={"provenance": provenance}), temporary / "scene.toml")
         draw_preview(Scene.load(temporary), temporary / "preview.png")
     return changes
 
 
-def _moved(loop: Loop, scene: Scene, city: CityMap | None) -> tuple[SceneConfig, list[str]]:
+def _moved(found: Sequence[Correction], links: Links, scene: Scene,
+           city: CityMap | None) -> tuple[SceneConfig, list[str]]:
     """Return the configuration with anchors moved to the nearest free position, and the changes."""
-    links = loop.after.whole.links
     found_m: dict[str, np.ndarray] = {}
-    for each in loop.after.whole.effects:
-        if isinstance(each.effect, DevicePositionError):
-            for row in site_of(links, each.params.device):
-                name = links.device_names[row]
-                found_m[name] = found_m.get(name, links.device_m[row, :2]) + each.params.move_m
+    for each in found:
+        for row, move_m in each.moves_m.items():
+            name = links.device_names[row]
+            found_m[name] = found_m.get(name, links.device_m[row, :2]) + move_m
     devices, changes = [], []
     for device in scene.config.devices:
         if device.device in found_m:
@@ -321,7 +302,8 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
 
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
-                roofs: list[Roof], base_m: np.ndarray) -> tuple[dict[int, set[str]], set[str]]:
+                roofs: list[RaisedRoof],
+                base_m: np.ndarray) -> tuple[dict[int, set[str]], set[str]]:
     """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, roofs, and boxes.
 
     Returns the names of the shapes of each building, and of those that are left.
@@ -345,7 +327,7 @@ def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
     return shapes_of, {shape.name for shape in shapes}
 
 
-def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof],
+def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[RaisedRoof],
                 base_m: np.ndarray) -> trimesh.Trimesh:
     """Return a mesh whose buildings (f,) are stretched to the heights of their roofs.
 

@@ -8,7 +8,6 @@ from typing import Any
 import radiotwin
 from radiotwin.closeloop.predict.blending import make_blend, needs_rest
 from radiotwin.closeloop.run import Loop
-from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import RadiusCalibration, calibrate_radii, whole_area
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
@@ -49,8 +48,8 @@ def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
         return RadiusCalibration()
     models = [fold.learnt.for_positions() for fold in model.folds]
     # A device that the loop found elsewhere is not where it was declared.
-    moved = {device for each in model.whole.effects if isinstance(each.effect, DevicePositionError)
-             for device in model.links.device[each.acts].tolist()}
+    moved = {device for each in model.whole.effects
+             for device in each.effect.correction(model.links, each.params).moves_m}
     known = links.with_ends(anchors=links.anchors - moved)
     held_out = [known.select(model.index == number) for number in range(len(models))]
     area_m = scene.config.extent.bounds if scene is not None else whole_area(models[0], links)

@@ -36,9 +36,8 @@ from radiotwin.closeloop.verdict.criteria import (
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 from radiotwin.closeloop.verdict.intervals import effect_size_db, why_not_borne_out
 from radiotwin.closeloop.verdict.posterior import judge, probability_of_all
-from radiotwin.effects.base import Effect
-from radiotwin.effects.catalogue.detection_limit import DetectionLimit
-from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
+from radiotwin.effects.base import Effect, LimitEffect
+from radiotwin.effects.registry import catalogue
 from radiotwin.links.sites import site_of
 from radiotwin.twin.model.fitting import prepare_additions, with_exact_levels
 
@@ -376,20 +375,23 @@ def with_moved_limits(model: CrossFit) -> CrossFit:
     fault.
 
     Args:
-        model: of n links; any other last effect leaves it as it is.
+        model: of n links; a last effect without such offsets leaves it as it is.
     """
     whole = model.whole
-    offsets = whole.effects[-1]
-    if not isinstance(offsets.effect, ReceiverGainOffset):
+    last = whole.effects[-1]
+    off_db = last.effect.reading_offsets_db(last.params, whole.coefficients_of(-1))
+    if not off_db:
         return model
-    limits = DetectionLimit().propose(whole.view)
-    own_db = whole.coefficients_of(-1)
-    off_db = dict(zip(offsets.params.members, own_db - np.median(own_db), strict=True))
+    found_db = np.full(len(model.links), -np.inf)
+    for limit in (effect() for effect in catalogue() if issubclass(effect, LimitEffect)):
+        for params in limit.propose(whole.view)[:1]:
+            found_db = np.maximum(found_db, limit.limits_db(model.links, params))
     limit_db = model.links.limit_db.copy()
-    for receiver, found_db in (limits[0].receivers if limits else {}).items():
-        mine = model.links.receiver == receiver
-        if abs(found_db - np.median(limit_db[mine]) - off_db.get(receiver, np.inf)) <= SAME_DB:
-            limit_db[mine] = found_db
+    for receiver, each_db in off_db.items():
+        of_receiver = model.links.receiver == receiver
+        own_db, usual_db = np.median(found_db[of_receiver]), np.median(limit_db[of_receiver])
+        if np.isfinite(own_db) and abs(own_db - usual_db - each_db) <= SAME_DB:
+            limit_db[of_receiver] = own_db
     if np.array_equal(limit_db, model.links.limit_db):
         return model
     return model.map(lambda fit: replace(

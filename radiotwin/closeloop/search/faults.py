@@ -48,7 +48,6 @@ from radiotwin.closeloop.verdict.criteria import (
 from radiotwin.closeloop.verdict.intervals import effect_size_db, why_not_borne_out
 from radiotwin.closeloop.verdict.posterior import judge
 from radiotwin.effects.base import DetectionEffect, Effect
-from radiotwin.effects.catalogue.gain_drift import DeviceDrift, ReceiverDrift
 from radiotwin.links import Links
 from radiotwin.links.correlation import devices_move
 from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel
@@ -56,14 +55,14 @@ from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel
 
 def add_changes(state: SearchState, inputs: SearchInputs) -> SearchState:
     """Add changes between flights, where flights are held out, one by one until none passes."""
-    for effect in (ReceiverDrift(between_flights=True), DeviceDrift(between_flights=True)):
+    changes = [each for effect in inputs.effects if (each := effect.between_flights()) is not None]
+    for effect in sorted(changes, key=lambda each: not each.of_receiver):  # receivers first
         if inputs.folds.by == "flight" and not effect.unavailable(inputs.links):
             state = _with_one_kind(state, effect, inputs)
     return state
 
 
-def _with_one_kind(state: SearchState, effect: ReceiverDrift | DeviceDrift,
-                   inputs: SearchInputs) -> SearchState:
+def _with_one_kind(state: SearchState, effect: Effect, inputs: SearchInputs) -> SearchState:
     """Add changes of receivers, or of devices."""
     criteria = inputs.criteria
     first = fit_candidate(state.model, effect, criteria)
@@ -110,15 +109,13 @@ def _stands_out(model: CrossFit, candidate: Candidate | Trial,
     """
     if not isinstance(candidate, Candidate):
         return False
-    effect, params = candidate.effect, candidate.whole.effects[-1].params
-    assert isinstance(effect, ReceiverDrift | DeviceDrift)
-    ((changed, drift),) = effect.drifts(params).items()
     view = model.whole.view
     links = view.links
+    change = candidate.effect.change(links, candidate.whole.effects[-1].params)
+    if change is None:
+        return False
+    end, changed, when_s = change
     seen = np.isfinite(links.level_db) & np.isfinite(links.time_s)
-    end = effect.index(links)
-    # Flights are before or after it, whole: a warm-up is over, by two thirds, after its constant.
-    when_s = drift.number + (links.first_s if drift.form == "warm_up" else 0.0)
     begins_s = pd.Series(links.time_s[seen]).groupby(links.flight[seen]).transform("min")
     group = np.where((end[seen] == changed) & (begins_s >= when_s), -1, end[seen])
     cells, cell = np.unique(np.column_stack([group, links.flight[seen]]), axis=0,
@@ -223,8 +220,7 @@ def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
     for number in reversed(range(state.step)):
         model, whole = state.model, state.model.whole
         applied = whole.effects[number]
-        timed = applied.effect.within_flights or isinstance(applied.effect,
-                                                            ReceiverDrift | DeviceDrift)
+        timed = applied.effect.within_flights or applied.effect.between_flights() is not None
         if not timed:
             continue
         others = whole.model.with_effects([each for each in whole.effects

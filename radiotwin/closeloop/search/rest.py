@@ -9,7 +9,7 @@ from radiotwin.closeloop.search.causes import forward_selection
 from radiotwin.closeloop.search.scoring import score_model
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
 from radiotwin.closeloop.search.trials import Trial
-from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
+from radiotwin.effects.registry import trend_over
 from radiotwin.links import residual_variables
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
@@ -24,7 +24,7 @@ def add_trends(state: SearchState, inputs: SearchInputs, variables: Sequence[str
         variables: names, the strongest first.
     """
     values = residual_variables(state.model.links, state.model.held_out_mean_db)
-    trends = [UnexplainedTrend(name) for name in variables
+    trends = [trend_over(name) for name in variables
               if values[name].dtype.kind == "f"]  # a curve needs an order
     return forward_selection(state, trends[:inputs.criteria.max_trends], inputs)
 

@@ -16,9 +16,8 @@ from math import comb, log
 import numpy as np
 from scipy.spatial import cKDTree
 
-from radiotwin.effects.arrays import one_hot
+from radiotwin.effects.arrays import curve_columns, one_hot
 from radiotwin.effects.base import Effect
-from radiotwin.effects.catalogue.unexplained_trend import curve_columns
 from radiotwin.effects.params import NEAR_SHARE
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
 from radiotwin.links import Links

@@ -24,6 +24,7 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses
+from radiotwin.effects.registry import effects_named
 
 LEAST_RATIO = 0.2  # of what belongs to places to noise; less is none
 NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
@@ -148,8 +149,20 @@ def probability_of_all(scores: Sequence[Trial], other: float, before: CrossFit,
 def probability_of(name: str, values: tuple[float, ...]) -> float:
     """Return the probability that an effect is there, from its `features`."""
     weights = calibration()["effect"]
-    own = weights["names"].get(name, 0.0)
+    own = _log_odds_of(name)
     return float(expit(weights["intercept"] + own + np.dot(weights["weights"], values)))
+
+
+@cache
+def _log_odds_of(name: str) -> float:
+    """Return how much likelier an effect is, for the same evidence, than effects are on the whole.
+
+    Of one without a calibration as of the effect that it is `calibrated_like`, or else 0, the mean
+    around which the calibration was fitted.
+    """
+    names = calibration()["effect"]["names"]
+    return names[name] if name in names else max(
+        (names.get(each.calibrated_like, 0.0) for each in effects_named(name)), default=0.0)
 
 
 def _probabilities(scores: Sequence[Trial], unnamed: float, rest_db: float,

@@ -11,10 +11,9 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antenna_params import allowed_of, vary_patterns
+from radiotwin.effects.antennas import allowed_of, no_body_frame, vary_patterns
 from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import GainEffect, ResidualView
-from radiotwin.effects.catalogue.tilted_dipole import TiltedDipole
 from radiotwin.effects.params import (
     EffectParams,
     Estimate,
@@ -24,6 +23,7 @@ from radiotwin.effects.params import (
     quantities,
     quantity,
 )
+from radiotwin.effects.patterns import Pattern
 from radiotwin.links import Links
 
 MIN_LINKS = 100  # of a receiver, detected and with a heading
@@ -55,9 +55,14 @@ class BodyShadowing(GainEffect):
     """Receivers that lose more on one side."""
 
     name = "body_shadowing"
+    settled_by = "fly the same track in both directions"
     variant = "loss around the body"
     figure = "pattern"
     of_receiver = True
+    parameter_labels = {"body_depth_db": "loss through the body",
+                        "body_azimuth_deg": "body, from the heading",
+                        "body_elevation_deg": "body, up from the deck",
+                        "body_width_deg": "body, across, to half its loss"}
     confused_with = ("antenna_pattern",)
 
     class Params(EffectParams):
@@ -68,7 +73,7 @@ class BodyShadowing(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
-        return TiltedDipole().unavailable(links)  # which needs headings, too
+        return no_body_frame(links)
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
@@ -97,6 +102,15 @@ class BodyShadowing(GainEffect):
     def variation(self, params: Params) -> Variation:
         return vary_patterns(params.receivers,
                              lambda receivers: self.Params(receivers=receivers))
+
+    @override
+    def typical_patterns(self, view: ResidualView) -> list[Pattern]:
+        azimuth_deg, depth = view.links.body_azimuth_deg, quantities(Body)["depth_db"]
+        if not np.isfinite(azimuth_deg).any():
+            return []
+        back = 0.5 - 0.5 * np.cos(np.radians(np.nan_to_num(azimuth_deg)))
+        return [Pattern("attitude", "dB", "behind the receiver's body", -back, low=depth["low"],
+                        high=depth["high"])]
 
     @override
     def parameters(self, links: Links, params: Params,

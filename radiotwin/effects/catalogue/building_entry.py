@@ -73,6 +73,8 @@ class BuildingEntry(GainEffect):
     """Links with one end inside a building lose on the way in."""
 
     name = "building_entry"
+    parameter_labels = {"entry_loss_db": "building entry loss",
+                        "scatter_sd_db": "standard deviation from place to place"}
     needs_map = True
     figure = "histogram"
     nlos_only = True

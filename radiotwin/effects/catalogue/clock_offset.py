@@ -39,6 +39,7 @@ class ReceiverClockOffset(GainEffect):
     """A clock offset of all positions of a receiver; one step finds one receiver, the worst."""
 
     name = "receiver_clock_offset"
+    settled_by = "fly one track forth and back"
     of_receiver = True
     repeatable = True
     always_exact = True  # a map's streets are what shows where it was

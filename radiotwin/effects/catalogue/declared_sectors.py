@@ -1,17 +1,15 @@
 """Sector antennas of which only the direction is known: a planner's table has it, not the pattern.
 
-All declared devices have one pattern (3GPP TR 38.901 V17, Table 7.3-1, as in `sector_antenna`),
-each turned to its own azimuth and tilt, and levels that have much in common (`sector_levels`). All
-azimuths may be off by one small angle (a compass, another north), and all tilts (what is electrical
-is in few tables); by a large one the table is wrong. So it holds for a sector that nobody has
-measured, too, which a pattern learnt for each device by itself does not.
+All declared devices have one pattern (that of `radiotwin.effects.antennas`), each turned to its own
+azimuth and tilt, and levels that have much in common. All azimuths may be off by one small angle (a
+compass, another north), and all tilts (what is electrical is in few tables); by a large one the
+table is wrong. So it holds for a sector that nobody has measured, too, which a pattern learnt for
+each device by itself does not.
 
-Levels of sector antennas, which have the more in common the more of a site they share.
-
-Radios and cables of a mast come from one installation, and sectors of one direction are carriers
-that share an antenna. So levels are random effects, nested: of all, of a mast, of a direction
-there, of a device. What was heard of the others then says what to expect of a sector that nobody
-has measured, and how surely.
+Levels have the more in common the more of a site devices share. Radios and cables of a mast come
+from one installation, and sectors of one direction are carriers that share an antenna. So levels
+are random effects, nested: of all, of a mast, of a direction there, of a device. What was heard of
+the others then says what to expect of a sector that nobody has measured, and how surely.
 """
 
 from collections import Counter
@@ -22,10 +20,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from typing_extensions import override
 
-from radiotwin.effects.antenna_params import allowed_of
-from radiotwin.effects.arrays import subsample
-from radiotwin.effects.base import LevelAt, ResidualView, Term
-from radiotwin.effects.catalogue.sector_antenna import (
+from radiotwin.effects.antennas import (
     BEAMWIDTHS_DEG,
     FRONT_TO_BACK_DB,
     LEVEL_SD_DB,
@@ -34,9 +29,12 @@ from radiotwin.effects.catalogue.sector_antenna import (
     MIN_NATS,
     VERTICALS_DEG,
     Rays,
-    SectorAntenna,
+    SectorEffect,
     SectorPattern,
+    allowed_of,
 )
+from radiotwin.effects.arrays import subsample
+from radiotwin.effects.base import LevelAt, ResidualView, Term
 from radiotwin.effects.params import (
     Decibels,
     DeviceIndex,
@@ -107,7 +105,7 @@ def unheard_sd_db(devices: list[int], groups: list[list[int]], heard: set[int],
                                                     strict=True)}
 
 
-class DeclaredSectors(SectorAntenna):
+class DeclaredSectors(SectorEffect):
     """One pattern for all devices of declared azimuth; links leave along the straight line.
 
     Attributes:
@@ -119,9 +117,10 @@ class DeclaredSectors(SectorAntenna):
     variant = "sector antennas of declared azimuth"
     straight: ClassVar[bool] = True
     is_declared = True
-    repeatable = False
+    parameter_labels = {"azimuth_offset_deg": "common error of the azimuths",
+                        "tilt_offset_deg": "common error of the tilts"}
 
-    class Params(SectorAntenna.Params):
+    class Params(SectorEffect.Params):
         """Antennas of devices, all of one pattern, at their declared azimuths and a common turn."""
 
         azimuth_offset_deg: float = quantity(
@@ -153,7 +152,7 @@ class DeclaredSectors(SectorAntenna):
         return None
 
     @override
-    def propose(self, view: ResidualView) -> list[SectorAntenna.Params]:
+    def propose(self, view: ResidualView) -> list[Params]:
         declared = _declared(view.links)
         if np.isin(view.links.device, declared).sum() < MIN_LINKS:
             return []

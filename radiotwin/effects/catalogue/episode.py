@@ -7,6 +7,7 @@ segmentation, Olshen et al. 2004, Biostatistics 5); no other window of that leng
 that.
 """
 
+from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Seconds,
 )
+from radiotwin.effects.patterns import Pattern, timed_members
 from radiotwin.links import Links, evidence_blocks
 from radiotwin.links.sites import site_of
 
@@ -52,6 +54,7 @@ LOW_M, MIN_PLACES = 10.0, 20  # height of receivers in streets, and places that 
 MIN_MEMBERS = 0.7  # share of them that must agree: it acts on all
 MIN_OVERLAP = 0.3  # of what two windows span together, for them to be one episode
 SAME_SHARE = 0.9  # of a flight's links: an episode of one receiver that long is a faulty flight
+TYPICAL = 0.1  # share of the time
 PRIOR_SD_DB, PRIOR_SD_DB_KM = 15.0, 30.0
 
 
@@ -70,6 +73,7 @@ class Episode(GainEffect):
     """A loss or an attenuation between two times; a step finds the strongest."""
 
     name = "episode"
+    settled_by = "repeat the flight in dry weather"
     figure = "dependence"
     of_receiver = True
     repeatable = True
@@ -165,6 +169,17 @@ class Episode(GainEffect):
                         f"{params.frequency_hz / 1e9:g} GHz: {most_db_km:.3g} dB/km (ITU-R P.676, "
                         "P.838)")
         return None
+
+    @override
+    def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        links = view.links
+        for mine in timed_members(links, links.receiver):
+            # Of the time that it measured: half-way may be between two flights.
+            start_s, end_s = np.nanquantile(links.time_s[mine],
+                                            [0.5 - TYPICAL / 2, 0.5 + TYPICAL / 2])
+            during = (links.time_s >= start_s) & (links.time_s <= end_s)
+            yield Pattern("receiver", "dB", f"over {100 * TYPICAL:.0f} % of the time of one "
+                          "receiver", -1.0 * (mine & during), low=MIN_DB)
 
     @override
     def parameters(self, links: Links, params: Params,

@@ -14,6 +14,7 @@ from typing_extensions import override
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.losses import max_gas_db_km, max_rain_db_km, specific_db_m
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.patterns import Pattern
 from radiotwin.links import Links
 
 PRIOR_SD_DB_KM = 30.0  # wide: heavy rain at 60 GHz is 15 dB/km
@@ -29,6 +30,8 @@ class ExcessAttenuation(GainEffect):
     """A specific attenuation that the channel's exponent does not cover."""
 
     name = "excess_attenuation"
+    parameter_labels = {"scale_height_m": "scale height (1/e)"}
+    settled_by = "measure at much longer distances with line of sight"
     confused_with = ("foliage", "receiver_saturation")
 
     class Params(EffectParams):
@@ -79,6 +82,14 @@ class ExcessAttenuation(GainEffect):
                     f"{params.frequency_hz / 1e9:g} GHz: {most_db_km:.3g} dB/km (ITU-R P.676, "
                     "P.838, P.833)")
         return None
+
+    @override
+    def typical_patterns(self, view: ResidualView) -> list[Pattern]:
+        links = view.links
+        most_db_km = max_at_ground_db_km(links.frequency_hz, MAX_HEIGHT_M) \
+            if np.isfinite(links.frequency_hz) else np.inf
+        return [Pattern("distance", "dB/km", "on all links, at all heights alike",
+                        -links.distance_m / 1000, high=most_db_km)]
 
     @override
     def parameters(self, links: Links, params: Params,

@@ -11,6 +11,7 @@ detecting outlying observations in samples', Technometrics 11). Maps that are wr
 of flights differ; roughness they hardly change.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +36,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     quantity,
 )
+from radiotwin.effects.patterns import Pattern, members
 from radiotwin.links import Links
 
 MIN_LINKS = 30  # of a receiver on a flight, at places where other flights were
@@ -81,6 +83,7 @@ class FaultyFlight(GainEffect):
     """One flight of one receiver that disagrees with all others; a step finds the worst."""
 
     name = "faulty_flight"
+    settled_by = "repeat that flight with a receiver that was compared with another"
     figure = "links"
     of_receiver = True
     repeatable = True
@@ -139,6 +142,16 @@ class FaultyFlight(GainEffect):
         return replace(Term.of_columns(columns, PRIOR_SD_DB),
                        prior_sd_db=np.array([PRIOR_SD_DB, RELATION_SD]),
                        random_effect_sd_db=noise_db)
+
+    @override
+    def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        links = view.links
+        flights = members(links.track)
+        between = [mine for mine in flights if not is_first_or_last(
+            int(links.receiver[mine][0]), int(links.flight[mine][0]), links)]
+        for mine in between or flights:  # a first or last one may be a step in time
+            yield Pattern("flight", "dB", "a constant of one flight of one receiver, "
+                                          "neither its first nor its last", -1.0 * mine)
 
     @override
     def parameters(self, links: Links, params: Params,

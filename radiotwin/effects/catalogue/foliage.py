@@ -6,6 +6,7 @@ that only links of one device pass cannot be located along these links: the box 
 direction in which it lies.
 """
 
+from collections.abc import Iterator
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -26,8 +27,10 @@ from radiotwin.effects.boxes import (
     is_beside_unknown,
     obstruction_nats,
 )
-from radiotwin.effects.losses import max_loss_db
+from radiotwin.effects.losses import UNKNOWN_MAX_LOSS_DB, max_loss_db
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.patterns import WIDE_M, Pattern, crossed
+from radiotwin.effects.places import Mark
 from radiotwin.links import Links
 
 MIN_NATS = 6.0  # that a cell must gain to be proposed
@@ -35,7 +38,7 @@ MAX_CELLS = 3  # that are proposed, with each of `SIDES_M`
 SIDES_M = (25.0, 55.0)  # of a proposed box
 MIN_HEIGHT_M, MAX_PROPOSED_HEIGHT_M = 3.0, 26.0  # of tree tops
 LOSSES_DB = (3.0, 6.0, 9.0, 12.0, 16.0, 20.0)  # of a link through it, equally likely
-UNKNOWN_MAX_LOSS_DB = 25.0  # where the frequency is unknown: of ITU-R P.833 at 1 GHz
+TYPICAL_HEIGHT_M = 10.0
 
 
 class VegetationLoss(NamedTuple):
@@ -54,6 +57,7 @@ class Foliage(GainEffect):
     """A box of vegetation; one step finds one."""
 
     name = "foliage"
+    settled_by = "fly low on both sides of the suspected place"
     figure = "links"
     repeatable = True
     confused_with = ("missing_obstacle", "excess_attenuation", "device_gain_offset",
@@ -74,8 +78,7 @@ class Foliage(GainEffect):
         centres_m, total = back_project(*ends_above_ground(links), nats)
         allowed = [i for i, height_m in enumerate(HEIGHTS_M)
                    if MIN_HEIGHT_M <= height_m <= MAX_PROPOSED_HEIGHT_M]
-        ceiling_db = (max_loss_db(links.frequency_hz) if np.isfinite(links.frequency_hz)
-                      else UNKNOWN_MAX_LOSS_DB)
+        ceiling_db = max_loss_db(links.frequency_hz)
         law = VegetationLoss(max_db=min(VegetationLoss().max_db, ceiling_db))
         return [self.Params(box=Box(x_m, y_m, side_m, side_m, HEIGHTS_M[allowed[height]], 0.0),
                             law=law, ceiling_db=ceiling_db)
@@ -107,6 +110,19 @@ class Foliage(GainEffect):
     def contradicted(self, params: Params, links: Links) -> str | None:
         through = devices_through(params.box, links)
         return BESIDE_UNKNOWN if is_beside_unknown(through, links) else None
+
+    @override
+    def mark(self, links: Links, params: Params) -> Mark:
+        box = params.box
+        return Mark(f"{self.label}\n{box.height_m:.0f} m high", np.array(box[:2]), box.outline_m)
+
+    @override
+    def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        for inside_m in crossed(view.links, TYPICAL_HEIGHT_M):
+            yield Pattern("place", "dB", f"of a grove {WIDE_M:.0f} m wide and "
+                          f"{TYPICAL_HEIGHT_M:.0f} m high, through its middle",
+                          -np.minimum(inside_m / WIDE_M, 1.0),
+                          high=max_loss_db(view.links.frequency_hz))
 
     @override
     def parameters(self, links: Links, params: Params,

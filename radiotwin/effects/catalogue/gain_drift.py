@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
-from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.base import Change, Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import (
     Allowed,
     DeviceIndex,
@@ -25,6 +25,7 @@ from radiotwin.effects.params import (
     Seconds,
     Variation,
 )
+from radiotwin.effects.patterns import Pattern, timed_members
 from radiotwin.links import Links
 
 MIN_LINKS = 60  # of a receiver or device, with a time
@@ -73,6 +74,10 @@ class _GainDrift(GainEffect):
     """
 
     repeatable = True
+    parameter_labels = {"warm_up_db": "excess at switch-on",
+                        "warm_up_each_flight_db": "excess at take-off",
+                        "ageing_db": "change from first to last", "step_time_s": "time of the step",
+                        "time_constant_s": "time constant"}
     forms: ClassVar[tuple[str, ...]]
     end: ClassVar[str]
 
@@ -92,6 +97,18 @@ class _GainDrift(GainEffect):
     def drifts(self, params: _DriftParams) -> dict[int, Drift]:
         """Return the drifts by index of the receiver or device."""
         return getattr(params, f"{self.end}s")
+
+    @override
+    def between_flights(self) -> Effect:
+        return type(self)(between_flights=True)
+
+    @override
+    def change(self, links: Links, params: _DriftParams) -> Change:
+        member, drift = next(iter(self.drifts(params).items()))
+        # Flights are before or after it, whole: a warm-up is over, by two thirds, after its
+        # constant.
+        when_s = drift.number + (links.first_s if drift.form == "warm_up" else 0.0)
+        return Change(self.index(links), member, when_s)
 
     def _members(self, links: Links) -> list[int]:
         """Return the receivers or devices that may drift."""
@@ -163,6 +180,14 @@ class _GainDrift(GainEffect):
                          changed)
 
     @override
+    def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        time_s = view.links.time_s
+        for mine in timed_members(view.links, self.index(view.links)):
+            first_s, last_s = np.nanmin(time_s[mine]), np.nanmax(time_s[mine])
+            ramp = np.nan_to_num((time_s - first_s) / (last_s - first_s))
+            yield Pattern(self.end, "dB", f"from first to last of one {self.end}", mine * ramp)
+
+    @override
     def parameters(self, links: Links, params: _DriftParams,
                    estimate: Estimate) -> dict[str, Parameter]:
         result, names = {}, getattr(links, f"{self.end}_names")
@@ -184,6 +209,7 @@ class ReceiverDrift(_GainDrift):
     """A receiver that warms up, once or on each flight, ages, or has changed."""
 
     name = "receiver_drift"
+    settled_by = "return to the same places at other times"
     of_receiver = True
     confused_with = ("receiver_gain_offset", "interference")
     forms = ("warm_up", "warm_up_each_flight", "ageing", "step")
@@ -200,6 +226,7 @@ class DeviceDrift(_GainDrift):
     """A device whose battery discharges or that has changed."""
 
     name = "device_drift"
+    settled_by = "return to the same places at other times"
     confused_with = ("device_gain_offset", "device_position_error")
     forms = ("ageing", "step")
     end = "device"

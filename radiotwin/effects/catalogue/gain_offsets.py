@@ -4,6 +4,7 @@ Cable and connector loss, antenna efficiency, transmit power and calibration add
 link budget (ITU-R P.341, 'The concept of transmission loss for radio links').
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import ClassVar
 
@@ -21,6 +22,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Unique,
 )
+from radiotwin.effects.patterns import Pattern, members
 from radiotwin.links import Links
 
 PRIOR_SD_DB = 10.0  # wide: an error of a cable, a connector or a declared power
@@ -78,6 +80,12 @@ class _GainOffset(GainEffect):
                        unheard_sd_db=np.where(unknown, params.offsets_sd_db, 0.0))
 
     @override
+    def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        for mine in members(self._index(view.links)):
+            yield Pattern(self.end, "dB", f"a constant of one {self.end}", mine * 1.0,
+                          low=MIN_OFFSET_DB)
+
+    @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
         largest_db = np.abs(coefficients - np.median(coefficients)).max()
         if largest_db < MIN_OFFSET_DB:
@@ -102,6 +110,7 @@ class DeviceGainOffset(_GainOffset):
     """Devices that radiate more or less than the others do."""
 
     name = "device_gain_offset"
+    settled_by = "measure the device's power next to it, with line of sight"
     of_device = True
     end = "device"
     confused_with = ("antenna_pattern", "device_position_error")
@@ -116,6 +125,7 @@ class ReceiverGainOffset(_GainOffset):
     """Receivers that read more or less than the others do."""
 
     name = "receiver_gain_offset"
+    settled_by = "let the receivers measure side by side"
     end = "receiver"
     of_receiver = True
     confused_with = ("receiver_drift", "antenna_pattern")
@@ -124,3 +134,9 @@ class ReceiverGainOffset(_GainOffset):
         """Receivers with an offset."""
 
         members: Unique[ReceiverIndex] = Field(description="Indices of those with an offset.")
+
+    @override
+    def reading_offsets_db(self, params: _GainOffset.Params,
+                           coefficients: np.ndarray) -> dict[int, float]:
+        off_db = coefficients - np.median(coefficients)
+        return dict(zip(params.members, off_db.tolist(), strict=True))

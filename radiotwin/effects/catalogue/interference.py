@@ -23,6 +23,7 @@ from radiotwin.effects.params import (
     Parameter,
     Variation,
 )
+from radiotwin.effects.places import Mark
 from radiotwin.links import Links
 
 HEIGHT_M = 1.5  # of the emitter
@@ -41,6 +42,8 @@ class Interference(ReceiverEffect):
     """One emitter that all receivers hear."""
 
     name = "interference"
+    parameter_labels = {"over_a_device_db": "power over a device's"}
+    settled_by = "listen with the devices switched off"
     figure = "links"
     confused_with = ("noise_floor_censoring", "receiver_drift")
 
@@ -125,6 +128,10 @@ class Interference(ReceiverEffect):
             return ("the emitter would be at the edge of the searched area or beyond: its position "
                     "is unknown")
         return None
+
+    @override
+    def mark(self, links: Links, params: Params) -> Mark:
+        return Mark(self.label, np.array(params.place_m))
 
     @override
     def parameters(self, links: Links, params: Params,

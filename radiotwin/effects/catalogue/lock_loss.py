@@ -6,12 +6,10 @@ with a p for each receiver. Of a receiver that goes on reading without lock the 
 some decibels with a probability p. Losses in sequences have the same p as losses at random; that
 neighbouring links are lost together widens the interval.
 
-Readings of a receiver that are now and then lower by the same amount, whatever the place.
-
-All links of an instant share the receiver's state: lock kept or lost. So the likelihood is a
-mixture over instants, fitted by EM (Dempster, Laird and Rubin 1977, JRSS B 39) from several first
-drops, and held against one Student t whose tails are as heavy as the levels want them. A drop that
-comes once is an episode or a faulty flight, and one that comes at certain places is the map's.
+All links of an instant share the receiver's state: lock kept or lost. So the likelihood of a drop
+is a mixture over instants, fitted by EM (Dempster, Laird and Rubin 1977, JRSS B 39) from several
+first drops, and held against one Student t whose tails are as heavy as the levels want them. A drop
+that comes once is an episode or a faulty flight, and one that comes at certain places is the map's.
 """
 
 from dataclasses import dataclass
@@ -179,6 +177,7 @@ class LockLoss(DetectionEffect):
     """A probability of loss for each receiver whose links become likelier by it."""
 
     name = "lock_loss"
+    parameter_labels = {"lost_share": "share lost", "drop_db": "level without lock, lower by"}
     confused_with = ("missing_obstacle", "noise_floor_censoring", "episode", "faulty_flight")
 
     class Params(EffectParams):

@@ -13,8 +13,7 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import LinkCache, city_of
 from radiotwin.effects.base import GainEffect, ResidualView
-from radiotwin.effects.catalogue.foliage import UNKNOWN_MAX_LOSS_DB
-from radiotwin.effects.losses import max_loss_db
+from radiotwin.effects.losses import UNKNOWN_MAX_LOSS_DB, max_loss_db
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
 from radiotwin.links import Links
 from radiotwin.scene.vegetation import KINDS
@@ -59,8 +58,7 @@ class MappedVegetation(GainEffect):
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         known = view.found_params(self.name, "kind")
-        frequency_hz = view.links.frequency_hz
-        most_db = max_loss_db(frequency_hz) if np.isfinite(frequency_hz) else UNKNOWN_MAX_LOSS_DB
+        most_db = max_loss_db(view.links.frequency_hz)
         return [self.Params(kind=kind, specific_attenuation_db_m=specific, greatest_loss_db=most_db)
                 for kind in self._kinds(view.links) if kind not in known
                 for specific in SPECIFIC_DB_M]

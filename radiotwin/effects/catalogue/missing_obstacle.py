@@ -8,7 +8,7 @@ straight line only, a large one most paths), plus a fitted offset. Exactly: the 
 the map with the box in it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from itertools import product
 from typing import TypeVar
@@ -47,6 +47,8 @@ from radiotwin.effects.params import (
     Parameter,
     Variation,
 )
+from radiotwin.effects.patterns import WIDE_M, Pattern, crossed
+from radiotwin.effects.places import Correction, Mark
 from radiotwin.links import Links
 from radiotwin.scene.citymap import CONCRETE, CityMap
 
@@ -66,6 +68,7 @@ MARGIN_M = 10.0  # and those within so much more are followed at once: boxes are
 TURNS_DEG = (-20.0, 20.0)  # from where quick levels end: of a nearly square box they tell little
 LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # of an obstructed link, equally likely
 MAX_LOSS_DB = 50.0  # that a box causes
+TYPICAL_HEIGHT_M = 15.0
 HEIGHT_SCALE_M = 20.0  # of Rayleigh distributed heights: dense urban, ITU-R P.1410-6, Table 1
 
 T = TypeVar("T")
@@ -75,6 +78,7 @@ class MissingObstacle(GainEffect):
     """A box that obstructs links; one step finds one."""
 
     name = "missing_obstacle"
+    settled_by = "fly low on both sides of the suspected place"
     figure = "links"
     repeatable = True
     always_exact = True
@@ -284,6 +288,22 @@ class MissingObstacle(GainEffect):
     @override
     def corrected_map(self, city: CityMap, params: Params) -> CityMap:
         return _with_box(city, params.box)
+
+    @override
+    def mark(self, links: Links, params: Params) -> Mark:
+        box = params.box
+        return Mark(f"{self.label}\n{box.height_m:.0f} m high", np.array(box[:2]), box.outline_m)
+
+    @override
+    def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        for inside_m in crossed(view.links, TYPICAL_HEIGHT_M):
+            yield Pattern("place", "dB", f"of a building {WIDE_M:.0f} m wide and "
+                          f"{TYPICAL_HEIGHT_M:.0f} m high, behind it", -1.0 * (inside_m > 0),
+                          high=MAX_LOSS_DB)
+
+    @override
+    def correction(self, links: Links, params: Params) -> Correction:
+        return Correction(boxes=(params.box,))
 
     @override
     def parameters(self, links: Links, params: Params,

@@ -29,6 +29,7 @@ class _Paths(PathEffect):
 
     nlos_only = True  # with line of sight they add tenths of a decibel
     in_paths = True
+    parameter_labels = {"strength_db": "strength relative to theory"}
     needs_map = True
     kinds: ClassVar[tuple[str, ...]]
 

@@ -3,6 +3,8 @@
 No law of its own: the channel predicts again with the end elsewhere, lines of sight included.
 """
 
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,8 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Variation,
 )
+from radiotwin.effects.patterns import Pattern, members
+from radiotwin.effects.places import Correction, Mark
 from radiotwin.links import Links, site_of
 
 MIN_LINKS = 60  # of an end that is moved about
@@ -34,6 +38,7 @@ DIRECTIONS = 12
 RECEIVER_MOVES_M = (5.0, 10.0, 20.0)
 RECEIVER_AXES = ((1, 0, 0), (0, 1, 0), (0.7, 0.7, 0), (0.7, -0.7, 0), (0, 0, 1))
 MAX_MOVE_M = 120.0  # east and north, of a device
+TYPICAL_M = 10.0  # move of a device, for the slope of levels in its position
 MAX_RECEIVER_MOVE_M = 60.0  # along each axis
 
 
@@ -41,6 +46,7 @@ class DevicePositionError(GainEffect):
     """A wrong position of an anchor and of all on its mast; one step finds one, the worst."""
 
     name = "device_position_error"
+    settled_by = "fly past the device on two sides, close by, or survey it again"
     figure = "links"
     repeatable = True
     always_exact = True
@@ -113,6 +119,29 @@ class DevicePositionError(GainEffect):
             follows_paths=params.exact)
 
     @override
+    def correction(self, links: Links, params: Params) -> Correction:
+        return Correction(moves_m=dict.fromkeys(site_of(links, params.device), params.move_m))
+
+    @override
+    def mark(self, links: Links, params: Params) -> Mark:
+        given_m = links.device_m[params.device, :2]
+        name, away_m = links.device_names[params.device], np.hypot(*params.move_m)
+        return Mark(f"{name} is\n{away_m:.0f} m away", given_m + params.move_m, from_m=given_m)
+
+    @override
+    def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        for mine in members(view.links.device):
+            device = int(view.links.device[mine][0])
+            if device in view.links.anchors:
+                move_db = partial(self._moved_north_db, view, device)
+                yield Pattern("position", "m", "of one device", move_db(TYPICAL_M) / TYPICAL_M,
+                              move_db, MIN_MOVE_M, MAX_MOVE_M)
+
+    def _moved_north_db(self, view: ResidualView, device: int, by_m: float) -> np.ndarray:
+        params = self.Params(device=device, move_m=(0.0, by_m))
+        return self.term(view.links, params, view.level_at).offset_db
+
+    @override
     def parameters(self, links: Links, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         declared_m = links.device_m[params.device, :2]
@@ -127,6 +156,10 @@ class ReceiverPositionError(GainEffect):
     """A constant error of all positions of a receiver; one step finds one receiver, the worst."""
 
     name = "receiver_position_error"
+    parameter_labels = {"true_minus_given_x_m": "true − given position, east",
+                        "true_minus_given_y_m": "true − given position, north",
+                        "true_minus_given_z_m": "true − given height"}
+    settled_by = "fly one track forth and back"
     figure = "links"
     of_receiver = True
     repeatable = True

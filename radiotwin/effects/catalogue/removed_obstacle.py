@@ -9,13 +9,14 @@ many a roof too high, and links that pass just below its edge gain from that bui
 well: it has to explain them much better than a lower building does.
 """
 
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import city_of
+from radiotwin.effects.arrays import city_of, frequent_labels
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.boxes import (
     Box,
@@ -25,6 +26,9 @@ from radiotwin.effects.boxes import (
     obstruction_nats,
 )
 from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter
+from radiotwin.effects.patterns import MIN_LINKS as MIN_HIDDEN
+from radiotwin.effects.patterns import Pattern
+from radiotwin.effects.places import Correction, Mark
 from radiotwin.errors import BadInput
 from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
@@ -44,6 +48,7 @@ class RemovedObstacle(GainEffect):
     """One building of the map; one step finds one."""
 
     name = "removed_obstacle"
+    settled_by = "fly low on both sides of the suspected building"
     figure = "links"
     nlos_only = True
     repeatable = True
@@ -109,6 +114,38 @@ class RemovedObstacle(GainEffect):
         apart_m = np.linalg.norm(buildings(city)[1] - np.array(params.centre_m), axis=1)
         nearest = int(apart_m.argmin())
         return _without(city, nearest)[0] if apart_m[nearest] < SAME_M else city
+
+    @override
+    def mark(self, links: Links, params: Params) -> Mark | None:
+        city = links.city
+        if city is None:
+            return None
+        faces = city.faces[buildings(city)[0] == params.building]
+        return Mark("removed building", np.array(params.centre_m[:2]),
+                    faces_m=city.vertices[faces][..., :2])
+
+    @override
+    def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
+        # Of one building that hides neither many links nor few: each map has paths of its own.
+        links = view.links
+        assert links.city is not None
+        blocker, (_, centres_m) = only_blocker(links), buildings(links.city)
+        hiding = sorted(frequent_labels(blocker[blocker >= 0], MIN_HIDDEN),
+                        key=lambda each: np.count_nonzero(blocker == each))
+        if not hiding:
+            return
+        building = hiding[len(hiding) // 2]
+        params = self.Params(building=building, exact=True,
+                             centre_m=tuple(centres_m[building].tolist()))
+        rise_db = self.term(links, params, view.level_at).offset_db
+        mean_db = float(rise_db[blocker == building].mean())
+        if mean_db > 0:
+            yield Pattern("building", "dB", "of a building of the map, behind it on average",
+                          rise_db / mean_db)
+
+    @override
+    def correction(self, links: Links, params: Params) -> Correction:
+        return Correction(gone=(params.building,))
 
     @override
     def parameters(self, links: Links, params: Params,

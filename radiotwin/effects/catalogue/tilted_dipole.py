@@ -14,7 +14,12 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antenna_params import AntennaParams, report_pattern, vary_patterns
+from radiotwin.effects.antennas import (
+    AntennaParams,
+    no_body_frame,
+    report_pattern,
+    vary_patterns,
+)
 from radiotwin.effects.arrays import LinkCache, frequent_labels
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.params import (
@@ -33,7 +38,6 @@ MIN_NATS = 4.0  # that a dipole must gain to be proposed
 DIRECTIVITY = 1.64  # of a half-wave dipole (Balanis, Sec. 4.6)
 MIN_GAIN = 10**-2.5  # below the maximum, linear: no real antenna has deeper nulls
 MEAN_GAIN = 0.5  # over all directions and both polarisations
-MIN_HEADING_SD = 0.05  # of its sine and cosine together; below it, the heading counts as constant
 TILTS_DEG = np.arange(0.0, 60.1, 5.0)  # that are tried
 AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0)
 
@@ -71,9 +75,11 @@ class TiltedDipole(GainEffect):
     """A dipole for each receiver that fits better with one."""
 
     name = "antenna_pattern"
+    settled_by = "fly the same track in both directions"
     variant = "tilted dipole of a receiver"
     figure = "pattern"
     of_receiver = True
+    parameter_labels = {"lean_azimuth_deg": "azimuth of the tilt, from the heading"}
     confused_with = ("body_shadowing", "receiver_gain_offset")
 
     class Params(EffectParams):
@@ -87,12 +93,7 @@ class TiltedDipole(GainEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
-        if np.isnan(links.heading_deg).all():
-            return "there is no heading_deg, so directions in the receiver's body frame are unknown"
-        heading = np.radians(links.heading_deg)
-        if np.nanstd(np.cos(heading)) + np.nanstd(np.sin(heading)) < MIN_HEADING_SD:
-            return "the heading never changes, so body and world frame cannot be distinguished"
-        return None
+        return no_body_frame(links)
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:

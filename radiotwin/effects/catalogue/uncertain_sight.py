@@ -30,6 +30,9 @@ class UncertainSight(GainEffect):
     """Levels between those of both classes near walls and roofs, and larger errors."""
 
     name = "uncertain_sight"
+    parameter_labels = {"contrast_db": "difference of both classes, by their scatter",
+                        "loss_without_sight_db": "loss where a link may have no line of sight",
+                        "gain_with_sight_db": "gain where it may have one"}
     variant = "walls and roofs that are off by metres"
     figure = "histogram"
     is_declared = True

@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import AfterValidator, Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import LinkCache
-from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.arrays import LinkCache, curve_basis, curve_knots
+from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, Unique
 from radiotwin.links import Links, residual_variable
 
@@ -38,6 +38,7 @@ class UnexplainedTrend(GainEffect):
     """A curve over one variable, the same for all receivers or one for each."""
 
     name = "unexplained_trend"
+    parameter_labels = {"rise_and_fall_db": "peak-to-peak variation"}
     nlos_only = True  # may be: its cause is unknown
     of_receiver = True
     is_cause = False
@@ -59,6 +60,12 @@ class UnexplainedTrend(GainEffect):
         self._values = LinkCache()
 
     @override
+    @classmethod
+    def of_variant(cls, variant: str) -> Effect | None:
+        over = variant.removeprefix(OVER)
+        return cls(over) if over in ON_MAPS else None
+
+    @override
     def propose(self, view: ResidualView) -> list[Params]:
         value = self._value(view.links, view.level_at)
         known = np.isfinite(value)
@@ -66,7 +73,7 @@ class UnexplainedTrend(GainEffect):
             return []
         receivers = np.unique(view.links.receiver).tolist()
         choices = [[None], *([receivers] if 1 < len(receivers) <= MAX_CURVES else [])]
-        knots = _knots(value[known], KNOTS, self.variable in CIRCULAR)
+        knots = curve_knots(value[known], KNOTS, self.variable in CIRCULAR)
 
         def rating(params: UnexplainedTrend.Params) -> float:
             term = self.term(view.links, params, view.level_at)
@@ -81,7 +88,7 @@ class UnexplainedTrend(GainEffect):
 
     @override
     def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        basis = _hats(self._value(links, level_at), np.array(params.knots),
+        basis = curve_basis(self._value(links, level_at), np.array(params.knots),
                       self.variable in CIRCULAR)
         columns = [basis if member is None else basis * (links.receiver == member)[:, None]
                    for member in params.receivers]
@@ -104,38 +111,3 @@ class UnexplainedTrend(GainEffect):
         """Return the variable (n,)."""
         return self._values.get(
             links, (level_at,), lambda: residual_variable(self.variable, links, level_at(links)))
-
-
-def curve_columns(value: np.ndarray, knots: int, circular: bool) -> np.ndarray:
-    """Return columns (n, ≤ knots) of a curve over values (n,), 0 where they are unknown."""
-    places = _knots(value[np.isfinite(value)], knots, circular)
-    return _hats(value, np.array(places), circular)
-
-
-def _knots(value: np.ndarray, count: int, circular: bool) -> list[float]:
-    """Return knots round the circle, or at evenly spaced quantiles of the values."""
-    if circular:
-        return (np.arange(count) * 360.0 / count).tolist()
-    return np.unique(np.quantile(value, (np.arange(count) + 0.5) / count)).tolist()
-
-
-def _hats(value: np.ndarray, knots: np.ndarray, circular: bool) -> np.ndarray:
-    """Return the piecewise linear basis (n, knots) of values (n,).
-
-    It is constant beyond the outer knots, and zero where the value is unknown.
-    """
-    known = np.isfinite(value)
-    filled = np.where(known, value, knots[0])
-    if circular:
-        position = filled % 360 / 360 * len(knots)
-        left = np.floor(position).astype(int) % len(knots)
-        right, share = (left + 1) % len(knots), position % 1
-    else:
-        position = np.interp(filled, knots, np.arange(len(knots)))
-        left = np.minimum(np.floor(position).astype(int), len(knots) - 1)
-        right, share = np.minimum(left + 1, len(knots) - 1), position - left
-    hats = np.zeros((len(value), len(knots)))
-    rows = np.arange(len(value))
-    np.add.at(hats, (rows, left), 1 - share)
-    np.add.at(hats, (rows, right), share)
-    return hats * known[:, None]

@@ -1,0 +1,254 @@
+"""Antennas that effects share: how patterns vary and are reported, and sector antennas.
+
+A sector antenna has the pattern of 3GPP TR 38.901 V17, Table 7.3-1: horizontally −min(12 (φ /
+φ_3dB)², A_max), vertically −min(12 ((θ − tilt) / θ_3dB)², A_max), together no less than −A_max. The
+maximum gain is the device's level and is fitted with it. With a 3D map each path has the gain of
+the direction in which it leaves the device. Power on paths that are not followed, which is fitted
+too, has the mean of the pattern. Where the paths over the map explain less than the straight line
+to the receiver, as over a map with guessed heights, the gain is that of the straight line.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from pydantic import Field, model_validator
+from typing_extensions import override
+
+from radiotwin.effects.arrays import LinkCache, frequent_labels, one_hot
+from radiotwin.effects.base import GainEffect, LevelAt, Term
+from radiotwin.effects.params import (
+    Allowed,
+    DeviceIndex,
+    EffectParams,
+    Parameter,
+    Variation,
+    quantities,
+    quantity,
+)
+from radiotwin.effects.places import Correction, FoundAntenna
+from radiotwin.links import Links
+from radiotwin.propagation.laws.followed_paths import free_space, rays_of, through_antenna_db
+
+MIN_LINKS = 100  # of a device whose antenna is looked for
+MIN_NATS = 4.0  # that a pattern must gain to be proposed
+MAX_PROPOSE_LINKS = 300  # of a device, from which its pattern is proposed
+LEVEL_SD_DB = 15.0  # prior standard deviation of the maximum gain, beside the channel's
+MIN_HEADING_SD = 0.05  # of its sine and cosine together; below it, the heading counts as constant
+# Grid of patterns that are tried first: flat ones, then the best of those with (tilt, beamwidth).
+BEAMWIDTHS_DEG = (65.0, 110.0)
+FRONT_TO_BACK_DB = (12.0, 25.0)
+VERTICALS_DEG = ((0.0, 360.0), (0.0, 15.0), (-6.0, 15.0), (-12.0, 15.0), (0.0, 40.0),
+                 (-10.0, 40.0), (15.0, 40.0), (40.0, 65.0))
+AROUND_DEG = np.arange(0.0, 360.0, 5.0)  # azimuths over which a pattern is averaged
+
+
+class AntennaParams(EffectParams):
+    """Pattern of one antenna.
+
+    Subclass it with `quantity` fields; the last is the power on paths that are not followed, which
+    counts only where there is a 3D map.
+    """
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_values(cls, given: Any) -> Any:
+        """Accept the bare values in order, as version 0.1 wrote them."""
+        if isinstance(given, list | tuple):
+            return dict(zip(cls.model_fields, given, strict=True))
+        return given
+
+
+Pattern = TypeVar("Pattern", bound=EffectParams)
+
+
+def vary_patterns(patterns: dict[int, Pattern],
+                  params: Callable[[dict[int, Pattern]], Any]) -> Variation:
+    """Return how the patterns of several antennas, or bodies, may be refined, each by itself.
+
+    Args:
+        patterns: pattern of each device or receiver.
+        params: patterns -> parameters of the effect.
+    """
+    members, fields = len(patterns), quantities(next(iter(patterns.values())))
+    values = np.array([[getattr(pattern, name) for name in fields]
+                       for pattern in patterns.values()])
+    steps, low, high = (np.tile([each[key] for each in fields.values()], members)
+                        for key in ("step", "low", "high"))
+
+    def changed(numbers: np.ndarray) -> Any:
+        rows = np.reshape(numbers, (members, -1)).tolist()
+        return params({member: pattern.model_copy(update=dict(zip(fields, row, strict=True)))
+                       for (member, pattern), row in zip(patterns.items(), rows, strict=True)})
+
+    return Variation(values.ravel(), steps, low, high, changed,
+                     list(np.arange(values.size).reshape(members, -1)))
+
+
+def allowed_of(name: str, field: dict[str, Any]) -> Allowed:
+    """Return the allowed values of a field of `quantities`; azimuths repeat."""
+    if name.endswith("azimuth_deg"):
+        return Allowed(period=360.0)
+    return Allowed(field["low"], field["high"])
+
+
+def report_pattern(pattern: AntennaParams, sd: np.ndarray, name: str,
+                   with_map: bool) -> dict[str, Parameter]:
+    """Return a pattern's parameters, by name; without a map, the last is not reported.
+
+    Args:
+        pattern: fitted.
+        sd: (r,) standard deviation of each parameter.
+        name: of the device or receiver.
+        with_map: whether paths were followed.
+    """
+    reported = {}
+    for (field, each), field_sd in zip(quantities(pattern).items(), sd, strict=True):
+        value = getattr(pattern, field)
+        value = value % 360 if field.endswith("azimuth_deg") else value
+        reported[f"{field}[{name}]"] = Parameter.normal(value, field_sd, each["unit"],
+                                                        allowed_of(field, each))
+    if not with_map:
+        reported.popitem()
+    return reported
+
+
+def no_body_frame(links: Links) -> str | None:
+    """Return why directions in the receivers' body frames are unknown; None where they are not."""
+    if np.isnan(links.heading_deg).all():
+        return "there is no heading_deg, so directions in the receiver's body frame are unknown"
+    heading = np.radians(links.heading_deg)
+    if np.nanstd(np.cos(heading)) + np.nanstd(np.sin(heading)) < MIN_HEADING_SD:
+        return "the heading never changes, so body and world frame cannot be distinguished"
+    return None
+
+
+class SectorPattern(AntennaParams):
+    """Pattern of one sector antenna; by default flat in elevation."""
+
+    azimuth_deg: float = quantity(
+        0.0, unit="deg", low=-720.0, high=1080.0, step=8.0,
+        description="Direction of the maximum, clockwise from north.")
+    beamwidth_deg: float = quantity(
+        65.0, unit="deg", low=20.0, high=150.0, step=10.0,
+        description="Horizontal width between the points 3 dB below the maximum.")
+    front_to_back_db: float = quantity(
+        25.0, unit="dB", low=8.0, high=45.0, step=3.0, description="Greatest attenuation.")
+    tilt_deg: float = quantity(
+        0.0, unit="deg", low=-60.0, high=80.0, step=4.0,
+        description="Elevation of the maximum, up is positive.")
+    vertical_beamwidth_deg: float = quantity(
+        360.0, unit="deg", low=6.0, high=360.0, step=5.0,
+        description="Vertical width between the points 3 dB below the maximum.")
+    scattered_db: float = quantity(
+        -35.0, unit="dB under free space", low=-80.0, high=-15.0, step=6.0,
+        description="Power on paths that are not followed.")
+
+
+def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray,
+                      pattern: SectorPattern) -> np.ndarray:
+    """Return the gain relative to the maximum [dB].
+
+    Args:
+        azimuth_deg: (…,) direction, clockwise from north [deg].
+        elevation_deg: (…,) direction, up [deg].
+        pattern: of the antenna.
+    """
+    max_db = pattern.front_to_back_db
+    # Rays come in single precision.
+    off = (np.asarray(azimuth_deg, dtype=float) - pattern.azimuth_deg + 180) % 360 - 180
+    above = np.asarray(elevation_deg, dtype=float) - pattern.tilt_deg
+    horizontal_db = np.minimum(12 * (off / pattern.beamwidth_deg) ** 2, max_db)
+    vertical_db = np.minimum(12 * (above / pattern.vertical_beamwidth_deg) ** 2, max_db)
+    return -np.minimum(horizontal_db + vertical_db, max_db)
+
+
+class Rays(NamedTuple):
+    """Directions in which links leave their device.
+
+    Attributes:
+        power: (n, sectors) power gain of what leaves into each sector.
+        azimuth_deg, elevation_deg: (n, sectors) its direction.
+        free: (n,) power gain in free space; 0 where the straight line is all.
+    """
+
+    power: np.ndarray
+    azimuth_deg: np.ndarray
+    elevation_deg: np.ndarray
+    free: np.ndarray
+
+    @classmethod
+    def of(cls, links: Links, rows: np.ndarray, straight: bool) -> "Rays":
+        """Return those of some links, which are followed over the map unless they are straight."""
+        links = links.select(rows)
+        if straight or links.city is None:
+            return cls(np.ones((len(links), 1)), links.azimuth_deg[:, None],
+                       links.elevation_deg[:, None], np.zeros(len(links)))
+        ray = rays_of(links, "departures")
+        power = np.linalg.norm(ray, axis=2)
+        sine = ray[..., 2] / np.maximum(power, 1e-30)
+        return cls(power, np.degrees(np.arctan2(ray[..., 0], ray[..., 1])),
+                   np.degrees(np.arcsin(np.clip(sine, -1, 1))), free_space(links.geometry))
+
+    def offset_db(self, pattern: SectorPattern) -> np.ndarray:
+        """Return (n,) what a pattern adds to each link [dB]."""
+        gain = 10 ** (sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern) / 10)
+        at_tilt = np.full(len(AROUND_DEG), pattern.tilt_deg)
+        mean_gain = np.mean(10 ** (sector_pattern_db(AROUND_DEG, at_tilt, pattern) / 10))
+        return through_antenna_db(self.power, gain, self.free * 10 ** (pattern.scattered_db / 10),
+                                  float(mean_gain))
+
+
+class SectorEffect(GainEffect):
+    """Devices with sector antennas."""
+
+    name = "antenna_pattern"
+    figure = "pattern"
+    of_device = True
+    confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle", "foliage")
+
+    class Params(EffectParams):
+        """Antennas of devices."""
+
+        devices: dict[DeviceIndex, SectorPattern] = Field(
+            description="Pattern of each device, by index.")
+        straight: bool = Field(False, description=(
+            "Whether links leave along the straight line even where there is a 3D map."))
+
+    def __init__(self) -> None:
+        self._rays = LinkCache()
+
+    @override
+    def unavailable(self, links: Links) -> str | None:
+        if not eligible_devices(links):
+            return f"no device of known position has {MIN_LINKS} links"
+        return None
+
+    @override
+    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
+        offset_db = np.zeros(len(links))
+        for device, pattern in params.devices.items():
+            rows = np.flatnonzero(links.device == device)
+            if len(rows):
+                rays = self._rays.get(links, (device, params.straight),
+                                      partial(Rays.of, links, rows, params.straight))
+                offset_db[rows] = rays.offset_db(pattern)
+        return Term(offset_db, one_hot(links.device, list(params.devices)),
+                    np.full(len(params.devices), LEVEL_SD_DB))
+
+    @override
+    def correction(self, links: Links, params: Params) -> Correction:
+        return Correction(antennas={device: FoundAntenna(
+            "sector antenna", pattern.azimuth_deg, pattern.beamwidth_deg,
+            partial(sector_pattern_db, pattern=pattern.model_copy(update={"azimuth_deg": 0.0})))
+            for device, pattern in params.devices.items()})
+
+
+def eligible_devices(links: Links) -> list[int]:
+    """Return devices with enough links and a declared position.
+
+    One that was located wrongly from these very measurements may look as if it had an antenna.
+    """
+    return [device for device in frequent_labels(links.device, MIN_LINKS)
+            if device in links.anchors]
