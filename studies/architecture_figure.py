@@ -18,7 +18,7 @@ BOXES = {  # name -> row, column, title, what is below it
     "localize": ("inputs", 3, "localize", "positions of\ndevices"),
     "measurements": ("predict", 0, "Measurements", "measurements\n.csv"),
     "links": ("predict", 1, "Links", "joined with map,\nchecked"),
-    "model": ("predict", 2, "FoldModel", "censored\nregression"),
+    "model": ("predict", 2, "Model", "censored\nregression"),
     "twin": ("predict", 3, "Twin", "predict(links)"),
     "map": ("predict", 4, "RadioMap", "mean, sd of\neach position"),
     "policy": ("predict", 5, "policy", "marl: learner\nor planner"),

@@ -22,7 +22,7 @@ from radiotwin.closeloop.search.stages import SearchInputs, search
 from radiotwin.effects.registry import catalogue
 from radiotwin.links import prepare_links
 from radiotwin.scene.citymap import CityMap
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.model import Model
 from studies.runner import Study
 from studies.tables import markdown
 from tests.undeclared.cases import FAMILIES, OUTSIDE, SEEDS, Case, case, stored
@@ -257,7 +257,7 @@ def draw_from_base(world: int, base: str, seed: int) -> Measurements:
     links = prepare_links(hidden.measurements, hidden.scene)
     kind = make_bases(hidden.scene, 0)[base]
     twin = kind.fit(links)
-    model = FoldModel.build(links, twin.channel, DOF, device_m=kind.device_m(twin))
+    model = Model.build(links, twin.channel, DOF, device_m=kind.device_m(twin))
     fit = model.fit()
     errors = np.random.default_rng(seed).standard_t(DOF, len(links))
     level_db = fit.readings().mean_db + fit.scale_db[model.group] * errors

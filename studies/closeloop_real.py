@@ -17,7 +17,7 @@ from radiotwin import BadInput, Loop, Measurements, close_loop, make_report, rea
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.effects.antennas import SectorEffect
 from radiotwin.twin.localize import calibrate_radii, locate, whole_area
-from radiotwin.twin.model.fold_model import Fit
+from radiotwin.twin.model.model import Fit
 from studies.closeloop import counted, summary
 from studies.runner import Study
 from studies.tables import markdown, number

@@ -202,7 +202,7 @@ def call(tree: Path, scratch: Path, *words: object, module: str = "radiotwin.cli
         "-c", "from radiotwin.cli import main; main()"]
     environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1",
                                 "RADIOTWIN_CACHE": str(scratch / "cache"), "COLUMNS": "160",
-                                "PYTHONDONTWRITEBYTECODE": "1"}
+                                "OGR_CURRENT_DATE": "2026-01-01T00:00:00.000Z"}
     done = subprocess.run([sys.executable, *command, *map(str, words)], cwd=scratch,
                           env=environment, capture_output=True, text=True, check=False)
     if done.returncode:

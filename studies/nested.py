@@ -27,7 +27,7 @@ from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.correlated_evidence import BOUNDS
 from radiotwin.links import prepare_links
 from radiotwin.twin.model.fitting import add_effect
-from radiotwin.twin.model.fold_model import Fit
+from radiotwin.twin.model.model import Fit
 from studies.runner import Study
 from studies.tables import markdown
 from tests import worlds

@@ -1,5 +1,6 @@
 """The documentation site builds without a single warning; tables of names are those of the code."""
 
+import ast
 import os
 import re
 import subprocess
@@ -41,3 +42,28 @@ def test_every_criterion_is_documented_with_its_default():
     documented = {name: float(default.replace(",", "")) for name, default in
                   re.findall(r"^\| `(\w+)` \| ([\d.,]+) \|", text, re.MULTILINE)}
     assert documented == {each.name: pytest.approx(each.default, rel=0.01) for each in fields(SelectionCriteria)}
+
+
+def names_of(path):
+    """Return the functions, classes, methods and constants of a module: `name` and `Class.name`."""
+    found = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
+        found |= {each.id for each in targets if isinstance(each, ast.Name)}
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            found |= {f"{node.name}.{each.name}" for each in node.body if isinstance(each, ast.FunctionDef)}
+            found |= {f"{node.name}.{each.target.id}" for each in node.body if isinstance(each, ast.AnnAssign)}
+    return found
+
+
+def test_what_the_architecture_names_is_there():
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    named = re.findall(r"`((?:radiotwin|marl|studies)/[\w/]+\.py):([\w.]+)`", text)
+    missing = [f"{path}:{name}" for path, name in named
+               if not (ROOT / path).is_file() or name not in names_of(ROOT / path)]
+    assert not missing
+    steps, concepts = text.split("## Where is")
+    assert re.findall(r"^(\d)\. ", steps, re.MULTILINE) == list("12345678")
+    assert len(re.findall(r"^\| .* \| `[\w/]+\.py:", concepts, re.MULTILINE)) >= 30

@@ -1,6 +1,5 @@
 """What Python shows of scenes, measurements, maps, twins and residuals: text, plots, tables, files, pickles."""
 
-import builtins
 import pickle
 import subprocess
 import sys
@@ -176,12 +175,7 @@ def test_tables_for_gis_programs(small_scene, measured, twin):
 
 
 def test_without_geopandas_it_is_said_what_to_install(monkeypatch):
-    def refuse(name, *arguments, **options):
-        if name == "geopandas":
-            raise ImportError(name)
-        return imported(name, *arguments, **options)
-    imported = builtins.__import__
-    monkeypatch.setattr(builtins, "__import__", refuse)
+    monkeypatch.setitem(sys.modules, "geopandas", None)
     with pytest.raises(rt.BadInput, match=r"pip install 'radiotwin\[geo\]'"):
         make_map(-80.0).to_geodataframe()
 

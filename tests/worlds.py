@@ -95,7 +95,7 @@ def quick_report(monkeypatch):
     for module in ("baselines", "predictor"):
         monkeypatch.setattr(f"radiotwin.closeloop.predict.{module}.grow_trees", grown)
     for most in ("MAX_MEMBERS", "MAX_PLACES"):
-        monkeypatch.setattr(f"radiotwin.closeloop.verdict.sensitivity.{most}", 1)
+        monkeypatch.setattr(f"radiotwin.effects.patterns.{most}", 1)
 
 
 @pytest.fixture(scope="session")

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from radiotwin.closeloop.search.posterior import features, probability_of
 
 import radiotwin as rt
+from radiotwin.closeloop.verdict.posterior import features, probability_of
 from radiotwin.effects import register
 from radiotwin.effects.base import ResidualView
 from radiotwin.links import prepare_links

@@ -29,7 +29,7 @@ from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_known, fit_links, reliable_m
 from radiotwin.twin.fit_paths import LOST_M, best_dof, fit_paths, relocation_from
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
-from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel
+from radiotwin.twin.model.model import AppliedEffect, Fit, Model
 from radiotwin.twin.twin import Twin
 
 WAYS = ("flight", "block", "quadrant", "device")
@@ -426,7 +426,7 @@ def cross_validate(links: Links, base: Base, folds: Folds,
     twin = base.fit(links)
     device_m = base.device_m(twin)
     dof = best_dof(links, twin.channel, device_m)
-    whole = FoldModel.build(links, twin.channel, dof, device_m=device_m)
+    whole = Model.build(links, twin.channel, dof, device_m=device_m)
     links = _with_evidence(links, whole)
     columns = {"evidence": links.evidence, "known_los": whole.links.los}
     whole = replace(whole, links=replace(whole.links.with_columns(**columns), notes=links.notes))
@@ -435,7 +435,7 @@ def cross_validate(links: Links, base: Base, folds: Folds,
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the fit to all links has warned already
             fitted = base.fit(part)
-        models.append(FoldModel.build(links, fitted.channel, dof, device_m=base.device_m(fitted),
+        models.append(Model.build(links, fitted.channel, dof, device_m=base.device_m(fitted),
                                       train=folds.index != number))
     return CrossFit(whole.fit(), tuple(each.fit() for each in models), folds.index, twin)
 
@@ -454,7 +454,7 @@ def best_base(models: dict[str, CrossFit]) -> str:
     return min(models, key=lambda name: models[name].rmse_db(in_common))
 
 
-def _with_evidence(links: Links, whole: FoldModel) -> Links:
+def _with_evidence(links: Links, whole: Model) -> Links:
     """Return links with pieces of evidence that fit the base's residual, if they have none yet."""
     if links.evidence is not None:
         return links

@@ -1,7 +1,7 @@
 """Where an effect is: what it corrects in the declared scene, and how maps mark it.
 
 `radiotwin.closeloop.output.corrected_scene` writes the scene with the corrections, and
-`radiotwin.report.closeloop_maps` draws the marks.
+`radiotwin.report.map_figures` draws the marks.
 """
 
 from collections.abc import Callable, Mapping

@@ -15,7 +15,7 @@ from radiotwin.effects.params import Parameter
 from radiotwin.effects.places import Mark
 from radiotwin.links import Links, evidence_blocks, residual_variables
 from radiotwin.report.labels import variable_label
-from radiotwin.twin.model.fold_model import Fit
+from radiotwin.twin.model.model import Fit
 
 MAX_MEMBERS = 6  # devices or receivers with a panel of their own
 MIN_SHARE = 0.02  # of the largest standard deviation of a contribution; below it, no panel

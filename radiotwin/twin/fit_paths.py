@@ -32,7 +32,7 @@ from radiotwin.twin.localize import (
 )
 from radiotwin.twin.localize.along_paths import CREDIBLE, MAX_DEVICES
 from radiotwin.twin.localize.estimate import TwinDevice
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.model import Model
 from radiotwin.twin.twin import Twin
 
 DOFS = (3.0, 5.0, 10.0, 30.0)  # of the errors, that are tried
@@ -56,8 +56,8 @@ def fit_along_paths(links: Links, scene: Scene, seed: int, start: Twin | None,
     twin = fit_paths(links, scene, law, relocation_from(scene, np.inf, start, executor))
     device_m, law_m = reliable_m(twin.devices, LOST_M), reliable_m(law.devices, LOST_M)
     dof = best_dof(links, twin.channel, device_m)
-    by_paths = FoldModel.build(links, twin.channel, dof, device_m=device_m)
-    by_law = FoldModel.build(links, law.channel, dof, device_m=law_m)
+    by_paths = Model.build(links, twin.channel, dof, device_m=device_m)
+    by_law = Model.build(links, law.channel, dof, device_m=law_m)
     fit, both = by_paths.fit(), by_paths.usable & by_law.usable
     heard = np.bincount(by_paths.group[by_paths.usable & np.isfinite(links.level_db)], minlength=2)
     # Slopes of their own would make any law of what paths bring.
@@ -130,7 +130,7 @@ def best_dof(links: Links, channel: ChannelModel, device_m: np.ndarray) -> float
         channel: fitted.
         device_m: (k, 3) where it has the devices [m]; NaN for none.
     """
-    model = FoldModel.build(links, channel, DOFS[0], device_m=device_m)
+    model = Model.build(links, channel, DOFS[0], device_m=device_m)
     objectives = [replace(model, dof=dof).fit().objective for dof in DOFS]
     return DOFS[int(np.argmin(objectives))]
 

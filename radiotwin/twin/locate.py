@@ -17,7 +17,7 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import DeviceEstimate, locate, misfit, whole_area
-from radiotwin.twin.model.fold_model import EffectModel
+from radiotwin.twin.model.model import FittedModel
 from radiotwin.twin.twin import Twin
 
 NOT_BY_PATHS = ("and following paths from every position where a device may be takes too long: "
@@ -111,7 +111,7 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
     return table, notes
 
 
-def _by_channel(twin: Twin, links: Links) -> EffectModel:
+def _by_channel(twin: Twin, links: Links) -> FittedModel:
     """Return a channel with the errors that it states, as it was fitted, for devices anywhere.
 
     Args:
@@ -132,11 +132,11 @@ def _by_channel(twin: Twin, links: Links) -> EffectModel:
                 for each in range(channel.error_groups(probes))]
     scale_db = np.array(usual_db) * np.sqrt((PLAIN_DOF - 2) / PLAIN_DOF)
     levels = np.zeros(channel.level_columns(probes)[0].shape[1])
-    return EffectModel(channel, (), levels, scale_db, PLAIN_DOF, np.nan_to_num(twin.device_m), (),
+    return FittedModel(channel, (), levels, scale_db, PLAIN_DOF, np.nan_to_num(twin.device_m), (),
                        links.first_s, 0.0)
 
 
-def _widening(model: EffectModel, links: Links, found: list[DeviceEstimate]) -> float:
+def _widening(model: FittedModel, links: Links, found: list[DeviceEstimate]) -> float:
     """Return how much larger residuals are than they were at home; 1 where they are much alike."""
     if np.isnan(model.typical_misfit) or not found:
         return 1.0

@@ -25,7 +25,7 @@ from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_ch
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.blend import Blend
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
-from radiotwin.twin.model.fold_model import EffectModel, FittedEffect, Unheard
+from radiotwin.twin.model.model import FittedEffect, FittedModel, Unheard
 
 if TYPE_CHECKING:
     from radiotwin.twin.twin import Twin
@@ -236,7 +236,7 @@ def check_twin_target(folder: Path) -> None:
                        "choose another output folder, or move it away")
 
 
-def _fitted_record(fitted: EffectModel) -> dict[str, Any]:
+def _fitted_record(fitted: FittedModel) -> dict[str, Any]:
     effects = [{"name": each.effect.name, "variant": each.effect.variant,
                 "params": each.params.model_dump(mode="json"),
                 "coefficients": each.coefficients.tolist()} for each in fitted.effects]
@@ -254,7 +254,7 @@ def _fitted_record(fitted: EffectModel) -> dict[str, Any]:
 
 
 def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevice],
-            beside: dict[str, np.ndarray]) -> EffectModel:
+            beside: dict[str, np.ndarray]) -> FittedModel:
     _check_levels(record, channel)
     device_m = np.array([(each.x_m, each.y_m, each.z_m) for each in devices])
     known = {"device": len(devices), "receiver": len(record.receivers)}
@@ -274,7 +274,7 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
     if record.blend is not None:
         blend = Blend.from_state(beside, record.blend, len(devices))
     _check_terms(effects, [each.device for each in devices], record.receivers)
-    return EffectModel(channel, tuple(effects), np.array(record.level_coefficients),
+    return FittedModel(channel, tuple(effects), np.array(record.level_coefficients),
                        np.array(record.scale_db), record.dof, np.nan_to_num(device_m),
                        tuple(record.receivers),
                        np.nan if record.first_s is None else record.first_s,

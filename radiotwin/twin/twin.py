@@ -38,7 +38,7 @@ from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.plot import MARKS, draw_outlines
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
-from radiotwin.twin.model.fold_model import EffectModel, FittedEffect
+from radiotwin.twin.model.model import FittedEffect, FittedModel
 from radiotwin.twin.store import decode_twin, encode_twin, read_twin, write_twin
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ class Twin(Summarised):
     level: str
     limit_db: float | None
     provenance: dict = field(default_factory=dict)
-    fitted: EffectModel | None = None
+    fitted: FittedModel | None = None
 
     @property
     def device_m(self) -> np.ndarray:

@@ -11,7 +11,7 @@ from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverG
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.links import prepare_links
-from radiotwin.twin.model.fold_model import FittedEffect
+from radiotwin.twin.model.model import FittedEffect
 
 
 @pytest.mark.parametrize("effect, params, coefficients, devices, receivers", [

@@ -25,7 +25,7 @@ from radiotwin.effects.catalogue.gain_drift import Drift, ReceiverDrift
 from radiotwin.effects.params import Estimate
 from radiotwin.links import prepare_links
 from radiotwin.links.measurements import Measurements
-from radiotwin.twin.model.fold_model import AppliedEffect
+from radiotwin.twin.model.model import AppliedEffect
 from tests.worlds import shortened
 
 LOSS_DB, BEGIN_S, END_S = 9.0, 330.0, 365.0

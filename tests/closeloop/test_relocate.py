@@ -9,7 +9,7 @@ from radiotwin.closeloop.crossfit import make_bases
 from radiotwin.closeloop.search import relocate
 from radiotwin.closeloop.search.relocate import is_better, relocate_devices
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.model import Model
 from tests.closeloop.drives import MASTS_M, drive, fitted
 
 WRONG_M = np.array([25.0, -30.0])
@@ -24,7 +24,7 @@ def misplaced(seed, device=1):
         unknown = each.links.with_ends(anchors=each.links.anchors - {device})
         device_m = unknown.device_m.copy()
         device_m[device, :2] += WRONG_M
-        built = FoldModel.build(unknown, each.channel, each.model.dof, device_m=device_m, train=each.train)
+        built = Model.build(unknown, each.channel, each.model.dof, device_m=device_m, train=each.train)
         return built.with_effects([built.apply(effect.effect, effect.params) for effect in each.effects]).fit()
     return model.map(moved)
 
@@ -76,9 +76,9 @@ def test_along_paths_folds_are_located_anew_only_where_a_device_moves(monkeypatc
         located.append(mine.sum())
         device_m = each.links.device_m.copy()
         device_m[1, 0] += moved_m
-        return FoldModel.build(each.links, each.channel, each.model.dof, device_m=device_m, train=mine), model.twin.devices
+        return Model.build(each.links, each.channel, each.model.dof, device_m=device_m, train=mine), model.twin.devices
 
-    monkeypatch.setattr(FoldModel, "corrected_map", property(lambda each: "another map"))
+    monkeypatch.setattr(Model, "corrected_map", property(lambda each: "another map"))
     monkeypatch.setattr(relocate, "_located_anew", anew)
     found = relocate_devices(model, model.links, make_bases(None, 0)["twin"])
     assert len(located) == asked and located[0] == len(model.links)

@@ -12,7 +12,7 @@ from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.propagation.laws.log_distance import LogDistance, LogDistanceLine
 from radiotwin.scene.citymap import CityMap
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.model import Model
 
 DEVICES_M, MOVED_M = np.array([[0.0, 0.0, 10.0], [300.0, 200.0, 10.0]]), np.array([[14.0, -18.0, 0.0], [0.0, 0.0, 0.0]])
 
@@ -39,7 +39,7 @@ def moved(make_links):
     distance_m = np.linalg.norm(receiver_m[:, None] - (DEVICES_M + MOVED_M), axis=2).ravel()
     links = make_links(DEVICES_M, receiver_m, level_db=-40 - 22 * np.log10(distance_m) + rng.normal(0, 0.5, 600))
     channel = SlowLaw(LogDistanceLine(-40.0, -2.2, 0.5))
-    return SimpleNamespace(whole=FoldModel.build(links, channel, 5.0).fit(), links=links), channel
+    return SimpleNamespace(whole=Model.build(links, channel, 5.0).fit(), links=links), channel
 
 
 class Sentenced(DevicePositionError):

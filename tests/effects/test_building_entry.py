@@ -10,7 +10,7 @@ from radiotwin.effects.catalogue.building_entry import BuildingEntry, entry_loss
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.fitting import add_effect
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.model import Model
 
 
 @pytest.mark.parametrize("ghz, elevation_deg, building, values", [
@@ -80,7 +80,7 @@ def test_loss_and_scatter_are_found(make_links):
         level_db[:300] -= rng.normal(12, 6, 300)
         links = make_links([[0.0, 0, 1.5]], receiver_m, city=CityMap(box.vertices, box.faces), level_db=level_db)
         law = LogDistance().fit(links.select(np.arange(600) >= 300).geometry, level_db[300:], None)
-        added = add_effect(FoldModel.build(links, law, 8.0).fit(), BuildingEntry())
+        added = add_effect(Model.build(links, law, 8.0).fit(), BuildingEntry())
         params = added.effects[-1].params
         found.append((BuildingEntry._loss_db(params, added.coefficients_of(-1)),
                       params.scatter_sd_db))

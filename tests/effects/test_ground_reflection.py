@@ -9,7 +9,7 @@ from radiotwin.effects.catalogue.lock_loss import LockLoss
 from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin import Twin, TwinDevice
-from radiotwin.twin.model.fold_model import EffectModel, FittedEffect
+from radiotwin.twin.model.model import FittedEffect, FittedModel
 
 FREQUENCY_HZ = 2.4e9
 
@@ -98,7 +98,7 @@ def test_a_map_has_it_and_does_not_have_what_belongs_to_receivers(small_scene):
 
     def mapped(effects):
         channel = LogDistance(LogDistanceLine(-40.0, 2.2, 3.0))
-        fitted = EffectModel(channel, tuple(FittedEffect(effect, params, np.zeros(0)) for effect, params in effects),
+        fitted = FittedModel(channel, tuple(FittedEffect(effect, params, np.zeros(0)) for effect, params in effects),
                              np.zeros(2), np.array([2.0]), 5.0, small_scene.device_m, ("g0",), np.nan, 0.0)
         return Twin(channel, devices, "gain_db", None, {}, fitted).radio_map(small_scene)
 

@@ -10,7 +10,7 @@ from radiotwin.effects.registry import effect_named
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 from radiotwin.twin.model.fitting import add_effect
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.model import Model
 
 WOOD = [(100.0, 0.0), (220.0, 0.0), (220.0, 300.0), (100.0, 300.0)]
 HEIGHT_M, SPECIFIC_DB_M, MOST_DB = 15.0, 0.2, 1.37 * 2400.0**0.42  # A_m of ITU-R P.833-10 at 2.4 GHz
@@ -46,7 +46,7 @@ def world(make_links):
 
 def model_of(links):
     twin = make_bases(None, 0)["log-distance"].fit(links)
-    return FoldModel.build(links, twin.channel, 8.0).fit()
+    return Model.build(links, twin.channel, 8.0).fit()
 
 
 def test_its_specific_attenuation_is_found(world):

@@ -14,7 +14,7 @@ from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 from radiotwin.twin.model.fitting import along_paths, refine
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.model import Model
 
 
 def test_where_no_link_has_line_of_sight_nothing_can_be_missing(make_links, view):
@@ -176,7 +176,7 @@ def test_along_paths_a_box_is_found_that_quick_levels_turned(make_links, seed):
     there = links.with_city(effect.corrected_map(city, effect.Params(box=true)))
     level_db = 10 * np.log10(path_gains(there.geometry) + 1e-13) + rng.normal(0, 1.0, len(links))
     channel = ImagePaths().fit(links.geometry, level_db, None)
-    model = FoldModel.build(links.with_columns(level_db=level_db), channel, 5.0)
+    model = Model.build(links.with_columns(level_db=level_db), channel, 5.0)
     def fitted(box):
         return model.with_effects([model.apply(effect, effect.Params(box=box, exact=True))]).fit()
 
@@ -192,7 +192,7 @@ def test_a_box_that_no_link_comes_near_stays_where_it_is(make_links):
     receiver_m = np.array([(x_m, y_m, 20.0) for x_m in range(50, 150, 10) for y_m in range(-60, 60, 10)], float)
     links = make_links([[0.0, 0, 2.0]], receiver_m, city=CityMap(house.vertices, house.faces),
                        level_db=np.linspace(-80, -70, len(receiver_m)))
-    model = FoldModel.build(links, ImagePaths().fit(links.geometry, links.level_db, None), 5.0)
+    model = Model.build(links, ImagePaths().fit(links.geometry, links.level_db, None), 5.0)
     far = MissingObstacle.Params(box=Box(-300.0, 0.0, 20.0, 20.0, 30.0, 0.0), known_paths=True)
     there = model.with_effects([model.apply(MissingObstacle(), far)]).fit()
     assert refine(there) is there

@@ -15,7 +15,7 @@ from radiotwin.effects.params import QUANTILE_90
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.fitting import add_effect
-from radiotwin.twin.model.fold_model import Fit, FoldModel
+from radiotwin.twin.model.model import Fit, Model
 
 CORNERS_M = [(-80.0, -20.0), (-15.0, -15.0), (50.0, -25.0), (-40.0, 60.0)]  # south-western, of blocks of 30 by 30 m
 MAPPED_M = (20.0, 18.0, 22.0, 15.0)
@@ -56,7 +56,7 @@ def world(make_links):
 
 
 def fitted(links):
-    fit = FoldModel.build(links, make_bases(None, 0)["twin"].fit(links).channel, 8.0).fit()
+    fit = Model.build(links, make_bases(None, 0)["twin"].fit(links).channel, 8.0).fit()
     return fit, add_effect(fit, RoofHeights())
 
 
@@ -120,7 +120,7 @@ def test_a_roof_is_as_far_off_as_its_map_may_be(world, sd_m, least_m, most_m):
     told = links.with_city(CityMap(links.city.vertices, links.city.faces,
                                    height_sd_m=np.full(len(links.city.faces), sd_m)))
     fit, _ = fitted(links)
-    view = Fit(fit.coefficients, fit.scale_db, fit.objective, FoldModel.build(told, fit.channel, 8.0)).view
+    view = Fit(fit.coefficients, fit.scale_db, fit.objective, Model.build(told, fit.channel, 8.0)).view
     off_m = [offsets(params.roofs)[0][0] for params in RoofHeights().propose(view)]
     assert least_m <= (np.nan_to_num(off_m[0]) if off_m else 0.0) <= most_m
 
@@ -134,7 +134,7 @@ def test_a_map_that_is_right_stays(world):
 
 def test_of_a_block_that_is_gone_nothing_is_said(world):
     twin = make_bases(None, 0)["twin"].fit(world(MAPPED_M, 2))
-    model = FoldModel.build(world((0.0, *MAPPED_M[1:]), 2), twin.channel, 8.0)
+    model = Model.build(world((0.0, *MAPPED_M[1:]), 2), twin.channel, 8.0)
     for params in RoofHeights().propose(model.fit().view):
         assert np.isnan(offsets(params.roofs)[0][0])
 

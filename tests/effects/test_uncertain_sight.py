@@ -10,7 +10,7 @@ from radiotwin.effects.catalogue import uncertain_sight
 from radiotwin.effects.catalogue.uncertain_sight import UncertainSight
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.fitting import add_effect
-from radiotwin.twin.model.fold_model import FoldModel
+from radiotwin.twin.model.model import Model
 
 BEHIND_DB = 20.0
 
@@ -52,7 +52,7 @@ def test_the_chance_is_that_of_a_wall_that_is_off(make_links, monkeypatch):
 
 def fitted(links):
     twin = make_bases(None, 0)["twin"].fit(links)
-    fit = FoldModel.build(links, twin.channel, 8.0).fit()
+    fit = Model.build(links, twin.channel, 8.0).fit()
     return fit, add_effect(fit, UncertainSight())
 
 

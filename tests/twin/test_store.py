@@ -15,7 +15,7 @@ from radiotwin.effects import catalogue
 from radiotwin.effects.catalogue.roof_heights import Roof
 from radiotwin.errors import BadInput
 from radiotwin.twin import Twin, check_twin_target, fit_twin
-from radiotwin.twin.model.fold_model import EffectModel, FittedEffect
+from radiotwin.twin.model.model import FittedEffect, FittedModel
 
 STORED = Path(__file__).parent / "stored"
 NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)
@@ -132,7 +132,7 @@ def test_every_effect_that_needs_a_map_is_tried():
 def test_a_twin_with_an_effect_that_needs_a_map_comes_back_without_one(twin, tmp_path, name):
     effect = next(each() for each in catalogue() if each.name == name)
     params = effect.Params(**OF_MAPS[name])
-    fitted = EffectModel(twin.channel, (FittedEffect(effect, params, np.zeros(0)),), np.zeros(2), np.array([3.0]), 5.0,
+    fitted = FittedModel(twin.channel, (FittedEffect(effect, params, np.zeros(0)),), np.zeros(2), np.array([3.0]), 5.0,
                          twin.device_m, ("r0",), np.nan, 0.0)
     replace(twin, fitted=fitted).save(tmp_path / "twin")
     (again,) = Twin.load(tmp_path / "twin").effects

@@ -47,7 +47,7 @@ from radiotwin.twin.model.correlated_shadowing import (
     receivers_move,
     standardised_residual,
 )
-from radiotwin.twin.model.fold_model import Fit
+from radiotwin.twin.model.model import Fit
 
 HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
 PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE

@@ -50,7 +50,7 @@ from radiotwin.closeloop.verdict.posterior import judge
 from radiotwin.effects.base import DetectionEffect, Effect
 from radiotwin.links import Links
 from radiotwin.links.correlation import devices_move
-from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel
+from radiotwin.twin.model.model import AppliedEffect, Fit, Model
 
 
 def add_changes(state: SearchState, inputs: SearchInputs) -> SearchState:
@@ -249,7 +249,7 @@ def _is_found(applied: AppliedEffect, without: Fit) -> bool:
                for acts in again)
 
 
-def _without(model: FoldModel, place: int | None) -> FoldModel:
+def _without(model: Model, place: int | None) -> Model:
     """Return a fold without the effect at a place; None: it has none of it."""
     return model.with_effects([each for number, each in enumerate(model.effects)
                                if number != place])

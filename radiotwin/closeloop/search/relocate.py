@@ -17,7 +17,7 @@ from radiotwin.effects.arrays import subsample
 from radiotwin.links import Links
 from radiotwin.twin.localize import position_log_likelihood
 from radiotwin.twin.localize.estimate import TwinDevice
-from radiotwin.twin.model.fold_model import EffectModel, Fit, FoldModel
+from radiotwin.twin.model.model import Fit, FittedModel, Model
 
 RADII_M = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)  # of circles around a position, that are tried
 DIRECTIONS = 12
@@ -66,7 +66,7 @@ def relocate_devices(model: CrossFit, links: Links, base: Base
     return found if is_better(model.held_out_nll, found.held_out_nll) else model
 
 
-def _is_moved(before: Fit, after: FoldModel) -> bool:
+def _is_moved(before: Fit, after: Model) -> bool:
     """Return whether any device with links moves noticeably, is found or is lost."""
     apart_m = np.linalg.norm(after.links.device_m - before.links.device_m, axis=1)
     moved = apart_m[before.links.device] > MIN_MOVE_M
@@ -97,7 +97,7 @@ def _with_positions(devices: list[TwinDevice], device_m: np.ndarray) -> list[Twi
 
 
 def _located_anew(fit: Fit, links: Links, mine: np.ndarray,
-                  base: Base) -> tuple[FoldModel, list[TwinDevice]]:
+                  base: Base) -> tuple[Model, list[TwinDevice]]:
     """Return one model with its devices where its base, over the corrected map, has them.
 
     Args:
@@ -110,13 +110,13 @@ def _located_anew(fit: Fit, links: Links, mine: np.ndarray,
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the base has warned already
         twin = base.fit(links.with_city(model.corrected_map).select(mine))
-    moved = FoldModel.build(model.links, model.channel, model.dof, device_m=base.device_m(twin),
+    moved = Model.build(model.links, model.channel, model.dof, device_m=base.device_m(twin),
                             train=mine)
     return moved.with_effects([moved.apply(each.effect, each.params) for each in model.effects]), \
         twin.devices
 
 
-def _relocated(fit: Fit, unknown: list[int]) -> FoldModel:
+def _relocated(fit: Fit, unknown: list[int]) -> Model:
     """Return one model with its devices moved, by its training links."""
     learnt, model = fit.learnt, fit.model
     device_m = model.links.device_m.copy()
@@ -129,12 +129,12 @@ def _relocated(fit: Fit, unknown: list[int]) -> FoldModel:
     nowhere = np.setdiff1d(model.links.device, model.links.device[model.usable])
     placed_m = device_m.copy()
     placed_m[nowhere] = np.nan
-    moved = FoldModel.build(model.links, model.channel, model.dof, device_m=placed_m,
+    moved = Model.build(model.links, model.channel, model.dof, device_m=placed_m,
                             train=model.train)
     return moved.with_effects([moved.apply(each.effect, each.params) for each in model.effects])
 
 
-def _likeliest(model: EffectModel, own: Links, start_m: np.ndarray) -> np.ndarray:
+def _likeliest(model: FittedModel, own: Links, start_m: np.ndarray) -> np.ndarray:
     """Return the likeliest position (2,) of a device on circles around the best so far [m]."""
     angles = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
     circle = np.column_stack([np.sin(angles), np.cos(angles)])

@@ -17,7 +17,7 @@ from radiotwin.inference.held_out import cross_fit_p_value, sign_flip_p_value
 from radiotwin.links import Links, evidence_blocks
 from radiotwin.runtime.execution import Executor
 from radiotwin.twin.model.fitting import add_effect, along_paths, prepare_additions
-from radiotwin.twin.model.fold_model import Fit, FittedEffect
+from radiotwin.twin.model.model import Fit, FittedEffect
 
 
 def ends_of(fitted: FittedEffect, links: Links) -> tuple[tuple[str, ...], tuple[str, ...]]:

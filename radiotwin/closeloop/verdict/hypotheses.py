@@ -22,7 +22,7 @@ from radiotwin.effects.params import NEAR_SHARE
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
 from radiotwin.links import Links
 from radiotwin.twin.model.correlated_shadowing import receivers_move
-from radiotwin.twin.model.fold_model import Fit
+from radiotwin.twin.model.model import Fit
 
 MAX_Z = 3.0  # an outlier counts as this many scales from its neighbours
 NEIGHBOURS = 9

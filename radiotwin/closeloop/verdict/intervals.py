@@ -25,7 +25,7 @@ from radiotwin.closeloop.crossfit import CrossFit, same_effects
 from radiotwin.effects.params import Estimate, Parameter
 from radiotwin.inference.sandwich import MAX_WIDTH
 from radiotwin.links import evidence_blocks
-from radiotwin.twin.model.fold_model import Fit
+from radiotwin.twin.model.model import Fit
 from radiotwin.twin.model.uncertainty import Linearised, Secant, estimates, linearise
 
 QUANTILE = 0.95  # upper end of a 90 % interval

@@ -28,7 +28,7 @@ from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept_with_name
 from radiotwin.runtime.processes import in_threads
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.localize.estimate import TwinDevice, read_device
-from radiotwin.twin.model.fold_model import Fit, FoldModel
+from radiotwin.twin.model.model import Fit, Model
 
 Followed = dict[tuple[float, ...], dict[int, float]]
 """Position -> hash of the other end's position -> power."""
@@ -112,7 +112,7 @@ class Relocation:
         if unknown > MAX_DEVICES:
             return list(devices)
         device_m = np.array([(each.x_m, each.y_m, each.z_m) for each in devices])
-        fits = [FoldModel.build(links, each, DOF, device_m=device_m).fit()
+        fits = [Model.build(links, each, DOF, device_m=device_m).fit()
                 for each in (channel.law, channel)]
         searches: dict[int, _Question] = {}
         for number, device in enumerate(devices):
@@ -221,7 +221,7 @@ class _Likelihood:
 
     def problem(self, links: Links, mean_db: np.ndarray) -> CensoredRegression:
         """Return the regression on the links, of which the channel predicts (n,)."""
-        return FoldModel.build(links, self.fit.channel, DOF, channel_db=mean_db).regression()
+        return Model.build(links, self.fit.channel, DOF, channel_db=mean_db).regression()
 
     def nll(self, links: Links, mean_db: np.ndarray) -> float:
         """Return the negative log-likelihood [nats]."""

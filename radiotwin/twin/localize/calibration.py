@@ -24,7 +24,7 @@ from radiotwin.twin.localize.without_map import (
     Area,
     PositionPosterior,
 )
-from radiotwin.twin.model.fold_model import EffectModel
+from radiotwin.twin.model.model import FittedModel
 
 POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)  # of the likelihood, that are tried
 MAX_TRIALS, MAX_TRIALS_WITH_MAP = 100, 24  # positions; over a map each takes seconds
@@ -49,7 +49,7 @@ class RadiusCalibration:
     typical_misfit: float = np.nan
 
 
-def calibrate_radii(models: list[EffectModel], held_out: list[Links], area_m: Area,
+def calibrate_radii(models: list[FittedModel], held_out: list[Links], area_m: Area,
                     seed: int) -> RadiusCalibration:
     """Locate devices of known position, each from links that its model has not seen.
 
@@ -109,7 +109,7 @@ def radius_factor(ratios: np.ndarray) -> float:
     return max(float(np.sqrt(square / (PRIOR_TRIALS + len(ratios)))), 1.0)
 
 
-def misfit(model: EffectModel, own: Links, place: DeviceEstimate) -> float:
+def misfit(model: FittedModel, own: Links, place: DeviceEstimate) -> float:
     """Return the mean square of residuals over their scale, of the links of a located device.
 
     The device's own level, as far as it may have one, counts as no misfit.

@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 
 from radiotwin.links import Links
 from radiotwin.twin.localize.estimate import DeviceEstimate
-from radiotwin.twin.model.fold_model import EffectModel
+from radiotwin.twin.model.model import FittedModel
 
 COARSE_CELLS, MAX_FINE_CELLS, MAX_SPLIT = 1500, 640, 4
 HELD = 0.999  # of the probability, by the coarse cells that are split
@@ -54,7 +54,7 @@ class PositionPosterior:
     n_links: int
 
     @classmethod
-    def of(cls, model: EffectModel, own: Links, area_m: Area, power: float
+    def of(cls, model: FittedModel, own: Links, area_m: Area, power: float
            ) -> PositionPosterior:
         """Return that of the links of one device; the cells hold the likelihood to a power."""
         coarse_m, width_m = _grid(area_m)
@@ -77,7 +77,7 @@ class PositionPosterior:
                               self.n_detected, self.n_links, 1 / power, True)
 
 
-def locate(model: EffectModel, links: Links, area_m: Area,
+def locate(model: FittedModel, links: Links, area_m: Area,
            on_progress: Callable[[], None] = lambda: None) -> Iterator[DeviceEstimate]:
     """Locate the devices of some links, whatever position the links have them at but for height.
 
@@ -99,14 +99,14 @@ def locate(model: EffectModel, links: Links, area_m: Area,
         on_progress()
 
 
-def whole_area(model: EffectModel, links: Links) -> Area:
+def whole_area(model: FittedModel, links: Links) -> Area:
     """Return the area around all ends that are known."""
     known = np.vstack([links.receiver_m[:, :2], model.device_m[:, :2]])
     (west, south), (east, north) = known.min(axis=0) - MARGIN_M, known.max(axis=0) + MARGIN_M
     return west, east, south, north
 
 
-def position_log_likelihood(model: EffectModel, own: Links,
+def position_log_likelihood(model: FittedModel, own: Links,
                             positions_m: np.ndarray) -> np.ndarray:
     """Return the log-likelihood (c,) of the links of one device, if it were elsewhere.
 
@@ -120,7 +120,7 @@ def position_log_likelihood(model: EffectModel, own: Links,
                            for first in range(0, len(positions_m), cells)])
 
 
-def _log_likelihood_at(model: EffectModel, own: Links, positions_m: np.ndarray) -> np.ndarray:
+def _log_likelihood_at(model: FittedModel, own: Links, positions_m: np.ndarray) -> np.ndarray:
     """Return the same for few enough positions, all at once."""
     n, cells, sd_db = len(own), len(positions_m), model.device_sd_db
     height_m = np.full(cells, own.device_m[own.device[0], 2])

@@ -22,7 +22,7 @@ from radiotwin.propagation.laws.kriging import MIN_POINTS, ResidualField
 from radiotwin.runtime.pieces import kept
 
 if TYPE_CHECKING:
-    from radiotwin.twin.model.fold_model import Fit
+    from radiotwin.twin.model.model import Fit
 
 MIN_SD = 1e-6  # of a residual that is nothing
 LEAST_SHARED_SD = 0.1  # of what relatives say, in error scales: less is nearly nothing

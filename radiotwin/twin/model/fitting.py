@@ -20,7 +20,7 @@ from radiotwin.propagation.laws.base import ANY_LEVEL_SD_DB
 from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept
 from radiotwin.runtime.processes import resident_bytes
-from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel, response
+from radiotwin.twin.model.model import AppliedEffect, Fit, Model, response
 
 EVALUATIONS = 25  # of the objective for each number, in one descent
 DESCENTS = 2  # a simplex that has collapsed too early starts anew; one for a fold, which is near
@@ -258,7 +258,7 @@ def _write_addition(found: Fit | None) -> Piece | None:
             {"params": params, "objective": float(found.objective)})
 
 
-def _reader(model: FoldModel, effect: Effect) -> Callable[..., Fit | None]:
+def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
     """Return what reads the fit of a model with one more effect."""
     def read(arrays: dict[str, np.ndarray], content: Any) -> Fit | None:
         if content is None:
@@ -271,7 +271,7 @@ def _reader(model: FoldModel, effect: Effect) -> Callable[..., Fit | None]:
     return read
 
 
-def _read_applied(model: FoldModel, effect: Effect, before: AppliedEffect | None,
+def _read_applied(model: Model, effect: Effect, before: AppliedEffect | None,
                   written: Any) -> AppliedEffect:
     """Return an effect with its parameters; that of before where they are the same."""
     params = effect.Params.model_validate(written)

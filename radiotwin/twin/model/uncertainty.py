@@ -20,7 +20,7 @@ from radiotwin.inference import student
 from radiotwin.inference.censored_regression import CensoredRegression, Linearisation
 from radiotwin.inference.sandwich import Scores
 from radiotwin.links import evidence_blocks, places
-from radiotwin.twin.model.fold_model import AppliedEffect, Fit, FoldModel
+from radiotwin.twin.model.model import AppliedEffect, Fit, Model
 
 MIN_FLIGHTS = 4  # that clusters of flights are made of
 STEP_SHARES = (0.02, 3.0)  # of `Variation.steps`, least and greatest secant
@@ -185,7 +185,7 @@ def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) ->
     return replace(secant, sides=(below, above))
 
 
-def _moved(model: FoldModel, number: int, applied: AppliedEffect) -> CensoredRegression:
+def _moved(model: Model, number: int, applied: AppliedEffect) -> CensoredRegression:
     effects = list(model.effects)
     effects[number] = applied
     return model.with_effects(effects).training

@@ -10,7 +10,7 @@ from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.links import prepare_links
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin.localize.without_map import locate
-from radiotwin.twin.model.fold_model import EffectModel, FittedEffect
+from radiotwin.twin.model.model import FittedEffect, FittedModel
 from tests.worlds import shortened
 
 AREA_M = (-200.0, 700.0, -200.0, 700.0)
@@ -44,7 +44,7 @@ class Counting(LogDistance):
 
 def model_of(channel, *effects, device_sd_db=0.0):
     """Return a model that knows three devices."""
-    return EffectModel(channel, effects, np.zeros(2), np.array([2.0]), 5.0, np.zeros((3, 3)), ("r0", "r1"), 0.0,
+    return FittedModel(channel, effects, np.zeros(2), np.array([2.0]), 5.0, np.zeros((3, 3)), ("r0", "r1"), 0.0,
                        device_sd_db)
 
 

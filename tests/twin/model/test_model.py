@@ -11,13 +11,13 @@ from radiotwin.effects.catalogue.roof_heights import RoofHeights
 from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.scene.citymap import CityMap
-from radiotwin.twin.model.fold_model import EffectModel, Fit, FittedEffect, FoldModel, device_sd_db
+from radiotwin.twin.model.model import Fit, FittedEffect, FittedModel, Model, device_sd_db
 
 
 def test_positions_are_sought_without_what_follows_paths_or_many_maps():
     """Each of thousands of places would need its own paths."""
     effects = tuple(FittedEffect(effect(), None, np.zeros(0)) for effect in (LockLoss, WallReflection, RoofHeights))
-    model = EffectModel(LogDistance(LogDistanceLine(-40.0, 2.2, 3.0)), effects, np.zeros(2), np.array([2.0]), 5.0,
+    model = FittedModel(LogDistance(LogDistanceLine(-40.0, 2.2, 3.0)), effects, np.zeros(2), np.array([2.0]), 5.0,
                         np.zeros((1, 3)), ("u0",), np.nan, 0.0)
     assert [each.effect.name for each in model.for_positions().effects] == ["lock_loss"]
     assert len(model.effects) == 3
@@ -35,10 +35,10 @@ def test_a_class_that_nothing_was_learnt_of_has_the_scale_of_the_other(make_link
     learnt = links.los == learnt_in_sight
     assert 50 < learnt.sum() < 250
     channel = SegmentedLogDistance().fit(links.geometry, level_db, links.limit_db, 0)
-    fold = FoldModel.build(links, channel, 5.0, train=learnt)
+    fold = Model.build(links, channel, 5.0, train=learnt)
     fit = fold.fit()
     assert fit.scale_db[0] == fit.scale_db[1] == pytest.approx(2.3, abs=0.6)  # of Student's t with 5 degrees
-    alone = FoldModel.build(links.select(learnt), channel, 5.0)
+    alone = Model.build(links.select(learnt), channel, 5.0)
     assert np.isfinite(alone.fit().predict(links).mean_db).all()
 
 
@@ -52,6 +52,6 @@ def test_what_devices_have_in_common_is_not_underestimated_for_few_of_them(make_
         links = make_links(device_m, [[250.0, 250.0, 100.0 + 5 * i] for i in range(20)])
         level_db = -40 - 20 * np.log10(links.distance_m) + rng.normal(0, 1, devices)[links.device] + rng.normal(0, 1, len(links))
         channel = LogDistance(LogDistanceLine(-40.0, -2.0, 1.0))
-        model = FoldModel.build(links.with_columns(level_db=level_db), channel, 5.0)
+        model = Model.build(links.with_columns(level_db=level_db), channel, 5.0)
         found.append(device_sd_db(Fit(np.zeros(model.level_columns.shape[1]), np.array([1.0]), 0.0, model)) ** 2)
     assert np.mean(found) == pytest.approx(1.0, abs=0.2)

@@ -1,8 +1,8 @@
 """A channel with effects, its fit to training links, and what that predicts of any links.
 
 This is the one place where the level of a link is put together: the channel's mean, its refitted
-level and slope, and every stage of the effects. `FoldModel` is the regression on one set of links,
-`Fit` has its coefficients, and `EffectModel` is the fit without its links, as a twin keeps it.
+level and slope, and every stage of the effects. `Model` is the regression on one set of links,
+`Fit` has its coefficients, and `FittedModel` is the fit without its links, as a twin keeps it.
 Selection, localisation, maps and reports all predict by it.
 """
 
@@ -62,7 +62,7 @@ class FittedEffect:
 
 
 @dataclass(frozen=True, eq=False)
-class FoldModel:
+class Model:
     """All links, of which some are learnt from: one fold, or the whole.
 
     Attributes:
@@ -94,7 +94,7 @@ class FoldModel:
     @classmethod
     def build(cls, links: Links, channel: ChannelModel, dof: float, *,
               device_m: np.ndarray | None = None, train: np.ndarray | None = None,
-              channel_db: np.ndarray | None = None) -> FoldModel:
+              channel_db: np.ndarray | None = None) -> Model:
         """Return a model without effects.
 
         Args:
@@ -141,11 +141,11 @@ class FoldModel:
         """Return an effect on these links."""
         return AppliedEffect(effect, params, effect.term(self.links, params, self.level_at))
 
-    def with_effects(self, effects: list[AppliedEffect]) -> FoldModel:
+    def with_effects(self, effects: list[AppliedEffect]) -> Model:
         """Return the same with other effects."""
         return replace(self, effects=effects)
 
-    def restrict(self, rows: np.ndarray, effects: list[AppliedEffect]) -> FoldModel:
+    def restrict(self, rows: np.ndarray, effects: list[AppliedEffect]) -> Model:
         """Return the model of some links (r,), all to be learnt from, with some of its effects."""
         everything = np.ones(len(rows), dtype=bool)
         return replace(
@@ -226,7 +226,7 @@ class Fit(FitResult):
         model: that was fitted.
     """
 
-    model: FoldModel
+    model: Model
 
     @property
     def links(self) -> Links:
@@ -279,10 +279,10 @@ class Fit(FitResult):
         return replace(self, coefficients=np.delete(self.coefficients, own), model=rest)
 
     @cached_property
-    def learnt(self) -> EffectModel:
+    def learnt(self) -> FittedModel:
         """What was learnt, without the training links."""
         model, sd_db = self.model, device_sd_db(self)
-        return EffectModel(
+        return FittedModel(
             model.channel, self.fitted_effects, self.coefficients[:model.level_columns.shape[1]],
             self.scale_db, model.dof, model.links.device_m, tuple(model.links.receiver_names),
             model.links.first_s, sd_db, unheard=Unheard.of(self, sd_db))
@@ -362,7 +362,7 @@ class Unheard:
 
         Args:
             fit: of a model.
-            device_sd_db: as of `EffectModel` [dB].
+            device_sd_db: as of `FittedModel` [dB].
         """
         links, own_db, declared = fit.links, np.zeros(len(fit.links)), set[int]()
         for number, each in enumerate(fit.effects):
@@ -383,7 +383,7 @@ class Unheard:
 
 
 @dataclass(frozen=True, eq=False)
-class EffectModel:
+class FittedModel:
     """A fitted channel with effects, ready for links that were not among the training links.
 
     Attributes:
@@ -422,7 +422,7 @@ class EffectModel:
     blend: Blend | None = None
     unheard: Unheard | None = None
 
-    def for_positions(self) -> EffectModel:
+    def for_positions(self) -> FittedModel:
         """Return the same without what takes too long for each place where a device may be.
 
         That is what the base says of errors of a map, for which each link is followed over nine
@@ -441,7 +441,7 @@ class EffectModel:
         """
         effects = [each for each in self.effects
                    if links.receiver_names or each.effect.is_on_maps(each.params)]
-        model = FoldModel.build(links, self.channel, self.dof)
+        model = Model.build(links, self.channel, self.dof)
         model = model.with_effects([model.apply(each.effect, each.params) for each in effects])
         coefficients = [self.level_coefficients, *(each.coefficients for each in effects)]
         needed = [model.level_columns, *(each.term.columns for each in model.effects)]
