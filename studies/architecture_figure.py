@@ -18,18 +18,18 @@ BOXES = {  # name -> row, column, title, what is below it
     "localize": ("inputs", 3, "localize", "positions of\ndevices"),
     "measurements": ("predict", 0, "Measurements", "measurements\n.csv"),
     "links": ("predict", 1, "Links", "joined with map,\nchecked"),
-    "model": ("predict", 2, "Model", "censored\nregression"),
-    "twin": ("predict", 3, "Twin", "predict(links)"),
+    "model": ("predict", 2, "Model, Fit", "censored\nregression"),
+    "twin": ("predict", 3, "Twin", "Fit, devices,\nprovenance"),
     "map": ("predict", 4, "RadioMap", "mean, sd of\neach position"),
     "policy": ("predict", 5, "policy", "marl: learner\nor planner"),
-    "residual": ("explain", 2, "residual", "of held-out\nlinks"),
+    "residual": ("explain", 2, "CrossFit", "residual of\nheld-out links"),
     "effects": ("explain", 3, "effects", "propose and fit\nparameters"),
-    "selection": ("explain", 4, "selection", "scores held-out\nlinks"),
-    "named": ("explain", 5, "named effect", "closeloop.json,\nevidence")}
+    "search": ("explain", 4, "search", "stages, a log\nof trials"),
+    "verdict": ("explain", 5, "verdict", "closeloop.json,\npage")}
 ARROWS = [("scene", "links"), ("channel", "model"), ("localize", "twin"), ("measurements", "links"),
           ("links", "model"), ("model", "twin"), ("twin", "map"), ("map", "policy"),
-          ("model", "residual"), ("residual", "effects"), ("effects", "selection"),
-          ("selection", "named")]
+          ("model", "residual"), ("residual", "effects"), ("effects", "search"),
+          ("search", "verdict")]
 BLUE, GREY = "#00695c", "#37474f"
 
 
@@ -76,8 +76,8 @@ def draw() -> Figure:
         draw_box(axes, name)
     for start, end in ARROWS:
         connect(axes, start, end)
-    # What was selected becomes part of the next fit, and of the twin.
-    x, y = middle("selection")
+    # What was kept becomes part of the next fit, and of the twin.
+    x, y = middle("search")
     back = y + HEIGHT / 2 + 0.32
     twin_x, twin_y = middle("twin")
     axes.plot([x, x, twin_x], [y + HEIGHT / 2, back, back], color=BLUE, linewidth=1.4)
