@@ -53,7 +53,8 @@ _NEEDED, _OPTIONAL = ("scene", "out", "number"), ("truth", "measurements", "devi
 FOLDER = "RADIOTWIN_FEDERATION"
 WEIGHTS, ROUNDS, DONE = "weights", "rounds.csv", "done.json"
 
-client_app, server_app = ClientApp(), ServerApp()
+client_app = ClientApp()  # Flower looks for a plain assignment in the source
+server_app = ServerApp()
 
 
 def arrays_of(weights: Weights) -> ArrayRecord:
