@@ -63,7 +63,7 @@ def a_mesh_by_a_variable(folder):
     edit(city, "meshes/ground.ply", "$x/a.ply")
 
 
-@stranger(f"marl.fedqmix {PLANNING} --resume", "written by another version")
+@stranger(f"marl.fedqmix {PLANNING} --resume", "checkpoint.safetensors")
 def a_checkpoint_that_writes_files(folder):
     forked(None, f"marl.fedqmix {PLANNING}", folder, until=folder / "run" / "config.json")
     assert json.loads((folder / "run" / "config.json").read_text())
@@ -73,7 +73,7 @@ def a_checkpoint_that_writes_files(folder):
     data = {"__array__": torch.frombuffer(bytearray(b"written"), dtype=torch.uint8)}
     torch.save({"format": 3, "state": {"rows": [{}], "blocks": [], "tables": [{"__table__": columns}], "strategy": {},
                                        "twin": {str(folder.parent / "outside" / "ran"): data}}},
-               folder / "run" / "checkpoint.pt")
+               folder / "run" / "checkpoint.safetensors")
 
 
 def piped(name):

@@ -10,7 +10,8 @@ from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds,
 from radiotwin.closeloop.predict.blending import held_out_coverage, make_blend
 from radiotwin.closeloop.predict.predictor import CombinedPrediction
 from radiotwin.errors import BadInput
-from radiotwin.links import prepare_links
+from radiotwin.links import Links, prepare_links
+from radiotwin.links.links import Columns, Ends
 from radiotwin.twin.model.blend import FORESTS
 from radiotwin.twin.twin import Twin
 from tests.worlds import fly, measured
@@ -64,9 +65,8 @@ def test_far_from_all_measurements_it_takes_the_far_weights(blended):
 
 def test_links_without_a_receiver_are_predicted_as_a_map_needs_them(blended):
     links = blended.links
-    of_map = links.synthetic(links.device_m, links.device[:50], links.receiver_m[:50], device_names=links.device_names,
-                             limit_db=None, frequency_hz=links.frequency_hz, city=None, is_gain=True,
-                             anchors=links.anchors)
+    of_map = Links(columns=Columns.unmeasured(links.receiver_m[:50], links.device[:50]), world=links.world,
+                   ends=Ends(device_names=links.device_names, device_m=links.device_m, anchors=links.anchors))
     assert np.isfinite(blended.twin.predict(of_map).mean_db).all()
 
 

@@ -23,9 +23,9 @@ def test_any_name_can_be_drawn(small_scene, tmp_path, name):
 
 
 def test_a_full_disk_is_one_error(tmp_path):
-    code = ("from radiotwin.report import style; from radiotwin.errors import RunFailed\n"
-            "figure = style.new_figure(4, 4); figure.add_subplot().plot([1, 2])\n"
-            "try:\n    style.save(figure, 'figure.png')\nexcept RunFailed as error:\n    print(error)")
+    code = ("from radiotwin.report import labels; from radiotwin.errors import RunFailed\n"
+            "figure = labels.new_figure(4, 4); figure.add_subplot().plot([1, 2])\n"
+            "try:\n    labels.save(figure, 'figure.png')\nexcept RunFailed as error:\n    print(error)")
     (tmp_path / "figure.png").write_bytes(b"old")
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, env=os.environ,
                           preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)))
