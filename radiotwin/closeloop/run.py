@@ -63,7 +63,7 @@ class Loop(Summarised):
         found: base and effects, and the log of all trials.
         criteria: thresholds that decided.
         dependences_before, dependences_after: of the held-out residual.
-        seed: of what is still to be drawn.
+        seed: of the folds, and of the draws in `prediction`.
         noise_floor_db: from links measured twice at one position; NaN where there are none.
         origin: of the frame of the links; None where it is not known.
     """
@@ -88,7 +88,10 @@ class Loop(Summarised):
 
     @cached_property
     def for_twin(self) -> CrossFit:
-        """The same without curves that no map has; with the rest, if it goes with just that."""
+        """`after`, fitted again without effects that no map can show.
+
+        If there are none it is `after` itself, with its interpolated shadowing.
+        """
         dropped = [each.effect for each in self.after.whole.effects
                    if not (each.effect.is_cause or each.effect.is_declared
                            or each.effect.is_on_maps(each.params))]

@@ -51,8 +51,8 @@ class SearchState:
 
     Attributes:
         model: base and effects; these are in the order of `log.kept`.
-        log: every trial. Of faults those kept and, once no more passed, the last ones refused; of
-            effects beside another (pairs, more of a kind) those kept.
+        log: trials. Not every refused one is logged: of faults only those of the last round are,
+            of effects beside another (pairs, more of a kind) only those kept.
         steps: what the residual says before each named effect; the last is of what is left.
         looked_at: the model that was looked at last, and the hypotheses about what it lacks.
         notes: what was found about effects that are declared, a sentence each.

@@ -1,4 +1,4 @@
-"""Trials of effects, and the log of them that the verdict and every page read.
+"""Trials of effects, and their log, from which `closeloop.json` and the pages are made.
 
 A trial never changes. Where a later judgement changes what is said of it, a new trial with its
 number supersedes it: `TrialLog.trials` has the last word on each.
@@ -29,11 +29,11 @@ class Trial:
             their fold could know.
         p_value: of no gain, links that err alike counted as one, corrected for the candidates.
         step: number of effects that were there before.
-        gain_by_fold: (folds,) `nll_gain` of each fold over the number of links that count as one;
+        gain_by_fold: (folds,) `nll_gain` of each fold, divided by the design effect;
             empty where it was not tried.
         evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
             it was not looked at.
-        passed: whether held-out links support it, however probable it is.
+        passed: whether held-out links support it; it may be refused for other reasons.
         features: (6,) what its probability depends on, see `radiotwin.closeloop.verdict.posterior`;
             empty where it was not tried.
         probability: that it is there.
@@ -77,7 +77,7 @@ class Trial:
 
     @property
     def is_open(self) -> bool:
-        """Whether nothing speaks against it, though it was not kept."""
+        """Whether it was neither kept nor refused."""
         return not self.kept and not self.reason
 
     def keep(self, **changes: Any) -> Trial:

@@ -63,13 +63,13 @@ class FittedEffect:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """All links, of which some are learnt from: one fold, or the whole.
+    """A channel and effects on n links, of which those in `train` are learnt from; not fitted yet.
 
     Attributes:
         links: n links, with the devices where the channel has them.
         train: (n,) bool, links that are learnt from.
         usable: (n,) bool, links to devices that have a position.
-        channel: fitted to the training links.
+        channel: fitted already.
         channel_db: (n,) its mean level [dB].
         level_columns: (n, p0) what is fitted again of the channel: `ChannelModel.level_columns`.
         level_prior_sd_db: (p0,) prior standard deviations of it.
@@ -425,16 +425,15 @@ class FittedModel:
     def for_positions(self) -> FittedModel:
         """Return the same without what takes too long for each place where a device may be.
 
-        That is what the base says of errors of a map, for which each link is followed over nine
-        maps, and effects that follow paths. Curves without a cause go, too: they describe what is
-        left on links of devices whose positions are known. How far their lack displaces devices is
-        in `radius_factor`.
+        Left out are effects that follow paths, among them errors of the map (nine maps for each
+        link), and curves without a cause, which describe devices whose positions are known. How far
+        their lack displaces devices is in `radius_factor`.
         """
         return replace(self, effects=tuple(each for each in self.effects
                                            if each.effect.is_cause and not each.effect.in_paths))
 
     def on_links(self, links: Links) -> Fit:
-        """Return the fit with any links (n,) in place of those that it has learnt from.
+        """Return these coefficients on other links (n,); all of them are in `train`, which says nothing.
 
         Where the links have no receivers (a map's have none) those are faultless: effects of
         receivers are left out.
