@@ -433,7 +433,7 @@ class FittedModel:
                                            if each.effect.is_cause and not each.effect.in_paths))
 
     def on_links(self, links: Links) -> Fit:
-        """Return these coefficients on other links (n,); all of them are in `train`, which says nothing.
+        """Return these coefficients on other links (n,), all of which are in `train`.
 
         Where the links have no receivers (a map's have none) those are faultless: effects of
         receivers are left out.
