@@ -50,7 +50,7 @@ THIN = 3  # one position in so many of the hidden and the null cases
 EVERY = 12  # one transmitter position in so many of the POWDER set
 CELL_M = 10.0  # one reading of a sector in each cell of the campus
 LEFT_OUT = re.compile(r"(^|_)(seconds|version|versions|cpu|wall|created|time_utc|date|elapsed)"
-                      r"(_s)?$|^peak_|^seconds_")
+                      r"(_s)?$|^peak_|^seconds_|^(learn_twin|round)_s$")
 WORDS = re.compile(r"\b\d+(\.\d+)? (s|min|h|seconds|minutes)\b|\d\d:\d\d:\d\d|0\+source"
                    r"|/\S*guard\S*|/tmp/\S*|0\.1\.0\S*")
 COST_RATIO = 1.1
@@ -278,7 +278,8 @@ def fedqmix(scene: Path, call: Call) -> list[str]:
 def fingerprints(folder: Path) -> Iterator[tuple[str, object]]:
     """Yield the name of each file of a folder and the hashes of its parts."""
     for path in sorted(folder.rglob("*")):
-        if path.is_file() and not path.name.startswith("events.out"):
+        # Events and checkpoints of planning repeat the rows of metrics.csv with their times.
+        if path.is_file() and not path.name.startswith(("events.out", "checkpoint")):
             yield path.relative_to(folder).as_posix(), fingerprint(path)
 
 
