@@ -36,11 +36,7 @@ MAX_LINE = 200
 
 
 def new_axes(ax: Axes | None) -> Axes:
-    """Return axes to draw into.
-
-    Args:
-        ax: given by the user; None: those of a new figure of pyplot, which notebooks show.
-    """
+    """Return axes to draw into: the user's, or those of a new figure of pyplot, for notebooks."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt
@@ -60,12 +56,9 @@ class PlotFrame:
 
     @classmethod
     def choose(cls, origin: Origin | None, geographic: bool | None) -> PlotFrame:
-        """Return the frame of a plot.
+        """Return the frame of a plot: longitude and latitude, or metres.
 
-        Args:
-            origin: of the local frame; None: not known.
-            geographic: True: longitude and latitude, False: metres, None: longitude and latitude
-                where the origin is known.
+        With `geographic` None it is longitude and latitude if the origin is known.
 
         Raises:
             BadInput: longitude and latitude are wanted and the origin is not known.
@@ -102,15 +95,9 @@ METRES = PlotFrame()
 
 def draw_cells(ax: Axes, frame: PlotFrame, x_m: np.ndarray, y_m: np.ndarray, values: np.ndarray,
                **look: Any) -> QuadMesh:
-    """Draw values in cells around the positions of a grid.
+    """Draw values (ny, nx) in cells around positions x (nx,) and y (ny,), ascending [m].
 
-    Args:
-        ax: to draw into.
-        frame: of the axes.
-        x_m: (nx,) ascending [m].
-        y_m: (ny,) ascending [m].
-        values: (ny, nx); NaN stays empty.
-        look: of `Axes.pcolormesh`.
+    NaN stays empty; `look` is that of `Axes.pcolormesh`.
     """
     corners = frame.at(*np.meshgrid(_edges(x_m, y_m), _edges(y_m, x_m)))
     return ax.pcolormesh(*corners, values, rasterized=True, linewidth=0, **look)
@@ -239,16 +226,11 @@ def span(low: float, high: float, unit: str) -> str:
 
 def geo_data_frame(table: pd.DataFrame, origin: Origin | None, *, position_m: np.ndarray | None
                    = None, geometry: Any = None) -> GeoDataFrame:
-    """Return a table with a geometry in metres of the local frame.
+    """Return a table of n rows with a geometry in metres of the local frame.
 
-    Its reference system is that of the frame, where the origin is known: `.to_crs(4326)` gives
-    longitude and latitude.
-
-    Args:
-        table: n rows.
-        origin: of the local frame; None: the result has no reference system.
-        position_m: (n, 2) or (n, 3) points [m]; a row with NaN has no geometry.
-        geometry: (n,) shapes in place of points.
+    The geometry is points (n, 2) or (n, 3) [m], none for a row with NaN, or other shapes (n,). Its
+    reference system is that of the frame, if the origin is known: `.to_crs(4326)` gives longitude
+    and latitude.
 
     Raises:
         BadInput: GeoPandas is not installed.

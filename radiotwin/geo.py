@@ -15,7 +15,7 @@ import os
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -43,42 +43,29 @@ SAME_DEG, SAME_ALTITUDE_M = 1e-9, 1e-3  # of one place, after rounding: 0.1 mm o
 
 
 def local_crs(origin: Origin) -> str:
-    """Return the PROJ string of the local frame, for programs that georeference files.
-
-    Args:
-        origin: of the local frame.
-    """
+    """Return the PROJ string of the local frame, for programs that georeference files."""
     return (f"+proj=aeqd +lat_0={origin.latitude_deg!r} +lon_0={origin.longitude_deg!r} "
             "+x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs +type=crs")
 
 
+def origin_attributes(origin: Origin | None) -> dict[str, Any]:
+    """Return an origin as attributes of a data set: `origin_latitude_deg` and so on."""
+    return {} if origin is None else {
+        f"origin_{name}": value for name, value in origin.model_dump().items()}
+
+
 def to_local(origin: Origin, longitude_deg: ArrayLike,
              latitude_deg: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Convert longitude and latitude to the local frame.
+    """Convert longitude and latitude [degrees] to x and y of the local frame [m].
 
-    Args:
-        origin: of the local frame.
-        longitude_deg: (n,) [degrees].
-        latitude_deg: (n,) [degrees].
-
-    Returns:
-        x and y [m], (n,) each; not finite where the projection is undefined.
+    They are not finite where the projection is undefined.
     """
     longitude_deg, latitude_deg = np.asarray(longitude_deg, float), np.asarray(latitude_deg, float)
     return _projection(origin)(longitude_deg, latitude_deg)
 
 
 def to_geographic(origin: Origin, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Convert points of the local frame to longitude and latitude.
-
-    Args:
-        origin: of the local frame.
-        x_m: (n,) [m].
-        y_m: (n,) [m].
-
-    Returns:
-        longitude and latitude [degrees], (n,) each.
-    """
+    """Convert x and y of the local frame [m] to longitude and latitude [degrees]."""
     return _projection(origin)(np.asarray(x_m, float), np.asarray(y_m, float), inverse=True)
 
 
@@ -89,10 +76,7 @@ def _projection(origin: Origin) -> "Proj":
 
 
 def reference_system(name: str) -> "CRS":
-    """Return a coordinate reference system.
-
-    Args:
-        name: `AUTHORITY:CODE`, URN, title of PROJ's database, or WKT.
+    """Return a system by `AUTHORITY:CODE`, URN, title of PROJ's database, or WKT.
 
     Raises:
         pyproj.exceptions.CRSError: it is not known, or a name that could open a file.
@@ -116,8 +100,7 @@ class FrameRecord(Table):
     crs: str | None = Field(None, description="PROJ string of the frame, for other programs")
     origin: Origin
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False,
-                              populate_by_name=True)
+    model_config = ConfigDict(populate_by_name=True)
 
     @model_validator(mode="after")
     def _consistent(self) -> "FrameRecord":
@@ -129,9 +112,6 @@ class FrameRecord(Table):
 
 def read_frame(folder: Path) -> Origin | None:
     """Return the origin of the frame of a folder's tables; None where `frame.toml` is absent.
-
-    Args:
-        folder: of the tables.
 
     Raises:
         BadInput: it cannot be read, it leads out of its folder, or a value is not allowed.
@@ -152,12 +132,7 @@ def read_frame(folder: Path) -> Origin | None:
 
 
 def write_frame(origin: Origin, path: Path) -> None:
-    """Write `frame.toml`.
-
-    Args:
-        origin: of the frame.
-        path: of the file.
-    """
+    """Write `frame.toml`."""
     record = FrameRecord(origin=origin, crs=local_crs(origin))
     with path.open("wb") as file:
         tomli_w.dump(record.model_dump(by_alias=True), file)
@@ -166,9 +141,6 @@ def write_frame(origin: Origin, path: Path) -> None:
 def place(origin: Origin) -> str:
     """Return an origin as a message names it.
 
-    Args:
-        origin: of a frame.
-
     >>> place(Origin(latitude_deg=36.0001, longitude_deg=-78.93575))
     '36.0001, -78.93575'
     """
@@ -176,12 +148,7 @@ def place(origin: Origin) -> str:
 
 
 def is_same_frame(one: Origin, other: Origin) -> bool:
-    """Return whether coordinates of one frame are those of the other.
-
-    Args:
-        one: origin of a frame.
-        other: origin of another.
-    """
+    """Return whether coordinates of the frame about one origin are those of the other."""
     turn_deg = abs(one.longitude_deg - other.longitude_deg) % 360
     return (abs(one.latitude_deg - other.latitude_deg) <= SAME_DEG
             and min(turn_deg, 360 - turn_deg) <= SAME_DEG
@@ -189,18 +156,10 @@ def is_same_frame(one: Origin, other: Origin) -> bool:
 
 
 def between_frames(position_m: np.ndarray, one: Origin, other: Origin) -> np.ndarray:
-    """Convert positions exactly, by way of latitude and longitude.
+    """Convert positions (n, 3) [m] exactly, by way of latitude and longitude; NaN stays.
 
     Heights count from the ground of a frame. They change only where both frames declare their
     ground's altitude: one of 0 m, which maps have that know no terrain, declares none.
-
-    Args:
-        position_m: (n, 3) in the frame about `one` [m]; NaN where unknown.
-        one: origin of their frame.
-        other: origin of the frame to convert to.
-
-    Returns:
-        (n, 3) in the frame about `other` [m].
     """
     moved_m = np.array(position_m, dtype=float)
     known = np.isfinite(moved_m[:, :2]).all(axis=1)

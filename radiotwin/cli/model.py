@@ -109,7 +109,6 @@ def map_(
     from radiotwin.maps.form import is_map
     from radiotwin.report import check_map_target, export_map
     from radiotwin.scene import Scene
-    from radiotwin.scene.folder import files_of
 
     if out is None and is_map(twin):
         raise BadInput(f"{twin} is a radio map already; give the file to write with --out")
@@ -117,7 +116,7 @@ def map_(
     out = out or place.with_name(f"{place.name}.nc")
     world = Scene.load(scene)
     check_map_target(out, world)
-    keep_inputs(out, twin, *files_of(world))
+    keep_inputs(out, twin, *world.files)
     with open_model(twin) as source:
         written = export_map(source, world, out, devices=split_names(devices),
                              altitudes_m=_altitudes(altitudes), name=str(twin), tell=notice)
@@ -334,7 +333,6 @@ def locate(
     from radiotwin.io.inputs import keep_inputs
     from radiotwin.links.measurements import read_measurements
     from radiotwin.scene import Scene
-    from radiotwin.scene.folder import files_of
     from radiotwin.twin import Twin
     from radiotwin.twin.localize.without_map import MIN_LINKS
     from radiotwin.twin.locate import (
@@ -347,7 +345,7 @@ def locate(
     require_suffix(out, ".csv", ".csv.gz")
     keep_inputs(out, measurements, devices or measurements.parent / "devices.csv", truth)
     known, world = Twin.load(twin), Scene.load(scene) if scene else None
-    keep_inputs(out, *(files_of(world) if world else []))
+    keep_inputs(out, *(world.files if world else []))
     check_can_locate(known, world)  # before a file is read that may be large
     data = in_frame_of(world, read_measurements(measurements, devices), shift)
     true = read_truth(truth, known.origin or data.origin) if truth else None

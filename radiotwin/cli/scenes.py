@@ -158,7 +158,6 @@ def export(
     """
     from radiotwin.io.inputs import keep_inputs
     from radiotwin.scene import Scene
-    from radiotwin.scene.folder import files_of
     from radiotwin.trace import read_points
     from radiotwin.twin.point_gains import export_ns3
 
@@ -166,7 +165,7 @@ def export(
         raise BadInput(f"--to {to!r} is unknown; allowed is ns3")
     world = Scene.load(scene)
     for name in ("nodes.csv", "losses.csv"):
-        keep_inputs(out / name, points, *files_of(world))
+        keep_inputs(out / name, points, *world.files)
     ends_m = read_points(points, world.config.origin, world.city)
     with open_model(source) as model:
         pairs = export_ns3(model, world, ends_m, out, devices=split_names(devices))
@@ -226,13 +225,12 @@ def trace(
     from radiotwin.runtime.cuda import tracing_device
     from radiotwin.runtime.execution import open_executor, worker_count
     from radiotwin.scene import Scene
-    from radiotwin.scene.folder import files_of
     from radiotwin.trace import trace_map, truth_path
 
     used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
     out = out or truth_path(scene, names)
-    keep_inputs(out, *files_of(scene))
+    keep_inputs(out, *scene.files)
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
                          combining=combining, seed=seed, radius_m=radius,
                          compute_device=used)
@@ -295,12 +293,11 @@ def gains(
     from radiotwin.runtime.execution import open_executor
     from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.scene import Scene
-    from radiotwin.scene.folder import files_of
     from radiotwin.trace import read_points, trace_points
 
     used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
-    keep_inputs(out, points, *files_of(scene))
+    keep_inputs(out, points, *scene.files)
     points_m = read_points(points, scene.config.origin, scene.city)
     settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed,
                          radius_m=radius, compute_device=used)
@@ -331,11 +328,10 @@ def paths(
     from radiotwin.io.inputs import keep_inputs
     from radiotwin.propagation.paths.listing import list_paths
     from radiotwin.scene import Scene
-    from radiotwin.scene.folder import files_of
     from radiotwin.trace import read_points
 
     scene = Scene.load(folder)
-    keep_inputs(out, points, *files_of(scene))
+    keep_inputs(out, points, *scene.files)
     points_m = read_points(points, scene.config.origin, scene.city)
     found = list_paths(scene, points_m, out, split_names(devices),
                        None if velocity is None else _speeds(velocity), bandwidth_hz)
@@ -403,11 +399,10 @@ def survey(
     from radiotwin.io.inputs import keep_inputs
     from radiotwin.maps.survey import fly_survey, read_truth
     from radiotwin.scene import Scene
-    from radiotwin.scene.folder import files_of
 
     scene = Scene.load(folder)
     for written in (out, out.parent / "devices.csv"):
-        keep_inputs(written, *files_of(scene))
+        keep_inputs(written, *scene.files)
     measurements = fly_survey(scene, read_truth(scene, truth), flights=flights, pattern=pattern,
                               seed=seed, noise_db=noise_db)
     measurements.write(out)

@@ -34,6 +34,7 @@ from radiotwin.coverage.transmitters import (
     with_defaults,
 )
 from radiotwin.errors import BadInput
+from radiotwin.geo import origin_attributes
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
@@ -272,9 +273,7 @@ def _dataset(values: dict[str, np.ndarray], transmitters: list[Transmitter], gri
                          coords={"y": grid.y_m, "x": grid.x_m,
                                  "transmitter": np.array([each.name for each in transmitters],
                                                          dtype=object)}, attrs=attributes)
-    if scene.config.origin is not None:
-        dataset.attrs |= {f"origin_{name}": value for name, value in
-                          scene.config.origin.model_dump().items()}
+    dataset.attrs |= origin_attributes(scene.config.origin)
     for name in dataset.data_vars:
         key = str(name)
         for ending in ("_dbm", "_db", "_bps"):

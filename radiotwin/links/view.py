@@ -17,6 +17,7 @@ from radiotwin.display import (
     some,
 )
 from radiotwin.errors import BadInput
+from radiotwin.geo import origin_attributes
 from radiotwin.io.forms import Origin
 from radiotwin.scene.plot import draw_outlines
 
@@ -90,15 +91,14 @@ def plot_links(table: pd.DataFrame, values: np.ndarray, ax: Axes, frame: PlotFra
 
 def links_dataset(table: pd.DataFrame, origin: Origin | None) -> xr.Dataset:
     """Return the columns of a table as variables over the dimension `link`, with units."""
-    attributes = {} if origin is None else {
-        f"origin_{name}": value for name, value in origin.model_dump().items()}
     variables = {}
     for name in table:
         unit = next((unit for ending, unit in _UNITS.items() if str(name).endswith(ending)), None)
         values = table[name].to_numpy()
         variables[name] = ("link", values.astype(object) if values.dtype.kind not in "biuf"
                            else values, {} if unit is None else {"units": unit})
-    return xr.Dataset(variables, {"link": np.arange(len(table))}, attributes)
+    return xr.Dataset(variables, {"link": np.arange(len(table))},
+                      origin_attributes(origin))
 
 
 def links_table(table: pd.DataFrame, origin: Origin | None) -> GeoDataFrame:

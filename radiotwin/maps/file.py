@@ -229,15 +229,10 @@ def _open_zarr(path: Path) -> Iterator[xr.Dataset]:
 
 @contextmanager
 def open_dataset(path: Path) -> Iterator[xr.Dataset]:
-    """Open a radio map whose values stay in its file until they are asked for.
+    """Open a radio map, NetCDF-4 or Zarr, whose values stay in its file until they are asked for.
 
-    All of it has been read once, in parts, and checked.
-
-    Args:
-        path: of a NetCDF-4 file, or of a Zarr folder.
-
-    Yields:
-        the dataset, which can be read until the context ends.
+    All of it has been read once, in parts, and checked. The dataset can be read until the context
+    ends.
 
     Raises:
         BadInput: no such file, damaged, or not a radio map.
@@ -250,10 +245,7 @@ def open_dataset(path: Path) -> Iterator[xr.Dataset]:
 
 
 def load_dataset(path: Path) -> xr.Dataset:
-    """Read a radio map into memory.
-
-    Args:
-        path: of a NetCDF-4 file, or of a Zarr folder.
+    """Read a radio map, NetCDF-4 or Zarr, into memory.
 
     Raises:
         BadInput: as `open_dataset`, or it is too large to be in memory.
@@ -318,9 +310,6 @@ def _as_bool(stored: xr.Variable) -> xr.Variable:
 def check_target(path: Path | str) -> None:
     """Check that a radio map can be written under a name; call it before long work.
 
-    Args:
-        path: of the file; `NAME.zarr` of a Zarr folder.
-
     Raises:
         BadInput: it cannot be written, or something else is there.
         RunFailed: the disk is full.
@@ -332,12 +321,7 @@ def check_target(path: Path | str) -> None:
 
 
 def size_of(shape: tuple[int, ...], devices: int) -> str:
-    """Return what a map takes that is written part by part, for people.
-
-    Args:
-        shape: numbers of positions along z, y and x.
-        devices: number of devices.
-    """
+    """Return, for people, the size of a map of shape (z, y, x) that is written part by part."""
     parts = list(parts_of(shape))
     values = max(math.prod(each.stop - each.start for each in part) for part in parts)
     return (f"{devices * math.prod(shape):,} links in {devices * len(parts):,} parts, of which one "
@@ -347,13 +331,13 @@ def size_of(shape: tuple[int, ...], devices: int) -> str:
 
 def write_parts(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[MapBlock],
                 path: Path | str) -> None:
-    """Write a radio map block by block, atomically.
+    """Write a radio map block by block, atomically: `NAME.zarr` as a Zarr folder, else NetCDF-4.
 
     Args:
         top: coordinates and attributes of the map.
         dtypes: of its variables, by name.
         blocks: of it, in the order of an array.
-        path: `NAME.zarr` for a Zarr folder; any other name for NetCDF-4.
+        path: of the file or folder.
 
     Raises:
         BadInput: `path` cannot be written.

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from radiotwin.errors import BadInput
-from radiotwin.geo import local_crs
+from radiotwin.geo import local_crs, origin_attributes
 from radiotwin.io.files import atomic_file
 from radiotwin.io.forms import Origin
 from radiotwin.runtime.console import progress
@@ -136,19 +136,14 @@ def header(devices: list[str], lattice: Lattice, attributes: dict[str, Any] | No
 def placed_attributes(attributes: dict[Hashable, Any] | dict[str, Any],
                       origin: Origin | None) -> dict[str, Any]:
     """Return the attributes of a map with another origin of the local frame, or with none."""
-    new = {} if origin is None else {
-        f"origin_{name}": value for name, value in origin.model_dump().items()}
     return {str(name): value for name, value in attributes.items()
-            if not str(name).startswith("origin_")} | new
+            if not str(name).startswith("origin_")} | origin_attributes(origin)
 
 
 def parts_of(shape: tuple[int, ...]) -> Iterator[tuple[slice, slice, slice]]:
     """Return slices of (z, y, x), in the order of an array, of at most `BLOCK_VALUES` each.
 
     A small lattice is one part; others are cut into levels, rows and, if need be, columns.
-
-    Args:
-        shape: numbers of positions along z, y and x.
     """
     levels, rows, columns = shape
     if levels * rows * columns <= BLOCK_VALUES:
@@ -166,19 +161,9 @@ def parts_of(shape: tuple[int, ...]) -> Iterator[tuple[slice, slice, slice]]:
 
 def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[MapBlock],
                  path: Path | str) -> None:
-    """Write a radio map as compressed NetCDF-4 by the CF conventions, atomically.
+    """Write a radio map as compressed NetCDF-4 by the CF conventions; see `write_parts`.
 
     HDF5 crashes where a write fails: it writes to a file that keeps the error until the end.
-
-    Args:
-        top: coordinates and attributes of the map.
-        dtypes: of its variables, by name.
-        blocks: of it.
-        path: of the file.
-
-    Raises:
-        BadInput: `path` cannot be written.
-        RunFailed: the disk is full or failed; an older file is unchanged.
     """
     import h5netcdf  # type: ignore[import-untyped]
 

@@ -36,7 +36,7 @@ from radiotwin.display import (
     span,
 )
 from radiotwin.errors import BadInput
-from radiotwin.geo import is_same_frame, place
+from radiotwin.geo import is_same_frame, origin_attributes, place
 from radiotwin.io.forms import Origin
 from radiotwin.maps.file import load_dataset, open_dataset, write_parts
 from radiotwin.maps.form import (
@@ -188,11 +188,7 @@ class MapDifference(OverDevices):
 
     @classmethod
     def of(cls, first: xr.Dataset, second: xr.Dataset) -> MapDifference:
-        """Subtract the gains of a map from those of another.
-
-        Args:
-            first: dataset of a radio map.
-            second: dataset of another one with the same devices over the same lattice.
+        """Subtract the gains of a map's dataset from those of another, over the same lattice.
 
         Raises:
             BadInput: other devices, other positions, other ground, or another frame.
@@ -222,11 +218,9 @@ class MapDifference(OverDevices):
                            f"{place(other)}; make both for the same scene")
         order = [names[1].index(name) for name in names[0]]
         difference = first["gain_db"].values - second["gain_db"].values[order]
-        known = origin or other
-        attributes = {f"origin_{name}": value
-                      for name, value in (known.model_dump() if known else {}).items()}
-        attributes |= {"minuend": str(first.attrs.get("source", "")),
-                       "subtrahend": str(second.attrs.get("source", ""))}
+        attributes = origin_attributes(origin or other) | {
+            "minuend": str(first.attrs.get("source", "")),
+            "subtrahend": str(second.attrs.get("source", ""))}
         variable = (first["gain_db"].dims, difference.astype(np.float32),
                     {"units": "dB", "long_name": "difference of the gains"})
         return cls(xr.Dataset({DIFFERENCE: variable}, first.coords, attributes))
@@ -372,11 +366,7 @@ class RadioMap(OverDevices):
     write = save  # the name of version 0.1
 
     def require_of(self, scene: Scene) -> None:
-        """Raise BadInput unless the map was made for a scene as it is now, with all its devices.
-
-        Args:
-            scene: whose hash is held against the map's attribute `scene_hash`.
-        """
+        """Raise BadInput unless the map was made for a scene as it is now, with all its devices."""
         known = set(self.devices)
         missing = [device.device for device in scene.config.devices if device.device not in known]
         if missing or not self.is_over_lattice_of(scene) \
@@ -442,11 +432,7 @@ class RadioMap(OverDevices):
                                        for name, array in arrays.items()})
 
     def placed(self, origin: Origin | None) -> RadioMap:
-        """Return the same map with another origin of the local frame.
-
-        Args:
-            origin: the new origin; None removes it.
-        """
+        """Return the same map with another origin of the local frame, or with none."""
         dataset = self.dataset.copy()
         dataset.attrs = placed_attributes(dataset.attrs, origin)
         return RadioMap(dataset)

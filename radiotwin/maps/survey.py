@@ -44,11 +44,7 @@ class FlightGrid:
         self._steps: dict[Cell, np.ndarray] = {}
 
     def steps_to(self, cell: Cell) -> np.ndarray:
-        """Return the (ny, nx) moves from every cell to `cell`; UNREACHABLE where there is no way.
-
-        Args:
-            cell: (row, column).
-        """
+        """Return the moves from every cell (ny, nx) to `cell`; UNREACHABLE if there is no way."""
         cell = (int(cell[0]), int(cell[1]))
         if cell not in self._steps:
             steps = np.full(self.allowed.shape, UNREACHABLE)
@@ -77,16 +73,7 @@ class FlightGrid:
                 if 0 <= row < rows and 0 <= column < columns and self.allowed[row, column]]
 
     def path(self, start: Cell, end: Cell, rng: np.random.Generator) -> list[Cell]:
-        """Draw one of the shortest paths.
-
-        Args:
-            start: First cell, which is not part of the result.
-            end: Last cell, which is.
-            rng: Source of the choice.
-
-        Returns:
-            Cells (row, column) in order; none where there is no way to go.
-        """
+        """Draw one of the shortest paths: its cells after the start; none if there is no way."""
         steps, cells, cell = self.steps_to(end), [], start
         while steps[tuple(cell)] > 0:
             nearer = [n for n in self.neighbours(cell) if steps[n] < steps[tuple(cell)]]
@@ -309,14 +296,7 @@ def fly_survey(scene: Scene, truth: RadioMap | str = "traced", *, flights: int =
 
 
 def declared_devices(scene: Scene) -> pd.DataFrame:
-    """Return the devices as a survey knows them: unknown ones with their height only.
-
-    Args:
-        scene: Scene that declares them.
-
-    Returns:
-        Rows of `devices.csv`: device, x_m, y_m, z_m, role.
-    """
+    """Return rows of `devices.csv` as a survey knows them: unknown ones with their height only."""
     rows = [(device.device,
              *((device.x_m, device.y_m) if device.role == "anchor" else (np.nan, np.nan)),
              device.z_m, device.role)
@@ -325,16 +305,7 @@ def declared_devices(scene: Scene) -> pd.DataFrame:
 
 
 def fly(scene: Scene, uav: UavConfig, pattern: str, rng: np.random.Generator) -> np.ndarray:
-    """Fly one UAV once.
-
-    Args:
-        scene: City and lattice.
-        uav: Its altitude, start, terminal and battery.
-        pattern: Key of `PATTERNS`.
-        rng: Source of the path.
-
-    Returns:
-        (slots, 2) cells (row, column) from its start to its terminal.
+    """Fly one UAV once: (slots, 2) cells (row, column) from its start to its terminal.
 
     Raises:
         BadInput: The battery does not reach from the start to the terminal.
@@ -364,15 +335,10 @@ def _lattice_index(scene: Scene, uav: UavConfig, cells: np.ndarray) -> np.ndarra
 
 
 def heading_deg(cells: np.ndarray) -> np.ndarray:
-    """Return the heading along a flight, clockwise from north.
+    """Return the heading (slots,) along the cells (slots, 2) of a flight, clockwise from north.
 
-    It is that of the last move; the first slot has that of the next move.
-
-    Args:
-        cells: (slots, 2) cells (row, column).
-
-    Returns:
-        (slots,) headings [degrees]; 0 where the UAV never moves.
+    It is that of the last move; the first slot has that of the next move. It is 0 where the UAV
+    never moves.
     """
     moves = np.diff(cells, axis=0)
     heading = pd.Series(np.full(len(cells), np.nan))
@@ -385,14 +351,8 @@ def link_table(scene: Scene, flight: str, receiver: str, index: np.ndarray, leve
                time_s: np.ndarray, heading_deg: np.ndarray) -> pd.DataFrame:
     """Return the measurements of one receiver on one flight as rows of `Measurements.table`.
 
-    Args:
-        scene: Names and order of the devices.
-        flight: Name of the flight.
-        receiver: Name of the receiver.
-        index: (slots,) flat lattice index of the positions.
-        level_db: (devices, slots) gain [dB], NaN where not detected.
-        time_s: (slots,) times [s].
-        heading_deg: (slots,) headings [degrees].
+    Positions are flat indices (slots,) of the lattice, gains (devices, slots) [dB] with NaN where
+    not detected, times [s] and headings [degrees] (slots,) each.
     """
     devices, slots = len(level_db), len(index)
     position_m = scene.lattice.positions_m[index]

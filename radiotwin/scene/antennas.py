@@ -45,14 +45,9 @@ class Pattern:
         return float(self.gain_dbi.max())
 
     def at(self, azimuth_deg: ArrayLike, elevation_deg: ArrayLike) -> np.ndarray:
-        """Interpolate the gain, bilinear in dB and periodic in azimuth.
+        """Interpolate the gain [dBi], bilinear in dB and periodic in azimuth.
 
-        Args:
-            azimuth_deg: any shape, clockwise from the boresight.
-            elevation_deg: any shape that broadcasts with it, above zero upwards.
-
-        Returns:
-            Gain of the common shape [dBi].
+        Azimuths are clockwise from the boresight, elevations above zero upwards; they broadcast.
         """
         # The first column is repeated at the end: 359.5 degrees lies between the last and the first
         azimuths = np.append(self.azimuth_deg, self.azimuth_deg[0] + 360)
@@ -106,14 +101,7 @@ class Antenna:
     tilt_deg: float = 0.0
 
     def gain_dbi(self, rays: np.ndarray) -> np.ndarray:
-        """Return the gain along rays.
-
-        Args:
-            rays: (..., 3) directions east, north, up, of any length above zero.
-
-        Returns:
-            (...,) gain [dBi].
-        """
+        """Return the gain (...,) [dBi] along rays (..., 3) east, north, up, longer than 0."""
         azimuth, tilt = np.radians([self.azimuth_deg, self.tilt_deg])
         ahead = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
         right = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])

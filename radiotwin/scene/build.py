@@ -312,22 +312,16 @@ def build_scene(source: Path | str, out_folder: Path | str, options: BuildOption
         raise BadInput(f"{source} lies too far from its x = y = 0 for --origin to say where that "
                        "is: it was moved to the middle; move it nearer, or write [origin] into "
                        "scene.toml")
-    extent = None
-    moved_m = np.repeat(city.moved_m[:2], 2)  # of x_min, x_max, y_min, y_max
-    if options.extent_m is not None:
-        extent = make_extent(_four(np.array(options.extent_m) + moved_m))
-    elif options.bbox is not None:
-        corners = np.array(options.bbox) + np.tile(city.moved_m[:2], 2)
-        x_min, y_min, x_max, y_max = corners.tolist()
-        extent = make_extent((x_min, x_max, y_min, y_max))
+    extent, bounds_m = None, options.extent_m
+    if bounds_m is None and options.bbox is not None:
+        bounds_m = options.bbox[0], options.bbox[2], options.bbox[1], options.bbox[3]
+    if bounds_m is not None:
+        east_m, north_m, _ = city.moved_m
+        extent = make_extent((bounds_m[0] + east_m, bounds_m[1] + east_m,
+                              bounds_m[2] + north_m, bounds_m[3] + north_m))
     declared = Declared(str(source), scene_name(source), extent, options.origin,
                         _provenance(city, str(source), options))
     return finish_scene(city, declared, out_folder, options, check_only)
-
-
-def _four(bounds_m: np.ndarray) -> tuple[float, float, float, float]:
-    x_min, x_max, y_min, y_max = bounds_m.tolist()
-    return x_min, x_max, y_min, y_max
 
 
 @dataclass(frozen=True)
@@ -374,14 +368,20 @@ def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, optio
     city.problems.extend(material_problems)
     plan = _plan(city, declared, options)
     if not check_only:
-        with atomic_folder(out_folder) as folder:
-            write_city(folder, shapes)
-            write_config(plan.config, folder / "scene.toml")
-            keep_declarations(out_folder, folder)
-            if buildings is not None:
-                write_csv(buildings, folder / "buildings.csv")
-            draw_preview(Scene.load(folder), folder / "preview.png")
+        write_scene(out_folder, shapes, plan.config, buildings)
     return _report(city, shapes, plan, declared, options, None if check_only else out_folder)
+
+
+def write_scene(folder: Path, shapes: list[CityShape], config: SceneConfig,
+                buildings: pd.DataFrame | None = None) -> None:
+    """Write a scene folder with its preview, and `buildings.csv` if there is such a table."""
+    with atomic_folder(folder) as temporary:
+        write_city(temporary, shapes)
+        write_config(config, temporary / "scene.toml")
+        keep_declarations(folder, temporary)
+        if buildings is not None:
+            write_csv(buildings, temporary / "buildings.csv")
+        draw_preview(Scene.load(temporary), temporary / "preview.png")
 
 
 def _city_shapes(city: ImportedCity, frequency_hz: float

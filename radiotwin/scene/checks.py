@@ -54,33 +54,15 @@ def listed(names: Sequence[str]) -> str:
 
 
 def upright(vertices: np.ndarray, up: str) -> np.ndarray:
-    """Rotate coordinates so that the axis `up` becomes z; x stays x where it can.
-
-    Args:
-        vertices: (v, 3)
-        up: `x`, `y` or `z`.
-
-    Returns:
-        (v, 3)
-    """
+    """Return coordinates (v, 3) rotated so that the axis x, y or z becomes z; x stays if it can."""
     return vertices @ _TO_Z_UP[up].T
 
 
-def building_heights(surfaces: Surfaces) -> np.ndarray:
-    """Return the height of each part that has walls, from its lowest to its highest point."""
-    low, high = surfaces.part_bounds()
-    return (high - low)[surfaces.wall_share > 0.1, 2]
-
-
 def check_up_axis(surfaces: Surfaces, ground: np.ndarray) -> list[Problem]:
-    """Return an error if there is no ground with z up, but there is one with another axis up.
+    """Return an error if there is no ground (f,) with z up, but there is one with another axis up.
 
     Without any ground, the city seems to lie on its side if five or more parts are much taller than
     the whole city is wide in one direction.
-
-    Args:
-        surfaces: The city.
-        ground: (f,) bool, faces of the ground.
     """
     if ground.any():
         return []
@@ -109,12 +91,9 @@ def _has_ground_below(surfaces: Surfaces) -> bool:
 
 
 def check_units(surfaces: Surfaces) -> list[Problem]:
-    """Return warnings if sizes look like feet or kilometres, an error if no unit makes sense.
-
-    Args:
-        surfaces: The city, in metres if its unit is right.
-    """
-    heights = building_heights(surfaces)
+    """Return warnings if sizes look like feet or kilometres, an error if no unit makes sense."""
+    low, high = surfaces.part_bounds()
+    heights = (high - low)[surfaces.wall_share > 0.1, 2]  # of parts that have walls
     width = float(np.ptp(surfaces.vertices[:, :2], axis=0).max())
     if width > 100e3:  # wider than any city
         return [error(f"the city is {width / 1000:.4g} km wide if its unit is the metre; a shape "
@@ -137,12 +116,7 @@ def check_units(surfaces: Surfaces) -> list[Problem]:
 
 
 def check_ground(ground: np.ndarray, surfaces: Surfaces) -> list[Problem]:
-    """Return a warning if there is no ground.
-
-    Args:
-        ground: (f,) bool, faces of the ground.
-        surfaces: The city.
-    """
+    """Return a warning if no face (f,) is ground."""
     if ground.any():
         return []
     lowest_m = surfaces.vertices[:, 2].min()
@@ -152,13 +126,7 @@ def check_ground(ground: np.ndarray, surfaces: Surfaces) -> list[Problem]:
 
 
 def check_closed(surfaces: Surfaces, ground: np.ndarray, names: Sequence[str]) -> list[Problem]:
-    """Return one warning about open meshes, and one about roofs apart from their walls.
-
-    Args:
-        surfaces: The city.
-        ground: (f,) bool, faces of the ground, which may be open.
-        names: Names of the shapes.
-    """
+    """Return a warning about open meshes beside the ground, and about roofs apart from walls."""
     found = []
     opened = np.zeros(surfaces.shapes, dtype=bool)
     opened[surfaces.shape[surfaces.free_edges[1]]] = True

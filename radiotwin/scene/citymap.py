@@ -112,24 +112,21 @@ class CityMap:
             BadInput: No such file, malformed XML, a mesh that cannot be read, one outside the
                 folder, or no shape of the ground's name.
         """
-        read = read_triangles(xml_path)
-        shapes = [(mesh, material or CONCRETE) for mesh, material, _ in read]
-        of_ground = None
-        if terrain is not None:
-            named = [name == terrain for *_, name in read]
-            if not any(named):
-                raise BadInput(f"{xml_path} has no shape {terrain!r}, which scene.toml declares as "
-                               "the ground ([terrain] shape); correct the name")
-            of_ground = np.repeat(named, [len(mesh.faces) for mesh, _ in shapes])
-        starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in shapes)])
-        materials = list(dict.fromkeys(material for _, material in shapes))
-        return cls(np.concatenate([mesh.vertices for mesh, _ in shapes]),
-                   np.concatenate([mesh.faces + start for (mesh, _), start in zip(shapes, starts)]),
-                   materials, np.repeat([materials.index(material) for _, material in shapes],
-                                        [len(mesh.faces) for mesh, _ in shapes]), vegetation,
-                   of_ground, None if height_sd_m is None else np.repeat(
-                       [height_sd_m.get(name, np.nan) for *_, name in read],
-                       [len(mesh.faces) for mesh, _ in shapes]))
+        meshes, found, names = zip(*read_triangles(xml_path))
+        if terrain is not None and terrain not in names:
+            raise BadInput(f"{xml_path} has no shape {terrain!r}, which scene.toml declares as "
+                           "the ground ([terrain] shape); correct the name")
+        of_shape = [material or CONCRETE for material in found]
+        materials = list(dict.fromkeys(of_shape))
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        faces = [len(mesh.faces) for mesh in meshes]
+        return cls(
+            np.concatenate([mesh.vertices for mesh in meshes]),
+            np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)]),
+            materials, np.repeat([materials.index(each) for each in of_shape], faces), vegetation,
+            None if terrain is None else np.repeat([name == terrain for name in names], faces),
+            None if height_sd_m is None else np.repeat(
+                [height_sd_m.get(name, np.nan) for name in names], faces))
 
     @cached_property
     def ground_material(self) -> Material:
@@ -368,15 +365,9 @@ class CityMap:
 
 
 def building_of_vertex(city: CityMap) -> np.ndarray:
-    """Return the building that each corner belongs to; -1: only ground.
+    """Return the building (v,) that each corner belongs to; -1: only ground.
 
     A building is what is joined by its triangles, above the ground.
-
-    Args:
-        city: 3D map.
-
-    Returns:
-        (v,) int
     """
     corners, index = np.unique(np.round(city.vertices / SAME_CORNER_M).astype(np.int64), axis=0,
                                return_inverse=True)
@@ -397,13 +388,7 @@ def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int
 
     The walls on opposite sides of a building move independently, so that it is shifted and grows or
     shrinks; its roof keeps its shape. The same seed moves them in the same direction whatever the
-    size of the errors.
-
-    Args:
-        city: 3D map.
-        wall_sd_m: standard deviation of the position of a wall, across it [m].
-        height_sd_m: standard deviation of a building's height [m].
-        seed: of the errors.
+    standard deviations of a wall's position, across it, and of a building's height.
     """
     rng = np.random.default_rng(seed)
     building = building_of_vertex(city)
@@ -431,14 +416,8 @@ def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int
 def shape_height_sds_m(folder: Path) -> dict[str, float] | None:
     """Return the standard deviation of the height of each shape [m], as `buildings.csv` has it.
 
-    A shape is a block of buildings that touch: it has their mean, by area.
-
-    Args:
-        folder: of a scene.
-
-    Returns:
-        shape -> standard deviation; None: the folder has no such table, or one of an earlier
-        version, without the column `height_sd_m`.
+    A shape is a block of buildings that touch: it has their mean, by area. None if the folder has
+    no such table, or one of an earlier version (without the column `height_sd_m`).
 
     Raises:
         BadInput: the table cannot be read, lies outside the folder, or has an impossible value.

@@ -183,8 +183,7 @@ class SceneConfig(Table):
     terrain: TerrainConfig | None = Field(None, description="None: flat ground at z = 0")
     provenance: dict[str, str] = {}
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False,
-                              populate_by_name=True)
+    model_config = ConfigDict(populate_by_name=True)
 
     @model_validator(mode="after")
     def _consistent(self) -> "SceneConfig":
@@ -267,14 +266,10 @@ def _explain(path: Path, error: ValidationError) -> str:
 
 
 def parse_config(data: dict[str, Any], path: Path | str) -> SceneConfig:
-    """Check the content of a scene file.
-
-    Args:
-        data: Nested tables as TOML gives them.
-        path: File named in messages.
+    """Check the content of a scene file, nested tables as TOML gives them.
 
     Raises:
-        BadInput: An unknown key, an impossible value, or too many of them; names file, key, value
+        BadInput: An unknown key, an impossible value, or too many of them; names `path`, key, value
             and what is allowed.
     """
     for name, budget in (("devices", DEVICES), ("uavs", UAVS)):
@@ -291,9 +286,6 @@ def parse_config(data: dict[str, Any], path: Path | str) -> SceneConfig:
 def read_config(path: Path | str) -> SceneConfig:
     """Read and check `scene.toml`.
 
-    Args:
-        path: The file.
-
     Raises:
         BadInput: No such file, not TOML, an unknown key or an impossible value.
     """
@@ -308,10 +300,6 @@ def write_config(config: SceneConfig, path: Path | str) -> None:
 
     Devices and UAVs become `[[devices]]` and `[[uavs]]` tables, which tomli_w would fold into one
     array: so another table can be appended by hand.
-
-    Args:
-        config: Content of the file.
-        path: File to write.
     """
     data = config.model_dump(by_alias=True, exclude_none=True)
     lists = {name: data.pop(name) for name in ("uavs", "devices")}

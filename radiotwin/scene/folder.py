@@ -1,4 +1,4 @@
-"""The folder of a scene: its city read and written, its files replaced and copied, its source.
+"""The folder of a scene: its city read and written, what may be replaced in it, its source.
 
 All that uses a scene's geometry reads `city.xml` and its meshes here, whose author may be unknown.
 The ray tracer loads a copy that is written here from what was read, never the scene's own file: as
@@ -22,11 +22,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.io.files import atomic_folder
 from radiotwin.io.forms import MAX_COORDINATE_M
-from radiotwin.io.inputs import is_within, read_bytes, require_within
+from radiotwin.io.inputs import is_within
 from radiotwin.runtime.console import progress
-from radiotwin.scene.config import DeviceConfig, UavConfig, write_config
 from radiotwin.scene.materials import (
     RESERVED_NAMES,
     Material,
@@ -43,12 +41,9 @@ from radiotwin.scene.ply import write_ply
 if TYPE_CHECKING:
     import trimesh
 
-    from radiotwin.scene.scene import Scene
-
 EARLIER = "scene.toml.old"  # the declarations that a new scene replaced
 SCENE_FILES = frozenset({"scene.toml", EARLIER, "city.xml", "meshes", "preview.png",
                          "buildings.csv"})
-COPIED = ("buildings.csv",)  # beside what is written anew
 MAP_SUFFIXES = ".osm, .osm.pbf, .geojson, .gpkg, .parquet, .shp, .zip, .city.json, .gml"
 
 
@@ -70,10 +65,8 @@ class CityShape:
 def write_city(folder: Path | str, shapes: Sequence[CityShape]) -> None:
     """Write `city.xml` and `meshes/*.ply` into an existing folder.
 
-    Args:
-        folder: Scene folder; `atomic_folder` gives one that appears only when all is written.
-        shapes: Shapes with names that are unique, also among the names of materials (Sionna RT
-            keeps both in one register).
+    Names of shapes are unique, also among the names of materials (Sionna RT keeps both in one
+    register).
     """
     folder = Path(folder)
     (folder / "meshes").mkdir(exist_ok=True)
@@ -124,14 +117,9 @@ def _shape_element(shape: CityShape) -> ET.Element:
 
 
 def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None, str]]:
-    """Read the triangles of every shape, whatever it is made of.
+    """Read mesh, material and name of every shape of a `city.xml`, in the file's order.
 
-    Args:
-        xml_path: `city.xml` of a scene folder.
-
-    Returns:
-        The mesh, the material and the name of each shape in the file's order; None: no known
-        material.
+    The material is None if the shape's is not known.
 
     Raises:
         BadInput: No such file, malformed XML, an element or a mesh that cannot be read, or a file
@@ -144,16 +132,10 @@ def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None,
 
 
 def read_city(xml_path: Path | str) -> list[CityShape]:
-    """Read the shapes with their materials.
+    """Read the shapes of a `city.xml` with their materials, in the file's order.
 
     Names that Sionna RT or a file system would not accept are changed; those of a city that
     `write_city` wrote stay, and writing it again gives the same bytes.
-
-    Args:
-        xml_path: `city.xml` of a scene folder.
-
-    Returns:
-        The shapes in the file's order.
 
     Raises:
         BadInput: As `read_triangles`; or a shape without a known material.
@@ -210,21 +192,8 @@ def _meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
     return meshes
 
 
-def files_of(scene: Scene) -> list[Path]:
-    """Return the files and folders that a scene is read from, and its tables."""
-    ends: list[DeviceConfig | UavConfig] = [*scene.config.devices, *scene.config.uavs]
-    names = SCENE_FILES | {end.antenna for end in ends if end.antenna is not None}
-    return [scene.folder / name for name in sorted(names)]
-
-
 def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | None = None) -> None:
-    """Raise BadInput if writing the folder would erase something else.
-
-    Args:
-        folder: Folder to write.
-        allowed: Names that it may hold.
-        source: File that must not lie in it.
-    """
+    """Raise BadInput if writing a folder would erase more than the allowed names, or the source."""
     try:
         held = os.listdir(folder)
     except (FileNotFoundError, NotADirectoryError):
@@ -242,62 +211,25 @@ def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | N
 
 
 def keep_declarations(folder: Path, new: Path) -> None:
-    """Keep the `scene.toml` that a scene replaces, where it is another: it may have been edited.
+    """Keep a `scene.toml` that is replaced as `scene.toml.old`, with a warning, if it differs.
 
-    Args:
-        folder: that is replaced.
-        new: folder with the new `scene.toml`; gets the one before as `scene.toml.old`.
-
-    Warns:
-        There was another.
+    It may have been edited. `new` is the folder with the new `scene.toml`.
     """
     before = folder / "scene.toml"
     if before.is_file() and not filecmp.cmp(before, new / "scene.toml", shallow=False):
         shutil.copyfile(before, new / EARLIER)
         warnings.warn(f"{folder} held a scene with other declarations; its scene.toml is kept as "
-                      f"{EARLIER}", stacklevel=3)
+                      f"{EARLIER}", stacklevel=4)
     elif (folder / EARLIER).is_file():
         shutil.copyfile(folder / EARLIER, new / EARLIER)
 
 
-def copy_scene(scene: Scene, folder: Path) -> None:
-    """Write a copy of a scene folder; see `Scene.save`.
-
-    Its preview and what tracing left in it are not copied.
-
-    Args:
-        scene: to copy.
-        folder: to write; a scene that is already in it is replaced.
-    """
-    if is_within(scene.folder, folder):
-        raise BadInput(f"{folder} holds the scene itself, which the copy would replace; choose "
-                       "another folder")
-    ends: list[DeviceConfig | UavConfig] = [*scene.config.devices, *scene.config.uavs]
-    antennas = {Path(end.antenna).parts[0] for end in ends if end.antenna is not None}
-    check_target(folder, SCENE_FILES | antennas)
-    with atomic_folder(folder) as temporary:
-        write_city(temporary, read_city(scene.xml_path))
-        scene.copy_antennas(temporary)
-        write_config(scene.config, temporary / "scene.toml")
-        for name in COPIED:
-            path = scene.folder / name
-            if path.is_file():
-                require_within(scene.folder, path, str(scene.folder))
-                (temporary / name).write_bytes(read_bytes(path, "file of a scene"))
-
-
 def published_scene(name: str) -> Path:
-    """Return the folder of a published scene.
+    """Return the folder of a published scene, `rbm` or `rdm`.
 
     The scene in the folder `scenes` of the working directory comes first, then that of the source
-    tree that the package was imported from, then the copy inside an installed package.
-
-    Args:
-        name: `rbm` or `rdm`.
-
-    Returns:
-        The first of these folders that exists; `scenes/NAME` where none does, so that the message
-        of a missing scene names it.
+    tree that the package was imported from, then the copy inside an installed package. Where there
+    is none, it is `scenes/NAME`, so that the message of a missing scene names it.
     """
     package = Path(__file__).parents[1]
     here = Path("scenes") / name
@@ -315,10 +247,7 @@ def sionna_scenes() -> dict[str, Path]:
 
 
 def find_source(source: Path | str) -> Path:
-    """Return the file of a source.
-
-    Args:
-        source: A path, or `sionna:NAME`.
+    """Return the file of a source: a path, or `sionna:NAME`.
 
     Raises:
         BadInput: Unknown name (the message lists the known ones), no such file, or neither XML nor

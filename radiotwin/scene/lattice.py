@@ -105,13 +105,7 @@ class Lattice:
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
     def index_of(self, positions_m: np.ndarray) -> np.ndarray:
-        """Return the flat (z, y, x) index of each position.
-
-        Args:
-            positions_m: (n, 3) positions that lie on the lattice to within 1 cm [m].
-
-        Returns:
-            (n,) indices into `positions_m` of the lattice.
+        """Return the flat (z, y, x) index (n,) of positions (n, 3) on the lattice, to within 1 cm.
 
         Raises:
             BadInput: A position is not on the lattice.

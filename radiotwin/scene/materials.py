@@ -84,13 +84,11 @@ _OWN = ("default", "ground", "roof")
 
 
 def safe_name(text: str) -> str:
-    """Return the text with everything but ASCII letters, digits, `_` and `-` replaced by `_`.
+    """Return a text with everything but ASCII letters, digits, `_` and `-` replaced by `_`.
 
     Sionna RT 2.2 stops at `$` (a Mitsuba parameter) in a name, and reads scene files in the
     system's own encoding; `.` is Mitsuba's separator; `/` and the like cannot be in a file name.
-
-    Args:
-        text: Any text; more than 100 characters are cut off.
+    More than 100 characters are cut off.
     """
     return re.sub(r"[^A-Za-z0-9_-]", "_", text)[:100] or "unnamed"
 
@@ -104,11 +102,9 @@ class Names(set[str]):
 
 
 def unique_name(name: str, taken: set[str]) -> str:
-    """Return the name, with a number appended where it is taken, and add it to `taken`.
+    """Return a name, with a number appended if it is taken, and add it to `taken`.
 
-    Args:
-        name: Name to use.
-        taken: Names in use, in lower case; grows by one. `Names` where they may be many.
+    Names in `taken` are in lower case; `Names` if they may be many.
     """
     numbers = taken.last_numbers if isinstance(taken, Names) else {}
     free, number = name, numbers.get(name.lower(), 1)
@@ -156,11 +152,7 @@ def itu_name(text: str) -> str | None:
 
 
 def itu_material(text: str, **settings: Any) -> Material:
-    """Return a material of the ITU table, named after its type.
-
-    Args:
-        text: `concrete`, `itu_concrete`, ...
-        settings: Other fields of `Material`.
+    """Return a material of the ITU table, named after its type, with other fields of `Material`.
 
     Raises:
         BadInput: Not in the table.
@@ -176,10 +168,6 @@ def permittivity(name: str, frequency_hz: float) -> tuple[float, float, bool]:
 
     Outside the frequency ranges of its fit, the nearest end of the nearest range is used: the power
     laws are not extrapolated, as no measurements support them there.
-
-    Args:
-        name: `concrete`, `itu_concrete`, ...
-        frequency_hz: Frequency [Hz].
 
     Returns:
         Relative permittivity (real part), conductivity [S/m], and whether the frequency is in a
@@ -212,15 +200,9 @@ def ranges_text(name: str) -> str:
 
 
 def constants(material: Material, frequency_hz: float) -> tuple[float, float, bool]:
-    """Return the constants of any material.
+    """Return relative permittivity and conductivity [S/m] of a material, and if ITU covers it.
 
-    Args:
-        material: With or without an ITU type.
-        frequency_hz: Frequency [Hz].
-
-    Returns:
-        Relative permittivity, conductivity [S/m], and whether ITU covers the frequency (True for a
-        material with its own constants).
+    The last is whether the frequency is in a range of the table; True for own constants.
     """
     if material.itu is not None:
         return permittivity(material.itu, frequency_hz)
@@ -235,10 +217,6 @@ def traceable(material: Material, frequency_hz: float) -> Material:
     Sionna RT stops on an ITU material outside its ranges, at the scene's frequency or at the
     3.5 GHz that it loads with. Such a material is returned with the constants that `permittivity`
     gives, named `<name>-fixed`; any other is returned as it is.
-
-    Args:
-        material: Any material.
-        frequency_hz: Frequency of the scene [Hz].
     """
     if material.itu is None:
         return material
@@ -252,16 +230,13 @@ def traceable(material: Material, frequency_hz: float) -> Material:
 def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],
                   overrides: Mapping[str, str], must_use_all: bool = True
                   ) -> tuple[list[Material | None], list[Problem]]:
-    """Find the radio material of every shape.
+    """Find the radio material of every shape, None where there is none, and problems.
 
     Args:
         shapes: As declared.
         declared: `<bsdf>` elements of the file by identifier.
         overrides: Identifier of a material (with or without `mat-`) -> ITU material to use.
         must_use_all: Whether each override has to name a material of these shapes.
-
-    Returns:
-        The material of each shape, None where there is none, and the problems found.
 
     Raises:
         BadInput: An override names a material that the city does not use, or no ITU material.
@@ -292,7 +267,7 @@ def materials_by_name(names: Sequence[str | None], overrides: Mapping[str, str],
         The material of each shape, and a problem about those that concrete was taken for.
 
     Raises:
-        BadInput: An override names a material that the model does not use, or no ITU material.
+        BadInput: As `map_materials`.
     """
     by_name: dict[str | None, Material | None] = {}
     unknown: list[str] = []
@@ -417,15 +392,11 @@ def _with_surface(identifier: str, node: Node, material: Material) -> Material:
 
 def settle(materials: Sequence[Material], frequency_hz: float, taken: set[str]
            ) -> tuple[dict[Material, Material], list[Problem]]:
-    """Return the materials as Sionna RT accepts them at a frequency, with unique names.
-
-    Args:
-        materials: Materials in use.
-        frequency_hz: Frequency of the scene [Hz].
-        taken: Names in use, in lower case; grows.
+    """Return materials as Sionna RT accepts them at a frequency, with unique names.
 
     Returns:
-        Material as declared -> as written, and a problem for each that is written as constants.
+        Material as declared -> as written, whose name is added to `taken` in lower case, and a
+        problem for each that is written as constants.
     """
     written, found = {}, []
     for material in sorted(set(materials), key=lambda one: (one.name, repr(one))):
@@ -465,13 +436,9 @@ class MaterialTable:
     roof: str | None = None
 
     def material_of(self, tags: Mapping[str, str]) -> tuple[Material, str]:
-        """Return the material of a building and its source.
+        """Return the material of a building, and the tag it follows from or `default`.
 
-        Args:
-            tags: of the building; a value may be a list with `;`.
-
-        Returns:
-            The material, and the tag it follows from, as `building:material=brick`, or `default`.
+        The value of a tag may be a list with `;`. A tag is returned as `building:material=brick`.
         """
         for key, known in self.by_tag.items():
             for value in _values(tags, key):
@@ -548,11 +515,7 @@ def read_material_table(path: Path | str) -> MaterialTable:
 
 
 def with_pairs(table: MaterialTable, pairs: Mapping[str, str]) -> MaterialTable:
-    """Return a table with some entries replaced.
-
-    Args:
-        table: to change.
-        pairs: value of `building:material`, or `default`, `ground` or `roof` -> ITU material.
+    """Return a table with entries replaced: values of `building:material`, default, ground, roof.
 
     Raises:
         BadInput: a material is not in ITU-R P.2040.

@@ -3,9 +3,10 @@
 import io
 import os
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mapbox_earcut
 import numpy as np
@@ -42,17 +43,10 @@ class RawMesh:
 
 
 def load_shapes(shapes: Iterable[DeclaredShape], source: Path) -> Iterator[RawMesh]:
-    """Load the shapes of a city one by one, within the budgets of all their vertices and faces.
-
-    Args:
-        shapes: As read from the XML file.
-        source: That file.
-
-    Yields:
-        Triangles of each shape, see `load_shape`.
+    """Load the shapes of the XML file `source` one by one, within the budgets of all together.
 
     Raises:
-        BadInput: As `load_shape`, or a budget is exceeded.
+        BadInput: As `load_shape`, or they have too many vertices or faces.
     """
     budget = MeshBudget(source)
     for shape in shapes:
@@ -62,25 +56,14 @@ def load_shapes(shapes: Iterable[DeclaredShape], source: Path) -> Iterator[RawMe
 
 
 class MeshBudget:
-    """Vertices and faces of a city so far.
-
-    Args:
-        source: Its XML file; messages begin with it.
-    """
+    """Vertices and faces of a city so far; messages begin with `source`."""
 
     def __init__(self, source: Path) -> None:
         self._subject = f"{source} with its meshes"
         self._vertices = self._faces = 0
 
     def add(self, mesh: RawMesh) -> None:
-        """Add a mesh.
-
-        Args:
-            mesh: Of one shape.
-
-        Raises:
-            BadInput: All together have too many vertices or faces.
-        """
+        """Add the mesh of a shape; BadInput if all together have too many vertices or faces."""
         self._vertices += len(mesh.vertices)
         self._faces += len(mesh.faces)
         VERTICES.check(self._vertices, self._subject)
@@ -90,11 +73,7 @@ class MeshBudget:
 def load_shape(shape: DeclaredShape) -> RawMesh:
     """Read or make a declared shape's triangles and apply its `to_world` transform.
 
-    Args:
-        shape: As read from the XML file.
-
-    Returns:
-        Triangles in the file's units and axes.
+    They are in the file's units and axes.
 
     Raises:
         BadInput: A missing, truncated, unreadable or too large mesh file, an unsupported kind of
@@ -124,16 +103,14 @@ def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
     if not os.path.exists(path):
         raise BadInput(f"mesh file {path} does not exist (named in {shape.node.position}); put it "
                        "there or remove the shape")
-    return cut_polygons(path, *(read_ply(path) if shape.kind == "ply" else read_obj(path)))
+    if shape.kind == "ply":
+        return cut_polygons(path, *read_ply(path))
+    vertices, groups = read_obj_groups(path)  # all objects are one mesh, as in Mitsuba
+    return cut_polygons(path, vertices, [each for group in groups.values() for each in group])
 
 
 def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -> RawMesh:
-    """Check the polygons of a mesh file, and cut them into triangles.
-
-    Args:
-        path: mesh file, for messages.
-        vertices: (v, 3)
-        polygons: (n, k) indices of vertices, for each number of corners k.
+    """Check polygons, (n, k) indices for each number of corners k, and cut them into triangles.
 
     Raises:
         BadInput: a coordinate is not finite or too large, a face names a vertex that is not there,
@@ -153,15 +130,7 @@ def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -
 
 
 def check_vertices(vertices: np.ndarray, source: str) -> None:
-    """Check the corners of a mesh.
-
-    Args:
-        vertices: (v, 3)
-        source: of the mesh; the message begins with it.
-
-    Raises:
-        BadInput: a coordinate is not finite, or too large.
-    """
+    """Raise BadInput, which begins with `source`, if one of (v, 3) is not finite, or too large."""
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         raise BadInput(f"{source}: vertex {np.flatnonzero(~finite)[0] + 1} is not finite (NaN or "
@@ -187,40 +156,33 @@ def _triangulate(vertices: np.ndarray, polygons: np.ndarray) -> np.ndarray:
     convex = (np.einsum("nki,ni->nk", turn, normal) >= 0).all(axis=1)
     fan = np.stack([np.zeros(k - 2, dtype=int), np.arange(1, k - 1), np.arange(2, k)], axis=1)
     triangles = [polygons[convex][:, fan].reshape(-1, 3)]
-    drop = np.abs(normal[~convex]).argmax(axis=1)  # the axis along which the polygon is flattened
-    for polygon, points, axis in zip(polygons[~convex], corners[~convex], drop):
-        flat = np.ascontiguousarray(np.delete(points, axis, axis=1))
-        ends = np.array([k], dtype=np.uint32)
-        ears = mapbox_earcut.triangulate_float64(flat, ends).reshape(-1, 3).astype(int)
-        a, b, c = points[ears].swapaxes(0, 1)
-        made = np.cross(b - a, c - a).sum(axis=0)
-        wanted = np.cross(points - points[0], np.roll(points, -1, axis=0) - points[0]).sum(axis=0)
-        triangles.append(polygon[ears if made @ wanted >= 0 else ears[:, ::-1]])
+    triangles += [polygon[cut_polygon(points, [k])]
+                  for polygon, points in zip(polygons[~convex], corners[~convex])]
     return np.concatenate(triangles)
 
 
-def read_obj(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Read vertices and polygons of a Wavefront OBJ file; all objects are one mesh, as in Mitsuba.
+def cut_polygon(corners: np.ndarray, ends: Sequence[int]) -> np.ndarray:
+    """Cut a planar polygon with holes into triangles (t, 3), which turn as its outline does.
 
-    Args:
-        path: OBJ file.
-
-    Returns:
-        (v, 3) vertices, and an (n, k) array of vertex indices for each number of corners k.
-
-    Raises:
-        BadInput: As `read_obj_groups`.
+    The corners (n, 3) are those of its rings, of which the first is the outline; `ends` are the
+    numbers of corners up to the end of each ring.
     """
-    vertices, groups = read_obj_groups(path)
-    return vertices, [polygons for group in groups.values() for polygons in group]
+    outline = corners[:ends[0]]
+    # Twice its area, as a vector (Newell)
+    normal = np.cross(outline - outline[0], np.roll(outline, -1, axis=0) - outline[0]).sum(axis=0)
+    flat = np.ascontiguousarray(np.delete(corners, int(np.abs(normal).argmax()), axis=1))
+    ears: Any = mapbox_earcut.triangulate_float64(flat, np.array(ends, dtype=np.uint32))
+    triangles = ears.astype(np.int64).reshape(-1, 3)
+    a, b, c = corners[triangles].swapaxes(0, 1)
+    turned = np.cross(b - a, c - a).sum(axis=0) @ normal < 0
+    return triangles[:, ::-1] if turned else triangles
 
 
 def read_obj_groups(path: Path
                     ) -> tuple[np.ndarray, dict[tuple[str, str | None], list[np.ndarray]]]:
     """Read vertices and polygons of a Wavefront OBJ file by object (`o`, else `g`) and material.
 
-    Args:
-        path: OBJ file; the file of materials that it names is not opened.
+    The file of materials that it names is not opened.
 
     Returns:
         (v, 3) vertices, and for each pair of an object and a material with faces an (n, k) array of
@@ -291,10 +253,6 @@ def clean(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     Sionna RT finds a diffracting edge where two triangles share its two vertices, so a mesh that
     repeats vertices for every face would never diffract.
 
-    Args:
-        vertices_m: (v, 3) [m]
-        faces: (f, 3) indices of vertices.
-
     Returns:
         (v', 3) vertices [m], (f', 3) faces, and the number of triangles dropped.
     """
@@ -324,12 +282,7 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def is_volume(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
-    """Return whether triangles enclose a volume: every edge joins two of them, normals outwards.
-
-    Args:
-        vertices_m: (v, 3) [m]
-        faces: (f, 3) indices of vertices.
-    """
+    """Return whether triangles enclose a volume: every edge joins two of them, normals outwards."""
     if len(faces) == 0:
         return False
     start, end = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
@@ -341,11 +294,6 @@ def is_volume(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
 
 
 def connected(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return the (count,) label of the group that each of some things is in.
-
-    Args:
-        pairs: (n, 2) indices of things that belong together.
-        count: number of things.
-    """
+    """Return the group (count,) that each thing is in, by the pairs (n, 2) that belong together."""
     graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(count, count))
     return connected_components(graph, directed=False)[1]

@@ -96,8 +96,7 @@ class Node:
 class XmlReader:
     """Reads files into trees within one budget of bytes and elements for all of them.
 
-    Args:
-        path: First file, which messages about the budget name.
+    Messages about the budget name `path`, the first file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -105,13 +104,7 @@ class XmlReader:
         self._bytes = self._elements = self._files = 0
 
     def read(self, path: Path) -> Node:
-        """Parse one file.
-
-        Args:
-            path: XML file.
-
-        Returns:
-            The root element.
+        """Parse one file and return its root element.
 
         Raises:
             BadInput: No such file, malformed XML (with line and column), declared entities, too
@@ -141,15 +134,10 @@ class XmlReader:
 
 
 def read_numbers(node: Node, text: str, counts: tuple[int, ...]) -> np.ndarray:
-    """Return the finite numbers in a text.
-
-    Args:
-        node: Element that has the text, for the message.
-        text: Numbers separated by blanks or commas.
-        counts: How many there may be.
+    """Return the finite numbers in a text, separated by blanks or commas.
 
     Raises:
-        BadInput: Something else, or another count.
+        BadInput: Something else, or a number of them that is not in `counts`; it names the node.
     """
     words = text.replace(",", " ").split(maxsplit=max(counts))
     try:
@@ -166,11 +154,7 @@ def read_numbers(node: Node, text: str, counts: tuple[int, ...]) -> np.ndarray:
 
 
 def read_vector(node: Node, default: float) -> np.ndarray:
-    """Return the (3,) of `value="x, y, z"`, of `value="s"`, or of x=, y=, z=.
-
-    Args:
-        node: Element with these attributes.
-        default: Value of an axis that is not given.
+    """Return the (3,) of `value="x, y, z"`, of `value="s"`, or of x=, y=, z=, else the default.
 
     Raises:
         BadInput: Something else than finite numbers.
@@ -182,11 +166,7 @@ def read_vector(node: Node, default: float) -> np.ndarray:
 
 
 def shown(text: str) -> str:
-    """Return a text for a message: quoted, control characters escaped, the end of a long one cut.
-
-    Args:
-        text: As it stands in the file.
-    """
+    """Return a text for a message: quoted, control characters escaped, a long one cut."""
     return repr(text if len(text) <= 60 else text[:60] + "…")
 
 
@@ -261,14 +241,11 @@ class DeclaredCity:
 
 
 def read_mitsuba_xml(path: Path | str, scene_folder: bool = False) -> DeclaredCity:
-    """Read a scene file and the files that it includes; meshes are not opened.
+    """Read shapes and materials of a scene file and of those that it includes; meshes stay closed.
 
     Args:
         path: XML file; mesh files are looked for relative to the file that names them.
         scene_folder: Whether it is the `city.xml` of a scene folder, which may say less.
-
-    Returns:
-        Shapes and materials.
 
     Raises:
         BadInput: No such file, malformed XML, not a scene, an element that is not allowed, a value

@@ -265,14 +265,7 @@ def _transform(node: dict[str, Any]) -> np.ndarray:
 
 
 def read_model(path: Path) -> list[ModelPart]:
-    """Read the objects of a model.
-
-    Args:
-        path: file with a suffix of `UP_AXES`.
-
-    Returns:
-        Objects of the file, one for each material; of STL and PLY, which have none, the connected
-        parts.
+    """Read the objects of a model, one for each material; of STL and PLY the connected parts.
 
     Raises:
         BadInput: no such file, damaged, too large, or without triangles.

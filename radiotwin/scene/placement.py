@@ -44,9 +44,7 @@ class BuiltGrid:
     def over(cls, extent: Extent, buildings: CityMap | None) -> "BuiltGrid":
         """Make a grid with cells of 1 m, larger where that would need more than 2 million.
 
-        Args:
-            extent: Area of the grid.
-            buildings: 3D map of the buildings alone; None: there are none.
+        `buildings` is a map of them alone; None: there are none.
 
         Raises:
             BadInput: The extent is but a line.
@@ -88,16 +86,10 @@ class BuiltGrid:
 
 
 def building_bounds(surfaces: Surfaces, solid: np.ndarray) -> tuple[float, float, float, float]:
-    """Return the horizontal bounding box of the buildings.
+    """Return the horizontal bounding box of the buildings, x_min, x_max, y_min, y_max [m].
 
-    Where the buildings are but a line or nothing, it is that of the whole city.
-
-    Args:
-        surfaces: The city.
-        solid: (f,) bool, faces that are not ground.
-
-    Returns:
-        (x_min, x_max, y_min, y_max) [m], never narrower than a tenth of its length.
+    Where the buildings, faces (f,) that are `solid`, are but a line or nothing, it is that of the
+    whole city. It is never narrower than a tenth of its length.
     """
     box = np.zeros((2, 2))
     for faces in (solid, np.ones_like(solid)):
@@ -113,15 +105,10 @@ def building_bounds(surfaces: Surfaces, solid: np.ndarray) -> tuple[float, float
 
 def building_tops(surfaces: Surfaces, solid: np.ndarray, ground: CityMap | None
                   ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the highest point of each shape above the datum, and above the ground below it.
+    """Return the highest point of each shape (shapes,) above the datum, and above the ground [m].
 
-    Args:
-        surfaces: The city.
-        solid: (f,) bool, faces that are not ground; a shape without them counts 0.
-        ground: 3D map of the ground alone.
-
-    Returns:
-        (shapes,) tops [m], (shapes,) heights above the ground below the shape's middle [m].
+    The ground is that below the shape's middle, of a map of the ground alone. A shape without faces
+    that are `solid`, (f,) bool, counts 0.
     """
     _, high = surfaces.face_bounds()
     tops_m = np.zeros(surfaces.shapes)
@@ -141,11 +128,7 @@ def _height_m(ground: CityMap, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
 
 
 def choose_extent(bounds: tuple[float, float, float, float]) -> Extent:
-    """Move bounds outwards to whole steps of the lattice, so that both borders lie on it.
-
-    Args:
-        bounds: (x_min, x_max, y_min, y_max) [m].
-    """
+    """Move bounds outwards to whole steps of the lattice, so that both borders lie on it."""
     step_m = choose_step(bounds)
     x_min, x_max, y_min, y_max = bounds
     return make_extent((np.floor(x_min / step_m) * step_m, np.ceil(x_max / step_m) * step_m,
@@ -153,14 +136,7 @@ def choose_extent(bounds: tuple[float, float, float, float]) -> Extent:
 
 
 def make_extent(bounds: tuple[float, float, float, float]) -> Extent:
-    """Return the extent with the given bounds.
-
-    Args:
-        bounds: (x_min, x_max, y_min, y_max) [m].
-
-    Raises:
-        BadInput: They are too far from the origin.
-    """
+    """Return the extent x_min, x_max, y_min, y_max [m]; BadInput if too far from the origin."""
     x_min, x_max, y_min, y_max = bounds
     if not max(map(abs, bounds)) <= MAX_COORDINATE_M:
         raise BadInput(f"an extent of x {x_min:g} to {x_max:g} m, y {y_min:g} to {y_max:g} m is "
@@ -170,11 +146,7 @@ def make_extent(bounds: tuple[float, float, float, float]) -> Extent:
 
 
 def choose_step(bounds: tuple[float, float, float, float]) -> float:
-    """Return 20 m, or the next of 10, 5, 2, 1, ... that fits five times into the narrower side.
-
-    Args:
-        bounds: (x_min, x_max, y_min, y_max) [m].
-    """
+    """Return 20 m, or the next of 10, 5, 2, 1, ... that fits five times into the narrower side."""
     x_min, x_max, y_min, y_max = bounds
     for exponent in range(1, -6, -1):
         for digit in (2, 1, 0.5):
@@ -184,13 +156,10 @@ def choose_step(bounds: tuple[float, float, float, float]) -> float:
 
 
 def choose_altitudes(heights_m: np.ndarray) -> list[float]:
-    """Return three altitudes from 10 m above 95 % of the roofs upwards, 5 m apart [m].
+    """Return three altitudes from 10 m above 95 % of the roofs (n,) upwards, 5 m apart [m].
 
     They are low enough that streets next to tall buildings stay without line of sight, and high
     enough that few lattice positions lie inside a building.
-
-    Args:
-        heights_m: (n,) tops of the buildings above the ground datum [m]; may be empty.
     """
     top_m = float(np.percentile(heights_m, 95)) if len(heights_m) else 0.0
     lowest_m = max(30.0, 5.0 * np.ceil((top_m + 10.0) / 5.0))
@@ -203,12 +172,7 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
 
     Positions are drawn one by one at random, preferably where much is built within 100 m around,
     each at some distance from all before; the distance shrinks until there is room for all.
-
-    Args:
-        count: Number of devices.
-        grid: Buildings in the extent.
-        ground: 3D map of the ground alone; None: flat at the datum.
-        rng: Source of the positions.
+    `ground` is a map of the ground alone; None: flat at the datum.
 
     Raises:
         BadInput: There is not enough free ground, or too many are asked for.
@@ -246,12 +210,7 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
 
 
 class _Squares:
-    """Points by the square of the plane that they lie in, so that few are compared with a new one.
-
-    Args:
-        side_m: Side of a square [m].
-        points: (2,) positions [m].
-    """
+    """Points by the square of the plane they lie in, so that a new one is compared with few."""
 
     def __init__(self, side_m: float, points: Iterable[np.ndarray]) -> None:
         self._side_m = side_m
@@ -288,14 +247,8 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
     """Place UAVs at the free lattice position nearest to the middle, at one altitude each.
 
     They end where they start, with a battery for 80 % of the moves along two sides of the extent,
-    at least 20.
-
-    Args:
-        count: Number of UAVs.
-        extent: Area of the lattice.
-        lattice: Its step and altitudes, which the UAVs take in turn.
-        buildings: 3D map of the buildings alone; None: there are none.
-        ground: 3D map of the terrain alone, that the lattice follows; None: it is above the datum.
+    at least 20. `buildings` and `ground` are maps of these alone; None: there are none, and the
+    lattice is above the datum.
 
     Raises:
         BadInput: No lattice position is free at an altitude, or too many are asked for.

@@ -1,4 +1,4 @@
-"""Draw a scene from above, into any axes or a picture; and a scene as rows and as a raster."""
+"""Draw a scene from above, into any axes or a picture."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
-import xarray as xr
 
 from radiotwin.display import (
     METRES,
@@ -17,17 +15,12 @@ from radiotwin.display import (
     add_legend,
     draw_cells,
     draw_points,
-    geo_data_frame,
     new_axes,
     plain,
 )
-from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_path
-from radiotwin.scene.citymap import GROUND_M
-from radiotwin.scene.folder import read_city
 
 if TYPE_CHECKING:
-    from geopandas import GeoDataFrame
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
@@ -42,7 +35,6 @@ PLOT_CELLS = 400  # along the longer side of a plot
 MARKS = (("anchor", "^", 110, "#d1495b", "anchor"),
          ("unknown", "*", 170, "#f08a00", "device to be found"))
 """Role, marker, size, colour and label of devices."""
-LAYERS = ("buildings", "devices")
 
 
 def height_grid(scene: Scene, cells: int = 1000,
@@ -91,13 +83,7 @@ def plot_scene(scene: Scene, ax: Axes | None, geographic: bool | None) -> Axes:
 
 
 def draw_outlines(ax: Axes, scene: Scene, frame: PlotFrame) -> None:
-    """Draw the outlines of the buildings.
-
-    Args:
-        ax: to draw into.
-        scene: whose buildings are drawn.
-        frame: of the axes.
-    """
+    """Draw the outlines of the buildings."""
     x_m, y_m = _centres(scene, PLOT_CELLS)
     grid_m = np.meshgrid(x_m, y_m)
     built = _built_m(scene, grid_m) > BUILDING_M
@@ -107,13 +93,7 @@ def draw_outlines(ax: Axes, scene: Scene, frame: PlotFrame) -> None:
 
 
 def draw_vegetation(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None:
-    """Draw declared vegetation.
-
-    Args:
-        axes: to draw into.
-        scene: Scene that declares it.
-        frame: of the axes.
-    """
+    """Draw declared vegetation."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -126,13 +106,7 @@ def draw_vegetation(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None
 
 
 def draw_devices(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None:
-    """Mark anchors, devices to be found and the UAVs' starts, labelled for a legend.
-
-    Args:
-        axes: to draw into.
-        scene: Scene that declares them.
-        frame: of the axes.
-    """
+    """Mark anchors, devices to be found and the UAVs' starts, labelled for a legend."""
     outline: dict[str, Any] = {"edgecolors": "white", "linewidths": 0.9, "zorder": 3,
                                "clip_on": False}
     for role, marker, size, colour, label in MARKS:
@@ -145,54 +119,6 @@ def draw_devices(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None:
     if len(starts):
         draw_points(axes, frame, *starts.T, marker="x", s=80, color="black", linewidths=2.2,
                     label="UAV start", zorder=3)
-
-
-def scene_raster(scene: Scene, step_m: float) -> xr.Dataset:
-    """Return the heights over the extent; see `Scene.to_xarray`."""
-    if not step_m > 0:
-        raise BadInput(f"step_m = {step_m:g} is not possible; give a length in metres, above 0")
-    x_min, x_max, y_min, y_max = scene.config.extent.bounds
-    x_m, y_m = (np.arange(low + step_m / 2, high, step_m)
-                for low, high in ((x_min, x_max), (y_min, y_max)))
-    attributes = {"name": scene.config.name}
-    if scene.config.origin is not None:
-        attributes |= {f"origin_{name}": value
-                       for name, value in scene.config.origin.model_dump().items()}
-    height_m = scene.city.height_at(*np.meshgrid(x_m, y_m)).astype(np.float32)
-    units = {"units": "m"}
-    return xr.Dataset(
-        {"height_m": (("y", "x"), height_m,
-                      units | {"long_name": "highest surface above the ground datum"})},
-        {"y": ("y", y_m, units | {"long_name": "north"}),
-         "x": ("x", x_m, units | {"long_name": "east"})}, attributes)
-
-
-def scene_table(scene: Scene, layer: str) -> GeoDataFrame:
-    """Return buildings or devices as rows with a geometry; see `Scene.to_geodataframe`."""
-    if layer not in LAYERS:
-        raise BadInput(f"layer {layer!r} is unknown; allowed are {', '.join(LAYERS)}")
-    origin = scene.config.origin
-    if layer == "devices":
-        rows = [(each.device, each.role, each.x_m, each.y_m, each.z_m)
-                for each in scene.config.devices]
-        table = pd.DataFrame(rows, columns=["device", "role", "x_m", "y_m", "z_m"])
-        return geo_data_frame(table, origin, position_m=scene.device_m)
-    import shapely
-
-    terrain = scene.config.terrain
-    found, outlines = [], []
-    for shape in read_city(scene.xml_path):
-        corners_m = shape.mesh.vertices[shape.mesh.faces]
-        x_m, y_m, z_m = shape.mesh.vertices[np.unique(shape.mesh.faces)].T
-        ground_m = 0.0 if terrain is None else scene.city.ground_height_m(x_m, y_m)
-        height_m = float((z_m - ground_m).max())
-        if height_m < GROUND_M or terrain is not None and shape.name == terrain.shape:
-            continue
-        flat = np.asarray(shapely.polygons(corners_m[..., :2]))
-        outlines.append(shapely.union_all(flat[shapely.area(flat) > 0], grid_size=1e-3))
-        found.append((shape.name, shape.material.name, height_m))
-    table = pd.DataFrame(found, columns=["building", "material", "height_m"])
-    return geo_data_frame(table, origin, geometry=np.array(outlines, dtype=object))
 
 
 def _top_m(height_m: np.ndarray) -> float:
@@ -212,12 +138,7 @@ def _centres(scene: Scene, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_preview(scene: Scene, path: Path | str) -> None:
-    """Write a picture of heights, devices and the UAVs' starts.
-
-    Args:
-        scene: Scene to draw.
-        path: PNG file to write.
-    """
+    """Write a PNG picture of heights, devices and the UAVs' starts."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -253,16 +174,7 @@ def _draw_contours(axes: Axes, scene: Scene) -> None:
 
 
 def draw_heights(axes: Axes, height_m: np.ndarray, bounds: Bounds) -> AxesImage:
-    """Draw heights with shaded relief.
-
-    Args:
-        axes: Axes in metres.
-        height_m: (ny, nx) heights, south first [m].
-        bounds: (x_min, x_max, y_min, y_max) [m].
-
-    Returns:
-        The image, for a colour bar.
-    """
+    """Draw heights (ny, nx), south first [m], with shaded relief; return the image."""
     from matplotlib import colormaps
     from matplotlib.colors import LightSource
 

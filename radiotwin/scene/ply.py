@@ -75,9 +75,6 @@ class _Lists:
 def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
     """Read vertices and polygons.
 
-    Args:
-        path: PLY file.
-
     Returns:
         (v, 3) vertices, and an (n, k) array of vertex indices for each number of corners k.
 
@@ -287,10 +284,7 @@ def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element
 def write_ply(path: Path, vertices_m: np.ndarray, faces: np.ndarray) -> None:
     """Write triangles as a binary little-endian PLY file; equal meshes give equal bytes.
 
-    Args:
-        path: File to write.
-        vertices_m: (v, 3) positions [m], stored in single precision.
-        faces: (f, 3) indices of vertices.
+    Positions (v, 3) [m] are stored in single precision.
     """
     header = (
         "ply\nformat binary_little_endian 1.0\n"

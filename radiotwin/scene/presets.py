@@ -12,9 +12,14 @@ import numpy as np
 import trimesh
 
 from radiotwin.errors import BadInput
-from radiotwin.io.files import atomic_folder, scratch_folder
-from radiotwin.scene import Scene
-from radiotwin.scene.build import BuildOptions, BuildReport, build_scene, check_target
+from radiotwin.io.files import scratch_folder
+from radiotwin.scene.build import (
+    BuildOptions,
+    BuildReport,
+    build_scene,
+    check_target,
+    write_scene,
+)
 from radiotwin.scene.config import (
     DeviceConfig,
     Extent,
@@ -22,11 +27,9 @@ from radiotwin.scene.config import (
     MissionConfig,
     SceneConfig,
     UavConfig,
-    write_config,
 )
-from radiotwin.scene.folder import CityShape, keep_declarations, write_city
+from radiotwin.scene.folder import CityShape
 from radiotwin.scene.materials import itu_material
-from radiotwin.scene.plot import draw_preview
 
 
 @dataclass(frozen=True)
@@ -69,10 +72,7 @@ class CityParameters:
 def draw_buildings(parameters: CityParameters, keep_free_m: np.ndarray, seed: int) -> np.ndarray:
     """Draw the buildings of a city as axis-aligned boxes, which may overlap.
 
-    Args:
-        parameters: Parameters of the city.
-        keep_free_m: (k, 2) points to keep clear of buildings by `clearance_m` [m].
-        seed: Seed of the draw.
+    Points (k, 2) [m] are kept clear of them by `clearance_m`.
 
     Returns:
         (n, 5) x_min, y_min, x_max, y_max, height [m].
@@ -142,16 +142,10 @@ def _trimmed(low: np.ndarray, high: np.ndarray, keep_free_m: np.ndarray, clearan
 
 
 def building_meshes(boxes: np.ndarray) -> list[trimesh.Trimesh]:
-    """Return boxes as watertight solids, one per group of boxes that touch.
+    """Return boxes as watertight solids from west to east, one per group of boxes that touch.
 
     Overlapping boxes are united, as the ray tracer would hit coplanar walls and roofs inside one
-    another twice.
-
-    Args:
-        boxes: (n, 5) x_min, y_min, x_max, y_max, height [m].
-
-    Returns:
-        Meshes with outward normals, from west to east.
+    another twice. A box is x_min, y_min, x_max, y_max, height [m].
     """
     solids = [trimesh.creation.box(bounds=[[x0, y0, 0.0], [x1, y1, height]])
               for x0, y0, x1, y1, height in boxes]
@@ -220,14 +214,7 @@ PRESETS = {
 
 
 def preset_config(name: str) -> SceneConfig:
-    """Return the `scene.toml` of a preset.
-
-    Args:
-        name: Key of `PRESETS`.
-
-    Raises:
-        BadInput: No such preset.
-    """
+    """Return the `scene.toml` of a preset, a key of `PRESETS`; BadInput if there is none."""
     preset = _find(name)
     (start_x_m, start_y_m), (terminal_x_m, terminal_y_m) = preset.start_m, preset.terminal_m
     return SceneConfig(
@@ -249,17 +236,7 @@ def preset_config(name: str) -> SceneConfig:
 
 
 def preset_boxes(name: str) -> np.ndarray:
-    """Return the buildings of a preset.
-
-    Args:
-        name: Key of `PRESETS`.
-
-    Returns:
-        (n, 5) x_min, y_min, x_max, y_max, height [m].
-
-    Raises:
-        BadInput: No such preset.
-    """
+    """Return the buildings (n, 5) of a preset: x_min, y_min, x_max, y_max, height [m]."""
     preset = _find(name)
     devices_m = np.array([(x_m, y_m) for x_m, y_m, _ in preset.devices])
     return draw_buildings(preset.city, devices_m, preset.seed)
@@ -284,23 +261,16 @@ def build_preset(name: str, folder: Path | str) -> None:
     shapes = [CityShape("ground", ground, itu_material("asphalt_concrete"))]
     shapes += [CityShape(f"building_{i:03d}", mesh, itu_material("concrete"))
                for i, mesh in enumerate(building_meshes(preset_boxes(name)))]
-    with atomic_folder(folder) as temporary:
-        write_city(temporary, shapes)
-        write_config(preset_config(name), temporary / "scene.toml")
-        keep_declarations(folder, temporary)
-        draw_preview(Scene.load(temporary), temporary / "preview.png")
+    write_scene(folder, shapes, preset_config(name))
 
 
 def build_preset_scene(name: str, folder: Path | str, check_only: bool = False) -> BuildReport:
     """Write the scene folder of a preset, and report on it as on any other city.
 
-    Args:
-        name: Key of `PRESETS`.
-        folder: Folder to write.
-        check_only: Build it in a temporary folder, and leave nothing behind.
+    To check only, it is built in a temporary folder, and nothing is left behind.
 
     Raises:
-        BadInput: No such preset, or the folder cannot be written or holds something else.
+        BadInput: As `build_preset`.
     """
     if check_only:
         with scratch_folder() as temporary:

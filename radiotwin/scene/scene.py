@@ -8,15 +8,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
-from radiotwin.display import Summarised, Summary, count, some
+from radiotwin.display import Summarised, Summary, count, geo_data_frame, some
 from radiotwin.errors import BadInput
+from radiotwin.geo import origin_attributes
 from radiotwin.io.budgets import SHAPES
-from radiotwin.io.inputs import open_input, read_bytes, require_within
+from radiotwin.io.files import atomic_folder
+from radiotwin.io.inputs import is_within, open_input, read_bytes, require_within
 from radiotwin.scene.antennas import Antenna, Pattern, read_pattern
-from radiotwin.scene.citymap import CityMap, shape_height_sds_m
-from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
-from radiotwin.scene.folder import mesh_paths
+from radiotwin.scene.citymap import GROUND_M, CityMap, shape_height_sds_m
+from radiotwin.scene.config import (
+    DeviceConfig,
+    SceneConfig,
+    UavConfig,
+    read_config,
+    write_config,
+)
+from radiotwin.scene.folder import SCENE_FILES, check_target, mesh_paths, read_city, write_city
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.vegetation import Vegetation
 
@@ -25,6 +34,7 @@ if TYPE_CHECKING:
     from geopandas import GeoDataFrame
     from matplotlib.axes import Axes
 
+LAYERS = ("buildings", "devices")
 _BLOCK_BYTES = 2**20
 
 
@@ -65,15 +75,27 @@ class Scene(Summarised):
     def save(self, folder: Path | str) -> None:
         """Write a copy of the scene folder, with the configuration of this object.
 
+        Its preview and what tracing left in it are not copied.
+
         Args:
             folder: Scene folder to write; a scene that is already in it is replaced.
 
         Raises:
             BadInput: The folder holds something else or this scene, or cannot be written.
         """
-        from radiotwin.scene.folder import copy_scene
-
-        copy_scene(self, Path(folder))
+        folder = Path(folder)
+        if is_within(self.folder, folder):
+            raise BadInput(f"{folder} holds the scene itself, which the copy would replace; choose "
+                           "another folder")
+        check_target(folder, SCENE_FILES | {Path(name).parts[0] for name in self._antenna_files})
+        with atomic_folder(folder) as temporary:
+            write_city(temporary, read_city(self.xml_path))
+            self.copy_antennas(temporary)
+            write_config(self.config, temporary / "scene.toml")
+            table = self.folder / "buildings.csv"
+            if table.is_file():
+                require_within(self.folder, table, str(self.folder))
+                (temporary / table.name).write_bytes(read_bytes(table, "file of a scene"))
 
     def plot(self, ax: "Axes | None" = None, *, geographic: bool | None = None) -> "Axes":
         """Draw buildings, vegetation, devices and the UAVs' starts from above.
@@ -101,9 +123,21 @@ class Scene(Summarised):
         Returns:
             Variable `height_m` (y, x) of the highest surface [m], 0 on the ground.
         """
-        from radiotwin.scene.plot import scene_raster
+        import xarray as xr
 
-        return scene_raster(self, step_m)
+        if not step_m > 0:
+            raise BadInput(f"step_m = {step_m:g} is not possible; give a length in metres, above 0")
+        x_min, x_max, y_min, y_max = self.config.extent.bounds
+        x_m, y_m = (np.arange(low + step_m / 2, high, step_m)
+                    for low, high in ((x_min, x_max), (y_min, y_max)))
+        attributes = {"name": self.config.name, **origin_attributes(self.config.origin)}
+        height_m = self.city.height_at(*np.meshgrid(x_m, y_m)).astype(np.float32)
+        units = {"units": "m"}
+        return xr.Dataset(
+            {"height_m": (("y", "x"), height_m,
+                          units | {"long_name": "highest surface above the ground datum"})},
+            {"y": ("y", y_m, units | {"long_name": "north"}),
+             "x": ("x", x_m, units | {"long_name": "east"})}, attributes)
 
     def to_geodataframe(self, layer: str = "buildings") -> "GeoDataFrame":
         """Return buildings or devices as rows with a geometry, in metres of the local frame.
@@ -115,9 +149,29 @@ class Scene(Summarised):
         Raises:
             BadInput: GeoPandas is not installed, or another layer.
         """
-        from radiotwin.scene.plot import scene_table
+        import shapely
 
-        return scene_table(self, layer)
+        if layer not in LAYERS:
+            raise BadInput(f"layer {layer!r} is unknown; allowed are {', '.join(LAYERS)}")
+        if layer == "devices":
+            rows = [(each.device, each.role, each.x_m, each.y_m, each.z_m)
+                    for each in self.config.devices]
+            table = pd.DataFrame(rows, columns=["device", "role", "x_m", "y_m", "z_m"])
+            return geo_data_frame(table, self.config.origin, position_m=self.device_m)
+        terrain = self.config.terrain
+        found, outlines = [], []
+        for shape in read_city(self.xml_path):
+            corners_m = shape.mesh.vertices[shape.mesh.faces]
+            x_m, y_m, z_m = shape.mesh.vertices[np.unique(shape.mesh.faces)].T
+            ground_m = 0.0 if terrain is None else self.city.ground_height_m(x_m, y_m)
+            height_m = float((z_m - ground_m).max())
+            if height_m < GROUND_M or terrain is not None and shape.name == terrain.shape:
+                continue
+            flat = np.asarray(shapely.polygons(corners_m[..., :2]))
+            outlines.append(shapely.union_all(flat[shapely.area(flat) > 0], grid_size=1e-3))
+            found.append((shape.name, shape.material.name, height_m))
+        table = pd.DataFrame(found, columns=["building", "material", "height_m"])
+        return geo_data_frame(table, self.config.origin, geometry=np.array(outlines, dtype=object))
 
     def __len__(self) -> int:
         """Return the number of declared devices."""
@@ -221,17 +275,23 @@ class Scene(Summarised):
         names = {uav.antenna for uav in self.config.uavs if uav.antenna is not None}
         return Antenna(self._pattern(names.pop()).heading_mean()) if names else None
 
+    @property
+    def _antenna_files(self) -> set[str]:
+        ends: list[DeviceConfig | UavConfig] = [*self.config.devices, *self.config.uavs]
+        return {end.antenna for end in ends if end.antenna is not None}
+
+    @property
+    def files(self) -> list[Path]:
+        """Files and folders that the scene is read from, and its tables."""
+        return [self.folder / name for name in sorted(SCENE_FILES | self._antenna_files)]
+
     def copy_antennas(self, folder: Path) -> None:
         """Copy the files of all antennas into another scene folder, under the same names.
-
-        Args:
-            folder: The other scene folder.
 
         Raises:
             BadInput: A file outside the scene folder, or one that cannot be read.
         """
-        ends: list[DeviceConfig | UavConfig] = [*self.config.devices, *self.config.uavs]
-        for name in sorted({end.antenna for end in ends if end.antenna is not None}):
+        for name in sorted(self._antenna_files):
             data = read_bytes(self._antenna_path(name), "antenna pattern")
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(data)

@@ -76,10 +76,9 @@ class Surfaces:
             yield slice(first, last), slice(start, end)
 
     def meshes(self, keep: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return (vertices, faces) of each mesh.
+        """Return (vertices, faces) of each mesh, of the faces to `keep`, (f,) bool; None: all.
 
-        Args:
-            keep: (f,) bool, faces to keep; None: all. Meshes that keep none are left out.
+        Meshes that keep none are left out.
         """
         keep = np.ones(len(self.faces), dtype=bool) if keep is None else keep
         result = []

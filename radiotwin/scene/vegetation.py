@@ -8,10 +8,10 @@ import shapely
 from pydantic import Field, field_validator
 from shapely.geometry.base import BaseGeometry
 
+from radiotwin.geo import GroundHeight
 from radiotwin.io.budgets import VEGETATION_CORNERS, VEGETATION_MEETINGS
 from radiotwin.io.forms import Metres, Number, Table
 
-GroundHeight = Callable[[np.ndarray, np.ndarray], np.ndarray]
 KINDS = ("wood", "park", "tree_row")
 SAMPLE_M, SAMPLES_AT_ONCE = 2.0, 1_000_000  # of ways on a terrain
 SIDES_AT_ONCE, WORK_AT_ONCE = 64, 5_000_000  # of outlines; ways by corners: bound the memory
@@ -63,10 +63,7 @@ class Vegetation:
 
     @classmethod
     def of(cls, declared: Sequence[VegetationConfig]) -> "Vegetation":
-        """Return what is declared, without overlaps.
-
-        Args:
-            declared: areas; an outline that crosses itself is taken apart.
+        """Return declared areas without overlaps; an outline that crosses itself is taken apart.
 
         Raises:
             BadInput: they have too many corners, or their outlines meet too often.
@@ -101,16 +98,10 @@ class Vegetation:
 
     def metres_through(self, a_m: np.ndarray, b_m: np.ndarray,
                        ground: GroundHeight | None = None) -> np.ndarray:
-        """Return the length of each straight way that is in vegetation.
+        """Return the length (n,) of each way from a to b, (n, 3), that is in vegetation [m].
 
-        Args:
-            a_m: (n, 3) where they begin [m].
-            b_m: (n, 3) where they end [m].
-            ground: returns the heights (p,) of a terrain at x and y (p,) [m]; ways are then sampled
-                every `SAMPLE_M`. None: flat, at z = 0.
-
-        Returns:
-            (n,) [m].
+        `ground` returns the heights (p,) of a terrain at x and y (p,) [m]; ways are then sampled
+        every `SAMPLE_M`. None: flat, at z = 0.
         """
         if ground is not None:
             return self._metres_on_terrain(a_m, b_m, ground)
@@ -131,7 +122,6 @@ class Vegetation:
                 share = np.where(whole_m > 1e-6, flat_m / np.maximum(whole_m, 1e-6), 1.0)
                 np.add.at(through_m, rows[part][way], share * long_m)
         return through_m
-
 
     def _metres_on_terrain(self, a_m: np.ndarray, b_m: np.ndarray,
                            ground: GroundHeight) -> np.ndarray:
@@ -173,12 +163,10 @@ def _require_few_meetings(rings: list) -> None:
 
 
 def count_meetings(sides: np.ndarray, at_once: int, check: Callable[[int], None]) -> int:
-    """Count how often sides of rings meet others than those beside them.
+    """Count how often sides (n,) of rings meet others than those beside them.
 
-    Args:
-        sides: (n,) lines.
-        at_once: number of lines whose pairs are found at once; bounds the memory.
-        check: called with the count so far; raises an exception to end the search.
+    Pairs of `at_once` lines are found at once, which bounds the memory; `check` is called with the
+    count so far, and raises an exception to end the search.
     """
     tree, found = shapely.STRtree(sides), 0
     for start in range(0, len(sides), at_once):

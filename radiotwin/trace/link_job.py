@@ -21,7 +21,7 @@ from radiotwin.runtime.cuda import share_of_gpu
 from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
-from radiotwin.scene.folder import CityShape, read_city
+from radiotwin.scene.folder import read_city
 from radiotwin.scene.lattice import Lattice
 from radiotwin.trace.settings import FINER, SolverSettings
 from radiotwin.trace.solver import Antennas, CellGains, PathGains
@@ -121,7 +121,7 @@ class LinkBatch:
 def link_pieces(scene: Scene, settings: SolverSettings,
                 devices: Sequence[tuple[str, np.ndarray, Antenna | None]], points_m: np.ndarray,
                 size: int | None = None) -> tuple[list[LinkBatch], np.ndarray]:
-    """Return the links of some devices to the same points in pieces.
+    """Return the links of some devices to the same points (n, 3) [m] in pieces.
 
     Points are solved together in their order, or where there are tiles by place.
 
@@ -159,8 +159,10 @@ class _Solve:
     Sent to another process, it takes the geometry along, and reads no file there.
     """
 
+    geometry_bytes = 0  # memory that the geometry takes beside the solver's own
+
     def __init__(self, scene: Scene, settings: SolverSettings) -> None:
-        self._city: Path | Sequence[CityShape] | None = scene.xml_path
+        self._city: Any = scene.xml_path  # or what is made of it
         self._frequency_hz, self._settings = scene.config.radio.frequency_hz, settings
         self._solver: Any = None
 
@@ -180,7 +182,7 @@ class SolveLinks(_Solve):
         return self._solver.gains(piece.device_m, piece.points_m, piece.antennas)
 
 
-class SolveTiles:
+class SolveTiles(_Solve):
     """Gains along paths in the part of the city that a piece reaches.
 
     The solver of the last tile is kept, as neighbouring pieces may share it.
@@ -190,24 +192,16 @@ class SolveTiles:
     """
 
     def __init__(self, scene: Scene, settings: SolverSettings) -> None:
+        super().__init__(scene, settings)
         self._city = PackedCity.of(read_city(scene.xml_path))
-        self._frequency_hz, self._settings = scene.config.radio.frequency_hz, settings
-        self._solved: tuple[Tile | None, int] | None = None
-        self._solver: Any = None
+        self.geometry_bytes = GEOMETRY_COPIES * self._city.nbytes
+        self._solved: tuple[Tile, int] | None = None
         self.shapes = 0
-
-    def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_solved": None, "_solver": None}
-
-    @property
-    def geometry_bytes(self) -> int:
-        """Memory that the geometry takes beside the solver's own."""
-        return GEOMETRY_COPIES * self._city.nbytes
 
     def __call__(self, piece: LinkBatch) -> np.ndarray:
         """Return (n,) gains [dB]."""
         assert piece.tile is not None
-        if self._solved != (piece.tile, piece.batch_receivers):
+        if self._solver is None or self._solved != (piece.tile, piece.batch_receivers):
             self._solver = None  # frees the last one's memory first
             settings = replace(self._settings, batch_receivers=piece.batch_receivers)
             kept = self._city.near(piece.tile)
@@ -234,28 +228,19 @@ class SolveCells(_Solve):
 
 def link_job(scene: Scene, settings: SolverSettings,
              description: str) -> Job[LinkBatch, np.ndarray]:
-    """Return the job that traces pieces.
-
-    Args:
-        scene: City and frequency.
-        settings: Of the solver.
-        description: Shown with the progress.
+    """Return the job that traces pieces; `description` is shown with its progress.
 
     Raises:
         BadInput: Antennas, which the solver `map` does not know.
     """
-    if settings.is_tiled:
-        solve = SolveTiles(scene, settings)
+    if settings.solver == "paths":
+        solve = SolveTiles(scene, settings) if settings.is_tiled else SolveLinks(scene, settings)
         return Job(description, solve, _resources(settings, solve.geometry_bytes), len,
                    LinkBatch.halves, lambda first, second: np.concatenate([first, second]))
-    resources = _resources(settings)
-    if settings.solver == "paths":
-        return Job(description, SolveLinks(scene, settings), resources, len, LinkBatch.halves,
-                   lambda first, second: np.concatenate([first, second]))
     if any(antenna is not None for antenna in (*scene.device_antennas, scene.uav_antenna)):
         raise BadInput(f"{scene.folder / 'scene.toml'} declares antennas, which the solver 'map' "
                        "does not know; use the solver 'paths'")
-    return Job(description, SolveCells(scene, settings), resources, len)
+    return Job(description, SolveCells(scene, settings), _resources(settings), len)
 
 
 def _resources(settings: SolverSettings, geometry_bytes: int = 0) -> Resources:
@@ -269,20 +254,9 @@ def _resources(settings: SolverSettings, geometry_bytes: int = 0) -> Resources:
 def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
                   executor: Executor, columns: np.ndarray | None = None, label: str = "",
                   description: str = "tracing") -> np.ndarray:
-    """Return the gains of lattice positions; only what the store lacks is solved.
+    """Return the gains (devices, positions) of a lattice [dB]; NaN where there is no path.
 
-    Args:
-        scene: City, devices and lattice.
-        settings: Settings of the solver.
-        store: Store of this scene and its map's settings.
-        index: Indices into `scene.config.devices`.
-        executor: Where it runs.
-        columns: As of `lattice_pieces`.
-        label: As of `lattice_pieces`.
-        description: Shown with the progress.
-
-    Returns:
-        (devices, positions) gain [dB], NaN where there is no path.
+    Only what the store lacks is solved. `columns` and `label` are those of `lattice_pieces`.
 
     Raises:
         BadInput: The scene cannot be read, or the store not written.
@@ -298,13 +272,11 @@ def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, ind
 
 def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
                 executor: Executor) -> tuple[slice, np.ndarray, np.ndarray]:
-    """Solve a sample of links with ten times the rays, in the same memory.
+    """Solve a sample of links with ten times the rays, in the same memory; see `solve_lattice`.
 
     The sample is 1 % of the positions (at least 8; drawn by the settings' seed) for all devices.
     With the solver `map`, which solves whole altitudes, it is the lowest altitude for the first
     device.
-
-    Args and what is raised are those of `solve_lattice`.
 
     Returns:
         Rows and columns in the result of `solve_lattice`, and their gains (rows, columns) [dB].
@@ -331,12 +303,8 @@ def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
                    ) -> tuple[list[LinkBatch], np.ndarray]:
     """Return the pieces that a map is traced in, and the order of the positions in them.
 
-    Args:
-        scene: City, devices and lattice.
-        settings: Settings of the solver.
-        index: Indices into `scene.config.devices`.
-        columns: Indices of positions; None: all.
-        label: Of their names; empty: that of a map's own.
+    `columns` are the indices of the positions to trace (None: all); `label` is part of the names of
+    their pieces.
     """
     points_m = scene.lattice.positions_m if columns is None else scene.lattice.positions_m[columns]
     label = label or ("batch" if settings.solver == "paths" else "altitude")

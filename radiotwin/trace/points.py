@@ -195,7 +195,7 @@ def _check_agreement(path: Path, raw: pd.DataFrame, points: np.ndarray, origin: 
 
 def _numbers(path: Path, raw: pd.DataFrame, name: str) -> np.ndarray:
     """Return the (n,) finite numbers of a column; degrees within their range."""
-    values = pd.to_numeric(raw[name].astype(str).str.strip(), errors="coerce").to_numpy(dtype=float)
+    values = as_numbers(raw[name].astype(str).str.strip())
     limit = {"latitude_deg": 90, "longitude_deg": 180}.get(name, np.inf)
     bad = ~np.isfinite(values) | (np.abs(values) > limit)
     if bad.any():

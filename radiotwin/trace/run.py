@@ -7,9 +7,9 @@ when ten times the rays are sent.
 import hashlib
 import math
 import warnings
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -42,32 +42,18 @@ MAX_STEM = 100  # characters of a file's name
 
 
 def free_space_gain_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
-    """Return Friis' gain between isotropic antennas (ITU-R P.525-4, eq. 4) [dB].
-
-    Args:
-        distance_m: Distances, any shape [m].
-        frequency_hz: Frequency [Hz].
-    """
+    """Return Friis' gain between isotropic antennas (ITU-R P.525-4, eq. 4) [dB]."""
     return 20 * np.log10(speed_of_light / (4 * np.pi * frequency_hz * np.asarray(distance_m)))
 
 
 def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, frequency_hz: float,
                 solver: str, combining: str, direct_dbi: np.ndarray | float = 0.0,
                 peak_dbi: np.ndarray | float = 0.0) -> dict[str, float]:
-    """Check raw gains against the limits of physics.
+    """Check raw gains (n,) of links [dB], NaN without a path, against the limits of physics.
 
     With antennas, a link is no weaker than its direct path, and no stronger than if all its paths
-    left and arrived in the directions of the antennas' peaks.
-
-    Args:
-        gain_db: (n,) gain of links [dB]; NaN: no path.
-        los: (n,) bool line of sight by the 3D map.
-        distance_m: (n,) lengths of the links [m].
-        frequency_hz: Frequency [Hz].
-        solver: As in `SolverSettings`.
-        combining: As in `SolverSettings`.
-        direct_dbi: (n,) gain of both antennas along the straight line [dBi].
-        peak_dbi: (n,) highest gain of both antennas [dBi].
+    left and arrived in the directions of the antennas' peaks: `direct_dbi` is the gain of both
+    along the straight line, `peak_dbi` their highest, (n,) each.
 
     Returns:
         Figures for the map's attributes.
@@ -110,11 +96,7 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
 
 
 def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float | str]:
-    """Compare two solutions of the same links.
-
-    Args:
-        gain_db: (n,) gain as in the map [dB]; NaN: not detected.
-        finer_db: (n,) gain with ten times the rays [dB]; NaN: not detected.
+    """Compare two solutions of the same links, (n,) gains [dB] with NaN where not detected.
 
     Returns:
         Attributes: RMS, median and 90th percentile of the difference over links detected in both,
@@ -135,12 +117,7 @@ def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float 
 
 
 def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
-    """Return the file that a scene's traced map is written to unless another is named.
-
-    Args:
-        scene: that is traced.
-        devices: names of those that are traced; None: all.
-    """
+    """Return the file that a scene's traced map is written to unless another is named."""
     name = "-".join(["truth", *(devices or [])])
     if len(name) > MAX_STEM:  # what is cut off counts, too
         digest = hashlib.sha256(name.encode()).hexdigest()[:12]
@@ -272,10 +249,6 @@ def _finished(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | Non
 def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
     """Return the indices into `scene.config.devices` of the named devices, or of all.
 
-    Args:
-        scene: Scene that declares them.
-        devices: Names; None: all.
-
     Raises:
         BadInput: The scene has no devices, or not that one.
     """
@@ -296,16 +269,11 @@ def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
     Raises:
         BadInput: The folder lies outside the scene's, or cannot be written.
     """
-    return BatchStore(scene.folder, _key(scene, settings))
-
-
-def _key(scene: Scene, settings: SolverSettings) -> dict[str, Any]:
-    lattice = scene.lattice
-    return {"scene": scene.content_hash(),
-            "lattice": {"x_m": lattice.x_m.tolist(), "y_m": lattice.y_m.tolist(),
-                        "z_m": lattice.z_m.tolist()}
-            | ({} if lattice.ground_m is None else {"ground_m": lattice.ground_m.tolist()}),
-            "settings": settings.attributes(), "libraries": library_versions()}
+    lattice = {name: values.tolist() for name, values in asdict(scene.lattice).items()
+               if values is not None}
+    return BatchStore(scene.folder, {
+        "scene": scene.content_hash(), "lattice": lattice, "settings": settings.attributes(),
+        "libraries": library_versions()})
 
 
 def _censor(raw_db: np.ndarray, inside: np.ndarray, impossible: np.ndarray, limit_db: float

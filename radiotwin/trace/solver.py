@@ -57,15 +57,12 @@ def library_versions() -> dict[str, str]:
 
 
 def import_sionna(device: Device = "cpu") -> Any:
-    """Return the module `sionna.rt`, on a libLLVM that works, or on a GPU.
+    """Return the module `sionna.rt`, on a libLLVM that works (`cpu`), or on a GPU (`cuda`).
 
     A process traces on one of them: Sionna RT cannot change from one to the other.
 
     Mitsuba looks for its plugins in the working directory first, which may be the folder of a
     stranger's scene: from now on it looks for them where it is installed, and nowhere else.
-
-    Args:
-        device: `cpu`, or `cuda` for a GPU.
 
     Raises:
         RunFailed: No usable libLLVM or GPU, or this process traces on another device already.
@@ -106,14 +103,6 @@ def load_city(city: City, frequency_hz: float, device: Device = "cpu") -> Any:
     Mitsuba's parser, which can load other files and plugins, gets a copy that is written from what
     `read_city` read, not the scene's own file. ITU materials outside their frequency range are
     held at its nearest end, with a warning.
-
-    Args:
-        city: `city.xml` of a scene folder, or what `read_city` returns; None for free space.
-        frequency_hz: Frequency [Hz].
-        device: Where it is solved.
-
-    Returns:
-        The `sionna.rt.Scene`.
 
     Raises:
         BadInput: The file cannot be read.
@@ -159,9 +148,7 @@ def _hold_in_range(material: Any, frequency_hz: float) -> None:
 def candidate_search(table_size: int, diffraction_probability: float) -> Iterator[None]:
     """Set two constants of Sionna RT's search for candidate paths that it has no arguments for.
 
-    Args:
-        table_size: Entries of the hash table of candidates, see `radiotwin.trace.settings`.
-        diffraction_probability: Share of rays that are diffracted at an edge, see there.
+    See `TABLE_SIZE` and `DIFFRACTION_PROBABILITY` of `radiotwin.trace.settings`.
     """
     from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator as Search
 
@@ -230,12 +217,7 @@ class PathGains:
 
     Each call of Sionna RT has one device and a fixed number of points. So a gain does not depend on
     the other devices, nor, but for rare collisions in a hash table, on the other points; kernels
-    are compiled once; and memory is bounded.
-
-    Args:
-        city: `city.xml` of a scene folder, or what `read_city` returns; None for free space.
-        frequency_hz: Frequency [Hz].
-        settings: Settings with solver `paths`.
+    are compiled once; and memory is bounded. The settings have the solver `paths`.
 
     Raises:
         BadInput: The file cannot be read.
@@ -313,16 +295,7 @@ class PathGains:
 
     def gains(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None)
               ) -> np.ndarray:
-        """Solve any number of points, batch by batch.
-
-        Args:
-            device_m: (3,) position [m].
-            points_m: (n, 3) positions [m].
-            antennas: As in `solve`.
-
-        Returns:
-            (n,) gain [dB] as in `solve`.
-        """
+        """Solve any number of points (n, 3), batch by batch; as `solve`."""
         gain_db = np.full(len(points_m), np.nan)
         for part in self.batches(len(points_m)):
             gain_db[part] = self.solve(device_m, points_m[part], antennas)
@@ -370,12 +343,6 @@ class CellGains:
     power that all rays carry through it: an average over 400 m² where the step is 20 m, not the
     gain at a point. So the border of a shadow is blurred, and a link in it has no sharp LoS.
 
-    Args:
-        city: `city.xml` of a scene folder, or what `read_city` returns; None for free space.
-        frequency_hz: Frequency [Hz].
-        settings: Settings with solver `map`.
-        lattice: Positions.
-
     Raises:
         BadInput: The file cannot be read.
         RunFailed: No usable libLLVM.
@@ -392,15 +359,7 @@ class CellGains:
         self._city.add(self._transmitter)
 
     def solve(self, device_m: np.ndarray, z_m: float) -> np.ndarray:
-        """Solve one altitude.
-
-        Args:
-            device_m: (3,) position [m].
-            z_m: Altitude [m].
-
-        Returns:
-            (ny * nx,) gain [dB]; NaN where no ray came through.
-        """
+        """Solve one altitude: (ny * nx,) gain [dB]; NaN where no ray came through."""
         import drjit
 
         settings, lattice = self.settings, self.lattice

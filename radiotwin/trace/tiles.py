@@ -121,12 +121,7 @@ class PackedCity:
 
 
 def with_radius(scene: Scene, settings: SolverSettings) -> SolverSettings:
-    """Return the settings with the culling radius that holds for a scene.
-
-    Args:
-        scene: City; one of more than `MANY_SHAPES` shapes is traced by tiles.
-        settings: As given; a radius that they have stays.
-    """
+    """Return the settings with the culling radius that holds for a scene; a given one stays."""
     if settings.solver != "paths" or settings.radius_m is not None:
         return settings
     folder = scene.folder / "meshes"
@@ -149,16 +144,10 @@ def longest_path_m(scene: Scene) -> float:
 
 def tile_of(device_m: np.ndarray, points_m: np.ndarray, radius_m: float, longest_m: float
             ) -> Tile:
-    """Return what links from one device reach.
+    """Return the part of the city that links from a device (3,) to points (n, 3) reach [m].
 
-    Args:
-        device_m: (3,) position [m].
-        points_m: (n, 3) positions of the other ends [m].
-        radius_m: Culling radius [m].
-        longest_m: Length of paths that need not be found [m].
-
-    Returns:
-        The tile; its radius is smaller where longer paths leave the line by less.
+    Paths longer than `longest_m` need not be found: if all shorter ones stay closer to the straight
+    line than `radius_m`, the tile is that much narrower.
     """
     import shapely
 
@@ -171,17 +160,10 @@ def tile_of(device_m: np.ndarray, points_m: np.ndarray, radius_m: float, longest
 
 
 def batches_by_place(points_m: np.ndarray, size: int) -> list[np.ndarray]:
-    """Split points into batches of points that lie close together.
+    """Split points (n, 3) into batches of points that lie close together: ascending indices.
 
     The points are halved across their longer side, again and again, as a k-d tree is made. All
     batches but one are full, as a batch costs the same however few points it has.
-
-    Args:
-        points_m: (n, 3) positions [m].
-        size: Most points of a batch.
-
-    Returns:
-        Indices of each batch, ascending; each point is in one.
     """
     def split(index: np.ndarray) -> list[np.ndarray]:
         batches = math.ceil(len(index) / size)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.meshes import clean, is_volume, load_shape, load_shapes, read_obj
+from radiotwin.scene.meshes import clean, is_volume, load_shape, load_shapes, read_obj_groups
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 
 
@@ -79,7 +79,7 @@ def test_obj_with_quads_negative_indices_and_objects(empty_city):
 def test_bad_obj_names_the_row(tmp_path, text, row):
     (tmp_path / "a.obj").write_text(text)
     with pytest.raises(BadInput, match=f"row {row}"):
-        read_obj(tmp_path / "a.obj")
+        read_obj_groups(tmp_path / "a.obj")
 
 
 @pytest.mark.parametrize("rotation", [np.eye(3), np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0.0]])])
@@ -171,7 +171,7 @@ def test_one_mesh_named_many_times_has_one_budget(empty_city, monkeypatch):
 def test_obj_indices_of_many_digits(tmp_path, text):
     (tmp_path / "a.obj").write_text(text)
     with pytest.raises(BadInput, match="row [23]"):
-        read_obj(tmp_path / "a.obj")
+        read_obj_groups(tmp_path / "a.obj")
 
 
 def test_cleaning_keeps_the_first_of_equal_corners_in_order():

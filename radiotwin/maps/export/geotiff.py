@@ -28,11 +28,6 @@ def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
     coordinate reference system is the local frame of the scene's origin; without an origin there
     is none, and coordinates are local metres.
 
-    Args:
-        radio_map: map to write.
-        scene: of the map.
-        path: of the .tif file.
-
     Raises:
         BadInput: rasterio is not installed, or the lattice is not regular.
     """
@@ -107,14 +102,7 @@ def _write_parts(radio_map: RadioMap | MapStream, path: Path, profile: dict[str,
 
 
 def require_rasterio(path: Path) -> Any:
-    """Return the package rasterio.
-
-    Args:
-        path: of the GeoTIFF file, for the message.
-
-    Raises:
-        BadInput: it is not installed.
-    """
+    """Return the package rasterio, or raise BadInput, which names the file to be written."""
     return optional_package(
         "rasterio", f"{path}: GeoTIFF is written with the package rasterio, which is not "
                     "installed; install it with `pip install 'radiotwin[gis]'`, or write .nc or "
@@ -125,11 +113,8 @@ def georeference(x_m: np.ndarray, y_m: np.ndarray, step_m: float,
                  origin: Origin | None) -> dict[str, Any]:
     """Return the reference system and the transform of a raster, north up, for rasterio.
 
-    Args:
-        x_m: middles of the cells to the east, ascending [m].
-        y_m: likewise to the north [m].
-        step_m: side of a cell [m].
-        origin: of the local frame; None: coordinates are local, without a system.
+    Middles of its cells are at x (nx,) and y (ny,), ascending [m]. Without an origin coordinates
+    are local, without a system.
     """
     import rasterio
 
@@ -159,14 +144,7 @@ def _window(block: MapBlock, height: int) -> tuple[slice, slice]:
 
 
 def cell_size_m(radio_map: RadioMap | MapStream, scene: Scene) -> float:
-    """Return the side of a cell: the lattice's step, or the scene's for a map of one position.
-
-    Args:
-        radio_map: map to be drawn in cells.
-        scene: of the map.
-
-    Returns:
-        The side [m].
+    """Return the side of a cell: the lattice's step, or the scene's for a map of one position [m].
 
     Raises:
         BadInput: the positions are not equally far apart.

@@ -55,12 +55,7 @@ class Overlay:
 def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     """Write a KMZ file with a folder for each device and a legend.
 
-    The first device is shown at first, and one altitude at a time.
-
-    Args:
-        radio_map: map to draw.
-        scene: of the map, with an origin.
-        path: of the .kmz file.
+    The first device is shown at first, and one altitude at a time. The scene has an origin.
 
     Raises:
         BadInput: the lattice is not regular.
@@ -158,10 +153,9 @@ def _corners(bounds_m: tuple[float, float, float, float], origin: Origin) -> str
 
 
 def enlarged_png(pixels: np.ndarray) -> bytes:
-    """Return the PNG of a raster, at least 512 pixels wide or high: viewers blur what they enlarge.
+    """Return the PNG of a raster (ny, nx, 4), south first, at least 512 pixels wide or high.
 
-    Args:
-        pixels: (ny, nx, 4) uint8, south first.
+    Viewers blur what they enlarge.
     """
     times = -(-512 // max(pixels.shape))
     enlarged = pixels[::-1].repeat(times, axis=0).repeat(times, axis=1)

@@ -29,13 +29,7 @@ _POSITION = ["x_m", "y_m", "z_m"]
 
 
 def write_dataset(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
-    """Write NetCDF-4 or Zarr after the CF conventions, for xarray and `RadioMap.load`.
-
-    Args:
-        radio_map: map to write.
-        scene: whose origin places the map on the globe.
-        path: of the .nc file, or the .zarr folder.
-    """
+    """Write NetCDF-4 or Zarr after the CF conventions, with the scene's origin."""
     placed = radio_map.placed(scene.config.origin)
     if isinstance(placed, RadioMap):
         placed.write(path)
@@ -45,15 +39,10 @@ def write_dataset(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
 
 
 def write_csv(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
-    """Write CSV with one row a link.
+    """Write CSV with one row a link; the scene is not used.
 
     Columns: device, x_m, y_m, z_m, gain_db (empty: not detected), los, and sigma_db of a learned
     map. Nine digits restore single precision to the bit.
-
-    Args:
-        radio_map: map to write.
-        scene: not used.
-        path: of the .csv file.
     """
     devices, lattice, is_first = radio_map.devices, radio_map.lattice, True
     with atomic_file(path) as file:
@@ -77,15 +66,10 @@ def _rows(block: MapBlock, devices: list[str], lattice: Lattice) -> pd.DataFrame
 
 
 def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
-    """Write NumPy arrays, which `numpy.load` reads without pickling.
+    """Write NumPy arrays, which `numpy.load` reads without pickling; the scene is not used.
 
     Arrays: gain_db, los and sigma_db (device, z, y, x), device, z_m, y_m, x_m; and ground_m (y, x)
     where z_m is above the ground.
-
-    Args:
-        radio_map: map to write.
-        scene: not used.
-        path: of the .npz file.
     """
     lattice, dataset = radio_map.lattice, radio_map.dataset
     arrays = {"device": np.array(radio_map.devices), "z_m": lattice.z_m, "y_m": lattice.y_m,
@@ -99,11 +83,6 @@ def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
 
 def check_map_place(name: str, attributes: dict[str, Any], scene: Scene) -> None:
     """Refuse a map of another city, which would get the outlines and the origin of this one.
-
-    Args:
-        name: of the map in messages.
-        attributes: of the map.
-        scene: that is given with it.
 
     Raises:
         BadInput: their origins differ.

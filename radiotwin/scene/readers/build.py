@@ -110,11 +110,6 @@ def _building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
     return pd.DataFrame(rows)
 
 
-def height_counts(table: pd.DataFrame) -> dict[str, int]:
-    """Count the buildings by the source of their height, once for each source of a building."""
-    return dict(Counter(table.drop_duplicates(["building", "height_from"])["height_from"]))
-
-
 @dataclass(frozen=True)
 class MapOptions:
     """How to read a map.
@@ -187,9 +182,6 @@ def build_scene_from_map(
             `materials` are for city models. None: the defaults.
         check_only: write nothing.
 
-    Returns:
-        The report of the scene.
-
     Raises:
         BadInput: the file cannot be read, holds no buildings (in the box), or an option is
             impossible.
@@ -238,7 +230,7 @@ def build_scene_from_map(
     problems += [*_overlaps(prisms, contacts), *ground.problems]
     city, shape_of = _city(prisms, contacts, ground, map_options.materials, problems)
     table = _building_table(prisms, shape_of, ground.config is not None)
-    counts = height_counts(table)
+    counts = Counter(table.drop_duplicates(["building", "height_from"])["height_from"])
     vegetation, unusable = make_vegetation(found.vegetation, origin,
                                            _both(around.bounds, extent.bounds))
     city.problems.extend(unusable)

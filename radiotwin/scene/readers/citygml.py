@@ -44,14 +44,9 @@ _MAX_VALUE = 1000  # characters of an attribute
 
 
 def read_citygml(path: Path, crs: str | None = None) -> MapFile:
-    """Read the buildings of a CityGML file.
+    """Read the surfaces of buildings in a CityGML file; of objects with an outline only, that.
 
-    Args:
-        path: `.gml` or `.citygml` file.
-        crs: coordinate reference system of a file that names none; None: refuse it.
-
-    Returns:
-        Their surfaces; of objects that have an outline only, that.
+    A file that names no coordinate reference system needs `crs`.
 
     Raises:
         BadInput: no such file, malformed XML, not CityGML, or coordinates that are not numbers;

@@ -25,15 +25,10 @@ _DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2
 
 
 def read_cityjson(path: Path, crs: str | None = None) -> MapFile:
-    """Read the buildings of a CityJSON file.
+    """Read the surfaces of buildings in a CityJSON file; of objects with an outline only, that.
 
-    Args:
-        path: `.json`, `.city.json.gz` or `.cityjson` file, or `.jsonl` with a feature in each
-            line.
-        crs: coordinate reference system of a file that names none; None: refuse it.
-
-    Returns:
-        Their surfaces; of objects that have an outline only, that.
+    A `.jsonl` has a feature in each line. A file that names no coordinate reference system needs
+    `crs`.
 
     Raises:
         BadInput: no such file, not CityJSON, or an impossible value, with the object's name.

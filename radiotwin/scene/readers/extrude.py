@@ -43,12 +43,8 @@ class Block:
 def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
     """Unite touching prisms of one material.
 
-    Args:
-        prisms: of all buildings.
-        contacts: of these prisms; a common wall or more joins them, a corner does not.
-
-    Returns:
-        The blocks; where blocks of different materials meet, the larger one stays whole.
+    A common wall or more joins them, a corner does not. Where blocks of different materials meet,
+    the larger one stays whole.
     """
     if not prisms:
         return []
@@ -89,11 +85,7 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
 def split_roof(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, trimesh.Trimesh | None]:
     """Part the roofs of a block, which face upwards, from its walls and bottom.
 
-    Args:
-        mesh: of the block.
-
-    Returns:
-        Walls with bottom, and roofs; None where nothing, or everything, faces upwards.
+    The roofs are None if nothing, or everything, faces upwards.
     """
     is_roof = mesh.face_normals[:, 2] > MIN_ROOF_COSINE
     if is_roof.all() or not is_roof.any():

@@ -100,10 +100,7 @@ def left_out_problems(left_out: Sequence[LeftOut],
                       bbox_deg: tuple[float, float, float, float] | None) -> list[Problem]:
     """Return one problem about all that was left out for the same reason.
 
-    Args:
-        left_out: in the file's order.
-        bbox_deg: (south, west, north, east) [degrees]: only what reaches into it is named; None:
-            all.
+    Only what reaches into the box (south, west, north, east) [degrees] is named; None: all.
     """
     by_reason: dict[str, list[str]] = {}
     for one in left_out:
@@ -130,26 +127,16 @@ def _is_set(tags: Mapping[str, str], key: str) -> bool:
 
 
 class OutlineBudget:
-    """Corners and crossings of the outlines of one map so far.
-
-    Args:
-        source: of the outlines; messages begin with it.
-    """
+    """Corners and crossings of the outlines of one map so far; messages begin with `source`."""
 
     def __init__(self, source: object) -> None:
         self.source = source
         self.corners = self.crossings = 0
 
     def check(self, name: str, area: BaseGeometry) -> None:
-        """Check one building, and all so far.
+        """Raise BadInput if outlines have too many corners or cross themselves too often.
 
-        Args:
-            name: of the building.
-            area: polygons, valid or not.
-
-        Raises:
-            BadInput: it has too many corners, or all have, or their outlines cross themselves too
-                often.
+        One building is checked (polygons, valid or not), and all so far.
         """
         subject = f"{self.source}: {name}"
         corners = int(shapely.get_num_coordinates(area))

@@ -47,12 +47,8 @@ _ENVELOPE_DOUBLES = (0, 4, 6, 6, 8)  # of a geometry's header, by its code
 def read_geojson(path: Path, crs: str | None = None) -> MapFile:
     """Read the polygons of a GeoJSON file.
 
-    Args:
-        path: file after RFC 7946 (longitude, latitude), or with an older `crs` member.
-        crs: coordinate reference system of a file without that member; None: that of RFC 7946.
-
-    Returns:
-        The buildings.
+    It is after RFC 7946 (longitude, latitude), or has an older `crs` member; `crs` is the system of
+    a file without.
 
     Raises:
         BadInput: no such file, not GeoJSON, or coordinates that are not numbers; with the
@@ -138,15 +134,10 @@ def _crs_name(path: Path, data: Mapping) -> str | None:
 def map_file(
     path: Path, rows: Iterable[tuple[str, Mapping, BaseGeometry | None]], crs: str | None
 ) -> MapFile:
-    """Return the buildings among the rows of a table.
-
-    Args:
-        path: file, for messages.
-        rows: name, properties and area of each.
-        crs: name of the coordinate reference system of the areas; None: not known.
+    """Return the buildings among the rows of a table: name, properties and area of each.
 
     Raises:
-        BadInput: no system, or one that is not known.
+        BadInput: no coordinate reference system, or one that is not known.
     """
     tagged = [(name, _tags(properties), area) for name, properties, area in rows]
     marked = any(key in tags for _, tags, _ in tagged for key in BUILDING_KEYS)
@@ -202,12 +193,7 @@ def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Fe
 def read_geopackage(path: Path, crs: str | None = None) -> MapFile:
     """Read the polygons of all layers of a GeoPackage, in any coordinate reference system.
 
-    Args:
-        path: `.gpkg` file.
-        crs: coordinate reference system of layers whose own is undefined; None: refuse them.
-
-    Returns:
-        The buildings, layer by layer.
+    `crs` is that of layers whose own is undefined; None: refuse them.
 
     Raises:
         BadInput: no such file, not a GeoPackage, one that another program has open, or a layer

@@ -110,14 +110,10 @@ def full_names(cut: Iterable[str], length: int = 10) -> dict[str, str]:
 
 
 def declared_column(text: str, ground: str | None) -> HeightColumn:
-    """Parse a column that the user names.
+    """Parse a column that the user names: `NAME`, in metres, or `NAME:UNIT` of `UNITS_M`.
 
     >>> declared_column("FLOORS:storeys", None)
     HeightColumn(name='floors', unit='storeys', ground='')
-
-    Args:
-        text: `NAME`, in metres, or `NAME:UNIT` with a unit of `UNITS_M`.
-        ground: name of the column with the elevation of the ground; None: heights are above it.
     """
     found = _UNIT.fullmatch(text)
     name, unit = (found[1], found[2].lower()) if found else (text, "m")
@@ -125,13 +121,7 @@ def declared_column(text: str, ground: str | None) -> HeightColumn:
 
 
 def check_declared(column: HeightColumn, rows: Iterable[Mapping[str, str]], source: object) -> None:
-    """Raise BadInput unless the columns that the user named are there.
-
-    Args:
-        column: as declared.
-        rows: tags of each building.
-        source: of the buildings, for the message.
-    """
+    """Raise BadInput unless the columns that the user named are in the tags of some building."""
     there = {key for tags in rows for key in tags}
     for name in (column.name, column.ground):
         if name and name not in there:
@@ -139,11 +129,7 @@ def check_declared(column: HeightColumn, rows: Iterable[Mapping[str, str]], sour
 
 
 def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
-    """Return what to say where no row has a known height; None where no column is of numbers.
-
-    Args:
-        rows: tags of each building.
-    """
+    """Return what to say if no row has a known height; None if no column is of numbers."""
     counts: dict[str, int] = {}
     for tags in rows:
         for key, value in tags.items():
@@ -179,16 +165,10 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def parse_length_m(text: str) -> float:
-    """Parse a length of OpenStreetMap.
+    """Parse a length of OpenStreetMap [m]; NaN if the text is none.
 
     >>> parse_length_m("12.5"), round(parse_length_m("33'"), 4)
     (12.5, 10.0584)
-
-    Args:
-        text: value of a tag.
-
-    Returns:
-        The length [m]; NaN where the text is none.
     """
     text = text.strip()
     if found := _METRES.fullmatch(text):
@@ -222,19 +202,10 @@ class Height:
 
 def height_of(tags: Mapping[str, str], default_m: float,
               declared: HeightColumn | None = None) -> Height:
-    """Return the vertical extent of a building.
+    """Return the vertical extent of a building; impossible values are listed as unusable.
 
-    The top is the first usable of the declared column, the known ones (see
-    `radiotwin.scene.readers.heights.KNOWN`), and the default; the bottom that of `min_height`,
-    `building:min_level` × 3 m, and the ground.
-
-    Args:
-        tags: of the building.
-        default_m: top of a building whose tags give none [m].
-        declared: column that goes before all known ones.
-
-    Returns:
-        The extent; impossible values are skipped and listed in its `unusable`.
+    The top is the first usable of the declared column, the known ones (see `KNOWN`), and the
+    default; the bottom that of `min_height`, `building:min_level` × 3 m, and the ground.
     """
     unusable: list[str] = []
     top_m, source, sd_m = default_m, "default", math.nan
@@ -260,16 +231,10 @@ def height_of(tags: Mapping[str, str], default_m: float,
 
 
 def height_sds_m(top_m: np.ndarray, sd_m: np.ndarray) -> np.ndarray:
-    """Return how well the height of each building of a map is known, of defaults, too.
+    """Return how well the height of each building of a map is known (n,) [m], of defaults, too.
 
-    A default is off as far as heights of the same map that are known lie from it.
-
-    Args:
-        top_m: (n,) tops above the ground [m].
-        sd_m: (n,) standard deviation of each as `Height` has it [m]; NaN of a default.
-
-    Returns:
-        (n,) standard deviations [m]
+    A default is off as far as heights of the same map that are known lie from it. Tops (n,) are
+    above the ground [m], standard deviations (n,) as `Height` has them [m].
     """
     guessed = np.isnan(sd_m)
     if guessed.any():
@@ -285,10 +250,6 @@ def source_text(source: str, declared: HeightColumn | None = None) -> str:
 
     >>> source_text("num_floors"), source_text("height")
     ('num_floors × 3 m', 'height tag')
-
-    Args:
-        source: of a `Height`.
-        declared: column that the user named.
     """
     column = next((one for one in (*((declared,) if declared else ()), *KNOWN)
                    if one.label == source), None)

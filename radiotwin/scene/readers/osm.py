@@ -94,13 +94,9 @@ class OsmElements:
 
 
 def assemble(elements: OsmElements) -> MapFile:
-    """Assemble the areas of buildings and building parts, and of vegetation.
+    """Assemble the areas of buildings and building parts, ways first, and of vegetation.
 
-    Args:
-        elements: of a map file.
-
-    Returns:
-        The areas, ways first; incomplete or open outlines are left out and reported.
+    Incomplete or open outlines are left out and reported.
     """
     budget = OutlineBudget("the map")
     left_out: list[LeftOut] = []
@@ -225,13 +221,9 @@ def _union(polygons: list[shapely.Polygon]) -> BaseGeometry:
 
 
 def stitch(chains: list[Sequence[int]]) -> list[list[int]] | None:
-    """Join ways that meet at their ends to closed rings.
+    """Join ways, by their nodes' ids, that meet at their ends to closed rings.
 
-    Args:
-        chains: node ids of each way.
-
-    Returns:
-        Node ids of each ring, the first again at its end; None where an end remains open.
+    The first node of a ring stands again at its end. None if an end remains open.
     """
     rings = [list(chain) for chain in chains
              if len(chain) >= MIN_RING_NODES and chain[0] == chain[-1]]
@@ -261,13 +253,7 @@ def _polygon(nodes: Sequence[int], elements: OsmElements) -> shapely.Polygon:
 
 
 def read_osm_xml(path: Path) -> OsmElements:
-    """Read all nodes, ways and relations that are not deleted.
-
-    Args:
-        path: `.osm` file.
-
-    Returns:
-        The elements.
+    """Read all nodes, ways and relations of an `.osm` file that are not deleted.
 
     Raises:
         BadInput: no such file, malformed XML, not a map of OpenStreetMap, or an impossible value;
@@ -346,13 +332,7 @@ class _Reader:
 
 
 def read_osm_pbf(path: Path) -> OsmElements:
-    """Read the elements that belong to buildings and vegetation.
-
-    Args:
-        path: `.osm.pbf` file.
-
-    Returns:
-        Buildings and vegetation, their ways and their nodes.
+    """Read buildings and vegetation, their ways and their nodes, of an `.osm.pbf` file.
 
     Raises:
         BadInput: pyosmium is not installed, no such file, or not a PBF file.
@@ -422,10 +402,10 @@ def _drop_other_relations(elements: OsmElements) -> None:
 def download_osm(
     path: Path, bbox_deg: tuple[float, float, float, float], server: str = SERVER
 ) -> None:
-    """Download the buildings and the vegetation of an area to an `.osm` file.
+    """Download the buildings and the vegetation of an area to an `.osm` file that does not exist.
 
     Args:
-        path: `.osm` file that does not exist yet.
+        path: `.osm` file.
         bbox_deg: south, west, north, east [degrees].
         server: address of an Overpass interpreter.
 

@@ -108,9 +108,6 @@ def read_shapefile(path: Path, crs: str | None = None) -> MapFile:
         path: `.shp` file with `.dbf` and `.prj` beside it, or `.zip` archive of one or more.
         crs: coordinate reference system of a file without `.prj`; None: refuse it.
 
-    Returns:
-        The buildings.
-
     Raises:
         BadInput: no such file, one of the three missing, cut off or damaged, or too large.
     """

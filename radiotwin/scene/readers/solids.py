@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-import mapbox_earcut
 import numpy as np
 import shapely
 import trimesh
@@ -21,7 +20,7 @@ from radiotwin.io.budgets import CORNERS, FACES, OVERLAPS, PART_PAIRS, TOUCHING_
 from radiotwin.io.forms import Origin
 from radiotwin.scene.checks import Problem, Severity
 from radiotwin.scene.materials import Material, MaterialTable
-from radiotwin.scene.meshes import clean
+from radiotwin.scene.meshes import clean, cut_polygon
 from radiotwin.scene.readers.features import Feature, Shell, problems_of
 from radiotwin.scene.readers.heights import KNOWN, MAX_HEIGHT_M, Height, HeightColumn, height_of
 from radiotwin.scene.surfaces import Surfaces
@@ -87,7 +86,7 @@ def make_prisms(
     features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float,
     height_column: HeightColumn | None = None
 ) -> tuple[list[Prism], list[Problem]]:
-    """Make prisms from buildings and their parts.
+    """Make prisms from buildings and their parts, parts first, and list the defects.
 
     Args:
         features: buildings and parts.
@@ -95,9 +94,6 @@ def make_prisms(
         table: materials by tag.
         default_height_m: of a building whose tags give no height [m].
         height_column: column that goes before all known ones.
-
-    Returns:
-        The prisms, parts first, and the defects that were found.
     """
     defects = _Defects()
     areas = _clean(features, origin, defects)
@@ -139,6 +135,11 @@ class _Defects:
                               "tag, or the default, was taken"),
         "upside down": ("warning", "building(s) begin (min_height) no lower than they end: left "
                                    "out"),
+        "no footprint": ("warning", "building(s) have no area seen from above: left out"),
+        "too tall": ("warning", f"building(s) are not between 0 and {MAX_HEIGHT_M:g} m tall: left "
+                                "out; are their elevations in metres?"),
+        "open": ("warning", "building(s) are not closed, or cross themselves: kept as they are, "
+                            "and not united with what they touch"),
         "material": ("warning", "building(s) have a building:material that is not in the table; "
                                 "the default was taken. Name it in --material-table or with "
                                 "--material NAME=ITU"),
@@ -162,10 +163,8 @@ class _Defects:
 
 def _clean(features: Sequence[Feature], origin: Origin, defects: _Defects) -> list[Area]:
     """Return the features of which something is left, with their areas in the local frame."""
-    def to_metres(points: np.ndarray) -> np.ndarray:
-        return np.column_stack(to_local(origin, *points.T))
-
-    areas = shapely.transform([feature.area for feature in features], to_metres)
+    areas = shapely.transform([feature.area for feature in features],
+                              lambda points: np.column_stack(to_local(origin, *points.T)))
     return [(feature, kept) for feature, area in zip(features, areas)
             if (kept := _clean_one(feature, area, defects)) is not None]
 
@@ -283,14 +282,7 @@ class Contacts:
 
 
 def find_contacts(prisms: Sequence[Prism]) -> Contacts:
-    """Find prisms that touch or overlap.
-
-    Args:
-        prisms: of all buildings.
-
-    Raises:
-        BadInput: there are too many such pairs.
-    """
+    """Find prisms that touch or overlap; BadInput if there are too many such pairs."""
     areas: Any = np.array([prism.area for prism in prisms], dtype=object)
     pairs = _touching(prisms, areas)
     shared_m2, shared_m = np.zeros(len(pairs)), np.zeros(len(pairs))
@@ -323,15 +315,7 @@ def _touching(prisms: Sequence[Prism], areas: Any) -> np.ndarray:
 
 def find_overlaps(prisms: Sequence[Prism],
                   contacts: Contacts) -> list[tuple[Prism, Prism, float]]:
-    """Find prisms of different buildings that overlap.
-
-    Args:
-        prisms: of all buildings.
-        contacts: of these prisms.
-
-    Returns:
-        Pairs of prisms, with the area they share, if it is more than 1 m² [m²].
-    """
+    """Return pairs of prisms of different buildings, and the area they share, above 1 m² [m²]."""
     found = []
     for (a, b), shared_m2 in zip(contacts.pairs.tolist(), contacts.shared_m2.tolist()):
         first, second = prisms[a], prisms[b]
@@ -343,19 +327,9 @@ def find_overlaps(prisms: Sequence[Prism],
 
 def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: MaterialTable
                       ) -> tuple[list[Prism], list[Problem]]:
-    """Make a prism with a body from each feature that has a shell.
-
-    Args:
-        features: buildings and parts, with shells.
-        origin: of the local frame.
-        table: materials by tag.
-
-    Returns:
-        The prisms, and the defects that were found.
-    """
+    """Make a prism with a body from each feature, which all have shells, and list the defects."""
     prisms: list[Prism] = []
-    no_area, too_high, opened, unknown = [], [], [], []
-    faces_so_far = 0
+    defects, faces_so_far = _Defects(), 0
     for feature in features:
         assert feature.shell is not None
         vertices, faces = _triangulate(feature.shell, origin)
@@ -363,28 +337,20 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
         FACES.check(faces_so_far, "the map")
         area = _footprint(vertices, faces)
         if area.area < SLIVER_AREA_M2:
-            no_area.append(feature.name)
+            defects.add("no footprint", feature.name)
             continue
         bottom_m, top_m = vertices[:, 2].min(), vertices[:, 2].max()
         if not 0 < top_m <= MAX_HEIGHT_M:
-            too_high.append(f"{feature.name}: {top_m:.4g} m")
+            defects.add("too tall", f"{feature.name}: {top_m:.4g} m")
             continue
         body, closed = _body(vertices, faces)
         if not closed:
-            opened.append(feature.name)
+            defects.add("open", feature.name)
         if value := table.unknown(feature.tags):
-            unknown.append(f"{feature.name}: {value}")
+            defects.add("material", f"{feature.name}: {value}")
         height = Height(float(bottom_m), float(top_m), "model")
         prisms.append(Prism(feature.name, area, height, *table.material_of(feature.tags), body))
-    return _with_sites(prisms), [
-        *problems_of(no_area, "building(s) have no area seen from above: left out"),
-        *problems_of(too_high, f"building(s) are not between 0 and {MAX_HEIGHT_M:g} m tall: left "
-                               "out; are their elevations in metres?"),
-        *problems_of(opened, "building(s) are not closed, or cross themselves: kept as they are, "
-                             "and not united with what they touch"),
-        *problems_of(unknown, "building(s) have a building:material that is not in the table; the "
-                              "default was taken. Name it in --material-table or with --material "
-                              "NAME=ITU")]
+    return _with_sites(prisms), defects.problems()
 
 
 def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
@@ -397,11 +363,7 @@ def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
 
 
 def elevation_fact(features: Sequence[Feature]) -> str:
-    """Return where the ground of buildings was, a line for a report.
-
-    Args:
-        features: buildings with shells, at least one.
-    """
+    """Return where the ground of buildings with shells was, a line for a report."""
     ground_m = [feature.shell.ground_m for feature in features if feature.shell is not None]
     return (f"buildings begin at {min(ground_m):.1f} to {max(ground_m):.1f} m above the file's "
             "vertical datum; each was put on the ground")
@@ -418,34 +380,22 @@ def _triangulate(shell: Shell, origin: Origin) -> tuple[np.ndarray, np.ndarray]:
     vertices = np.column_stack([x_m, y_m, points[:, 2] - shell.ground_m])
     vertices, same = np.unique(np.round(vertices, _DECIMALS), axis=0, return_inverse=True)
     same = same.reshape(-1)
-    found = [np.zeros((0, 3), dtype=np.int64)]
-    for rings in shell.polygons:
-        faces = _cut(vertices, [same[ring] for ring in rings])
-        found.append(faces)
-    return vertices, np.concatenate(found)
+    faces = [_cut(vertices, [same[ring] for ring in rings]) for rings in shell.polygons]
+    return vertices, np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
 
 
 def _cut(vertices: np.ndarray, rings: list[np.ndarray]) -> np.ndarray:
     """Return the triangles of a polygon with holes, which turn as its outline does."""
     rings = [ring[ring != np.roll(ring, 1)] for ring in rings]
     rings = [rings[0], *(ring for ring in rings[1:] if len(ring) > 2)]
-    outline = vertices[rings[0]]
-    if len(outline) < 3:
+    if len(rings[0]) < 3:
         return np.zeros((0, 3), dtype=np.int64)
-    if len(outline) == 3 and len(rings) == 1:
+    if len(rings[0]) == 3 and len(rings) == 1:
         return rings[0][None]
     corners = np.concatenate(rings)
     CORNERS.check(len(corners), "the map")
-    # Twice its area, as a vector (Newell)
-    normal = np.cross(outline - outline[0], np.roll(outline, -1, axis=0) - outline[0]).sum(axis=0)
-    axis = int(np.abs(normal).argmax())
-    flat = np.delete(vertices[corners], axis, axis=1)
-    ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
-    ears: Any = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends)
-    faces = corners[ears.astype(np.int64).reshape(-1, 3)]
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    turned = np.cross(b - a, c - a).sum(axis=0) @ normal < 0
-    return faces[:, ::-1] if turned else faces
+    ends = np.cumsum([len(ring) for ring in rings]).tolist()
+    return corners[cut_polygon(vertices[corners], ends)]
 
 
 def _footprint(vertices: np.ndarray, faces: np.ndarray) -> shapely.MultiPolygon:

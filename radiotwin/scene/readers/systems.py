@@ -23,11 +23,7 @@ _MARGIN_DEG = 1.0  # around the area of use that a system declares
 
 
 def find_system(path: Path, name: str) -> "CRS":
-    """Find a coordinate reference system by its name.
-
-    Args:
-        path: file that names it, for the message.
-        name: `AUTHORITY:CODE`, URN, title of PROJ's database, or WKT.
+    """Find a system by `AUTHORITY:CODE`, URN, title of PROJ's database, or WKT.
 
     Raises:
         BadInput: it is not known, or a name that could open a file.
@@ -43,10 +39,6 @@ def find_system(path: Path, name: str) -> "CRS":
 
 def degrees_from(path: Path, system: "CRS") -> Callable[[np.ndarray], np.ndarray]:
     """Return a conversion of (n, 2) east and north to (n, 2) longitude and latitude [degrees].
-
-    Args:
-        path: file that names the system, for the message.
-        system: of two dimensions.
 
     Raises:
         BadInput: now or when it is used, the system cannot be converted.
@@ -74,11 +66,6 @@ def degrees_from(path: Path, system: "CRS") -> Callable[[np.ndarray], np.ndarray
 def chosen_system(path: Path, named: str | None, declared: str | None) -> str | None:
     """Return the system of a file: the one that it names, else the one that the user declared.
 
-    Args:
-        path: file, for the message.
-        named: by the file; None: nothing.
-        declared: by the user; None: nothing.
-
     Raises:
         BadInput: they differ.
     """
@@ -103,10 +90,8 @@ def check_declared_system(name: str) -> None:
 def find_city_system(path: Path, name: str) -> "CRS":
     """Find the system of a 3D city model, as GML and CityJSON name it.
 
-    Args:
-        path: file that names it, for the message.
-        name: `urn:ogc:def:crs:EPSG::25832`, `https://www.opengis.net/def/crs/EPSG/0/7415`,
-            `urn:ogc:def:crs,crs:EPSG::25832,crs:EPSG::7837`, `urn:adv:crs:ETRS89_UTM32`, …
+    Such names are `urn:ogc:def:crs:EPSG::25832`, `https://www.opengis.net/def/crs/EPSG/0/7415`,
+    `urn:ogc:def:crs,crs:EPSG::25832,crs:EPSG::7837`, `urn:adv:crs:ETRS89_UTM32`.
 
     Raises:
         BadInput: it is not known.
@@ -130,18 +115,10 @@ def vertical_unit_m(system: "CRS") -> float:
 
 
 def to_degrees(path: Path, system: "CRS", points: np.ndarray) -> np.ndarray:
-    """Convert points of a 3D city model to longitude and latitude.
+    """Convert points (n, 2) of a 3D city model to longitude and latitude [degrees].
 
     Standards want a system's own order of axes, many programs write east before north. The
     points tell: they lie in the area that the system is meant for.
-
-    Args:
-        path: file, for the message.
-        system: of the points.
-        points: (n, 2) in the file's order.
-
-    Returns:
-        (n, 2) longitude and latitude [degrees].
 
     Raises:
         BadInput: in neither order the points lie where the system is used.
@@ -167,10 +144,6 @@ def to_degrees(path: Path, system: "CRS", points: np.ndarray) -> np.ndarray:
 
 
 def plane_of(system: "CRS") -> "CRS":
-    """Return the horizontal part of a system.
-
-    Args:
-        system: of two or three dimensions, or of two systems.
-    """
+    """Return the horizontal part of a system."""
     parts = system.sub_crs_list
     return parts[0] if parts else system.to_2d()

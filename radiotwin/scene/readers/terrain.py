@@ -52,16 +52,10 @@ FLAT_FACT = "flat, at z = 0: a map holds no terrain (--terrain FILE.tif adds one
 
 
 def read_heights(path: Path, origin: Origin, box_m: Bounds) -> HeightGrid:
-    """Read the heights of an area, averaged or interpolated to a grid.
+    """Read the heights of an area (x_min, x_max, y_min, y_max) [m], brought to a grid.
 
-    Args:
-        path: GeoTIFF of one band, in any known coordinate reference system.
-        origin: of the local frame.
-        box_m: (x_min, x_max, y_min, y_max) of the area [m].
-
-    Returns:
-        The heights above the zero of the file's vertical reference. A node without one, where the
-        file has no data, has that of the nearest pixel which has one.
+    They are above the zero of the file's vertical reference, averaged or interpolated. A node
+    without one, where the file has no data, has that of the nearest pixel which has one.
 
     Raises:
         BadInput: rasterio is not installed; not a GeoTIFF, or one without a system, with several
@@ -276,16 +270,13 @@ class Ground:
 
 
 def make_ground(terrain: Path | None, origin: Origin, box_m: Bounds, shape: str) -> Ground:
-    """Return the ground of an area.
+    """Return the ground of an area, above its datum.
 
     Args:
         terrain: GeoTIFF of heights; None: the ground is flat.
         origin: of the local frame; an altitude other than 0 becomes the datum of a terrain.
         box_m: (x_min, x_max, y_min, y_max) [m].
         shape: name of its shape.
-
-    Returns:
-        The ground, above its datum.
 
     Raises:
         BadInput: the raster cannot be used, or the declared altitude is above the lowest ground.
@@ -332,20 +323,13 @@ def _fact(grid: HeightGrid, mesh: GroundMesh, datum_m: float) -> str:
 
 
 def stand_on(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
-    """Put buildings on a terrain.
+    """Put buildings on a terrain; flat ground leaves them as they are.
 
     Heights of OpenStreetMap count from the lowest point where the building meets the ground [1], as
     those of most 3D city models do: so do those of all its parts. A wall from the ground begins
     `SKIRT_M` below that point.
 
     [1] https://wiki.openstreetmap.org/wiki/Key:height
-
-    Args:
-        prisms: with heights above the ground.
-        ground: that they are put on; flat ground leaves them as they are.
-
-    Returns:
-        The prisms, with heights above the datum.
     """
     if ground.config is None:
         return list(prisms)

@@ -30,10 +30,7 @@ SIMPLIFIED_M, MIN_AREA_M2 = 1.0, 50.0  # what outlines may be off; less is a gar
 
 
 def kind_of(tags: Mapping[str, str]) -> str | None:
-    """Return the kind of vegetation that tags describe; None: none.
-
-    Args:
-        tags: as in OpenStreetMap.
+    """Return the kind of vegetation that tags of OpenStreetMap describe; None: none.
 
     >>> kind_of({"landuse": "forest"}), kind_of({"natural": "water"})
     ('wood', None)
@@ -44,28 +41,20 @@ def kind_of(tags: Mapping[str, str]) -> str | None:
 def make_vegetation(features: Sequence[Feature], origin: Origin,
                     box_m: tuple[float, float, float, float]
                     ) -> tuple[list[VegetationConfig], list[Problem]]:
-    """Make volumes from areas and lines.
+    """Make volumes from areas and lines, cut to a box x_min, x_max, y_min, y_max [m].
 
-    Args:
-        features: of which `kind_of` is some kind.
-        origin: of the local frame.
-        box_m: (x_min, x_max, y_min, y_max) that they are cut to [m].
-
-    Returns:
-        a volume for each polygon that is left, of which several may share a name, and what was left
-        out.
+    There is one for each polygon that is left, of which several may share a name. What was left out
+    is reported.
     """
     x_min, x_max, y_min, y_max = box_m
     box = shapely.box(x_min, y_min, x_max, y_max)
-
-    def to_metres(points: np.ndarray) -> np.ndarray:
-        return np.column_stack(to_local(origin, *points.T))
 
     found = []
     for feature in features:
         kind = kind_of(feature.tags)
         assert kind is not None
-        area = shapely.transform(feature.area, to_metres)
+        area = shapely.transform(feature.area, lambda points: np.column_stack(
+            to_local(origin, *points.T)))
         area = area.buffer(ROW_WIDTH_M / 2) if kind == "tree_row" else shapely.make_valid(area)
         area = shapely.make_valid(shapely.simplify(shapely.intersection(area, box), SIMPLIFIED_M))
         for part in shapely.get_parts(shapely.get_parts(area)):
@@ -96,11 +85,7 @@ def _area_m2(declared: VegetationConfig) -> float:
 
 
 def vegetation_fact(declared: Sequence[VegetationConfig]) -> str:
-    """Return how much vegetation there is, a line for a report.
-
-    Args:
-        declared: volumes.
-    """
+    """Return how much vegetation there is, a line for a report."""
     area_m2 = dict.fromkeys(HEIGHT_M, 0.0)
     for each in declared:
         area_m2[each.kind] += _area_m2(each)
