@@ -62,8 +62,8 @@ def candidates_of(seed: int, settings: dict) -> dict:
         "hidden": [[each["name"], each.get("in_catalogue", family not in OUTSIDE)]
                    for each in hidden.answer["effects"]],
         "open": sorted(undeclared - right),
-        "named": [each.effect.name for each in loop.after.whole.effects
-                  if not each.effect.is_declared],
+        "named": [each.name for each in loop.after.whole.effects
+                  if not each.is_declared],
         "candidates": [[*_row(score), score.name in right or _is_wrong_map(score, nuisance)]
                        for score in loop.found.log.trials if score.features],
         "steps": [[max([0.0, *(score.nats for score in loop.found.log.trials if score.features

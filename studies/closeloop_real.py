@@ -110,12 +110,10 @@ def turned_rmse_db(loop: Loop) -> float:
     def turned(fit: Fit) -> Fit:
         effects = []
         for each in fit.effects:
-            if isinstance(each.effect, SectorEffect):
-                devices = {device: pattern.model_copy(
-                    update={"azimuth_deg": pattern.azimuth_deg + 180.0})
-                    for device, pattern in each.params.devices.items()}
-                each = fit.model.apply(each.effect, each.params.model_copy(
-                    update={"devices": devices}))
+            if isinstance(each, SectorEffect):
+                each = each.changed(devices={
+                    device: pattern.model_copy(update={"azimuth_deg": pattern.azimuth_deg + 180.0})
+                    for device, pattern in each.params.devices.items()})
             effects.append(each)
         return fit.model.with_effects(effects).fit()
 

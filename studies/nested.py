@@ -109,8 +109,8 @@ def _without(hypotheses: Hypotheses) -> Sampled:
 
 def _with(hypotheses: Hypotheses, fit: Fit) -> Sampled:
     """Return the likelihood over the last effect's numbers, within their bounds."""
-    applied, own = fit.effects[-1], fit.model.coefficient_slices[-1]
-    varied = applied.effect.variation(applied.params)
+    own = fit.model.coefficient_slices[-1]
+    varied = fit.effects[-1].variation()
     assert varied is not None
     coefficients = fit.coefficients.copy()
     coefficients[own] = 0.0
@@ -118,10 +118,10 @@ def _with(hypotheses: Hypotheses, fit: Fit) -> Sampled:
     plain = FitResult(coefficients, fit.scale_db, np.nan)
 
     def at(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        other = fit.model.apply(applied.effect, varied.params(numbers))
-        problem = fit.model.with_effects([other]).training
+        model = fit.model.with_effects([varied.effect(numbers)])
+        problem, term = model.training, model.terms[0]
         z = (problem.level_db - problem.predict(plain).mean_db) / hypotheses.scale_db
-        return z, other.term.columns / hypotheses.scale_db[:, None], other.term.prior_sd_db
+        return z, term.columns / hypotheses.scale_db[:, None], term.prior_sd_db
 
     return _of(hypotheses, at, varied.low, varied.high)
 

@@ -61,8 +61,8 @@ def _close(measured: Measurements, scene: Scene | None, seed: int) -> Loop:
 
 
 def _named(loop: Loop) -> list[str]:
-    return [each.effect.name for each in loop.after.whole.effects
-            if each.effect.is_cause and not each.effect.is_declared]
+    return [each.name for each in loop.after.whole.effects
+            if each.is_cause and not each.is_declared]
 
 
 def _louder(measured: Measurements, change_db: np.ndarray) -> Measurements:

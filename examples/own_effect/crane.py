@@ -40,6 +40,8 @@ class Crane(GainEffect):
 
         place_m: tuple[Metres, Metres] = Field(description="x and y of the tower [m].")
 
+    params: Params
+
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         ends_m = np.vstack([view.links.device_m[view.links.device], view.links.receiver_m])[:, :2]
@@ -51,17 +53,17 @@ class Crane(GainEffect):
         return [tried[best]] if nats[best] > MIN_NATS else []
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        inside_m = cross(_tower(params), *ends_above(links, params.place_m)).inside_m
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        inside_m = cross(_tower(self.params), *ends_above(links, self.params.place_m)).inside_m
         return Term.of_columns(-(inside_m > 0).astype(float)[:, None], prior_sd_db=5.0)
 
     @override
-    def reach(self, links: Links, params: Params) -> np.ndarray:
-        around = _tower(params)._replace(length_m=2 * NEAR_M, width_m=2 * NEAR_M)
-        return cross(around, *ends_above(links, params.place_m)).inside_m > 0
+    def reach(self, links: Links) -> np.ndarray:
+        around = _tower(self.params)._replace(length_m=2 * NEAR_M, width_m=2 * NEAR_M)
+        return cross(around, *ends_above(links, self.params.place_m)).inside_m > 0
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+    def implausible(self, coefficients: np.ndarray) -> str | None:
         loss_db = coefficients[0]
         return None if 0 < loss_db < MAX_LOSS_DB else f"a lattice does not take {loss_db:.1f} dB"
 
@@ -72,18 +74,17 @@ class Crane(GainEffect):
                           high=MAX_LOSS_DB)
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         return {"loss_db": Parameter.normal(estimate.coefficients[0], estimate.coefficients_sd[0],
                                             "dB")}
 
     @override
-    def mark(self, links: Links, params: Params) -> Mark:
-        return Mark(self.label, np.array(params.place_m), _tower(params).outline_m)
+    def mark(self, links: Links) -> Mark:
+        return Mark(self.label, np.array(self.params.place_m), _tower(self.params).outline_m)
 
     @override
-    def correction(self, links: Links, params: Params) -> Correction:
-        return Correction(boxes=(_tower(params),))
+    def correction(self, links: Links) -> Correction:
+        return Correction(boxes=(_tower(self.params),))
 
 
 def _tower(params: Crane.Params) -> Box:

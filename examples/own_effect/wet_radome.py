@@ -32,6 +32,8 @@ class WetRadome(GainEffect):
         start_s: float = Field(description="Beginning of the rain [s].")
         end_s: float = Field(description="End of the rain [s].")
 
+    params: Params
+
     @override
     def unavailable(self, links: Links) -> str | None:
         return None if np.isfinite(links.time_s).any() else "there is no time_s"
@@ -45,12 +47,12 @@ class WetRadome(GainEffect):
         return [episodes[int(np.argmax(gains))]]
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        rains = (links.time_s >= params.start_s) & (links.time_s <= params.end_s)
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        rains = (links.time_s >= self.params.start_s) & (links.time_s <= self.params.end_s)
         return Term.of_columns(-rains[:, None].astype(float), prior_sd_db=5.0)
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+    def implausible(self, coefficients: np.ndarray) -> str | None:
         return None if coefficients[0] > 0 else "rain would have to amplify"
 
     @override
@@ -61,7 +63,6 @@ class WetRadome(GainEffect):
                       self.term(view.links, rain, view.level_at).columns[:, 0], high=10.0)
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         return {"loss_db": Parameter.normal(estimate.coefficients[0], estimate.coefficients_sd[0],
                                             "dB")}

@@ -29,7 +29,7 @@ from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_known, fit_links, reliable_m
 from radiotwin.twin.fit_paths import LOST_M, best_dof, fit_paths, relocation_from
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
-from radiotwin.twin.model.model import AppliedEffect, Fit, Model
+from radiotwin.twin.model.model import Fit, Model
 from radiotwin.twin.twin import Twin
 
 WAYS = ("flight", "block", "quadrant", "device")
@@ -328,10 +328,10 @@ class CrossFit:
         """
         found = np.zeros(len(self.index), dtype=bool)
         for number, fold in enumerate(self.folds):
-            for applied, place in zip(self.whole.effects, same_effects(self.whole, fold),
-                                      strict=True):
-                if applied.effect.within_flights and place is None:
-                    found |= (self.index == number) & applied.acts
+            for effect, term, place in zip(self.whole.effects, self.whole.model.terms,
+                                           same_effects(self.whole, fold), strict=True):
+                if effect.within_flights and place is None:
+                    found |= (self.index == number) & term.acts
         return found
 
     def rmse_db(self, rows: np.ndarray | None = None) -> float:
@@ -357,9 +357,9 @@ def same_effects(whole: Fit, fold: Fit) -> list[int | None]:
     another. Where a fold has as many, each is one of them, if in another order.
     """
     places: list[int | None] = [None] * len(whole.effects)
-    for effect in dict.fromkeys(each.effect for each in whole.effects):
+    for entry in dict.fromkeys(each.entry for each in whole.effects):
         of_whole, of_fold = ([place for place, each in enumerate(model.effects)
-                              if each.effect is effect] for model in (whole, fold))
+                              if each.entry is entry] for model in (whole, fold))
         for place, found in _on_the_same_links(whole, fold, of_whole, of_fold):
             places[place] = found
     return places
@@ -374,9 +374,9 @@ def _on_the_same_links(whole: Fit, fold: Fit, of_whole: list[int],
     # Where nothing tells them apart, the order in which they were found does.
     shared = np.eye(len(of_whole), len(of_fold)) * 1e-9
     for row, place in enumerate(of_whole):
-        acts = whole.effects[place].acts
+        acts = whole.model.terms[place].acts
         for column, found in enumerate(of_fold):
-            others = fold.effects[found].acts
+            others = fold.model.terms[found].acts
             shared[row, column] += (acts & others).sum() / max((acts | others).sum(), 1)
     return [(of_whole[row], of_fold[column])
             for row, column in zip(*linear_sum_assignment(shared, maximize=True), strict=True)
@@ -397,10 +397,10 @@ def without_quality(model: CrossFit) -> CrossFit:
         known = quality[each.train & np.isfinite(quality)]
         usual = float(np.median(known)) if len(known) else np.nan
         links = each.links.with_columns(quality=np.full(len(quality), usual))
-        effects = [applied if "quality" not in applied.effect.uses
-                   else AppliedEffect(applied.effect, applied.params, applied.effect.term(
-                       links, applied.params, each.model.level_at)) for applied in each.effects]
-        return replace(each, model=replace(each.model, links=links, effects=effects))
+        terms = tuple(term if "quality" not in effect.uses
+                      else effect.term(links, each.model.level_at)
+                      for effect, term in zip(each.effects, each.model.terms, strict=True))
+        return replace(each, model=replace(each.model, links=links, terms=terms))
 
     return model.map(blind).with_shadowing(model.shadowing)
 

@@ -92,14 +92,12 @@ class Loop(Summarised):
 
         If there are none it is `after` itself, with its interpolated shadowing.
         """
-        dropped = [each.effect for each in self.after.whole.effects
-                   if not (each.effect.is_cause or each.effect.is_declared
-                           or each.effect.is_on_maps(each.params))]
+        dropped = [each.entry for each in self.after.whole.effects
+                   if not (each.is_cause or each.is_declared or each.is_on_maps())]
         if not dropped:
             return self.after
         return self.after.map(lambda fit: fit.model.with_effects(
-            [each for each in fit.effects
-             if not any(each.effect is other for other in dropped)]).fit())
+            each for each in fit.effects if each.entry not in dropped).fit())
 
     @property
     def remaining(self) -> list[ResidualDependence]:
@@ -109,13 +107,12 @@ class Loop(Summarised):
     @property
     def verdict(self) -> str:
         """`effect` where a cause was named; else `none`, `unexplained` or `undecided`."""
-        named = any(each.effect.is_cause and not each.effect.is_declared
-                    for each in self.after.whole.effects)
+        named = any(each.is_cause and not each.is_declared for each in self.after.whole.effects)
         return "effect" if named else verdict_without_effect(self.found.steps, self.criteria)
 
     @property
     def _summary(self) -> Summary:
-        names = some(each.effect.name for each in self.after.whole.effects) or "no effect"
+        names = some(each.name for each in self.after.whole.effects) or "no effect"
         error = f"RMSE {self.before.rmse_db():.2f} dB before, {self.after.rmse_db():.2f} dB after"
         return Summary("Loop", f"verdict {self.verdict}: {names}, base {self.base}, {error}", (
             ("verdict", self.verdict), ("effects", names), ("base", self.base),

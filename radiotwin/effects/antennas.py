@@ -64,12 +64,12 @@ Pattern = TypeVar("Pattern", bound=EffectParams)
 
 
 def vary_patterns(patterns: dict[int, Pattern],
-                  params: Callable[[dict[int, Pattern]], Any]) -> Variation:
+                  effect: Callable[[dict[int, Pattern]], Any]) -> Variation:
     """Return how the patterns of several antennas, or bodies, may be refined, each by itself.
 
     Args:
         patterns: pattern of each device or receiver.
-        params: patterns -> parameters of the effect.
+        effect: patterns -> the effect with them.
     """
     members, fields = len(patterns), quantities(next(iter(patterns.values())))
     values = np.array([[getattr(pattern, name) for name in fields]
@@ -79,7 +79,7 @@ def vary_patterns(patterns: dict[int, Pattern],
 
     def changed(numbers: np.ndarray) -> Any:
         rows = np.reshape(numbers, (members, -1)).tolist()
-        return params({member: pattern.model_copy(update=dict(zip(fields, row, strict=True)))
+        return effect({member: pattern.model_copy(update=dict(zip(fields, row, strict=True)))
                        for (member, pattern), row in zip(patterns.items(), rows, strict=True)})
 
     return Variation(values.ravel(), steps, low, high, changed,
@@ -216,6 +216,8 @@ class SectorEffect(GainEffect):
         straight: bool = Field(False, description=(
             "Whether links leave along the straight line even where there is a 3D map."))
 
+    params: Params
+
     def __init__(self) -> None:
         self._rays = LinkCache()
 
@@ -226,23 +228,23 @@ class SectorEffect(GainEffect):
         return None
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
         offset_db = np.zeros(len(links))
-        for device, pattern in params.devices.items():
+        for device, pattern in self.params.devices.items():
             rows = np.flatnonzero(links.device == device)
             if len(rows):
-                rays = self._rays.get(links, (device, params.straight),
-                                      partial(Rays.of, links, rows, params.straight))
+                rays = self._rays.get(links, (device, self.params.straight),
+                                      partial(Rays.of, links, rows, self.params.straight))
                 offset_db[rows] = rays.offset_db(pattern)
-        return Term(offset_db, one_hot(links.device, list(params.devices)),
-                    np.full(len(params.devices), LEVEL_SD_DB))
+        return Term(offset_db, one_hot(links.device, list(self.params.devices)),
+                    np.full(len(self.params.devices), LEVEL_SD_DB))
 
     @override
-    def correction(self, links: Links, params: Params) -> Correction:
+    def correction(self, links: Links) -> Correction:
         return Correction(antennas={device: FoundAntenna(
             "sector antenna", pattern.azimuth_deg, pattern.beamwidth_deg,
             partial(sector_pattern_db, pattern=pattern.model_copy(update={"azimuth_deg": 0.0})))
-            for device, pattern in params.devices.items()})
+            for device, pattern in self.params.devices.items()})
 
 
 def eligible_devices(links: Links) -> list[int]:

@@ -16,9 +16,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 
@@ -63,6 +64,11 @@ class Term:
     random_effect_sd_db: np.ndarray | None = None
     unheard_sd_db: np.ndarray | None = None
 
+    @property
+    def acts(self) -> np.ndarray:
+        """(n,) bool, links whose level it may change."""
+        return (self.offset_db != 0) | (self.columns != 0).any(axis=1)
+
     def select(self, rows: np.ndarray) -> Term:
         """Return the term of the links of a mask or an index array."""
         inputs, scatter_db, unheard_db = (
@@ -87,6 +93,11 @@ class Term:
         """Return a term that adds nothing and carries inputs (n, …) of a response."""
         n = len(inputs)
         return cls(np.zeros(n), np.zeros((n, 0)), np.zeros(0), inputs)
+
+
+# Levels of the channel that a term is made of: quick ones, those of paths that are known already,
+# or those of paths that are followed anew.
+Levels = Literal["quick", "known_paths", "exact"]
 
 
 class Change(NamedTuple):
@@ -126,7 +137,7 @@ class Effect(ABC):
             are open: it is no candidate cause but a part of the base, where held-out links gain by
             it.
         in_paths: whether a base that follows paths has it, so that it is no candidate there.
-        always_exact: whether `exact` may be asked of every candidate, not only of what is kept.
+        always_exact: whether `exactly` may be asked of every candidate, not only of what is kept.
         uses: columns of the measurements that it reads and that no map has, such as `quality`.
         needs_map: whether its term needs the 3D map.
         settled_by: what to measure, to settle whether it is there; "the device" is replaced by the
@@ -135,6 +146,8 @@ class Effect(ABC):
             made from their own names do not do.
         calibrated_like: name of the effect whose calibration it takes where it has none of its own,
             because it has not been traced; "" = it is judged as effects are on the whole.
+        params: of one that was found, an instance of `Params`; the catalogue's own have none.
+        levels: which levels of the channel its term asks for, see `Levels`.
     """
 
     name: ClassVar[str]
@@ -159,10 +172,45 @@ class Effect(ABC):
     parameter_labels: ClassVar[Mapping[str, str]] = {}
     calibrated_like: ClassVar[str] = ""
 
+    params: EffectParams
+    levels: Levels = "quick"
+
     @property
     def label(self) -> str:
         """Printed name."""
         return self.name.replace("_", " ")
+
+    @property
+    def entry(self) -> Effect:
+        """The effect of the catalogue that this one was found by, or itself."""
+        return vars(self).get("_entry", self)
+
+    def with_params(self, params: EffectParams, levels: Levels | None = None) -> Self:
+        """Return the effect with parameters; `levels` None: as this one has them."""
+        found = copy(self)
+        found.params, found.levels = params, levels or self.levels
+        vars(found)["_entry"] = self.entry
+        return found
+
+    def changed(self, **update: Any) -> Self:
+        """Return the effect with some parameters changed, which are not checked."""
+        return self.with_params(self.params.model_copy(update=update))
+
+    def record(self) -> dict[str, Any]:
+        """Return what files have of it, for JSON: name, variant, params, and unusual `levels`."""
+        usual = self.levels == type(self).levels
+        return {"name": self.name, "variant": self.variant,
+                "params": self.params.model_dump(mode="json")} | (
+                    {} if usual else {"levels": self.levels})
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether its term is of paths that are followed anew."""
+        return self.levels == "exact"
+
+    def is_same(self, other: Effect | None) -> bool:
+        """Return whether another one of this kind has the same parameters and kind of levels."""
+        return other is not None and self.params == other.params and self.levels == other.levels
 
     @classmethod
     def of_variant(cls, variant: str) -> Effect | None:
@@ -176,8 +224,8 @@ class Effect(ABC):
         """
         return "there is no 3D map" if self.needs_map and links.city is None else None
 
-    def kind(self, params: Any) -> Any:
-        """Return of which kind parameters are: a search begins at the best of each kind."""
+    def kind(self) -> Any:
+        """Return of which kind its parameters are: a search begins at the best of each kind."""
         return None
 
     def propose(self, view: ResidualView) -> list[Any]:
@@ -187,21 +235,20 @@ class Effect(ABC):
         """
         return [self.Params()]
 
-    def propose_like(self, view: ResidualView, params: Any) -> list[Any]:
-        """Return the same for a part of the data, once all of it has proposed `params`."""
+    def propose_like(self, view: ResidualView) -> list[Any]:
+        """Return the same for a part of the data, once all of it has led to this effect."""
         return self.propose(view)
 
     @abstractmethod
-    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
         """Return what it adds to the mean level of n links.
 
         Args:
             links: n links.
-            params: an instance of `Params`.
             level_at: the channel's levels of other links, such as with devices elsewhere.
         """
 
-    def variation(self, params: Any) -> Variation | None:
+    def variation(self) -> Variation | None:
         """Return how the parameters may be refined; None where they are fixed.
 
         By default, every parameter made with `quantity` is, within its bounds.
@@ -210,16 +257,16 @@ class Effect(ABC):
         if not fields:
             return None
         values, steps, low, high = (np.array(column, dtype=float) for column in zip(
-            *((getattr(params, name), each["step"], each["low"], each["high"])
+            *((getattr(self.params, name), each["step"], each["low"], each["high"])
               for name, each in fields.items()), strict=True))
 
-        def changed(numbers: np.ndarray) -> Any:
+        def varied(numbers: np.ndarray) -> Effect:
             inside = np.clip(numbers, low, high).tolist()
-            return params.model_copy(update=dict(zip(fields, inside, strict=True)))
+            return self.changed(**dict(zip(fields, inside, strict=True)))
 
-        return Variation(values, steps, low, high, changed)
+        return Variation(values, steps, low, high, varied)
 
-    def is_on_maps(self, params: Any) -> bool:
+    def is_on_maps(self) -> bool:
         """Return whether a map, which has neither receivers nor times, is drawn with it."""
         return not self.of_receiver
 
@@ -230,66 +277,64 @@ class Effect(ABC):
         """
         return None
 
-    def change(self, links: Links, params: Any) -> Change | None:
+    def change(self, links: Links) -> Change | None:
         """Return what changed, and when; None: it is no change in time."""
         return None
 
-    def reading_offsets_db(self, params: Any, coefficients: np.ndarray) -> dict[int, float]:
+    def reading_offsets_db(self, coefficients: np.ndarray) -> dict[int, float]:
         """Return how much more receivers read than others, by index [dB]; by default nothing.
 
         A receiver hears the same signals, so its limit of detection moves with its readings.
 
         Args:
-            params: fitted.
             coefficients: (q,) of the columns of its term.
         """
         return {}
 
-    def reach(self, links: Links, params: Any) -> np.ndarray | None:
+    def reach(self, links: Links) -> np.ndarray | None:
         """Return which (n,) links similar parameters may act on; None for any."""
         return None
 
-    def exact(self, params: Any) -> Any | None:
+    def exactly(self) -> Effect | None:
         """Return the same, asking the channel for exact levels; None where nothing changes."""
         return None
 
-    def corrected_map(self, city: CityMap, params: Any) -> CityMap:
+    def corrected_map(self, city: CityMap) -> CityMap:
         """Return the map as the effect has it; by default the same object."""
         return city
 
-    def neg_log_prior(self, params: Any) -> float:
+    def neg_log_prior(self) -> float:
         """Return how much less likely parameters are than the likeliest, before data [nats].
 
         By default, of every parameter with a `prior_sd`, normal around its default.
         """
-        return sum(0.5 * ((getattr(params, name) - each["default"]) / each["prior_sd"]) ** 2
+        return sum(0.5 * ((getattr(self.params, name) - each["default"]) / each["prior_sd"]) ** 2
                    for name, each in quantities(self.Params).items() if each["prior_sd"])
 
-    def implausible(self, params: Any, coefficients: np.ndarray) -> str | None:
+    def implausible(self, coefficients: np.ndarray) -> str | None:
         """Return why what was fitted cannot be this effect; None where it can.
 
         Args:
-            params: fitted.
             coefficients: (q,) of the columns of its term.
         """
         return None
 
-    def contradicted(self, params: Any, links: Links) -> str | None:
-        """Return what in the map of n links speaks against fitted parameters; None for nothing."""
+    def contradicted(self, links: Links) -> str | None:
+        """Return what in the map of n links speaks against it as fitted; None for nothing."""
         return None
 
-    def parameters(self, links: Links, params: Any, estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         """Return what was found, by name; by default every parameter made with `quantity`."""
-        return {name: Parameter.normal(getattr(params, name), sd, each["unit"],
+        return {name: Parameter.normal(getattr(self.params, name), sd, each["unit"],
                                        Allowed(each["low"], each["high"]))
                 for (name, each), sd in zip(quantities(self.Params).items(), estimate.params_sd,
                                             strict=True)}
 
-    def mark(self, links: Links, params: Any) -> Mark | None:
+    def mark(self, links: Links) -> Mark | None:
         """Return how maps mark where it is; None where it has no place."""
         return None
 
-    def correction(self, links: Links, params: Any) -> Correction:
+    def correction(self, links: Links) -> Correction:
         """Return what it says of the declared scene, to be corrected; by default nothing.
 
         A device that it moves is not where it was declared.
@@ -304,12 +349,12 @@ class Effect(ABC):
         """
         return ()
 
-    def like(self, params: Any, other: Any) -> Any:
-        """Return the same cause in the form closest to other parameters of this effect.
+    def like(self, other: Any) -> Effect:
+        """Return the same cause in the form closest to another effect of this kind.
 
         For parameters of which several forms mean the same, such as a box turned by 90°.
         """
-        return params
+        return self
 
 
 class GainEffect(Effect):
@@ -317,39 +362,37 @@ class GainEffect(Effect):
 
     stage = "gain"
 
-    def gain_db(self, links: Links, params: Any) -> np.ndarray:
+    def gain_db(self, links: Links) -> np.ndarray:
         """Return what it adds to each link (n,) [dB]; a loss is negative."""
         raise NotImplementedError(f"{type(self).__name__} defines neither gain_db nor term")
 
-    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
         """Return `gain_db` as a term without coefficients."""
-        return Term.of_offset(self.gain_db(links, params))
+        return Term.of_offset(self.gain_db(links))
 
 
 class _ResponseEffect(Effect):
     """An effect that maps one level to another; override `inputs`, or `term` that carries them."""
 
-    def inputs(self, links: Links, params: Any) -> np.ndarray:
+    def inputs(self, links: Links) -> np.ndarray:
         """Return what `response` needs of each link (n, …)."""
         raise NotImplementedError(f"{type(self).__name__} defines neither inputs nor term")
 
     @abstractmethod
-    def response(self, level_db: np.ndarray, params: Any,
-                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what becomes of mean levels.
 
         Args:
             level_db: (n,) [dB].
-            params: an instance of `Params`.
             inputs: (n, …) of the links.
 
         Returns:
             (n,) [dB], and its slope in `level_db` (n,), above zero.
         """
 
-    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
         """Return a term that adds nothing and carries the inputs."""
-        return Term.of_inputs(self.inputs(links, params))
+        return Term.of_inputs(self.inputs(links))
 
 
 class PathEffect(_ResponseEffect):
@@ -370,7 +413,7 @@ class _BlankingEffect(Effect):
 
     of_receiver = True
 
-    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
         """Return a term that adds nothing."""
         return Term.of_offset(np.zeros(len(links)))
 
@@ -381,7 +424,7 @@ class DetectionEffect(_BlankingEffect):
     stage = "detection"
 
     @abstractmethod
-    def losses(self, links: Links, params: Any) -> Losses:
+    def losses(self, links: Links) -> Losses:
         """Return what becomes of n links; each value (n,), probabilities below 1."""
 
 
@@ -391,7 +434,7 @@ class LimitEffect(_BlankingEffect):
     stage = "limit"
 
     @abstractmethod
-    def limits_db(self, links: Links, params: Any) -> np.ndarray:
+    def limits_db(self, links: Links) -> np.ndarray:
         """Return the level (n,) below which links are blank; -inf where the declared one holds."""
 
 
@@ -413,7 +456,7 @@ class ResidualView:
         scale_db: (n,) scale of the errors [dB].
         mean_db: (n,) predicted level [dB].
         level_at: the channel's levels of other links, such as with devices elsewhere.
-        found: name and parameters of the effects so far.
+        found: the effects so far.
     """
 
     links: Links
@@ -421,12 +464,12 @@ class ResidualView:
     scale_db: np.ndarray
     mean_db: np.ndarray
     level_at: LevelAt
-    found: tuple[tuple[str, EffectParams], ...] = ()
+    found: tuple[Effect, ...] = ()
 
     def found_params(self, name: str, parameter: str) -> list[Any]:
         """Return the values of a parameter of the effects of that name that were found before."""
-        return [getattr(params, parameter) for kept, params in self.found
-                if kept == name and hasattr(params, parameter)]
+        return [getattr(each.params, parameter) for each in self.found
+                if each.name == name and hasattr(each.params, parameter)]
 
     @cached_property
     def design_effect(self) -> float:

@@ -168,7 +168,7 @@ class Variation:
         values: (r,) now.
         steps: (r,) typical uncertainty of each.
         low, high: (r,) bounds.
-        params: numbers (r,) -> parameters.
+        effect: numbers (r,) -> the effect with them.
         members: indices of numbers that belong together and act on links of their own, such as
             those of one device; each group is refined by itself. None: all act on the same links.
         follows_paths: whether each value is judged on paths that are followed anew. That is slow
@@ -183,7 +183,7 @@ class Variation:
     steps: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    params: Callable[[np.ndarray], Any]
+    effect: Callable[[np.ndarray], Any]
     members: list[np.ndarray] | None = None
     follows_paths: bool = False
     is_rough: bool = False

@@ -177,7 +177,7 @@ def collect(loop: Loop) -> LoopData:
     links = _links(model.whole, loop.before.held_out_mean_db)
     before = loop.dependences_before
     dependences = [*significant(before, loop.criteria), *loop.remaining]
-    in_base = sum(each.effect.is_declared for each in model.whole.effects)  # they come first
+    in_base = sum(each.is_declared for each in model.whole.effects)  # they come first
     interpolated_db = None
     if model.shadowing:
         interpolated_db = model.held_out_shadowing[0] * model.held_out_scales[0]
@@ -205,13 +205,12 @@ def _effects(loop: Loop, links: DrawnLinks) -> list[EffectData]:
         return []
     with_db = np.where(whole.usable, whole.readings().mean_db, np.nan)
     effects = []
-    for number, (applied, parameters) in enumerate(zip(whole.effects, loop.parameters,
+    for number, (effect, parameters) in enumerate(zip(whole.effects, loop.parameters,
                                                        strict=True)):
         without_db = whole.without(number).readings().mean_db
-        effect = applied.effect
         effects.append(EffectData(
             effect.name, effect.figure, effect.stage, effect.nlos_only, effect.of_receiver,
-            dict(applied.params), effect.mark(whole.links, applied.params), parameters, links,
+            dict(effect.params), effect.mark(whole.links), parameters, links,
             np.where(whole.usable, without_db, np.nan), with_db))
     return effects
 

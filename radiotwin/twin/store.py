@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from radiotwin.effects.base import Effect, Levels
 from radiotwin.effects.params import Seconds
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
@@ -25,7 +26,7 @@ from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_ch
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.blend import Blend
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
-from radiotwin.twin.model.model import FittedEffect, FittedModel, Unheard
+from radiotwin.twin.model.model import FittedModel, Unheard
 
 if TYPE_CHECKING:
     from radiotwin.twin.twin import Twin
@@ -60,11 +61,12 @@ class DeviceRecord(_Strict):
 
 
 class FittedEffectRecord(_Strict):
-    """A fitted effect; `params` are checked by the effect's own `Params`."""
+    """A fitted effect; `params` are checked by its own `Params`, `levels` None: as always."""
 
     name: str
     variant: str
     params: dict[str, Any]
+    levels: Levels | None = None
     coefficients: list[_Decibels]
 
 
@@ -237,9 +239,8 @@ def check_twin_target(folder: Path) -> None:
 
 
 def _fitted_record(fitted: FittedModel) -> dict[str, Any]:
-    effects = [{"name": each.effect.name, "variant": each.effect.variant,
-                "params": each.params.model_dump(mode="json"),
-                "coefficients": each.coefficients.tolist()} for each in fitted.effects]
+    effects = [each.record() | {"coefficients": coefficients.tolist()}
+               for each, coefficients in zip(fitted.effects, fitted.coefficients, strict=True)]
     return {"level_coefficients": fitted.level_coefficients.tolist(),
             "scale_db": fitted.scale_db.tolist(), "dof": float(fitted.dof), "effects": effects,
             "receivers": list(fitted.receivers),
@@ -258,13 +259,14 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
     _check_levels(record, channel)
     device_m = np.array([(each.x_m, each.y_m, each.z_m) for each in devices])
     known = {"device": len(devices), "receiver": len(record.receivers)}
-    effects = []
+    effects, coefficients = [], []
     for each in record.effects:
         effect = effect_named(each.name, each.variant)
         # As JSON, because strict checks allow only there what JSON has no other form for.
         params = effect.Params.model_validate_json(json.dumps(each.params), strict=True,
                                                    context=known)
-        effects.append(FittedEffect(effect, params, np.array(each.coefficients, dtype=float)))
+        effects.append(effect.with_params(params, each.levels))
+        coefficients.append(np.array(each.coefficients, dtype=float))
     shadowing = None
     if record.shadowing is not None:
         shadowing = CorrelatedShadowing.from_state(record.shadowing)
@@ -273,9 +275,10 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
         raise ValueError("arrays beside the channel belong to nothing")
     if record.blend is not None:
         blend = Blend.from_state(beside, record.blend, len(devices))
-    _check_terms(effects, [each.device for each in devices], record.receivers)
-    return FittedModel(channel, tuple(effects), np.array(record.level_coefficients),
-                       np.array(record.scale_db), record.dof, np.nan_to_num(device_m),
+    _check_terms(effects, coefficients, [each.device for each in devices], record.receivers)
+    return FittedModel(channel, tuple(effects), tuple(coefficients),
+                       np.array(record.level_coefficients), np.array(record.scale_db), record.dof,
+                       np.nan_to_num(device_m),
                        tuple(record.receivers),
                        np.nan if record.first_s is None else record.first_s,
                        record.device_sd_db, record.likelihood_power, shadowing,
@@ -292,7 +295,8 @@ def _unheard(record: UnheardRecord | None, devices: int) -> Unheard | None:
     return Unheard(tuple(record.devices), record.mean_db, record.sd_db)
 
 
-def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: list[str]) -> None:
+def _check_terms(effects: list[Effect], coefficients: list[np.ndarray], devices: list[str],
+                 receivers: list[str]) -> None:
     """Refuse effects with another number of coefficients than they need, on a link or two."""
     n = max(len(devices), len(receivers), 2)
     row, nothing = np.arange(n), np.zeros(n)
@@ -306,15 +310,15 @@ def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: lis
         ends=Ends(device_names=devices, receiver_names=receivers or ["any"],
                   flight_names=["f0", "f1"], device_m=np.zeros((len(devices), 3)),
                   anchors=frozenset(range(len(devices))), flown=Flown.of(columns)))
-    for each in effects:
-        if each.effect.needs_map or getattr(each.params, "exact", False):
+    for each, own in zip(effects, coefficients, strict=True):
+        if each.needs_map or each.is_exact:
             continue  # checked when it predicts
-        term = each.effect.term(links, each.params, lambda links, exact=False: np.zeros(len(links)))
-        if term.columns.shape[1] != len(each.coefficients):
-            raise ValueError(f"{each.effect.name} needs {term.columns.shape[1]} coefficients and "
-                             f"has {len(each.coefficients)}")
+        term = each.term(links, lambda links, exact=False: np.zeros(len(links)))
+        if term.columns.shape[1] != len(own):
+            raise ValueError(f"{each.name} needs {term.columns.shape[1]} coefficients and "
+                             f"has {len(own)}")
         if not (np.isfinite(term.offset_db).all() and np.isfinite(term.columns).all()):
-            raise ValueError(f"{each.effect.name} adds something else than numbers")
+            raise ValueError(f"{each.name} adds something else than numbers")
 
 
 def _check_levels(record: FittedRecord, channel: ChannelModel) -> None:

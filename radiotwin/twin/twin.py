@@ -23,6 +23,7 @@ from radiotwin.display import (
     plain,
     some,
 )
+from radiotwin.effects.base import Effect
 from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, place
 from radiotwin.inference.gaussian import detection_probability
@@ -38,7 +39,7 @@ from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.plot import MARKS, draw_outlines
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
-from radiotwin.twin.model.model import FittedEffect, FittedModel
+from radiotwin.twin.model.model import FittedModel
 from radiotwin.twin.store import decode_twin, encode_twin, read_twin, write_twin
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ class Twin(Summarised):
         return np.array(positions_m, dtype=float).reshape(-1, 3)
 
     @property
-    def effects(self) -> tuple[FittedEffect, ...]:
+    def effects(self) -> tuple[Effect, ...]:
         """Effects that `close-loop` found."""
         return self.fitted.effects if self.fitted else ()
 
@@ -140,7 +141,7 @@ class Twin(Summarised):
     @property
     def description(self) -> str:
         """Channel and effects, in one line."""
-        names = [each.effect.name for each in self.effects]
+        names = [each.name for each in self.effects]
         if self.fitted is not None and self.fitted.shadowing is not None:
             names.append(SHADOWING)
         return self.channel.name + (f" with {', '.join(names)}" if names else "")
@@ -290,7 +291,7 @@ class Twin(Summarised):
         return Summary("Twin", f"{self.description}, {count(len(self), 'device')}, {found}, "
                        f"{self.level}", (
             ("channel", self.channel.name),
-            ("effects", some(each.effect.name for each in self.effects) or "none"),
+            ("effects", some(each.name for each in self.effects) or "none"),
             ("devices", some(each.device for each in self.devices)), ("unknown devices", found),
             ("level", self.level), ("limit of detection", limit),
             ("scene", str(self.provenance.get("scene", "none")))))

@@ -185,7 +185,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
         BadInput: the folder cannot be written or holds something else, or the result is no scene.
     """
     links = loop.after.whole.links
-    found = [each.effect.correction(links, each.params) for each in loop.after.whole.effects]
+    found = [each.correction(links) for each in loop.after.whole.effects]
     label, centres_m = buildings(scene.city)
     gone = [building for each in found for building in each.gone]
     keep = ~np.isin(label, gone)

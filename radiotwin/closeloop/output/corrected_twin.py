@@ -49,7 +49,7 @@ def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
     models = [fold.learnt.for_positions() for fold in model.folds]
     # A device that the loop found elsewhere is not where it was declared.
     moved = {device for each in model.whole.effects
-             for device in each.effect.correction(model.links, each.params).moves_m}
+             for device in each.correction(model.links).moves_m}
     known = links.with_ends(anchors=links.anchors - moved)
     held_out = [known.select(model.index == number) for number in range(len(models))]
     area_m = scene.config.extent.bounds if scene is not None else whole_area(models[0], links)

@@ -75,12 +75,11 @@ def make_report(loop: Loop) -> dict[str, Any]:
     """Return the content of `closeloop.json`; numbers that are not known are null."""
     kept = loop.found.log.kept
     named = [trial for trial in kept if trial.name != SHADOWING]
-    effects = [{"name": each.effect.name, "variant": each.effect.variant, "rank": rank,
-                "uses": list(each.effect.uses), "is_declared": each.effect.is_declared,
-                "params": each.params.model_dump(mode="json"),
+    effects = [each.record() | {
+                "rank": rank, "uses": list(each.uses), "is_declared": each.is_declared,
                 "parameters": {name: parameter.record() for name, parameter in parameters.items()},
                 "size_db": size.record(),
-                "confused_with": list(each.effect.confused_with),
+                "confused_with": list(each.confused_with),
                 "indistinguishable_from": list(trial.rivals),
                 "probability": trial.probability,
                 "evidence": {"heldout_nll_gain": trial.nll_gain, "p_value": trial.p_value,
@@ -101,7 +100,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
     links = loop.after.links
     error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),
                              "noise_floor_db": loop.noise_floor_db}
-    if any("quality" in each.effect.uses for each in loop.after.whole.effects):
+    if any("quality" in each.uses for each in loop.after.whole.effects):
         error["after_without_quality"] = scores(without_quality(loop.after))
     for name, groups in _groups(links).items():
         error[f"by_{name}"] = {label: {"before": scores(loop.before, rows),

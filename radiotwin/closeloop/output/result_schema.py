@@ -4,6 +4,7 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from radiotwin.effects.base import Levels
 from radiotwin.io.forms import Real, Record, Whole
 
 
@@ -77,6 +78,7 @@ class EffectRecord(Record):
     is_declared: bool = False
     rank: Whole
     params: dict[str, Any] = Field(default_factory=dict)
+    levels: Levels | None = None
     parameters: dict[str, ParameterRecord]
     size_db: ParameterRecord | None = None
     confused_with: list[str] = Field(default_factory=list)

@@ -109,7 +109,7 @@ class _Learnt:
             rng = np.random.default_rng(seed)
             rows = np.sort(rng.choice(rows, MAX_AWAY_LINKS, replace=False))
         part, quadrant = self.part.select(rows), _quadrant(self.fit.links)[rows]
-        whole = self.fit.model.restrict(rows, self.fit.effects)
+        whole = self.fit.model.restrict(rows)
         errors, shares, scales = [np.zeros((0, len(self.names)))], [np.zeros(0)], [np.zeros(0)]
         tested = [np.zeros(0, dtype=int)]
         for each in range(4):

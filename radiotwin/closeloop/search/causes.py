@@ -124,7 +124,7 @@ def _try_all(state: SearchState, available: list[Effect], hypotheses: Hypotheses
              inputs: SearchInputs) -> list[Tried]:
     """Fit every available effect, and score it on held-out links unless a better one passed."""
     model, step = state.model, state.step
-    there = [each.effect for each in model.whole.effects]
+    there = [each.entry for each in model.whole.effects]
     effects = [effect for effect in available
                if effect.repeatable or not any(each is effect for each in there)]
     prepare_additions([model.whole], effects, inputs.executor)
@@ -157,7 +157,7 @@ def _score(state: SearchState, candidates: list[Candidate], available: int, inpu
             continue
         inputs.on_progress(f"step {step + 1}: {effect.name}, held out")
         # One more of a kind needs no correction: that there is such a thing has been shown.
-        more = any(each.effect is effect for each in model.whole.effects)
+        more = any(each.entry is effect for each in model.whole.effects)
         trial, extended = score_candidate(model, candidate, 1 if more else available, inputs)
         tried.append(Tried(effect, trial, extended or model))
     return tried
@@ -324,8 +324,8 @@ def _alike(nats: float, other: Trial, criteria: SelectionCriteria) -> bool:
 
 def _on_one_mast(model: CrossFit) -> int:
     """Return how many devices the last effect acts on, if they are all on one mast; else 0."""
-    applied, links = model.whole.effects[-1], model.links
-    devices = np.unique(links.device[applied.acts])
+    links = model.links
+    devices = np.unique(links.device[model.whole.model.terms[-1].acts])
     on_mast = len(devices) and set(devices) <= set(site_of(links, devices[0]))
     return len(devices) if on_mast else 0
 
@@ -379,13 +379,13 @@ def with_moved_limits(model: CrossFit) -> CrossFit:
     """
     whole = model.whole
     last = whole.effects[-1]
-    off_db = last.effect.reading_offsets_db(last.params, whole.coefficients_of(-1))
+    off_db = last.reading_offsets_db(whole.coefficients_of(-1))
     if not off_db:
         return model
     found_db = np.full(len(model.links), -np.inf)
     for limit in (effect() for effect in catalogue() if issubclass(effect, LimitEffect)):
         for params in limit.propose(whole.view)[:1]:
-            found_db = np.maximum(found_db, limit.limits_db(model.links, params))
+            found_db = np.maximum(found_db, limit.with_params(params).limits_db(model.links))
     limit_db = model.links.limit_db.copy()
     for receiver, each_db in off_db.items():
         of_receiver = model.links.receiver == receiver

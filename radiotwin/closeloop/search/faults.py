@@ -16,7 +16,6 @@ flights of all receivers, or all devices, differ.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -50,7 +49,7 @@ from radiotwin.closeloop.verdict.posterior import judge
 from radiotwin.effects.base import DetectionEffect, Effect
 from radiotwin.links import Links
 from radiotwin.links.correlation import devices_move
-from radiotwin.twin.model.model import AppliedEffect, Fit, Model
+from radiotwin.twin.model.model import Fit, Model
 
 
 def add_changes(state: SearchState, inputs: SearchInputs) -> SearchState:
@@ -83,8 +82,8 @@ def _with_one_kind(state: SearchState, effect: Effect, inputs: SearchInputs) -> 
         if why:
             return state.refuse(trial.refuse(why, passed=False))
         model = extended
-        params = candidate.whole.effects[-1].params
-        there = replace(candidate, whole=with_effect(state.model, effect, params).whole)
+        found = candidate.whole.effects[-1]
+        there = replace(candidate, whole=with_effect(state.model, found).whole)
         # A flight that is held out does not tell when the change was.
         state = state.keep(trial, with_candidate(state.model, there, inputs.executor))
     return state
@@ -111,7 +110,7 @@ def _stands_out(model: CrossFit, candidate: Candidate | Trial,
         return False
     view = model.whole.view
     links = view.links
-    change = candidate.effect.change(links, candidate.whole.effects[-1].params)
+    change = candidate.whole.effects[-1].change(links)
     if change is None:
         return False
     end, changed, when_s = change
@@ -137,9 +136,9 @@ def _stands_out(model: CrossFit, candidate: Candidate | Trial,
     return bool(p_value <= criteria.max_p_value)
 
 
-def with_effect(model: CrossFit, effect: Effect, params: Any) -> CrossFit:
-    """Return a model with one more effect in the whole and every fold, its parameters given."""
-    return model.map(lambda fit: fit.with_effects([*fit.effects, fit.model.apply(effect, params)]))
+def with_effect(model: CrossFit, effect: Effect) -> CrossFit:
+    """Return a model with one more effect, as it was found, in the whole and every fold."""
+    return model.map(lambda fit: fit.with_effects([*fit.effects, effect]))
 
 
 def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
@@ -205,9 +204,8 @@ def _unless_outdone(fault: Candidate, lasting: list[Candidate],
 
 def _acts(candidate: Candidate) -> np.ndarray:
     """Return (n,) bool, the links that a candidate says something of."""
-    applied = candidate.whole.effects[-1]
-    blanks = isinstance(applied.effect, DetectionEffect)
-    return blanks | applied.acts
+    blanks = isinstance(candidate.effect, DetectionEffect)
+    return blanks | candidate.whole.model.terms[-1].acts
 
 
 def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
@@ -219,14 +217,13 @@ def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
     """
     for number in reversed(range(state.step)):
         model, whole = state.model, state.model.whole
-        applied = whole.effects[number]
-        timed = applied.effect.within_flights or applied.effect.between_flights() is not None
+        effect = whole.effects[number]
+        timed = effect.within_flights or effect.between_flights() is not None
         if not timed:
             continue
-        others = whole.model.with_effects([each for each in whole.effects
-                                           if each is not applied]).fit()
+        others = _without(whole.model, number).fit()
         gain = others.objective - whole.objective
-        if gain >= inputs.criteria.min_training_gain_nats and _is_found(applied, others):
+        if gain >= inputs.criteria.min_training_gain_nats and _is_found(whole, number, others):
             continue
         folds = [_without(each.model, same_effects(whole, each)[number]).fit()
                  for each in model.folds]
@@ -236,17 +233,17 @@ def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
     return state
 
 
-def _is_found(applied: AppliedEffect, without: Fit) -> bool:
+def _is_found(fit: Fit, number: int, without: Fit) -> bool:
     """Return whether the search of a fault finds it in what a fit without it leaves.
 
     Steps in time have no search of their own.
     """
-    effect = applied.effect
+    effect, acts, model = fit.effects[number], fit.model.terms[number].acts, without.model
     if not effect.within_flights:
         return True
-    again = [without.model.apply(effect, params).acts for params in effect.propose(without.view)]
-    return any((applied.acts & acts).sum() >= MIN_SHARED * (applied.acts | acts).sum()
-               for acts in again)
+    again = [effect.with_params(params).term(model.links, model.level_at).acts
+             for params in effect.entry.propose(without.view)]
+    return any((acts & each).sum() >= MIN_SHARED * (acts | each).sum() for each in again)
 
 
 def _without(model: Model, place: int | None) -> Model:
@@ -265,7 +262,7 @@ def _in_other_folds(model: CrossFit, links: Links, base: Base, folds: Folds) -> 
     """Return the base with a model's effects as they are, fitted to other folds."""
     other = cross_validate(links, base, folds, training_parts(links, folds))
     for each in model.whole.effects:
-        other = with_effect(other, each.effect, each.params)
+        other = with_effect(other, each)
     return other
 
 
@@ -276,9 +273,10 @@ def _folds(links: Links, seed: int) -> Folds:
 
 def _adopted(model: CrossFit, candidate: Candidate) -> CrossFit:
     """Return a model with the effect; a fold has it as far as its own training links show it."""
-    effect, like = candidate.effect, candidate.whole.effects[-1].params
+    found = candidate.whole.effects[-1]
+
     def adopted(fold: Fit) -> Fit:
-        own: list[Any] = effect.propose_like(fold.view, like)
-        return fold.with_effects([*fold.effects, fold.model.apply(effect, own[0])]) if own else fold
+        own = found.propose_like(fold.view)
+        return fold.with_effects([*fold.effects, found.with_params(own[0])]) if own else fold
 
     return model.extended(candidate.whole, [adopted(fold) for fold in model.folds])

@@ -45,7 +45,7 @@ def relocate_devices(model: CrossFit, links: Links, base: Base
         device.
     """
     unknown = [device for device in range(len(links.device_names)) if device not in links.anchors]
-    if not unknown or not any(each.effect.is_cause for each in model.whole.effects):
+    if not unknown or not any(each.is_cause for each in model.whole.effects):
         return model
     twin = model.twin
     if not model.whole.channel.follows_paths:
@@ -112,8 +112,7 @@ def _located_anew(fit: Fit, links: Links, mine: np.ndarray,
         twin = base.fit(links.with_city(model.corrected_map).select(mine))
     moved = Model.build(model.links, model.channel, model.dof, device_m=base.device_m(twin),
                             train=mine)
-    return moved.with_effects([moved.apply(each.effect, each.params) for each in model.effects]), \
-        twin.devices
+    return moved.with_effects(model.effects), twin.devices
 
 
 def _relocated(fit: Fit, unknown: list[int]) -> Model:
@@ -131,7 +130,7 @@ def _relocated(fit: Fit, unknown: list[int]) -> Model:
     placed_m[nowhere] = np.nan
     moved = Model.build(model.links, model.channel, model.dof, device_m=placed_m,
                             train=model.train)
-    return moved.with_effects([moved.apply(each.effect, each.params) for each in model.effects])
+    return moved.with_effects(model.effects)
 
 
 def _likeliest(model: FittedModel, own: Links, start_m: np.ndarray) -> np.ndarray:

@@ -17,24 +17,26 @@ from radiotwin.inference.held_out import cross_fit_p_value, sign_flip_p_value
 from radiotwin.links import Links, evidence_blocks
 from radiotwin.runtime.execution import Executor
 from radiotwin.twin.model.fitting import add_effect, along_paths, prepare_additions
-from radiotwin.twin.model.model import Fit, FittedEffect
+from radiotwin.twin.model.model import Fit
 
 
-def ends_of(fitted: FittedEffect, links: Links) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the devices and of the receivers that parameters belong to.
+def ends_of(effect: Effect, coefficients: np.ndarray,
+            links: Links) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the devices and of the receivers that an effect belongs to.
 
     Where each end has a coefficient, and few are off, that is the one that is off most.
 
     Args:
-        fitted: effect with its parameters.
+        effect: that was found.
+        coefficients: (q,) of its term.
         links: that it was fitted to.
 
     Returns:
         names of devices, names of receivers; both empty for an effect of all links.
     """
-    params, effect = fitted.params, fitted.effect
+    params = effect.params
     if effect.sparse and hasattr(params, "members"):
-        off = np.abs(fitted.coefficients - np.median(fitted.coefficients))
+        off = np.abs(coefficients - np.median(coefficients))
         most = [params.members[int(off.argmax())]]
         return (_names(most, links.device_names) if effect.of_device else (),
                 _names(most, links.receiver_names) if effect.of_receiver else ())
@@ -82,13 +84,12 @@ def fit_candidate(model: CrossFit, effect: Effect, criteria: SelectionCriteria,
     links, city = model.links.select(model.whole.usable), model.whole.model.corrected_map
     if city is not links.city:  # what was found is part of what is known
         links = links.with_city(city)
-    why = effect.contradicted(whole.effects[-1].params, links)
+    why = whole.effects[-1].contradicted(links)
     if why:
         return replace(refused, reason=why)
     whole = along_paths(whole, model.whole)
-    params = whole.effects[-1].params
-    why = effect.implausible(params, whole.coefficients_of(-1)) \
-        or effect.contradicted(params, links)
+    found = whole.effects[-1]
+    why = found.implausible(whole.coefficients_of(-1)) or found.contradicted(links)
     if why:
         return replace(refused, reason=why)
     gain = model.whole.objective - whole.objective
@@ -113,11 +114,10 @@ def score_candidate(model: CrossFit, candidate: Candidate, tried: int,
     Returns:
         the trial, and the model with it; None where it does not pass.
     """
-    fitted = FittedEffect(candidate.effect, candidate.whole.effects[-1].params,
-                          candidate.whole.coefficients_of(-1))
-    devices, receivers = ends_of(fitted, model.links)
+    found = candidate.whole.effects[-1]
+    devices, receivers = ends_of(found, candidate.whole.coefficients_of(-1), model.links)
     extended = with_candidate(model, candidate, inputs.executor)
-    trial = Trial(candidate.effect.name, step=len(model.whole.effects), params=fitted.params,
+    trial = Trial(candidate.effect.name, step=len(model.whole.effects), params=found.params,
                   evidence_nats=candidate.evidence, variant=candidate.effect.variant,
                   devices=devices, receivers=receivers)
     trial = score_model(model, extended, trial, evidence_blocks(model.links), tried, inputs,
@@ -127,7 +127,7 @@ def score_candidate(model: CrossFit, candidate: Candidate, tried: int,
 
 def with_candidate(model: CrossFit, candidate: Candidate, executor: Executor) -> CrossFit:
     """Return a model with a candidate; a fold has it as its own training links show it."""
-    effect, like = candidate.effect, candidate.whole.effects[-1].params
+    effect, like = candidate.effect, candidate.whole.effects[-1]
     prepare_additions(model.folds, [effect], executor, like)
     return model.extended(candidate.whole, [add_effect(fold, effect, like) or fold
                                             for fold in model.folds])

@@ -126,9 +126,9 @@ class Hypotheses:
         Returns:
             NaN for an effect that residuals do not show.
         """
-        applied, own = fit.effects[-1], fit.coefficients_of(-1)
-        term = applied.term.select(fit.train)
-        if term.random_effect_sd_db is not None and applied.effect.within_flights:
+        effect, own = fit.effects[-1], fit.coefficients_of(-1)
+        term = fit.model.terms[-1].select(fit.train)
+        if term.random_effect_sd_db is not None and effect.within_flights:
             return np.nan  # it makes errors larger, which levels alone do not show
         z = _tamed(fit.model.training.residual_db(fit) / self.scale_db, self.near)
         # What its columns brought, and what levels gave way for it, is integrated over again.
@@ -138,7 +138,7 @@ class Hypotheses:
         shown_db += levels @ (fit.coefficients[:p] - self.coefficients[:p])
         z += shown_db / self.scale_db
         columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
-        if applied.effect.sparse:
+        if effect.sparse:
             return self._of_few(z, columns, own)
         slopes = _slopes(fit)
         return self.gain_nats(z, columns.beside(
@@ -200,13 +200,13 @@ class Hypotheses:
 
 def _slopes(fit: Fit) -> Columns:
     """Return what each number of the last effect changes (n, q) [dB], and how far it may (q,)."""
-    model, applied = fit.model, fit.effects[-1]
-    variation = applied.effect.variation(applied.params)
+    model, effect = fit.model, fit.effects[-1]
+    variation = effect.variation()
     if variation is None:
         return Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0))
-    here = variation.params(variation.values)
-    if here != applied.params:  # it varies with quicker levels than it has
-        model = model.with_effects([*model.effects[:-1], model.apply(applied.effect, here)])
+    here = variation.effect(variation.values)
+    if not here.is_same(effect):  # it varies with quicker levels than it has
+        model = model.with_last(here)
     mean_db, slopes_db = model.training.predict(fit).mean_db, []
     # Of paths those that folds will ask for, too.
     share = NEAR_SHARE if variation.follows_paths else STEP_SHARE
@@ -215,8 +215,7 @@ def _slopes(fit: Fit) -> Columns:
         if values[number] + step > variation.high[number]:
             step = -step
         values[number] += step
-        other = model.apply(applied.effect, variation.params(values))
-        changed = model.with_effects([*model.effects[:-1], other]).training.predict(fit)
+        changed = model.with_last(variation.effect(values)).training.predict(fit)
         slopes_db.append((changed.mean_db - mean_db) / step)
     width = variation.high - variation.low
     return Columns(np.column_stack(slopes_db), width / np.sqrt(12.0))

@@ -47,8 +47,8 @@ def effect_parameters(model: CrossFit) -> list[dict[str, Parameter]]:
     of_whole = estimates(whole)
     of_folds = [estimates(linearise(fold, _as_followed(whole, fold))) for fold in model.folds]
     found = []
-    for number, (applied, estimate) in enumerate(zip(model.whole.effects, of_whole, strict=True)):
-        reported = applied.effect.parameters(model.links, applied.params, estimate)
+    for number, (effect, estimate) in enumerate(zip(model.whole.effects, of_whole, strict=True)):
+        reported = effect.parameters(model.links, estimate)
         folds = [_of_fold(fold, own, model.whole, number)
                  for fold, own in zip(model.folds, of_folds, strict=True)]
         found.append({name: _with_folds(parameter, [fold[name] for fold in folds if name in fold],
@@ -67,8 +67,7 @@ def _as_followed(whole: Linearised, fold: Fit) -> dict[int, list[Secant]]:
         own = whole.variations[number]
         if place is None or own is None or not own.follows_paths:
             continue
-        applied = fold.effects[place]
-        other = applied.effect.variation(applied.params)
+        other = fold.effects[place].variation()
         if other is not None and other.follows_paths and len(other.values) == len(own.values):
             known[place] = [each.moved(whole.fit.train, fold.train)
                             for each in whole.secants[number]]
@@ -81,9 +80,7 @@ def _of_fold(fold: Fit, own: list[Estimate], whole: Fit,
     place = same_effects(whole, fold)[number]
     if place is None:
         return {}
-    effect = whole.effects[number].effect
-    params = effect.like(fold.effects[place].params, whole.effects[number].params)
-    return effect.parameters(fold.links, params, own[place])
+    return fold.effects[place].like(whole.effects[number]).parameters(fold.links, own[place])
 
 
 def _with_folds(parameter: Parameter, folds: list[Parameter], count: int) -> Parameter:

@@ -82,7 +82,7 @@ def _size_found(effect: Effect, view: ResidualView, pattern: Pattern, size: floa
         change_db = pattern.of_size_db(size)
         changed = replace(view, residual_db=view.residual_db + change_db)
         least = EXPLAINED * changed.score(Term.of_offset(change_db))
-        if any(changed.score(effect.term(view.links, params, view.level_at)) >= least
+        if any(changed.score(effect.with_params(params).term(view.links, view.level_at)) >= least
                for params in effect.propose(changed)):
             return size
         size *= LARGER

@@ -71,6 +71,8 @@ class BodyShadowing(GainEffect):
         receivers: dict[ReceiverIndex, Body] = Field(
             min_length=1, description="Body of each receiver, by index.")
 
+    params: Params
+
     @override
     def unavailable(self, links: Links) -> str | None:
         return no_body_frame(links)
@@ -86,22 +88,22 @@ class BodyShadowing(GainEffect):
         return [self.Params(receivers=found)] if found else []
 
     @override
-    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+    def propose_like(self, view: ResidualView) -> list[Params]:
         """Return also what all links proposed: every link bears on it, in each part alike."""
-        return [*self.propose(view), params]
+        return [*self.propose(view), self.params]
 
     @override
-    def gain_db(self, links: Links, params: Params) -> np.ndarray:
+    def gain_db(self, links: Links) -> np.ndarray:
         gain_db = np.zeros(len(links))
-        for receiver, body in params.receivers.items():
+        for receiver, body in self.params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
             gain_db[rows] = -body.loss_db(_arrivals(links.select(rows)))
         return gain_db
 
     @override
-    def variation(self, params: Params) -> Variation:
-        return vary_patterns(params.receivers,
-                             lambda receivers: self.Params(receivers=receivers))
+    def variation(self) -> Variation:
+        return vary_patterns(self.params.receivers,
+                             lambda receivers: self.with_params(self.Params(receivers=receivers)))
 
     @override
     def typical_patterns(self, view: ResidualView) -> list[Pattern]:
@@ -113,11 +115,10 @@ class BodyShadowing(GainEffect):
                         high=depth["high"])]
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         reported: dict[str, Parameter] = {}
-        bodies_sd = np.reshape(estimate.params_sd, (len(params.receivers), -1))
-        for (receiver, body), sd in zip(params.receivers.items(), bodies_sd, strict=True):
+        bodies_sd = np.reshape(estimate.params_sd, (len(self.params.receivers), -1))
+        for (receiver, body), sd in zip(self.params.receivers.items(), bodies_sd, strict=True):
             for (field, each), field_sd in zip(quantities(body).items(), sd, strict=True):
                 value = getattr(body, field)
                 value = value % 360 if field == "azimuth_deg" else value

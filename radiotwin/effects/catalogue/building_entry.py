@@ -89,6 +89,8 @@ class BuildingEntry(GainEffect):
             0.0, unit="dB", low=0.0, high=30.0, step=2.0,
             description="Standard deviation of the loss, over buildings and places in them [dB].")
 
+    params: Params
+
     def __init__(self) -> None:
         self._entering = LinkCache()
 
@@ -111,7 +113,8 @@ class BuildingEntry(GainEffect):
                             scatter_sd_db=START_SD_DB) for building in CLASSES]
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        params = self.params
         chance = self._chance(links)
         median_db = entry_loss_db(params.frequency_hz, links.elevation_deg, params.building)
         low_db, high_db = (entry_loss_db(params.frequency_hz, 0.0, params.building, probability)
@@ -120,9 +123,9 @@ class BuildingEntry(GainEffect):
                     random_effect_sd_db=np.sqrt(chance) * params.scatter_sd_db)
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
-        loss_db, most_db = self._loss_db(params, coefficients), entry_loss_db(
-            params.frequency_hz, 0.0, params.building, MAX_PROBABILITY)
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        loss_db, most_db = self._loss_db(self.params, coefficients), entry_loss_db(
+            self.params.frequency_hz, 0.0, self.params.building, MAX_PROBABILITY)
         if loss_db < 0:
             return f"buildings would have to amplify, by {-loss_db:.1f} dB"
         if loss_db < MIN_LOSS_DB:
@@ -133,10 +136,9 @@ class BuildingEntry(GainEffect):
         return None
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        scatter = Parameter.normal(params.scatter_sd_db, estimate.params_sd[0], "dB")
-        return {"entry_loss_db": Parameter.normal(self._loss_db(params, estimate.coefficients),
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        scatter = Parameter.normal(self.params.scatter_sd_db, estimate.params_sd[0], "dB")
+        return {"entry_loss_db": Parameter.normal(self._loss_db(self.params, estimate.coefficients),
                                                   estimate.coefficients_sd[0], "dB"),
                 "scatter_sd_db": replace(scatter, low=max(scatter.low, 0.0))}
 

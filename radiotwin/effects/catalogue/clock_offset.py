@@ -6,14 +6,13 @@ another direction whenever it turns. The channel predicts again with the receive
 sight included.
 """
 
-from typing import Any
-
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels, subsample
-from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import ResidualView
+from radiotwin.effects.moves import MAX_ENDS, MIN_LINKS, MovedEnd
 from radiotwin.effects.params import (
     Allowed,
     EffectParams,
@@ -25,24 +24,18 @@ from radiotwin.effects.params import (
 )
 from radiotwin.links import Links
 
-MIN_LINKS = 60  # with a time, of a receiver that is looked at
-MAX_RECEIVERS = 60  # that are shifted in time, or it takes too long
-MIN_NATS = 6.0  # that an offset must gain to be proposed
-MAX_PROPOSE_LINKS = 600  # of a receiver, on which offsets are tried
 MIN_SPEED_M_S = 0.3  # below it, positions that jitter look like a movement
 # How far a receiver moves between the two times [m]: tried, first step and bound of the search.
 TRIED_M = (4.0, 8.0, 15.0, 25.0, 40.0, 60.0, 85.0)
 STEP_M, MAX_M = 3.0, 120.0
 
 
-class ReceiverClockOffset(GainEffect):
+class ReceiverClockOffset(MovedEnd):
     """A clock offset of all positions of a receiver; one step finds one receiver, the worst."""
 
     name = "receiver_clock_offset"
     settled_by = "fly one track forth and back"
     of_receiver = True
-    repeatable = True
-    always_exact = True  # a map's streets are what shows where it was
     confused_with = ("receiver_position_error", "body_shadowing")
 
     class Params(EffectParams):
@@ -54,65 +47,49 @@ class ReceiverClockOffset(GainEffect):
         speed_m_s: float = Field(
             ge=1e-6, le=1e9,
             description="Mean while it moves; scales steps and bounds of the search [m/s].")
-        exact: bool = Field(False, description="Whether paths are followed to those positions.")
+
+    params: Params
 
     @override
     def unavailable(self, links: Links) -> str | None:
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
         moving = _speeds_m_s(links)
-        if len(moving) > MAX_RECEIVERS:
+        if len(moving) > MAX_ENDS:
             return (f"{len(moving)} receivers are too many to shift each in time; "
-                    f"at most {MAX_RECEIVERS}")
+                    f"at most {MAX_ENDS}")
         return None if moving else f"no receiver with {MIN_LINKS} links moves"
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        links = view.links
-        best: tuple[float, Any] = MIN_NATS, None
         known = view.found_params(self.name, "receiver")
-        for receiver, speed_m_s in sorted(_speeds_m_s(links).items()):
-            if receiver in known:
-                continue
-            every = np.flatnonzero(links.receiver == receiver)
-            rows = subsample(every, MAX_PROPOSE_LINKS)
-            mine, share = links.select(rows), len(every) / len(rows)
-            before_db = view.level_at(mine)
-            for offset_s in (sign * size_m / speed_m_s for size_m in TRIED_M for sign in (-1, 1)):
-                moved = _at_other_time(mine, receiver, offset_s)
-                nats = share * view.gain_nats(rows, view.level_at(moved) - before_db).sum()
-                if nats > best[0]:
-                    best = nats, self.Params(receiver=receiver, offset_s=offset_s,
-                                             speed_m_s=speed_m_s)
-        return [best[1]] if best[1] else []
+        return self.best_move(view, (
+            [self.Params(receiver=receiver, offset_s=sign * size_m / speed_m_s, speed_m_s=speed_m_s)
+             for size_m in TRIED_M for sign in (-1, 1)]
+            for receiver, speed_m_s in sorted(_speeds_m_s(view.links).items())
+            if receiver not in known))
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        offset_db = np.zeros(len(links))
-        rows = np.flatnonzero(links.receiver == params.receiver)
-        mine = links.select(rows)
-        moved = _at_other_time(mine, params.receiver, params.offset_s)
-        offset_db[rows] = level_at(moved, params.exact) - level_at(mine, params.exact)
-        return Term.of_offset(offset_db)
+    def rows(self, links: Links) -> np.ndarray:
+        return np.flatnonzero(links.receiver == self.params.receiver)
 
     @override
-    def exact(self, params: Params) -> Params:
-        return params.model_copy(update={"exact": True})
+    def moved(self, links: Links) -> Links:
+        return _at_other_time(links, self.params.receiver, self.params.offset_s)
 
     @override
-    def variation(self, params: Params) -> Variation:
+    def variation(self) -> Variation:
+        params = self.params
         max_s, step_s = MAX_M / params.speed_m_s, STEP_M / params.speed_m_s
         return Variation(
             np.array([params.offset_s]), np.array([step_s]), np.array([-max_s]), np.array([max_s]),
-            lambda numbers: params.model_copy(update={"offset_s": float(numbers[0])}),
-            follows_paths=params.exact)
+            lambda numbers: self.changed(offset_s=float(numbers[0])), follows_paths=self.is_exact)
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        name = f"positions_late_by_s[{links.receiver_names[params.receiver]}]"
-        max_s = MAX_M / params.speed_m_s
-        return {name: Parameter.normal(params.offset_s, estimate.params_sd[0], "s",
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        name = f"positions_late_by_s[{links.receiver_names[self.params.receiver]}]"
+        max_s = MAX_M / self.params.speed_m_s
+        return {name: Parameter.normal(self.params.offset_s, estimate.params_sd[0], "s",
                                        Allowed(-max_s, max_s))}
 
 

@@ -143,6 +143,8 @@ class DeclaredSectors(SectorEffect):
                 raise ValueError("groups are not of two devices and more, each in two at most")
             return self
 
+    params: Params
+
     @override
     def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
@@ -168,31 +170,33 @@ class DeclaredSectors(SectorEffect):
                             has_tilts=bool(np.isfinite(view.links.tilt_deg[declared]).any()))]
 
     @override
-    def neg_log_prior(self, params: Any) -> float:
+    def neg_log_prior(self) -> float:
+        params = self.params
         tilt = 0.5 * (params.tilt_offset_deg / TILT_SD_DEG) ** 2 if params.has_tilts else 0.0
-        return super().neg_log_prior(params) + tilt
+        return super().neg_log_prior() + tilt
 
     @override
-    def implausible(self, params: Any, coefficients: np.ndarray) -> str | None:
-        if abs(params.azimuth_offset_deg) <= MAX_TURN_DEG:
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        if abs(self.params.azimuth_offset_deg) <= MAX_TURN_DEG:
             return None
-        return (f"they fit azimuths that are all turned by {params.azimuth_offset_deg:+.0f}°; "
+        return (f"they fit azimuths that are all turned by {self.params.azimuth_offset_deg:+.0f}°; "
                 "azimuth_deg counts clockwise from north")
 
     @override
-    def term(self, links: Links, params: Any, level_at: LevelAt) -> Term:
-        own = super().term(links, params, level_at)
-        shared = _shared(params)
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        own = super().term(links, level_at)
+        shared = _shared(self.params)
         sd_db = np.zeros(len(links))
-        for device, level_sd_db in params.unheard_sd_db.items():
+        for device, level_sd_db in self.params.unheard_sd_db.items():
             sd_db[links.device == device] = level_sd_db
         return Term(own.offset_db, own.columns @ np.column_stack([shared, np.eye(len(shared))]),
-                    np.r_[LEVEL_SD_DB, np.full(len(params.groups), GROUP_SD_DB),
-                          own_sd_db(list(params.devices), params.groups)],
+                    np.r_[LEVEL_SD_DB, np.full(len(self.params.groups), GROUP_SD_DB),
+                          own_sd_db(list(self.params.devices), self.params.groups)],
                     unheard_sd_db=sd_db)
 
     @override
-    def variation(self, params: Any) -> Variation:
+    def variation(self) -> Variation:
+        params = self.params
         fields = _numbers()
         first = next(iter(params.devices.values()))
         values = np.array([getattr(params if name in OFFSETS else first, name) for name in fields])
@@ -204,7 +208,7 @@ class DeclaredSectors(SectorEffect):
         low[at] = values[at] + bounds["low"] - min(own_deg)
         high[at] = values[at] + bounds["high"] - max(own_deg)
 
-        def changed(numbers: np.ndarray) -> DeclaredSectors.Params:
+        def varied(numbers: np.ndarray) -> DeclaredSectors:
             found = dict(zip(fields, numbers.tolist(), strict=True))
             offsets = {name: found.pop(name) for name in OFFSETS}
             turn_deg, up_deg = (each - getattr(params, name) for name, each in offsets.items())
@@ -212,26 +216,25 @@ class DeclaredSectors(SectorEffect):
                 "azimuth_deg": pattern.azimuth_deg + turn_deg,
                 "tilt_deg": pattern.tilt_deg + up_deg})
                 for device, pattern in params.devices.items()}
-            return params.model_copy(update={"devices": devices} | offsets)
+            return self.changed(devices=devices, **offsets)
 
-        return Variation(values, steps, low, high, changed)
+        return Variation(values, steps, low, high, varied)
 
     @override
-    def parameters(self, links: Links, params: Any,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        values = self.variation(params).values
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        values = self.variation().values
         reported = {name: Parameter.normal(value, sd, field["unit"], allowed_of(name, field))
                     for (name, field), value, sd in zip(_numbers().items(), values,
                                                         estimate.params_sd, strict=True)}
-        if not params.has_tilts:
+        if not self.params.has_tilts:
             reported["tilt_deg"] = reported.pop("tilt_offset_deg")
-        if links.city is None or params.straight:
+        if links.city is None or self.params.straight:
             reported.pop("scattered_db")
         # The common one is the channel's.
-        shares = np.column_stack([_shared(params)[:, 1:], np.eye(len(params.devices))])
+        shares = np.column_stack([_shared(self.params)[:, 1:], np.eye(len(self.params.devices))])
         level_db = shares @ estimate.coefficients[1:]
         sd_db = estimate.sd_of(np.column_stack([np.zeros(len(shares)), shares]))
-        for device, value_db, each_sd_db in zip(params.devices, level_db, sd_db, strict=True):
+        for device, value_db, each_sd_db in zip(self.params.devices, level_db, sd_db, strict=True):
             reported[f"gain_db[{links.device_names[device]}]"] = Parameter.normal(
                 float(value_db), float(each_sd_db), "dB")
         return reported

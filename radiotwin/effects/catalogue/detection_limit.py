@@ -36,6 +36,8 @@ class DetectionLimit(LimitEffect):
         sd_db: dict[ReceiverIndex, Decibels] = Field(
             default_factory=dict, description="Standard deviation of each [dB].")
 
+    params: Params
+
     @override
     def unavailable(self, links: Links) -> str | None:
         return None if np.isnan(links.level_db).any() else "no link is blank"
@@ -56,15 +58,14 @@ class DetectionLimit(LimitEffect):
         return [self.Params(receivers=found, sd_db=sd_db)] if found else []
 
     @override
-    def limits_db(self, links: Links, params: Params) -> np.ndarray:
+    def limits_db(self, links: Links) -> np.ndarray:
         by_receiver_db = np.full(len(links.receiver_names), -np.inf)
-        by_receiver_db[list(params.receivers)] = list(params.receivers.values())
+        by_receiver_db[list(self.params.receivers)] = list(self.params.receivers.values())
         return by_receiver_db[links.receiver]
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         unit = links.level_unit
         return {f"limit[{links.receiver_names[receiver]}]": Parameter.normal(
-                    limit_db, params.sd_db.get(receiver, np.nan), unit)
-                for receiver, limit_db in params.receivers.items()}
+                    limit_db, self.params.sd_db.get(receiver, np.nan), unit)
+                for receiver, limit_db in self.params.receivers.items()}

@@ -98,6 +98,8 @@ class Episode(GainEffect):
         frequency_hz: float | None = Field(
             None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, no bound.")
 
+    params: Params
+
     @override
     def unavailable(self, links: Links) -> str | None:
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
@@ -122,15 +124,15 @@ class Episode(GainEffect):
         return [each for _, each in sorted(found, key=lambda each: -each[0])[:2]]
 
     @override
-    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+    def propose_like(self, view: ResidualView) -> list[Params]:
         # The times are found anew: those of all links would be known from what is held out.
         value_db, weight = by_precision(view, compared_where_possible_db(view)[0])
-        rows = _timed_rows(view.links, params.receiver, params.flight)
+        rows = _timed_rows(view.links, self.params.receiver, self.params.flight)
         window = _strongest(view.links, value_db, weight, rows) \
             if len(rows) >= MIN_LINKS else None
-        if window is None or not _is_same(window, params):
+        if window is None or not _is_same(window, self.params):
             return []
-        return [params.model_copy(update={key: value for key, value in window._asdict().items()
+        return [self.params.model_copy(update={key: value for key, value in window._asdict().items()
                                           if key not in ("nats", "form")})]
 
     def _proposed(self, links: Links, value_db: np.ndarray, weight: np.ndarray,
@@ -151,14 +153,15 @@ class Episode(GainEffect):
         return (window.nats, params) if stands_out else None
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        loss = np.where(_inside(links, params), -1.0, 0.0)
-        if params.form == "attenuation":
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        loss = np.where(_inside(links, self.params), -1.0, 0.0)
+        if self.params.form == "attenuation":
             return Term.of_columns((loss * links.distance_m / 1000)[:, None], PRIOR_SD_DB_KM)
         return Term.of_columns(loss[:, None], PRIOR_SD_DB)
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        params = self.params
         if coefficients[0] < 0:
             unit = "dB" if params.form == "loss" else "dB/km"
             return f"it would have to amplify, by {-coefficients[0]:.1f} {unit}"
@@ -182,8 +185,8 @@ class Episode(GainEffect):
                           "receiver", -1.0 * (mine & during), low=MIN_DB)
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        params = self.params
         who = "all" if params.receiver is None else links.receiver_names[params.receiver]
         member = f"[{who}]" if params.flight is None else f"[{who}, flight {params.flight}]"
         time_s = links.time_s[_timed_rows(links, params.receiver, params.flight)]

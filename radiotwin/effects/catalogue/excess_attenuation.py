@@ -42,6 +42,8 @@ class ExcessAttenuation(GainEffect):
         frequency_hz: float | None = Field(
             None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, no bound.")
 
+    params: Params
+
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         frequency_hz = view.links.frequency_hz
@@ -50,27 +52,28 @@ class ExcessAttenuation(GainEffect):
                 for height_m in SCALE_HEIGHTS_M]
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        height_m = params.scale_height_m
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        height_m = self.params.scale_height_m
         low = np.minimum(links.device_m[links.device, 2], links.receiver_m[:, 2])
         rise = np.maximum(np.abs(links.offset_m[:, 2]), 1e-3) / height_m
         density = np.exp(-np.maximum(low, 0.0) / height_m) * -np.expm1(-rise) / rise
         return Term.of_columns((-links.distance_m / 1000 * density)[:, None], PRIOR_SD_DB_KM)
 
     @override
-    def variation(self, params: Params) -> Variation:
+    def variation(self) -> Variation:
+        params = self.params
         return Variation(np.log([params.scale_height_m]), np.array([0.4]), np.log([MIN_HEIGHT_M]),
                          np.log([MAX_HEIGHT_M]),
-                         lambda numbers: params.model_copy(
-                             update={"scale_height_m": float(np.exp(numbers[0]))}))
+                         lambda numbers: self.changed(scale_height_m=float(np.exp(numbers[0]))))
 
     @override
-    def neg_log_prior(self, params: Params) -> float:
+    def neg_log_prior(self) -> float:
         # Receivers that fly at one height do not tell: of profiles that fit alike, the lower one.
-        return 0.5 * (np.log(params.scale_height_m / TREES_M) / HEIGHT_SD) ** 2
+        return 0.5 * (np.log(self.params.scale_height_m / TREES_M) / HEIGHT_SD) ** 2
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        params = self.params
         if coefficients[0] < 0:
             return f"it would have to amplify, by {-coefficients[0]:.1f} dB/km"
         if params.frequency_hz is None:
@@ -92,13 +95,12 @@ class ExcessAttenuation(GainEffect):
                         -links.distance_m / 1000, high=most_db_km)]
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         return {"specific_attenuation_db_km": Parameter.normal(
                     estimate.coefficients[0], estimate.coefficients_sd[0], "dB/km",
                     Allowed(low=0.0)),
                 "scale_height_m": Parameter.log_normal(
-                    params.scale_height_m, estimate.params_sd[0], "m",
+                    self.params.scale_height_m, estimate.params_sd[0], "m",
                     Allowed(MIN_HEIGHT_M, MAX_HEIGHT_M, is_log=True))}
 
 

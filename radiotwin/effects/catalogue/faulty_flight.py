@@ -100,6 +100,8 @@ class FaultyFlight(GainEffect):
             1.0, unit="dB", low=0.0, high=60.0, step=1.0,
             description="Standard deviation beside that of other flights [dB].")
 
+    params: Params
+
     @override
     def unavailable(self, links: Links) -> str | None:
         pairs = np.unique(np.column_stack([links.receiver, links.flight]), axis=0)
@@ -127,18 +129,18 @@ class FaultyFlight(GainEffect):
         return [params for _, params in sorted(found, key=lambda each: each[0])[:1]]
 
     @override
-    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
-        there = flight_mask(view.links, params.receiver, params.flight)
-        return [params] if there.sum() >= MIN_LINKS else []
+    def propose_like(self, view: ResidualView) -> list[Params]:
+        there = flight_mask(view.links, self.params.receiver, self.params.flight)
+        return [self.params] if there.sum() >= MIN_LINKS else []
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        rows = np.flatnonzero(flight_mask(links, params.receiver, params.flight))
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        rows = np.flatnonzero(flight_mask(links, self.params.receiver, self.params.flight))
         columns, noise_db = np.zeros((len(links), 2)), np.zeros(len(links))
         columns[rows, 0] = 1.0
         if len(rows):
-            columns[rows, 1] = level_at(links.select(rows)) - params.centre_db
-        noise_db[rows] = params.noise_sd_db
+            columns[rows, 1] = level_at(links.select(rows)) - self.params.centre_db
+        noise_db[rows] = self.params.noise_sd_db
         return replace(Term.of_columns(columns, PRIOR_SD_DB),
                        prior_sd_db=np.array([PRIOR_SD_DB, RELATION_SD]),
                        random_effect_sd_db=noise_db)
@@ -154,12 +156,11 @@ class FaultyFlight(GainEffect):
                                           "neither its first nor its last", -1.0 * mine)
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        member = f"[{links.receiver_names[params.receiver]}, flight {params.flight}]"
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        member = f"[{links.receiver_names[self.params.receiver]}, flight {self.params.flight}]"
         offset_db, slope = estimate.coefficients
         offset_sd_db, slope_sd = estimate.coefficients_sd
-        noise = Parameter.normal(params.noise_sd_db, estimate.params_sd[0], "dB")
+        noise = Parameter.normal(self.params.noise_sd_db, estimate.params_sd[0], "dB")
         return {"offset_db" + member: Parameter.normal(offset_db, offset_sd_db, "dB"),
                 "added_noise_db" + member: replace(noise, low=max(noise.low, 0.0)),
                 "relation" + member: Parameter.normal(1 + slope, slope_sd, "of the prediction")}

@@ -71,6 +71,8 @@ class Foliage(GainEffect):
         ceiling_db: float = Field(UNKNOWN_MAX_LOSS_DB, gt=0, le=1000, description=(
             "Greatest loss of vegetation at the frequency [dB]; what costs more is none."))
 
+    params: Params
+
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links = view.links
@@ -86,34 +88,33 @@ class Foliage(GainEffect):
                 if gain > MIN_NATS for side_m in SIDES_M]
 
     @override
-    def gain_db(self, links: Links, params: Params) -> np.ndarray:
-        crossing = cross(params.box, *ends_above(links, params.box[:2]))
-        specific_db_m, max_db = params.law
+    def gain_db(self, links: Links) -> np.ndarray:
+        crossing = cross(self.params.box, *ends_above(links, self.params.box[:2]))
+        specific_db_m, max_db = self.params.law
         return -max_db * (1 - np.exp(-crossing.inside_m * specific_db_m / max_db))
 
     @override
-    def variation(self, params: Params) -> Variation:
-        x_m, y_m = params.box[:2]
+    def variation(self) -> Variation:
+        x_m, y_m = self.params.box[:2]
         low = [x_m - 80, y_m - 80, 5.0, 5.0, MIN_HEIGHT_M, -90.0, np.log(0.05),
-               np.log(min(3.0, params.ceiling_db))]
+               np.log(min(3.0, self.params.ceiling_db))]
         high = [x_m + 80, y_m + 80, 200.0, 200.0, 30.0, 90.0, np.log(5.0),
-                np.log(params.ceiling_db)]
+                np.log(self.params.ceiling_db)]
         return Variation(
-            np.array([*params.box, *np.log(params.law)]),
+            np.array([*self.params.box, *np.log(self.params.law)]),
             np.array([CELL_M, CELL_M, 12.0, 12.0, 3.0, 20.0, 0.4, 0.3]),
             np.array(low), np.array(high),
-            lambda numbers: params.model_copy(update={
-                "box": Box(*numbers[:6].tolist()),
-                "law": VegetationLoss(*np.exp(numbers[6:]).tolist())}))
+            lambda numbers: self.changed(box=Box(*numbers[:6].tolist()),
+                                         law=VegetationLoss(*np.exp(numbers[6:]).tolist())))
 
     @override
-    def contradicted(self, params: Params, links: Links) -> str | None:
-        through = devices_through(params.box, links)
+    def contradicted(self, links: Links) -> str | None:
+        through = devices_through(self.params.box, links)
         return BESIDE_UNKNOWN if is_beside_unknown(through, links) else None
 
     @override
-    def mark(self, links: Links, params: Params) -> Mark:
-        box = params.box
+    def mark(self, links: Links) -> Mark:
+        box = self.params.box
         return Mark(f"{self.label}\n{box.height_m:.0f} m high", np.array(box[:2]), box.outline_m)
 
     @override
@@ -125,21 +126,20 @@ class Foliage(GainEffect):
                           high=max_loss_db(view.links.frequency_hz))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        variation = self.variation(params)
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        variation = self.variation()
         low, high = variation.low.tolist(), variation.high.tolist()
         reported = {name: Parameter.normal(value, sd, "deg" if name == "turn_deg" else "m",
                                            Allowed(least, most))
-                    for name, value, sd, least, most in zip(Box._fields, params.box,
+                    for name, value, sd, least, most in zip(Box._fields, self.params.box,
                                                             estimate.params_sd, low, high)}
         names = {"specific_attenuation_db_m": "dB/m", "greatest_loss_db": "dB"}
         return reported | {
             name: Parameter.log_normal(value, sd, unit, Allowed(least, most, is_log=True))
             for (name, unit), value, sd, least, most in zip(
-                names.items(), params.law, estimate.params_sd[6:], np.exp(low[6:]).tolist(),
+                names.items(), self.params.law, estimate.params_sd[6:], np.exp(low[6:]).tolist(),
                 np.exp(high[6:]).tolist(), strict=True)}
 
     @override
-    def like(self, params: Params, other: Params) -> Params:
-        return params.model_copy(update={"box": params.box.like(other.box)})
+    def like(self, other: "Foliage") -> "Foliage":
+        return self.changed(box=self.params.box.like(other.params.box))

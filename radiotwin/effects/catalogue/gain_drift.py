@@ -80,6 +80,7 @@ class _GainDrift(GainEffect):
                         "time_constant_s": "time constant"}
     forms: ClassVar[tuple[str, ...]]
     end: ClassVar[str]
+    params: _DriftParams
 
     def __init__(self, between_flights: bool = False) -> None:
         self._between_flights = between_flights
@@ -94,17 +95,17 @@ class _GainDrift(GainEffect):
         """Return the index (n,) of the receiver or device of each link."""
         return getattr(links, self.end)
 
-    def drifts(self, params: _DriftParams) -> dict[int, Drift]:
+    def drifts(self) -> dict[int, Drift]:
         """Return the drifts by index of the receiver or device."""
-        return getattr(params, f"{self.end}s")
+        return getattr(self.params, f"{self.end}s")
 
     @override
     def between_flights(self) -> Effect:
         return type(self)(between_flights=True)
 
     @override
-    def change(self, links: Links, params: _DriftParams) -> Change:
-        member, drift = next(iter(self.drifts(params).items()))
+    def change(self, links: Links) -> Change:
+        member, drift = next(iter(self.drifts().items()))
         # Flights are before or after it, whole: a warm-up is over, by two thirds, after its
         # constant.
         when_s = drift.number + (links.first_s if drift.form == "warm_up" else 0.0)
@@ -129,9 +130,9 @@ class _GainDrift(GainEffect):
         return self._best(view, sorted(set(self._members(view.links)) - known))
 
     @override
-    def propose_like(self, view: ResidualView, params: _DriftParams) -> list[Any]:
+    def propose_like(self, view: ResidualView) -> list[Any]:
         # Whether this member drifts is the question, and not whether any does.
-        return self._best(view, list(self.drifts(params)))
+        return self._best(view, list(self.drifts()))
 
     def _best(self, view: ResidualView, members: list[int]) -> list[Any]:
         links, found = view.links, []
@@ -152,11 +153,12 @@ class _GainDrift(GainEffect):
         return [params for _, params in sorted(found, key=lambda each: -each[0])[:MAX_PROPOSALS]]
 
     @override
-    def term(self, links: Links, params: _DriftParams, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        params = self.params
         columns, time_s = [], links.time_s
         if not self.of_receiver and params.span_s:  # a map has no time: it is of the latest state
             time_s = np.where(np.isnan(time_s), params.span_s[1], time_s)
-        for member, drift in self.drifts(params).items():
+        for member, drift in self.drifts().items():
             mine = (self.index(links) == member) & np.isfinite(time_s)
             columns.append(np.where(mine, _shape(drift, links, time_s, params.span_s), 0.0))
             # An offset of its own, or the drift would have to model a constant error, too.
@@ -164,20 +166,19 @@ class _GainDrift(GainEffect):
         return Term.of_columns(np.column_stack(columns), PRIOR_SD_DB)
 
     @override
-    def variation(self, params: _DriftParams) -> Variation | None:
-        drifts = self.drifts(params)
+    def variation(self) -> Variation | None:
+        drifts = self.drifts()
         warming = [member for member, drift in drifts.items() if drift.form in WARM_UPS]
         if not warming:
             return None
         values, n = np.log([drifts[member].number for member in warming]), len(warming)
 
-        def changed(numbers: np.ndarray) -> _DriftParams:
+        def varied(numbers: np.ndarray) -> _GainDrift:
             new = {member: drifts[member]._replace(number=float(np.exp(number)))
                    for member, number in zip(warming, numbers)}
-            return params.model_copy(update={f"{self.end}s": drifts | new})
+            return self.changed(**{f"{self.end}s": drifts | new})
 
-        return Variation(values, np.full(n, 0.3), np.full(n, 0.0), np.full(n, MAX_LOG_S),
-                         changed)
+        return Variation(values, np.full(n, 0.3), np.full(n, 0.0), np.full(n, MAX_LOG_S), varied)
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
@@ -188,11 +189,10 @@ class _GainDrift(GainEffect):
             yield Pattern(self.end, "dB", f"from first to last of one {self.end}", mine * ramp)
 
     @override
-    def parameters(self, links: Links, params: _DriftParams,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         result, names = {}, getattr(links, f"{self.end}_names")
         log_sd = iter(estimate.params_sd)
-        for number, (member, (form, value)) in enumerate(self.drifts(params).items()):
+        for number, (member, (form, value)) in enumerate(self.drifts().items()):
             name = names[member]
             result[f"{form}_db[{name}]"] = Parameter.normal(
                 estimate.coefficients[2 * number], estimate.coefficients_sd[2 * number], "dB")
@@ -221,6 +221,8 @@ class ReceiverDrift(_GainDrift):
         receivers: Annotated[dict[ReceiverIndex, Drift], AfterValidator(_possible)] = Field(
             min_length=1, description="Drift of each receiver, by index.")
 
+    params: Params
+
 
 class DeviceDrift(_GainDrift):
     """A device whose battery discharges or that has changed."""
@@ -236,6 +238,8 @@ class DeviceDrift(_GainDrift):
 
         devices: Annotated[dict[DeviceIndex, Drift], AfterValidator(_possible)] = Field(
             min_length=1, description="Drift of each device, by index.")
+
+    params: Params
 
     @override
     def _members(self, links: Links) -> list[int]:

@@ -46,6 +46,8 @@ class _GainOffset(GainEffect):
                                      ge=0, le=1000,
                                      description="Standard deviation of the offsets [dB].")
 
+    params: Params
+
     def _names(self, links: Links) -> list[str]:
         return getattr(links, f"{self.end}_names")
 
@@ -73,11 +75,11 @@ class _GainOffset(GainEffect):
         return [self.Params(members=members, offsets_sd_db=float(np.std(offsets_db)))]
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
         index = self._index(links)
-        unknown = ~np.isin(index, params.members)
-        return replace(Term.of_columns(one_hot(index, params.members), PRIOR_SD_DB),
-                       unheard_sd_db=np.where(unknown, params.offsets_sd_db, 0.0))
+        unknown = ~np.isin(index, self.params.members)
+        return replace(Term.of_columns(one_hot(index, self.params.members), PRIOR_SD_DB),
+                       unheard_sd_db=np.where(unknown, self.params.offsets_sd_db, 0.0))
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
@@ -86,7 +88,7 @@ class _GainOffset(GainEffect):
                           low=MIN_OFFSET_DB)
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+    def implausible(self, coefficients: np.ndarray) -> str | None:
         largest_db = np.abs(coefficients - np.median(coefficients)).max()
         if largest_db < MIN_OFFSET_DB:
             return (f"none of them is off by more than {largest_db:.1f} dB, which is within any "
@@ -94,8 +96,7 @@ class _GainOffset(GainEffect):
         return None
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         # Relative to the median member: a common offset is the channel's intercept.
         order = np.argsort(estimate.coefficients)
         median = order[len(order) // 2]
@@ -103,7 +104,7 @@ class _GainOffset(GainEffect):
         sd_db, names = estimate.sd_of(contrast), self._names(links)
         return {f"offset_db[{names[member]}]": Parameter.normal(value_db, each_sd_db, "dB")
                 for member, value_db, each_sd_db in zip(
-                    params.members, contrast @ estimate.coefficients, sd_db)}
+                    self.params.members, contrast @ estimate.coefficients, sd_db)}
 
 
 class DeviceGainOffset(_GainOffset):
@@ -120,6 +121,8 @@ class DeviceGainOffset(_GainOffset):
 
         members: Unique[DeviceIndex] = Field(description="Indices of those with an offset.")
 
+    params: Params
+
 
 class ReceiverGainOffset(_GainOffset):
     """Receivers that read more or less than the others do."""
@@ -135,8 +138,9 @@ class ReceiverGainOffset(_GainOffset):
 
         members: Unique[ReceiverIndex] = Field(description="Indices of those with an offset.")
 
+    params: Params
+
     @override
-    def reading_offsets_db(self, params: _GainOffset.Params,
-                           coefficients: np.ndarray) -> dict[int, float]:
+    def reading_offsets_db(self, coefficients: np.ndarray) -> dict[int, float]:
         off_db = coefficients - np.median(coefficients)
-        return dict(zip(params.members, off_db.tolist(), strict=True))
+        return dict(zip(self.params.members, off_db.tolist(), strict=True))

@@ -66,6 +66,8 @@ class GroundReflection(GainEffect):
         wavelength_m: float = Field(
             gt=0, le=1000, description="Of the radio; scales steps and bounds of the search [m].")
 
+    params: Params
+
     def __init__(self) -> None:
         self._bounces = LinkCache()
 
@@ -94,39 +96,37 @@ class GroundReflection(GainEffect):
             tried = [self.Params(strength=strength, roughness_m=roughness * wavelength_m,
                                  ground_m=ground_m, wavelength_m=wavelength_m)
                      for strength in STRENGTHS for roughness in ROUGHNESSES]
-            nats = [0.5 * share * (before - squares(self.gain_db(part, params)))
+            nats = [0.5 * share * (before - squares(self.with_params(params).gain_db(part)))
                     for params in tried]
             best.append((max(nats), tried[int(np.argmax(nats))]))
         best = [pair for pair in sorted(best, key=lambda pair: -pair[0]) if pair[0] > MIN_NATS]
         return [params for _, params in best[:MAX_PROPOSALS]]
 
     @override
-    def gain_db(self, links: Links, params: Params) -> np.ndarray:
+    def gain_db(self, links: Links) -> np.ndarray:
         offset_db = np.zeros(len(links))
         clear, device_m, receiver_m = self._bounces.get(links, None, lambda: _bounces(links))
         rows = np.flatnonzero(clear)
         offset_db[rows] = two_ray_db(
             device_m[rows], receiver_m[rows], links.frequency_hz,
-            params.strength, params.roughness_m, params.ground_m)
+            self.params.strength, self.params.roughness_m, self.params.ground_m)
         return offset_db
 
     @override
-    def variation(self, params: Params) -> Variation:
-        names, wavelength_m = ("strength", "roughness_m", "ground_m"), params.wavelength_m
+    def variation(self) -> Variation:
+        names, wavelength_m = ("strength", "roughness_m", "ground_m"), self.params.wavelength_m
         return Variation(
-            np.array([getattr(params, name) for name in names]),
+            np.array([getattr(self.params, name) for name in names]),
             np.array([0.2, 0.05 * wavelength_m, 0.08 * wavelength_m]),
             np.array([0.0, 0.0, -2 * MAX_HEIGHT_M]),
             np.array([MAX_STRENGTH, wavelength_m, 2 * MAX_HEIGHT_M]),
-            lambda numbers: params.model_copy(
-                update=dict(zip(names, numbers.tolist(), strict=True))))
+            lambda numbers: self.changed(**dict(zip(names, numbers.tolist(), strict=True))))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         units = {"strength": "of medium dry ground", "roughness_m": "m", "ground_m": "m"}
-        of = self.variation(params)
-        return {name: Parameter.normal(getattr(params, name), sd, unit,
+        of = self.variation()
+        return {name: Parameter.normal(getattr(self.params, name), sd, unit,
                                        Allowed(float(low), float(high)))
                 for (name, unit), sd, low, high in zip(units.items(), estimate.params_sd, of.low,
                                                        of.high, strict=True)}

@@ -59,6 +59,8 @@ class Interference(ReceiverEffect):
         through_channel: bool = Field(False, description=(
             "Whether its power falls by the channel, as it was found over a 3D map."))
 
+    params: Params
+
     @override
     def unavailable(self, links: Links) -> str | None:
         positions = np.unique((links.receiver_m[:, :2] / SAME_POSITION_M).round(), axis=0)
@@ -95,51 +97,50 @@ class Interference(ReceiverEffect):
         return found
 
     @override
-    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+    def propose_like(self, view: ResidualView) -> list[Params]:
         """Return also what all links proposed: every link bears on it, in each part alike."""
-        return [*self.propose(view), params]
+        return [*self.propose(view), self.params]
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        params = self.params
         fall_db = _fall_db(links, params.place_m, level_at if params.through_channel else None)
         return Term.of_inputs(np.exp((params.level_db + fall_db) * NEPERS))
 
     @override
-    def response(self, level_db: np.ndarray, params: Params,
-                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return add_power(level_db, inputs)
 
     @override
-    def variation(self, params: Params) -> Variation:
-        level_db = params.level_db
-        low, high = np.reshape(params.within_m, (2, 2)).tolist()
+    def variation(self) -> Variation:
+        level_db = self.params.level_db
+        low, high = np.reshape(self.params.within_m, (2, 2)).tolist()
 
-        def changed(numbers: np.ndarray) -> Interference.Params:
+        def varied(numbers: np.ndarray) -> Interference:
             x_m, y_m, level_db = numbers.tolist()
-            return params.model_copy(update={"place_m": (x_m, y_m), "level_db": level_db})
+            return self.changed(place_m=(x_m, y_m), level_db=level_db)
 
-        return Variation(np.array([*params.place_m, level_db]), np.array([20.0, 20.0, 3.0]),
-                         np.array([*low, level_db - 40]), np.array([*high, level_db + 40]), changed)
+        return Variation(np.array([*self.params.place_m, level_db]), np.array([20.0, 20.0, 3.0]),
+                         np.array([*low, level_db - 40]), np.array([*high, level_db + 40]), varied)
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
-        low, high = np.reshape(params.within_m, (2, 2))
-        if (np.minimum(params.place_m - low, high - params.place_m) < EDGE_M).any():
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        low, high = np.reshape(self.params.within_m, (2, 2))
+        if (np.minimum(self.params.place_m - low, high - self.params.place_m) < EDGE_M).any():
             return ("the emitter would be at the edge of the searched area or beyond: its position "
                     "is unknown")
         return None
 
     @override
-    def mark(self, links: Links, params: Params) -> Mark:
-        return Mark(self.label, np.array(params.place_m))
+    def mark(self, links: Links) -> Mark:
+        return Mark(self.label, np.array(self.params.place_m))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        level = ("over_a_device_db", "dB") if params.through_channel else (
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        level = ("over_a_device_db", "dB") if self.params.through_channel else (
             f"level_at_{REFERENCE_M:.0f}_m", links.level_unit)
         names, units = ("x_m", "y_m", level[0]), ("m", "m", level[1])
-        of = self.variation(params)
+        of = self.variation()
         return {name: Parameter.normal(value, sd, unit, Allowed(float(low), float(high)))
                 for name, value, sd, unit, low, high in zip(
                     names, of.values.tolist(), estimate.params_sd, units, of.low, of.high)}

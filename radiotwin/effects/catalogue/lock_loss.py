@@ -189,6 +189,8 @@ class LockLoss(DetectionEffect):
             default_factory=dict, description="By how much the level is lower without lock, of "
             "those receivers that are not blank then [dB].")
 
+    params: Params
+
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links, blank, shares, drops_db = view.links, {}, {}, {}
@@ -210,46 +212,46 @@ class LockLoss(DetectionEffect):
         return proposed
 
     @override
-    def losses(self, links: Links, params: Params) -> Losses:
+    def losses(self, links: Links) -> Losses:
         blank, drop, drop_db = np.zeros((3, len(links.receiver_names)))
-        for receiver, probability in params.receivers.items():
-            (drop if receiver in params.drops_db else blank)[receiver] = probability
-        drop_db[list(params.drops_db)] = list(params.drops_db.values())
+        for receiver, probability in self.params.receivers.items():
+            (drop if receiver in self.params.drops_db else blank)[receiver] = probability
+        drop_db[list(self.params.drops_db)] = list(self.params.drops_db.values())
         return Losses(*(each[links.receiver] for each in (blank, drop, drop_db)))
 
     @override
-    def variation(self, params: Params) -> Variation | None:
-        if len(params.receivers) > MAX_VARIED:
+    def variation(self) -> Variation | None:
+        if len(self.params.receivers) > MAX_VARIED:
             return None
-        log_odds = logit(np.array(list(params.receivers.values())))
-        drops_db = np.array(list(params.drops_db.values()))
+        log_odds = logit(np.array(list(self.params.receivers.values())))
+        drops_db = np.array(list(self.params.drops_db.values()))
         start, change = np.r_[log_odds, drops_db], np.r_[
             np.full(len(log_odds), MAX_CHANGE), np.full(len(drops_db), MAX_CHANGE_DB)]
         least = np.r_[np.full(len(log_odds), -np.inf), np.full(len(drops_db), MIN_DROP_DB / 2)]
         most = np.r_[np.full(len(log_odds), np.inf), np.full(len(drops_db), MAX_DROP_DB)]
 
-        def changed(numbers: np.ndarray) -> LockLoss.Params:
+        def varied(numbers: np.ndarray) -> LockLoss:
             shares, own_db = np.split(numbers, [len(log_odds)])
-            return self.Params(receivers=dict(zip(params.receivers, expit(shares).tolist())),
-                               drops_db=dict(zip(params.drops_db, own_db.tolist())))
+            return self.with_params(self.Params(
+                receivers=dict(zip(self.params.receivers, expit(shares).tolist())),
+                drops_db=dict(zip(self.params.drops_db, own_db.tolist()))))
 
         return Variation(
             start, np.r_[np.full(len(log_odds), STEP), np.full(len(drops_db), STEP_DB)],
-            np.maximum(start - change, least), np.minimum(start + change, most), changed)
+            np.maximum(start - change, least), np.minimum(start + change, most), varied)
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         sd = estimate.params_sd
         if not len(sd):  # too many to be varied
-            sd = np.full(len(params.receivers) + len(params.drops_db), np.nan)
-        shares_sd, drops_sd_db = np.split(sd, [len(params.receivers)])
+            sd = np.full(len(self.params.receivers) + len(self.params.drops_db), np.nan)
+        shares_sd, drops_sd_db = np.split(sd, [len(self.params.receivers)])
         result = {}
-        for (receiver, probability), own_sd in zip(params.receivers.items(), shares_sd):
+        for (receiver, probability), own_sd in zip(self.params.receivers.items(), shares_sd):
             low, high = expit(logit(probability) + QUANTILE_90 * own_sd * np.array([-1, 1]))
             result[f"lost_share[{links.receiver_names[receiver]}]"] = Parameter(
                 probability, float(low), float(high), "of its links")
-        for (receiver, drop_db), sd_db in zip(params.drops_db.items(), drops_sd_db):
+        for (receiver, drop_db), sd_db in zip(self.params.drops_db.items(), drops_sd_db):
             result[f"drop_db[{links.receiver_names[receiver]}]"] = Parameter.normal(
                 drop_db, sd_db, "dB")
         return result

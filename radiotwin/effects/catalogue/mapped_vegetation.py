@@ -41,6 +41,8 @@ class MappedVegetation(GainEffect):
         greatest_loss_db: float = Field(UNKNOWN_MAX_LOSS_DB, gt=0, le=1000, description=(
             "Of a link through it, at the frequency [dB]."))
 
+    params: Params
+
     def __init__(self) -> None:
         self._through = LinkCache()
 
@@ -64,22 +66,21 @@ class MappedVegetation(GainEffect):
                 for specific in SPECIFIC_DB_M]
 
     @override
-    def gain_db(self, links: Links, params: Params) -> np.ndarray:
-        most_db = params.greatest_loss_db
-        through_m = self._through_m(links, params.kind)
-        return most_db * np.expm1(-through_m * params.specific_attenuation_db_m / most_db)
+    def gain_db(self, links: Links) -> np.ndarray:
+        most_db = self.params.greatest_loss_db
+        through_m = self._through_m(links, self.params.kind)
+        return most_db * np.expm1(-through_m * self.params.specific_attenuation_db_m / most_db)
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
-        if params.specific_attenuation_db_m < MIN_SPECIFIC_DB_M:
-            return f"the {params.kind.replace('_', ' ')} would have to cost nothing"
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        if self.params.specific_attenuation_db_m < MIN_SPECIFIC_DB_M:
+            return f"the {self.params.kind.replace('_', ' ')} would have to cost nothing"
         return None
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        return {f"specific_attenuation_db_m[{params.kind}]": Parameter.normal(
-            params.specific_attenuation_db_m, estimate.params_sd[0], "dB/m",
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        return {f"specific_attenuation_db_m[{self.params.kind}]": Parameter.normal(
+            self.params.specific_attenuation_db_m, estimate.params_sd[0], "dB/m",
             Allowed(low=0.0, high=5.0))}
 
     def _kinds(self, links: Links) -> list[str]:

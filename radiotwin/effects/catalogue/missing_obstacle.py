@@ -19,7 +19,7 @@ from scipy.constants import speed_of_light
 from typing_extensions import override
 
 from radiotwin.effects.arrays import LinkCache, city_of, ends_above, ends_above_ground, subsample
-from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.boxes import (
     BESIDE_UNKNOWN,
     HEIGHTS_M,
@@ -90,12 +90,11 @@ class MissingObstacle(GainEffect):
         box: Box = Field(description="In place of the building.")
         scattered_db: Decibels = Field(
             0.0, description="Power in the shadow, relative to the channel without line of sight.")
-        exact: bool = Field(False, description="Whether paths are followed over a map with it.")
-        known_paths: bool = Field(False, description=(
-            "Whether of the paths over the map without it those count that it does not block."))
         by_class: bool = Field(False, description=(
             "Whether the shadow has the level of the class without line of sight, not what is "
             "left on the other paths."))
+
+    params: Params
 
     def __init__(self) -> None:
         self._shadows, self._known = LinkCache(), LinkCache()
@@ -121,8 +120,8 @@ class MissingObstacle(GainEffect):
         return [each for each in found if each is not None]
 
     @override
-    def kind(self, params: Params) -> bool:
-        return params.by_class
+    def kind(self) -> bool:
+        return self.params.by_class
 
     def _best_shape(self, view: ResidualView, los: np.ndarray, centre_m: np.ndarray,
                     height: int, by_class: bool) -> Params | None:
@@ -163,19 +162,19 @@ class MissingObstacle(GainEffect):
                      if built_share(links, tried[0], found) <= MAX_BUILT), None)
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
         offset_db = np.zeros(len(links))
-        if params.exact:
+        if self.is_exact:
             city = city_of(links, self.name)
-            rows = np.flatnonzero(self._near(links, params.box))
+            rows = np.flatnonzero(self._near(links, self.params.box))
             mine = links.select(rows)
-            with_box = mine.with_city(_with_box(city, params.box))
+            with_box = mine.with_city(_with_box(city, self.params.box))
             offset_db[rows] = level_at(with_box, True) - level_at(mine, True)
             return Term.of_offset(offset_db)
-        if params.known_paths:
-            return Term.of_offset(self._past_db(links, params.box, level_at))
-        return Term.of_offset(self._offsets_db(links, params.box, (params.scattered_db,),
-                                               params.by_class, level_at)[0])
+        if self.levels == "known_paths":
+            return Term.of_offset(self._past_db(links, self.params.box, level_at))
+        return Term.of_offset(self._offsets_db(links, self.params.box, (self.params.scattered_db,),
+                                               self.params.by_class, level_at)[0])
 
     def _offsets_db(self, links: Links, box: Box, scattered_db: tuple[float, ...],
                     by_class: bool, level_at: LevelAt) -> np.ndarray:
@@ -226,9 +225,8 @@ class MissingObstacle(GainEffect):
         return near_box(box, links.device_m[links.device], links.receiver_m, within_m)
 
     @override
-    def reach(self, links: Links, params: Params) -> np.ndarray | None:
-        along_paths = params.exact or params.known_paths
-        return self._near(links, params.box) if along_paths else None
+    def reach(self, links: Links) -> np.ndarray | None:
+        return None if self.levels == "quick" else self._near(links, self.params.box)
 
     def _shadow_db(self, links: Links, level_at: LevelAt, by_class: bool) -> np.ndarray:
         """Return what links (n,) lose if something hides the other end [dB]; see `Params`."""
@@ -238,24 +236,24 @@ class MissingObstacle(GainEffect):
         return self._shadows.get(links, (level_at, by_class), derive)
 
     @override
-    def exact(self, params: Params) -> Params:
+    def exactly(self) -> Effect:
         # The search goes on from here: a turn must not begin at its bounds.
-        return params.model_copy(update={"box": params.box.straightened(), "exact": True,
-                                         "known_paths": False, "by_class": False})
+        return self.with_params(self.changed(box=self.params.box.straightened(),
+                                             by_class=False).params, "exact")
 
     @override
-    def variation(self, params: Params) -> Variation:
+    def variation(self) -> Variation:
+        params = self.params
         x_m, y_m = params.box[:2]
         # To follow paths for each value takes minutes, and known ones tell nearly the same; what
         # reaches the shadow is on them.
-        along_paths = params.exact or params.known_paths
+        along_paths = self.levels != "quick"
+        varied = self.with_params(params, "known_paths" if along_paths else "quick")
         count = len(params.box) + (not along_paths)
 
-        def changed(numbers: np.ndarray) -> MissingObstacle.Params:
+        def of(numbers: np.ndarray) -> Effect:
             values = [*numbers.tolist(), params.scattered_db][:len(params.box) + 1]
-            return params.model_copy(update={
-                "box": Box(*values[:-1]), "scattered_db": values[-1], "exact": False,
-                "known_paths": along_paths})
+            return varied.changed(box=Box(*values[:-1]), scattered_db=values[-1])
 
         values = np.array([*params.box, params.scattered_db])[:count]
         turned = [np.array([*box, params.scattered_db])[:count]
@@ -263,35 +261,35 @@ class MissingObstacle(GainEffect):
         return Variation(
             values, np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0])[:count],
             np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0])[:count],
-            np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0])[:count], changed,
+            np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0])[:count], of,
             is_rough=along_paths, starts=turned if along_paths else ())
 
     @override
-    def neg_log_prior(self, params: Params) -> float:
+    def neg_log_prior(self) -> float:
         # Links that all pass below the roof only bound its height from below.
-        return 0.5 * (params.box.height_m / HEIGHT_SCALE_M) ** 2
+        return 0.5 * (self.params.box.height_m / HEIGHT_SCALE_M) ** 2
 
     @override
-    def contradicted(self, params: Params, links: Links) -> str | None:
-        through = devices_through(params.box, links)
+    def contradicted(self, links: Links) -> str | None:
+        through = devices_through(self.params.box, links)
         if is_beside_unknown(through, links):
             return BESIDE_UNKNOWN
         if is_seen_from_one_place(through, links):
             return ("it is seen from one place only: how far away it is, and how large, nothing "
                     "tells")
-        share = built_share(links, params.box)
+        share = built_share(links, self.params.box)
         if share <= MAX_BUILT:
             return None
         return (f"{share:.0%} of it and of what is around it would be buildings of the map, or "
                 "found before: their walls or roofs are off, then, and no other is missing")
 
     @override
-    def corrected_map(self, city: CityMap, params: Params) -> CityMap:
-        return _with_box(city, params.box)
+    def corrected_map(self, city: CityMap) -> CityMap:
+        return _with_box(city, self.params.box)
 
     @override
-    def mark(self, links: Links, params: Params) -> Mark:
-        box = params.box
+    def mark(self, links: Links) -> Mark:
+        box = self.params.box
         return Mark(f"{self.label}\n{box.height_m:.0f} m high", np.array(box[:2]), box.outline_m)
 
     @override
@@ -302,13 +300,12 @@ class MissingObstacle(GainEffect):
                           high=MAX_LOSS_DB)
 
     @override
-    def correction(self, links: Links, params: Params) -> Correction:
-        return Correction(boxes=(params.box,))
+    def correction(self, links: Links) -> Correction:
+        return Correction(boxes=(self.params.box,))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        variation = self.variation(params)
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        variation = self.variation()
         reach = variation.values + QUANTILE_90 * estimate.sides_sd * np.array([[-1.0], [1.0]])
         units = {"turn_deg": "deg", "scattered_db": "dB"}
         return {name: Parameter(float(value), float(low), float(high), units.get(name, "m"),
@@ -318,8 +315,8 @@ class MissingObstacle(GainEffect):
                     *reach, variation.low, variation.high, strict=True)}
 
     @override
-    def like(self, params: Params, other: Params) -> Params:
-        return params.model_copy(update={"box": params.box.like(other.box)})
+    def like(self, other: "MissingObstacle") -> Effect:
+        return self.changed(box=self.params.box.like(other.params.box))
 
 
 def _ways(links: Links, ways: tuple[T, ...]) -> tuple[T, ...]:

@@ -53,6 +53,8 @@ class NoiseFloor(ReceiverEffect):
             "Whether no other receiver has a floor; else those without an estimate have the "
             "median, where three or more have one."))
 
+    params: Params
+
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links, found, own, highest = view.links, {}, {}, {}
@@ -92,45 +94,43 @@ class NoiseFloor(ReceiverEffect):
         return float(view.gain_nats(rows, change_db).sum())
 
     @override
-    def inputs(self, links: Links, params: Params) -> np.ndarray:
-        floors_db = list(params.receivers.values())
+    def inputs(self, links: Links) -> np.ndarray:
+        floors_db = list(self.params.receivers.values())
         # A receiver without an estimate has the usual floor, unless some have one alone.
-        usual = len(floors_db) >= MIN_RECEIVERS and not params.alone
+        usual = len(floors_db) >= MIN_RECEIVERS and not self.params.alone
         usual_db = np.median(floors_db) if usual else -np.inf
         by_receiver_db = np.full(len(links.receiver_names), usual_db)
-        by_receiver_db[list(params.receivers)] = floors_db
+        by_receiver_db[list(self.params.receivers)] = floors_db
         return np.exp(by_receiver_db * NEPERS)[links.receiver]
 
     @override
-    def response(self, level_db: np.ndarray, params: Params,
-                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return add_power(level_db, inputs)
 
     @override
-    def variation(self, params: Params) -> Variation:
+    def variation(self) -> Variation:
+        params = self.params
         n = len(params.receivers)
         return Variation(
             np.array(list(params.receivers.values())), np.full(n, 2.0), np.full(n, -250.0),
             np.array([params.highest.get(receiver, 50.0) for receiver in params.receivers]),
-            lambda numbers: params.model_copy(update={
-                "receivers": dict(zip(params.receivers, numbers.tolist()))}),
+            lambda numbers: self.changed(receivers=dict(zip(params.receivers, numbers.tolist()))),
             list(np.arange(n)[:, None]))
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
-        at_bound = [floor_db > params.highest.get(receiver, np.inf) - AT_BOUND_DB
-                    for receiver, floor_db in params.receivers.items()]
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        at_bound = [floor_db > self.params.highest.get(receiver, np.inf) - AT_BOUND_DB
+                    for receiver, floor_db in self.params.receivers.items()]
         if 2 * sum(at_bound) <= len(at_bound):
             return None
         return (f"the levels would have it higher, but more than {MAX_BELOW:.0%} of the readings "
                 f"would be {BELOW_DB:.0f} dB below it then: it is no floor")
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         unit = links.level_unit
         return {f"floor[{links.receiver_names[receiver]}]": Parameter.normal(floor_db, sd_db, unit)
-                for (receiver, floor_db), sd_db in zip(params.receivers.items(),
+                for (receiver, floor_db), sd_db in zip(self.params.receivers.items(),
                                                        estimate.params_sd)}
 
 

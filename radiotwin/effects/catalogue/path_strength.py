@@ -39,6 +39,8 @@ class _Paths(PathEffect):
         strength_db: Decibels = Field(description="Level of a path whose power gain is 1 [dB].")
         level_db: Decibels = Field(description="Level that a gain of 0 dB is measured as [dB].")
 
+    params: Params
+
     @override
     def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
@@ -60,27 +62,25 @@ class _Paths(PathEffect):
                 for strength_db in STRENGTHS_DB]
 
     @override
-    def inputs(self, links: Links, params: Params) -> np.ndarray:
+    def inputs(self, links: Links) -> np.ndarray:
         city_of(links, self.name)
         return paths_of(links, self.kinds)
 
     @override
-    def response(self, level_db: np.ndarray, params: Params,
-                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return add_power(level_db, inputs * np.exp(params.strength_db * NEPERS))
+    def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return add_power(level_db, inputs * np.exp(self.params.strength_db * NEPERS))
 
     @override
-    def variation(self, params: Params) -> Variation:
-        level_db = params.level_db
+    def variation(self) -> Variation:
+        level_db = self.params.level_db
         return Variation(
-            np.array([params.strength_db]), np.array([2.0]), np.array([level_db - BELOW_DB]),
+            np.array([self.params.strength_db]), np.array([2.0]), np.array([level_db - BELOW_DB]),
             np.array([level_db + ABOVE_DB]),
-            lambda numbers: params.model_copy(update={"strength_db": float(numbers[0])}))
+            lambda numbers: self.changed(strength_db=float(numbers[0])))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        return {"strength_db": Parameter.normal(params.strength_db - params.level_db,
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        return {"strength_db": Parameter.normal(self.params.strength_db - self.params.level_db,
                                                 estimate.params_sd[0], "dB",
                                                 Allowed(-BELOW_DB, ABOVE_DB))}
 

@@ -5,14 +5,14 @@ No law of its own: the channel predicts again with the end elsewhere, lines of s
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels, subsample
-from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import ResidualView
+from radiotwin.effects.moves import MAX_ENDS, MIN_LINKS, MovedEnd
 from radiotwin.effects.params import (
     Allowed,
     DeviceIndex,
@@ -27,11 +27,7 @@ from radiotwin.effects.patterns import Pattern, members
 from radiotwin.effects.places import Correction, Mark
 from radiotwin.links import Links, site_of
 
-MIN_LINKS = 60  # of an end that is moved about
-MAX_ENDS = 60  # that are moved about, or it takes too long
-MIN_NATS = 6.0  # that a move must gain to be proposed
 MIN_MOVE_M = 5.0  # less is within what surveys, receivers and the walls of maps are off by
-MAX_PROPOSE_LINKS = 600  # of an end, on which moves are tried
 # Moves that are tried: of devices on circles, of receivers along axes.
 RADII_M = (8.0, 15.0, 25.0, 40.0, 60.0, 85.0)
 DIRECTIONS = 12
@@ -42,14 +38,12 @@ TYPICAL_M = 10.0  # move of a device, for the slope of levels in its position
 MAX_RECEIVER_MOVE_M = 60.0  # along each axis
 
 
-class DevicePositionError(GainEffect):
+class DevicePositionError(MovedEnd):
     """A wrong position of an anchor and of all on its mast; one step finds one, the worst."""
 
     name = "device_position_error"
     settled_by = "fly past the device on two sides, close by, or survey it again"
     figure = "links"
-    repeatable = True
-    always_exact = True
     confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern",
                      "device_gain_offset")
 
@@ -60,7 +54,8 @@ class DevicePositionError(GainEffect):
             description="Index of the anchor, or of one of those on its mast.")
         move_m: tuple[Metres, Metres] = Field(
             description="True minus declared position, east and north [m].")
-        exact: bool = Field(False, description="Whether paths are followed to the new position.")
+
+    params: Params
 
     @override
     def unavailable(self, links: Links) -> str | None:
@@ -74,59 +69,47 @@ class DevicePositionError(GainEffect):
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links = view.links
-        best: tuple[float, Any] = MIN_NATS, None
         moves = [(float(radius * np.sin(angle)), float(radius * np.cos(angle)))
                  for radius in RADII_M
                  for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
         known = {other for device in view.found_params(self.name, "device")
                  for other in site_of(links, device)}
         masts = {min(site_of(links, device)) for device in _movable_anchors(links)}
-        for device in sorted(masts - known):
-            every = np.flatnonzero(np.isin(links.device, site_of(links, device)))
-            rows = subsample(every, MAX_PROPOSE_LINKS)
-            mine, share = links.select(rows), len(every) / len(rows)
-            before_db = view.level_at(mine)
-            for move_m in moves:
-                change_db = view.level_at(_with_moved(mine, device, move_m)) - before_db
-                nats = share * view.gain_nats(rows, change_db).sum()
-                if nats > best[0]:
-                    best = nats, self.Params(device=device, move_m=move_m)
-        return [best[1]] if best[1] else []
+        return self.best_move(view, ([self.Params(device=device, move_m=move_m) for move_m in moves]
+                                     for device in sorted(masts - known)))
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        offset_db = np.zeros(len(links))
-        rows = np.flatnonzero(np.isin(links.device, site_of(links, params.device)))
-        mine = links.select(rows)
-        moved = _with_moved(mine, params.device, params.move_m)
-        offset_db[rows] = level_at(moved, params.exact) - level_at(mine, params.exact)
-        return Term.of_offset(offset_db)
+    def rows(self, links: Links) -> np.ndarray:
+        return np.flatnonzero(np.isin(links.device, site_of(links, self.params.device)))
 
     @override
-    def exact(self, params: Params) -> Params:
-        return params.model_copy(update={"exact": True})
+    def moved(self, links: Links) -> Links:
+        device_m = links.device_m.copy()
+        device_m[site_of(links, self.params.device), :2] += self.params.move_m
+        return links.with_devices(device_m)
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
-        return _too_near(params.move_m)
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        return _too_near(self.params.move_m)
 
     @override
-    def variation(self, params: Params) -> Variation:
+    def variation(self) -> Variation:
         return Variation(
-            np.array(params.move_m), np.full(2, 6.0), np.full(2, -MAX_MOVE_M),
+            np.array(self.params.move_m), np.full(2, 6.0), np.full(2, -MAX_MOVE_M),
             np.full(2, MAX_MOVE_M),
-            lambda move_m: params.model_copy(update={"move_m": tuple(move_m.tolist())}),
-            follows_paths=params.exact)
+            lambda move_m: self.changed(move_m=tuple(move_m.tolist())),
+            follows_paths=self.is_exact)
 
     @override
-    def correction(self, links: Links, params: Params) -> Correction:
+    def correction(self, links: Links) -> Correction:
+        params = self.params
         return Correction(moves_m=dict.fromkeys(site_of(links, params.device), params.move_m))
 
     @override
-    def mark(self, links: Links, params: Params) -> Mark:
-        given_m = links.device_m[params.device, :2]
-        name, away_m = links.device_names[params.device], np.hypot(*params.move_m)
-        return Mark(f"{name} is\n{away_m:.0f} m away", given_m + params.move_m, from_m=given_m)
+    def mark(self, links: Links) -> Mark:
+        given_m = links.device_m[self.params.device, :2]
+        name, away_m = links.device_names[self.params.device], np.hypot(*self.params.move_m)
+        return Mark(f"{name} is\n{away_m:.0f} m away", given_m + self.params.move_m, from_m=given_m)
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
@@ -138,21 +121,20 @@ class DevicePositionError(GainEffect):
                               move_db, MIN_MOVE_M, MAX_MOVE_M)
 
     def _moved_north_db(self, view: ResidualView, device: int, by_m: float) -> np.ndarray:
-        params = self.Params(device=device, move_m=(0.0, by_m))
-        return self.term(view.links, params, view.level_at).offset_db
+        north = self.with_params(self.Params(device=device, move_m=(0.0, by_m)))
+        return north.term(view.links, view.level_at).offset_db
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        declared_m = links.device_m[params.device, :2]
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        declared_m = links.device_m[self.params.device, :2]
         return {f"{axis}_m[{links.device_names[device]}]": Parameter.normal(
                     old_m + move_m, sd, "m", Allowed(old_m - MAX_MOVE_M, old_m + MAX_MOVE_M))
-                for device in site_of(links, params.device)
-                for axis, old_m, move_m, sd in zip("xy", declared_m, params.move_m,
+                for device in site_of(links, self.params.device)
+                for axis, old_m, move_m, sd in zip("xy", declared_m, self.params.move_m,
                                                    estimate.params_sd, strict=True)}
 
 
-class ReceiverPositionError(GainEffect):
+class ReceiverPositionError(MovedEnd):
     """A constant error of all positions of a receiver; one step finds one receiver, the worst."""
 
     name = "receiver_position_error"
@@ -162,8 +144,6 @@ class ReceiverPositionError(GainEffect):
     settled_by = "fly one track forth and back"
     figure = "links"
     of_receiver = True
-    repeatable = True
-    always_exact = True
     confused_with = ("receiver_gain_offset",)
 
     class Params(EffectParams):
@@ -172,7 +152,8 @@ class ReceiverPositionError(GainEffect):
         receiver: ReceiverIndex = Field(description="Index of the receiver.")
         move_m: tuple[Metres, Metres, Metres] = Field(
             description="True minus given position, east, north and up [m].")
-        exact: bool = Field(False, description="Whether paths are followed to the new positions.")
+
+    params: Params
 
     @override
     def unavailable(self, links: Links) -> str | None:
@@ -183,51 +164,37 @@ class ReceiverPositionError(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        links = view.links
-        best: tuple[float, Any] = MIN_NATS, None
         moves = [sign * size_m * np.array(axis) for axis in RECEIVER_AXES
                  for size_m in RECEIVER_MOVES_M for sign in (-1, 1)]
         known = set(view.found_params(self.name, "receiver"))
-        for receiver in sorted(set(frequent_labels(links.receiver, MIN_LINKS)) - known):
-            every = np.flatnonzero(links.receiver == receiver)
-            rows = subsample(every, MAX_PROPOSE_LINKS)
-            mine, share = links.select(rows), len(every) / len(rows)
-            before_db = view.level_at(mine)
-            for move_m in moves:
-                moved = mine.with_receivers(mine.receiver_m + move_m)
-                nats = share * view.gain_nats(rows, view.level_at(moved) - before_db).sum()
-                if nats > best[0]:
-                    best = nats, self.Params(receiver=receiver, move_m=tuple(move_m.tolist()))
-        return [best[1]] if best[1] else []
+        receivers = sorted(set(frequent_labels(view.links.receiver, MIN_LINKS)) - known)
+        return self.best_move(view, (
+            [self.Params(receiver=receiver, move_m=tuple(move_m.tolist())) for move_m in moves]
+            for receiver in receivers))
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        offset_db = np.zeros(len(links))
-        rows = np.flatnonzero(links.receiver == params.receiver)
-        mine = links.select(rows)
-        moved = mine.with_receivers(mine.receiver_m + np.array(params.move_m))
-        offset_db[rows] = level_at(moved, params.exact) - level_at(mine, params.exact)
-        return Term.of_offset(offset_db)
+    def rows(self, links: Links) -> np.ndarray:
+        return np.flatnonzero(links.receiver == self.params.receiver)
 
     @override
-    def exact(self, params: Params) -> Params:
-        return params.model_copy(update={"exact": True})
+    def moved(self, links: Links) -> Links:
+        return links.with_receivers(links.receiver_m + np.array(self.params.move_m))
 
     @override
-    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
-        return _too_near(params.move_m)
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        return _too_near(self.params.move_m)
 
     @override
-    def variation(self, params: Params) -> Variation:
+    def variation(self) -> Variation:
         return Variation(
-            np.array(params.move_m), np.full(3, 3.0), np.full(3, -MAX_RECEIVER_MOVE_M),
+            np.array(self.params.move_m), np.full(3, 3.0), np.full(3, -MAX_RECEIVER_MOVE_M),
             np.full(3, MAX_RECEIVER_MOVE_M),
-            lambda move_m: params.model_copy(update={"move_m": tuple(move_m.tolist())}),
-            follows_paths=params.exact)
+            lambda move_m: self.changed(move_m=tuple(move_m.tolist())),
+            follows_paths=self.is_exact)
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        params = self.params
         name = links.receiver_names[params.receiver]
         return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(
                     move_m, sd, "m", Allowed(-MAX_RECEIVER_MOVE_M, MAX_RECEIVER_MOVE_M))
@@ -246,10 +213,3 @@ def _movable_anchors(links: Links) -> list[int]:
     """Return anchors with enough links; other devices were located where these links fit best."""
     return [device for device in frequent_labels(links.device, MIN_LINKS)
             if device in links.anchors]
-
-
-def _with_moved(links: Links, device: int, move_m: tuple[float, float]) -> Links:
-    """Return the links with a device and all on its mast moved east and north."""
-    device_m = links.device_m.copy()
-    device_m[site_of(links, device), :2] += move_m
-    return links.with_devices(device_m)

@@ -55,6 +55,8 @@ class ReceiverSaturation(ReceiverEffect):
         receivers: dict[ReceiverIndex, Compression] = Field(
             description="Of each receiver, by index.")
 
+    params: Params
+
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links, found = view.links, {}
@@ -78,43 +80,41 @@ class ReceiverSaturation(ReceiverEffect):
         return [self.Params(receivers=found)] if found else []
 
     @override
-    def inputs(self, links: Links, params: Params) -> np.ndarray:
+    def inputs(self, links: Links) -> np.ndarray:
         by_receiver = np.full((len(links.receiver_names), 2), np.inf)
-        for receiver, compression in params.receivers.items():
+        for receiver, compression in self.params.receivers.items():
             by_receiver[receiver] = compression
         return by_receiver[links.receiver]
 
     @override
-    def response(self, level_db: np.ndarray, params: Params,
-                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         reading_db, slope = level_db.copy(), np.ones_like(level_db)
         mine = np.isfinite(inputs[:, 0])
         reading_db[mine], slope[mine] = _compress(level_db[mine], *inputs[mine].T)
         return reading_db, slope
 
     @override
-    def variation(self, params: Params) -> Variation:
-        n = len(params.receivers)
+    def variation(self) -> Variation:
+        n = len(self.params.receivers)
         values = np.concatenate([[level_db, np.log(smoothness)]
-                                 for level_db, smoothness in params.receivers.values()])
+                                 for level_db, smoothness in self.params.receivers.values()])
 
-        def changed(numbers: np.ndarray) -> ReceiverSaturation.Params:
-            return self.Params(receivers={
+        def varied(numbers: np.ndarray) -> ReceiverSaturation:
+            return self.with_params(self.Params(receivers={
                 receiver: Compression(float(level_db), float(np.exp(log_smoothness)))
-                for receiver, (level_db, log_smoothness) in zip(params.receivers,
-                                                                numbers.reshape(-1, 2))})
+                for receiver, (level_db, log_smoothness) in zip(self.params.receivers,
+                                                                numbers.reshape(-1, 2))}))
 
         return Variation(values, np.tile([3.0, 0.4], n), np.tile([-250.0, np.log(0.4)], n),
-                         np.tile([50.0, np.log(8.0)], n), changed,
+                         np.tile([50.0, np.log(8.0)], n), varied,
                          list(np.arange(2 * n).reshape(n, 2)))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         unit = links.level_unit
         return {f"saturation_level[{links.receiver_names[receiver]}]":
                 Parameter.normal(compression.level_db, sd_db, unit)
-                for (receiver, compression), sd_db in zip(params.receivers.items(),
+                for (receiver, compression), sd_db in zip(self.params.receivers.items(),
                                                           estimate.params_sd[::2])}
 
 

@@ -17,7 +17,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from radiotwin.effects.arrays import city_of, frequent_labels
-from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
+from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.boxes import (
     Box,
     building_height_sds_m,
@@ -53,6 +53,7 @@ class RemovedObstacle(GainEffect):
     nlos_only = True
     repeatable = True
     needs_map = True
+    levels = "exact"
     always_exact = True
     confused_with = ("device_position_error",)
 
@@ -61,7 +62,8 @@ class RemovedObstacle(GainEffect):
 
         building: int = Field(ge=0, description="Index, as `buildings` numbers them.")
         centre_m: tuple[Metres, Metres, Metres] = Field(description="Centre x, y, and height [m].")
-        exact: bool = Field(False, description="Whether paths are followed over a map without it.")
+
+    params: Params
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
@@ -86,42 +88,37 @@ class RemovedObstacle(GainEffect):
             lower_m = building_height_sds_m(links.city)[building] * np.array(LOWER)
             if least > 0 and all(_gain_nats(view, building, _lower(links.city, building, by_m))
                                  < least for by_m in lower_m.tolist()):
-                return [self.Params(building=building, centre_m=tuple(centres_m[building].tolist()),
-                                    exact=True)]
+                return [self.Params(building=building,
+                                    centre_m=tuple(centres_m[building].tolist()))]
         return []
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
         offset_db, with_it = np.zeros(len(links)), city_of(links, self.name)
-        if params.exact:
-            city, box = _without(with_it, params.building)
-            rows = _near(links, box)
-            mine = links.select(rows)
-            offset_db[rows] = level_at(mine.with_city(city), True) - level_at(mine, True)
-            return Term.of_offset(offset_db)
-        rows = np.flatnonzero(only_blocker(links) == params.building)
-        if len(rows):
-            offset_db[rows] = _rise_db(links.select(rows), level_at)
+        city, box = _without(with_it, self.params.building)
+        rows = _near(links, box)
+        mine = links.select(rows)
+        offset_db[rows] = level_at(mine.with_city(city), True) - level_at(mine, True)
         return Term.of_offset(offset_db)
 
     @override
-    def exact(self, params: Params) -> Params:
-        return params.model_copy(update={"exact": True})
+    def exactly(self) -> Effect:
+        return self
 
     @override
-    def corrected_map(self, city: CityMap, params: Params) -> CityMap:
+    def corrected_map(self, city: CityMap) -> CityMap:
         # By its place: other effects' buildings that are gone, or there, have changed the numbers.
-        apart_m = np.linalg.norm(buildings(city)[1] - np.array(params.centre_m), axis=1)
+        apart_m = np.linalg.norm(buildings(city)[1] - np.array(self.params.centre_m), axis=1)
         nearest = int(apart_m.argmin())
         return _without(city, nearest)[0] if apart_m[nearest] < SAME_M else city
 
     @override
-    def mark(self, links: Links, params: Params) -> Mark | None:
+    def mark(self, links: Links) -> Mark | None:
         city = links.city
         if city is None:
             return None
-        faces = city.faces[buildings(city)[0] == params.building]
-        return Mark("removed building", np.array(params.centre_m[:2]),
+        faces = city.faces[buildings(city)[0] == self.params.building]
+        return Mark("removed building", np.array(self.params.centre_m[:2]),
                     faces_m=city.vertices[faces][..., :2])
 
     @override
@@ -135,21 +132,21 @@ class RemovedObstacle(GainEffect):
         if not hiding:
             return
         building = hiding[len(hiding) // 2]
-        params = self.Params(building=building, exact=True,
-                             centre_m=tuple(centres_m[building].tolist()))
-        rise_db = self.term(links, params, view.level_at).offset_db
+        gone = self.with_params(self.Params(building=building,
+                                            centre_m=tuple(centres_m[building].tolist())))
+        rise_db = gone.term(links, view.level_at).offset_db
         mean_db = float(rise_db[blocker == building].mean())
         if mean_db > 0:
             yield Pattern("building", "dB", "of a building of the map, behind it on average",
                           rise_db / mean_db)
 
     @override
-    def correction(self, links: Links, params: Params) -> Correction:
-        return Correction(gone=(params.building,))
+    def correction(self, links: Links) -> Correction:
+        return Correction(gone=(self.params.building,))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        params = self.params
         return {name: Parameter(value, value, value, "m")
                 for name, value in zip(("x_m", "y_m", "height_m"), params.centre_m, strict=True)}
 
@@ -166,11 +163,6 @@ def _gain_nats(view: ResidualView, building: int, other: CityMap) -> float:
 def _near(links: Links, box: Box) -> np.ndarray:
     """Return the rows of links that pass near a box."""
     return np.flatnonzero(near_box(box, links.device_m[links.device], links.receiver_m, NEAR_M))
-
-
-def _rise_db(links: Links, level_at: LevelAt) -> np.ndarray:
-    """Return what links (n,) gain if nothing were in their straight line [dB]."""
-    return level_at(links.with_los(np.ones(len(links), bool)), True) - level_at(links, True)
 
 
 def only_blocker(links: Links) -> np.ndarray:

@@ -192,6 +192,8 @@ class RoofHeights(GainEffect):
 
         roofs: tuple[Roof, ...] = Field(description="Roofs, and how much higher they are.")
 
+    params: Params
+
     @override
     def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
@@ -208,11 +210,11 @@ class RoofHeights(GainEffect):
         return [self.Params(roofs=roofs)] if roofs else []
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
         city, offset_db = city_of(links, self.name), np.zeros(len(links))
         count = len(buildings(city)[1])
         raised_m = np.zeros(count)
-        for roof in params.roofs:
+        for roof in self.params.roofs:
             if not 0 <= roof.building < count:
                 raise BadInput(f"the effect {self.name} has a roof of building {roof.building}, "
                                f"but the map has {count}; give the scene that the twin was made "
@@ -235,17 +237,16 @@ class RoofHeights(GainEffect):
         return Term.of_offset(offset_db)
 
     @override
-    def correction(self, links: Links, params: Params) -> Correction:
+    def correction(self, links: Links) -> Correction:
         return Correction(roofs=tuple(
             RaisedRoof(roof.building, roof.x_m, roof.y_m, roof.height_m, roof.true_offset_m,
-                       roof.offset_sd_m) for roof in surely_off(params.roofs)))
+                       roof.offset_sd_m) for roof in surely_off(self.params.roofs)))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         return {f"true_minus_mapped_height_m[{roof.x_m:.0f}, {roof.y_m:.0f}]":
                 Parameter.normal(roof.true_offset_m, roof.offset_sd_m, "m")
-                for roof in surely_off(params.roofs)}
+                for roof in surely_off(self.params.roofs)}
 
 
 def surely_off(roofs: Sequence[Roof]) -> list[Roof]:

@@ -56,9 +56,9 @@ class SectorAntenna(SectorEffect):
                 for chosen in ([mast, {best}] if len(mast) > 1 else [{best}])]
 
     @override
-    def variation(self, params: SectorEffect.Params) -> Variation:
-        return vary_patterns(params.devices,
-                             lambda devices: params.model_copy(update={"devices": devices}))
+    def variation(self) -> Variation:
+        return vary_patterns(self.params.devices,
+                             lambda devices: self.changed(devices=devices))
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
@@ -71,14 +71,13 @@ class SectorAntenna(SectorEffect):
                           low=size["low"], high=size["high"])
 
     @override
-    def parameters(self, links: Links, params: SectorEffect.Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         reported: dict[str, Parameter] = {}
-        patterns_sd = np.reshape(estimate.params_sd, (len(params.devices), -1))
-        for number, (device, pattern) in enumerate(params.devices.items()):
+        patterns_sd = np.reshape(estimate.params_sd, (len(self.params.devices), -1))
+        for number, (device, pattern) in enumerate(self.params.devices.items()):
             name = links.device_names[device]
             reported |= report_pattern(pattern, patterns_sd[number], name,
-                                       links.city is not None and not params.straight)
+                                       links.city is not None and not self.params.straight)
             reported[f"gain_db[{name}]"] = Parameter.normal(
                 estimate.coefficients[number], estimate.coefficients_sd[number], "dB")
         return reported

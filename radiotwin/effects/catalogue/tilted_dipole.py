@@ -88,6 +88,8 @@ class TiltedDipole(GainEffect):
         receivers: dict[ReceiverIndex, DipoleParams] = Field(
             description="Dipole of each receiver, by index.")
 
+    params: Params
+
     def __init__(self) -> None:
         self._arrivals = LinkCache()
 
@@ -107,9 +109,9 @@ class TiltedDipole(GainEffect):
         return [self.Params(receivers=found)] if found else []
 
     @override
-    def gain_db(self, links: Links, params: Params) -> np.ndarray:
+    def gain_db(self, links: Links) -> np.ndarray:
         offset_db = np.zeros(len(links))
-        for receiver, dipole in params.receivers.items():
+        for receiver, dipole in self.params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
             arrivals = self._arrivals.get(links, receiver,
                                           partial(_Arrivals.of, links, rows))
@@ -117,16 +119,15 @@ class TiltedDipole(GainEffect):
         return offset_db
 
     @override
-    def variation(self, params: Params) -> Variation:
-        return vary_patterns(params.receivers,
-                             lambda receivers: self.Params(receivers=receivers))
+    def variation(self) -> Variation:
+        return vary_patterns(self.params.receivers,
+                             lambda receivers: self.with_params(self.Params(receivers=receivers)))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         reported: dict[str, Parameter] = {}
-        dipoles_sd = np.reshape(estimate.params_sd, (len(params.receivers), -1))
-        for (receiver, dipole), sd in zip(params.receivers.items(), dipoles_sd, strict=True):
+        dipoles_sd = np.reshape(estimate.params_sd, (len(self.params.receivers), -1))
+        for (receiver, dipole), sd in zip(self.params.receivers.items(), dipoles_sd, strict=True):
             reported |= report_pattern(dipole, sd, links.receiver_names[receiver],
                                        links.city is not None)
         return reported

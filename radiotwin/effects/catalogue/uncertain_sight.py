@@ -46,6 +46,8 @@ class UncertainSight(GainEffect):
             12.0, unit="dB", low=0.5, high=60.0, step=3.0, description=(
                 "Difference of level between both classes that errors near walls are of [dB]."))
 
+    params: Params
+
     def __init__(self) -> None:
         self._chances = LinkCache()
 
@@ -65,16 +67,16 @@ class UncertainSight(GainEffect):
         return [self.Params(contrast_db=contrast_db) for contrast_db in CONTRASTS_DB]
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        params = self.params
         chance, los = self._chance(links), links.los
         columns = np.column_stack([np.where(los, chance - 1.0, 0.0), np.where(los, 0.0, chance)])
         return replace(Term.of_columns(columns, PRIOR_SD_DB),
                        random_effect_sd_db=params.contrast_db * np.sqrt(chance * (1.0 - chance)))
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        contrast = Parameter.normal(params.contrast_db, estimate.params_sd[0], "dB",
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        contrast = Parameter.normal(self.params.contrast_db, estimate.params_sd[0], "dB",
                                     Allowed(low=0.0))
         names = "loss_without_sight_db", "gain_with_sight_db"
         return {"contrast_db": contrast} | {

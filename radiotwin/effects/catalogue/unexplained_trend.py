@@ -52,6 +52,8 @@ class UnexplainedTrend(GainEffect):
         receivers: Unique[ReceiverIndex | None] = Field(
             description="Indices of the receivers with a curve each; [None] is one for all.")
 
+    params: Params
+
     def __init__(self, variable: str) -> None:
         """Make the effect for a variable of `residual_variables`."""
         self.variable = variable
@@ -76,30 +78,29 @@ class UnexplainedTrend(GainEffect):
         knots = curve_knots(value[known], KNOTS, self.variable in CIRCULAR)
 
         def rating(params: UnexplainedTrend.Params) -> float:
-            term = self.term(view.links, params, view.level_at)
+            term = self.with_params(params).term(view.links, view.level_at)
             return view.score(term) - term.columns.shape[1]  # (Akaike 1974)
 
         return [max((self.Params(knots=knots, receivers=members) for members in choices),
                     key=rating)]
 
     @override
-    def is_on_maps(self, params: Params) -> bool:
-        return self.variable in ON_MAPS and params.receivers == [None]
+    def is_on_maps(self) -> bool:
+        return self.variable in ON_MAPS and self.params.receivers == [None]
 
     @override
-    def term(self, links: Links, params: Params, level_at: LevelAt) -> Term:
-        basis = curve_basis(self._value(links, level_at), np.array(params.knots),
+    def term(self, links: Links, level_at: LevelAt) -> Term:
+        basis = curve_basis(self._value(links, level_at), np.array(self.params.knots),
                       self.variable in CIRCULAR)
         columns = [basis if member is None else basis * (links.receiver == member)[:, None]
-                   for member in params.receivers]
+                   for member in self.params.receivers]
         return Term.of_columns(np.hstack(columns), PRIOR_SD_DB)
 
     @override
-    def parameters(self, links: Links, params: Params,
-                   estimate: Estimate) -> dict[str, Parameter]:
-        curves = np.reshape(estimate.coefficients, (len(params.receivers), -1))
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        curves = np.reshape(estimate.coefficients, (len(self.params.receivers), -1))
         result = {}
-        for member, curve in zip(params.receivers, curves):
+        for member, curve in zip(self.params.receivers, curves):
             label = self.variable
             if member is not None:
                 label += f", {links.receiver_names[member]}"

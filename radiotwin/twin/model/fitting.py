@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from radiotwin.effects.arrays import subsample
-from radiotwin.effects.base import Effect
+from radiotwin.effects.base import Effect, Term
 from radiotwin.effects.params import NEAR_SHARE, Variation
 from radiotwin.inference import censored_regression
 from radiotwin.links import Links
@@ -20,7 +20,7 @@ from radiotwin.propagation.laws.base import ANY_LEVEL_SD_DB
 from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept
 from radiotwin.runtime.processes import resident_bytes
-from radiotwin.twin.model.model import AppliedEffect, Fit, Model, response
+from radiotwin.twin.model.model import Fit, Model, response
 
 EVALUATIONS = 25  # of the objective for each number, in one descent
 DESCENTS = 2  # a simplex that has collapsed too early starts anew; one for a fold, which is near
@@ -49,37 +49,36 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
         anywhere: whether the search also begins at `Variation.starts`.
     """
     model, last = fit.model, fit.effects[-1]
-    variation = last.effect.variation(last.params)
+    variation = last.variation()
     if variation is None or not len(variation.values):
         return fit
     if variation.members is not None:
         return _refine_members(fit, last, variation)
-    train, near = model.train, last.effect.reach(model.links, last.params)
+    train, near = model.train, last.reach(model.links)
     train = train if near is None else train & near
     rows = subsample(np.flatnonzero(train), max_links)
     if not len(rows):
         return fit
     design_effect = fit.view.design_effect * len(rows) / max(train.sum(), 1)
-    small = model.restrict(rows, model.effects[:-1])
+    small = model.with_effects(model.effects[:-1]).restrict(rows)
     rest = small.regression()
     # What has no coefficients of its own moves those of the others little: they stay meanwhile.
-    alone = last.effect.stage == "gain" and not len(last.term.prior_sd_db)
+    alone = last.stage == "gain" and not len(model.terms[-1].prior_sd_db)
     latest = fit
 
     def objective(numbers: np.ndarray) -> float:
         nonlocal latest
         inside = np.clip(numbers, variation.low, variation.high)
-        params = variation.params(inside)
-        tried = small.apply(last.effect, params)
+        effect = variation.effect(inside)
+        tried = small.with_effects([*small.effects, effect])
         if alone:
-            moved = replace(rest, gain_db=rest.gain_db + tried.term.offset_db)
+            moved = replace(rest, gain_db=rest.gain_db + tried.terms[-1].offset_db)
             misfit = moved.nll(fit).sum()
         else:
-            latest = small.with_effects([*small.effects, tried]).fit(latest)
+            latest = tried.fit(latest)
             misfit = latest.objective
         outside = np.abs((numbers - inside) / variation.steps).sum()
-        return float(misfit + design_effect * last.effect.neg_log_prior(params)
-                     + OUTSIDE_NATS * outside)
+        return float(misfit + design_effect * effect.neg_log_prior() + OUTSIDE_NATS * outside)
 
     numbers = variation.values
     if anywhere:
@@ -91,23 +90,23 @@ def refine(fit: Fit, evaluations: int = EVALUATIONS, descents: int = DESCENTS,
     return _better(fit, last, variation, numbers)
 
 
-def _refine_members(fit: Fit, last: AppliedEffect, variation: Variation) -> Fit:
+def _refine_members(fit: Fit, last: Effect, variation: Variation) -> Fit:
     """Vary the numbers of each member by themselves, on the links that they act on.
 
     Only a level of its own is fitted beside them.
     """
     model, numbers = fit.model, variation.values.copy()
-    arriving_db = model.regression().arriving(fit.coefficients)[0] - last.term.offset_db
+    arriving_db = model.regression().arriving(fit.coefficients)[0] - model.terms[-1].offset_db
 
-    def changed(links: Links, numbers: np.ndarray) -> AppliedEffect:
-        params = variation.params(np.clip(numbers, variation.low, variation.high))
-        return AppliedEffect(last.effect, params, last.effect.term(links, params, model.level_at))
+    def changed(links: Links, numbers: np.ndarray) -> tuple[Effect, Term]:
+        effect = variation.effect(np.clip(numbers, variation.low, variation.high))
+        return effect, effect.term(links, model.level_at)
 
     def acted_db(links: Links, numbers: np.ndarray) -> np.ndarray:
-        there = changed(links, numbers)
-        if last.effect.stage != "receiver":
-            return there.term.offset_db
-        through = response([there], "receiver", slice(None))
+        effect, term = changed(links, numbers)
+        if effect.stage != "receiver":
+            return term.offset_db
+        through = response([(effect, term.inputs)])
         assert through is not None
         return sum((through(np.full(len(links), level_db))[0] for level_db in EXTREMES_DB),
                    start=np.zeros(len(links)))
@@ -123,22 +122,25 @@ def _refine_members(fit: Fit, last: AppliedEffect, variation: Variation) -> Fit:
             continue
         latest = None
         links = model.links.select(rows)
-        others = [replace(each, term=each.term.select(rows)) for each in model.effects[:-1]]
+        others = [(each, None if term.inputs is None else term.inputs[rows])
+                  for each, term in zip(model.effects[:-1], model.terms, strict=False)
+                  if each.stage == "receiver"]
         alone = replace(model.with_effects([]).regression(rows),
                         law_columns=np.ones((len(rows), 1)),
                         prior_sd_db=np.full(1, ANY_LEVEL_SD_DB))
 
         def objective(values: np.ndarray, member: np.ndarray = member, rows: np.ndarray = rows,
-                      links: Links = links, others: list[AppliedEffect] = others,
+                      links: Links = links, others: list[tuple[Effect, Any]] = others,
                       alone: censored_regression.CensoredRegression = alone) -> float:
             nonlocal latest
             tried = numbers.copy()
             tried[member] = np.clip(values, variation.low[member], variation.high[member])
-            there = changed(links, tried)
+            effect, term = changed(links, tried)
+            own = [(effect, term.inputs)] if effect.stage == "receiver" else []
             outside = np.abs((values - tried[member]) / variation.steps[member]).sum()
             latest = censored_regression.fit(
-                replace(alone, law_db=arriving_db[rows] + there.term.offset_db,
-                        receiver=response([*others, there], "receiver", slice(None))), latest)
+                replace(alone, law_db=arriving_db[rows] + term.offset_db,
+                        receiver=response([*others, *own])), latest)
             return latest.objective + OUTSIDE_NATS * outside
 
         numbers[member] = _descend(objective, numbers[member], variation.steps[member])
@@ -160,16 +162,16 @@ def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray, steps
     return found.x * steps
 
 
-def _better(fit: Fit, last: AppliedEffect, variation: Variation, numbers: np.ndarray) -> Fit:
+def _better(fit: Fit, last: Effect, variation: Variation, numbers: np.ndarray) -> Fit:
     """Return the fit with the last effect's numbers changed, where that is better."""
-    params = variation.params(np.clip(numbers, variation.low, variation.high))
-    better = _with_params(fit, params)
-    prior = last.effect.neg_log_prior(last.params) - last.effect.neg_log_prior(params)
+    effect = variation.effect(np.clip(numbers, variation.low, variation.high))
+    better = fit.with_last(effect)
+    prior = last.neg_log_prior() - effect.neg_log_prior()
     gain = fit.objective - better.objective + fit.view.design_effect * prior
     return better if gain > 0 else fit
 
 
-def add_effect(fit: Fit, effect: Effect, like: Any = None) -> Fit | None:
+def add_effect(fit: Fit, effect: Effect, like: Effect | None = None) -> Fit | None:
     """Find the best parameters of an effect on the training links, beside the effects there are.
 
     On all links with quick levels, which `along_paths` replaces; on those of a fold with exact ones
@@ -178,7 +180,7 @@ def add_effect(fit: Fit, effect: Effect, like: Any = None) -> Fit | None:
     Args:
         fit: without it.
         effect: what is added.
-        like: parameters that were found on all links, where the fit is of a fold.
+        like: what was found of it on all links, where the fit is of a fold.
 
     Returns:
         the fit with the effect; None where nothing in the residual looks like the effect.
@@ -198,7 +200,7 @@ def along_paths(fit: Fit, without: Fit) -> Fit:
         the fit with exact levels in its last effect where these are better; what was given where
         they are not, or may not be asked for (`Effect.always_exact`).
     """
-    effect, gain = fit.effects[-1].effect, without.objective - fit.objective
+    effect, gain = fit.effects[-1], without.objective - fit.objective
     if not effect.always_exact or gain < MIN_GAIN_NATS or not _changes_few(fit):
         return fit
     found = kept("effect-along-paths", (fit, without), lambda: _best_along_paths(fit, without),
@@ -207,7 +209,7 @@ def along_paths(fit: Fit, without: Fit) -> Fit:
 
 
 def prepare_additions(without: Sequence[Fit], effects: Sequence[Effect], executor: Executor,
-                      like: Any = None) -> None:
+                      like: Effect | None = None) -> None:
     """Compute what `add_effect` will be asked, on the workers of an executor.
 
     The results are among the finished parts (`radiotwin.runtime.pieces`), from where `add_effect`
@@ -239,7 +241,7 @@ class _Addition:
 
     without: list[Fit]
     effects: list[Effect]
-    like: Any
+    like: Effect | None
 
     def __call__(self, piece: tuple[int, int]) -> Piece | None:
         fit, effect = self.without[piece[0]], self.effects[piece[1]]
@@ -250,12 +252,12 @@ def _write_addition(found: Fit | None) -> Piece | None:
     """Return what `add_effect` found, without the terms; None if JSON cannot hold it."""
     if found is None:
         return {}, None
-    params = [each.params.model_dump(mode="json") for each in found.effects]
-    for each, written in zip(found.effects, params, strict=True):
+    effects = [(each.params.model_dump(mode="json"), each.levels) for each in found.effects]
+    for each, (written, _) in zip(found.effects, effects, strict=True):
         if each.params.model_validate(json.loads(json.dumps(written))) != each.params:
             return None
     return ({"coefficients": found.coefficients, "scale_db": found.scale_db},
-            {"params": params, "objective": float(found.objective)})
+            {"effects": effects, "objective": float(found.objective)})
 
 
 def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
@@ -263,36 +265,32 @@ def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
     def read(arrays: dict[str, np.ndarray], content: Any) -> Fit | None:
         if content is None:
             return None
-        before = [*model.effects, None]
-        effects = [_read_applied(model, each.effect if each else effect, each, params)
-                   for each, params in zip(before, content["params"], strict=True)]
+        effects = []
+        for before, (written, levels) in zip((*model.effects, effect), content["effects"],
+                                             strict=True):
+            found = before.with_params(before.Params.model_validate(written), levels)
+            # The terms of those that are as they were need not be made again.
+            effects.append(before if before in model.effects and before.is_same(found) else found)
         return Fit(arrays["coefficients"], arrays["scale_db"], content["objective"],
                    model.with_effects(effects))
     return read
 
 
-def _read_applied(model: Model, effect: Effect, before: AppliedEffect | None,
-                  written: Any) -> AppliedEffect:
-    """Return an effect with its parameters; that of before where they are the same."""
-    params = effect.Params.model_validate(written)
-    same = before is not None and before.params == params
-    return before if before is not None and same else model.apply(effect, params)
-
-
-def _best_addition(fit: Fit, effect: Effect, like: Any) -> Fit | None:
-    proposals = effect.propose(fit.view) if like is None else effect.propose_like(fit.view, like)
-    kinds: dict[Any, list[Any]] = {}
+def _best_addition(fit: Fit, effect: Effect, like: Effect | None) -> Fit | None:
+    proposals = effect.propose(fit.view) if like is None else like.propose_like(fit.view)
+    kinds: dict[Any, list[Effect]] = {}
     for params in proposals:
-        kinds.setdefault(effect.kind(params), []).append(params)
-    exactly = like is not None and effect.always_exact and like == effect.exact(like)
-    found = [_best_of_a_kind(fit, effect, each, like is not None) for each in kinds.values()]
+        proposed = effect.with_params(params)
+        kinds.setdefault(proposed.kind(), []).append(proposed)
+    found = [_best_of_a_kind(fit, each, like is not None) for each in kinds.values()]
     if not found:
         return None
     best = min(found, key=_objective)
-    if not exactly or fit.objective - best.objective < MIN_GAIN_NATS:
+    exactly = like is not None and like.always_exact and like.is_same(like.exactly())
+    if like is None or not exactly or fit.objective - best.objective < MIN_GAIN_NATS:
         return best
     best = with_exact_levels(best)
-    near = _near(fit, effect, like)
+    near = _near(fit, like)
     return near if near.objective < best.objective else best
 
 
@@ -304,7 +302,7 @@ def _best_along_paths(fit: Fit, without: Fit) -> Fit:
     best = with_exact_levels(_over_known_paths(fit))
     if not _is_exact(best) and best.channel.follows_paths:
         best = _exactly_beside(best)
-    variation = best.effects[-1].effect.variation(best.effects[-1].params)
+    variation = best.effects[-1].variation()
     if variation is None or not variation.follows_paths:
         return best
     before = without.objective
@@ -316,13 +314,13 @@ def _best_along_paths(fit: Fit, without: Fit) -> Fit:
     return best
 
 
-def _best_of_a_kind(fit: Fit, effect: Effect, proposals: list[Any], is_fold: bool) -> Fit:
+def _best_of_a_kind(fit: Fit, proposed: list[Effect], is_fold: bool) -> Fit:
     """Return the best of some proposals, refined where it gains."""
-    applied = [fit.model.apply(effect, params) for params in proposals]
-    if effect.stage == "gain" and len(applied) > MAX_PROPOSALS:  # only gains have a score
-        applied.sort(key=lambda each: -fit.view.score(each.term.select(fit.train)))
-        applied = applied[:MAX_PROPOSALS]
-    best = min((fit.with_effects([*fit.effects, each]) for each in applied), key=_objective)
+    tried = [fit.model.with_effects([*fit.effects, each]) for each in proposed]
+    if proposed[0].stage == "gain" and len(tried) > MAX_PROPOSALS:  # only gains have a score
+        tried.sort(key=lambda each: -fit.view.score(each.terms[-1].select(fit.train)))
+        tried = tried[:MAX_PROPOSALS]
+    best = min((each.fit(fit) for each in tried), key=_objective)
     if fit.objective - best.objective < MIN_GAIN_NATS:
         return best
     return refine(best, descents=1 if is_fold else DESCENTS)
@@ -330,19 +328,13 @@ def _best_of_a_kind(fit: Fit, effect: Effect, proposals: list[Any], is_fold: boo
 
 def _changes_few(fit: Fit) -> bool:
     """Return whether the last effect changes so few links that their paths can be followed."""
-    return int(np.count_nonzero(fit.effects[-1].term.offset_db)) <= MAX_FOLLOWED_LINKS
+    return int(np.count_nonzero(fit.model.terms[-1].offset_db)) <= MAX_FOLLOWED_LINKS
 
 
 def _is_exact(fit: Fit) -> bool:
     """Return whether the last effect has exact levels."""
     last = fit.effects[-1]
-    return bool(last.params == last.effect.exact(last.params))
-
-
-def _with_params(fit: Fit, params: Any) -> Fit:
-    """Return the fit with other parameters in the last effect."""
-    *others, last = fit.effects
-    return fit.with_effects([*others, fit.model.apply(last.effect, params)])
+    return last.is_same(last.exactly())
 
 
 def _exactly_beside(fit: Fit) -> Fit:
@@ -352,11 +344,11 @@ def _exactly_beside(fit: Fit) -> Fit:
     that is tried follows paths.
     """
     last = fit.effects[-1]
-    variation = last.effect.variation(last.params)
-    if variation is None or len(variation.values) > MAX_EXACT_NUMBERS:
+    variation, exactly = last.variation(), last.exactly()
+    if variation is None or exactly is None or len(variation.values) > MAX_EXACT_NUMBERS:
         return fit
-    start = _with_params(fit, last.effect.exact(last.params))
-    beside = refine(start, evaluations=EXACT_EVALUATIONS, descents=1, max_links=MAX_EXACT_LINKS)
+    beside = refine(fit.with_last(exactly), evaluations=EXACT_EVALUATIONS, descents=1,
+                    max_links=MAX_EXACT_LINKS)
     return beside if beside.objective < fit.objective else fit
 
 
@@ -370,26 +362,27 @@ def _over_known_paths(fit: Fit, is_near: bool = False) -> Fit:
         is_near: whether it is known to be near the best.
     """
     last = fit.effects[-1]
-    exact = last.effect.exact(last.params) if fit.channel.follows_paths else None
-    variation = None if exact is None else last.effect.variation(exact)
+    exact = last.exactly() if fit.channel.follows_paths else None
+    variation = None if exact is None else exact.variation()
     if variation is None or variation.follows_paths:
         return fit
-    start = _with_params(fit, variation.params(variation.values))
-    found = refine(start, descents=1, anywhere=not is_near)
-    exactly = _with_params(fit, last.effect.exact(found.effects[-1].params))
+    start = fit.with_last(variation.effect(variation.values))
+    found = refine(start, descents=1, anywhere=not is_near).effects[-1].exactly()
+    assert found is not None
+    exactly = fit.with_last(found)
     return exactly if exactly.objective < fit.objective else fit
 
 
-def _near(fit: Fit, effect: Effect, like: Any) -> Fit:
-    """Return the best fit to a fold around the parameters that were found on all links.
+def _near(fit: Fit, like: Effect) -> Fit:
+    """Return the best fit to a fold around the effect that was found on all links.
 
     Each number by itself a share of its step to both sides, and all that gain together: every fold
     asks for the same exact levels, which are kept.
     """
-    def fitted(params: Any) -> Fit:
-        return fit.with_effects([*fit.effects, fit.model.apply(effect, params)])
+    def fitted(effect: Effect) -> Fit:
+        return fit.with_effects([*fit.effects, effect])
 
-    variation, best = effect.variation(like), fitted(like)
+    variation, best = like.variation(), fitted(like)
     if variation is None:
         return best
     if not variation.follows_paths:
@@ -400,11 +393,11 @@ def _near(fit: Fit, effect: Effect, like: Any) -> Fit:
         for shift in (-NEAR_SHARE * step, NEAR_SHARE * step):
             values = variation.values.copy()
             values[number] += shift
-            moved = fitted(variation.params(np.clip(values, variation.low, variation.high)))
+            moved = fitted(variation.effect(np.clip(values, variation.low, variation.high)))
             if moved.objective < least:
                 least, numbers[number] = moved.objective, values[number]
             best = min(best, moved, key=_objective)
-    together = fitted(variation.params(np.clip(numbers, variation.low, variation.high)))
+    together = fitted(variation.effect(np.clip(numbers, variation.low, variation.high)))
     return min(best, together, key=_objective)
 
 
@@ -413,12 +406,10 @@ def with_exact_levels(fit: Fit) -> Fit:
     if not fit.channel.follows_paths:
         return fit
     for number, each in enumerate(fit.effects):
-        params = each.effect.exact(each.params)
-        if params is None or params == each.params:
+        exactly = each.exactly()
+        if exactly is None or each.is_same(exactly):
             continue
-        effects = list(fit.effects)
-        effects[number] = fit.model.apply(each.effect, params)
-        other = fit.with_effects(effects)
+        other = fit.with_effects([*fit.effects[:number], exactly, *fit.effects[number + 1:]])
         if other.objective < fit.objective:
             fit = other
     return fit

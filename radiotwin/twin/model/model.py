@@ -8,14 +8,14 @@ Selection, localisation, maps and reports all predict by it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from radiotwin.effects.base import DetectionEffect, Effect, LevelAt, LimitEffect, ResidualView, Term
-from radiotwin.effects.params import EffectParams
 from radiotwin.errors import BadInput
 from radiotwin.inference import censored_regression
 from radiotwin.inference.censored_regression import (
@@ -39,29 +39,6 @@ MAX_Z = 4.0  # an outlier counts as this many scales
 
 
 @dataclass(frozen=True, eq=False)
-class AppliedEffect:
-    """An effect with its parameters, and what it adds to all links of a model."""
-
-    effect: Effect
-    params: Any
-    term: Term
-
-    @property
-    def acts(self) -> np.ndarray:
-        """(n,) bool, links whose level it may change."""
-        return (self.term.offset_db != 0) | (self.term.columns != 0).any(axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class FittedEffect:
-    """An effect with its parameters (`Effect.Params`) and the coefficients (q,) of its term."""
-
-    effect: Effect
-    params: EffectParams
-    coefficients: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Model:
     """A channel and effects on n links, of which those in `train` are learnt from; not fitted yet.
 
@@ -77,6 +54,7 @@ class Model:
         groups: number of these, also where no link is of one.
         dof: degrees of freedom of the errors.
         effects: found so far.
+        terms: what each of them adds to the n links.
     """
 
     links: Links
@@ -89,7 +67,8 @@ class Model:
     group: np.ndarray
     groups: int
     dof: float
-    effects: list[AppliedEffect] = field(default_factory=list)
+    effects: tuple[Effect, ...] = ()
+    terms: tuple[Term, ...] = ()
 
     @classmethod
     def build(cls, links: Links, channel: ChannelModel, dof: float, *,
@@ -127,44 +106,46 @@ class Model:
     @property
     def effect_names(self) -> frozenset[str]:
         """Names of the effects found so far, without those that were declared."""
-        return frozenset(each.effect.name for each in self.effects if not each.effect.is_declared)
+        return frozenset(each.name for each in self.effects if not each.is_declared)
 
     @property
     def corrected_map(self) -> CityMap | None:
         """The map with what effects add to it and take from it; None without a map."""
         city = self.links.city
         for each in self.effects:
-            city = None if city is None else each.effect.corrected_map(city, each.params)
+            city = None if city is None else each.corrected_map(city)
         return city
 
-    def apply(self, effect: Effect, params: Any) -> AppliedEffect:
-        """Return an effect on these links."""
-        return AppliedEffect(effect, params, effect.term(self.links, params, self.level_at))
+    def with_effects(self, effects: Iterable[Effect]) -> Model:
+        """Return the same with other effects; terms of those that it has are not made again."""
+        known, effects = dict(zip(self.effects, self.terms, strict=True)), tuple(effects)
+        return replace(self, effects=effects, terms=tuple(
+            known[each] if each in known else each.term(self.links, self.level_at)
+            for each in effects))
 
-    def with_effects(self, effects: list[AppliedEffect]) -> Model:
-        """Return the same with other effects."""
-        return replace(self, effects=effects)
+    def with_last(self, effect: Effect) -> Model:
+        """Return the same with another effect in place of the last one."""
+        return self.with_effects([*self.effects[:-1], effect])
 
-    def restrict(self, rows: np.ndarray, effects: list[AppliedEffect]) -> Model:
-        """Return the model of some links (r,), all to be learnt from, with some of its effects."""
+    def restrict(self, rows: np.ndarray) -> Model:
+        """Return the model of some links (r,), all to be learnt from."""
         everything = np.ones(len(rows), dtype=bool)
         return replace(
             self, links=self.links.select(rows), train=everything, usable=everything,
             channel_db=self.channel_db[rows], level_columns=self.level_columns[rows],
-            group=self.group[rows],
-            effects=[replace(each, term=each.term.select(rows)) for each in effects])
+            group=self.group[rows], terms=tuple(term.select(rows) for term in self.terms))
 
     def regression(self, rows: np.ndarray | slice = slice(None)) -> CensoredRegression:
         """Return the regression on the links of a mask, an index array or a slice."""
-        links, terms = self.links, [each.term for each in self.effects]
+        links, terms = self.links, self.terms
         n = len(self.channel_db[rows])
         return CensoredRegression(
             links.level_db[rows], self.limit_db[rows],
-            self.channel_db[rows], self.level_columns[rows], response(self.effects, "paths", rows),
+            self.channel_db[rows], self.level_columns[rows], self._response("paths", rows),
             sum((term.offset_db[rows] for term in terms), np.zeros(n)),
             censored_regression.design([term.columns[rows] for term in terms], n),
             np.concatenate([self.level_prior_sd_db, *(term.prior_sd_db for term in terms)]),
-            self.group[rows], response(self.effects, "receiver", rows), self.dof,
+            self.group[rows], self._response("receiver", rows), self.dof,
             self.losses.select(rows), self._random_effect_sd_db(rows))
 
     @cached_property
@@ -177,9 +158,8 @@ class Model:
         """(n,) level below which a link is blank [dB]; -inf where none is known."""
         limit_db = self.links.limit_db
         for each in self.effects:
-            if isinstance(each.effect, LimitEffect):
-                own_db = each.effect.limits_db(self.links, each.params)
-                limit_db = np.maximum(limit_db, own_db)
+            if isinstance(each, LimitEffect):
+                limit_db = np.maximum(limit_db, each.limits_db(self.links))
         return limit_db
 
     def fit(self, start: FitResult | None = None) -> Fit:
@@ -193,15 +173,15 @@ class Model:
     @property
     def coefficient_slices(self) -> list[slice]:
         """Of each effect: where its coefficients are among all."""
-        widths = [each.term.columns.shape[1] for each in self.effects]
+        widths = [term.columns.shape[1] for term in self.terms]
         ends = np.cumsum([self.level_columns.shape[1], *widths]).tolist()
         return [slice(first, end) for first, end in zip(ends, ends[1:], strict=False)]
 
     @cached_property
     def losses(self) -> Losses:
         """Losses of all links whatever their level."""
-        every = [each.effect.losses(self.links, each.params)
-                 for each in self.effects if isinstance(each.effect, DetectionEffect)]
+        every = [each.losses(self.links) for each in self.effects
+                 if isinstance(each, DetectionEffect)]
         if not every:
             return NO_LOSSES
         kept = np.prod([1.0 - np.asarray(each.blank) for each in every], axis=0)
@@ -210,12 +190,18 @@ class Model:
         return Losses(1.0 - kept, most.drop, most.drop_db)
 
     def _scatter_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
-        return _joined_sd_db([each.term.random_effect_sd_db for each in self.effects], rows)
+        return _joined_sd_db([term.random_effect_sd_db for term in self.terms], rows)
 
     def _random_effect_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
         """Return (n,) the sd of all that is not learnt of a link; 0 where there is none."""
-        unheard = [each.term.unheard_sd_db for each in self.effects]
+        unheard = [term.unheard_sd_db for term in self.terms]
         return np.hypot(self._scatter_sd_db(rows), _joined_sd_db(unheard, rows))
+
+    def _response(self, stage: str, rows: np.ndarray | slice) -> Response | None:
+        """Return what effects of a stage do to levels, one after the other; None without any."""
+        return response([(each, None if term.inputs is None else term.inputs[rows])
+                         for each, term in zip(self.effects, self.terms, strict=True)
+                         if each.stage == stage])
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +235,7 @@ class Fit(FitResult):
         return self.model.channel
 
     @property
-    def effects(self) -> list[AppliedEffect]:
+    def effects(self) -> tuple[Effect, ...]:
         """Of the model."""
         return self.model.effects
 
@@ -258,19 +244,17 @@ class Fit(FitResult):
         """The training links as an effect sees them; the same object if asked again."""
         return _view(self)
 
-    @property
-    def fitted_effects(self) -> tuple[FittedEffect, ...]:
-        """The effects with their coefficients, without their terms on these links."""
-        return tuple(FittedEffect(each.effect, each.params, self.coefficients_of(number))
-                     for number, each in enumerate(self.effects))
-
     def coefficients_of(self, number: int) -> np.ndarray:
         """Return the coefficients (q,) of one of the effects."""
         return self.coefficients[self.model.coefficient_slices[number]]
 
-    def with_effects(self, effects: list[AppliedEffect]) -> Fit:
+    def with_effects(self, effects: Iterable[Effect]) -> Fit:
         """Return the model with other effects, fitted again from these coefficients."""
         return self.model.with_effects(effects).fit(self)
+
+    def with_last(self, effect: Effect) -> Fit:
+        """Return the same with another effect in place of the last one."""
+        return self.model.with_last(effect).fit(self)
 
     def without(self, place: int) -> Fit:
         """Return the fit with one effect taken away; nothing else is changed."""
@@ -283,7 +267,9 @@ class Fit(FitResult):
         """What was learnt, without the training links."""
         model, sd_db = self.model, device_sd_db(self)
         return FittedModel(
-            model.channel, self.fitted_effects, self.coefficients[:model.level_columns.shape[1]],
+            model.channel, model.effects,
+            tuple(self.coefficients_of(number) for number in range(len(model.effects))),
+            self.coefficients[:model.level_columns.shape[1]],
             self.scale_db, model.dof, model.links.device_m, tuple(model.links.receiver_names),
             model.links.first_s, sd_db, unheard=Unheard.of(self, sd_db))
 
@@ -303,7 +289,7 @@ class Fit(FitResult):
         """
         reading = self.readings()
         mean_db, whole = reading.mean_db, reading.scale_db
-        if all(each.term.unheard_sd_db is None for each in self.effects):
+        if all(term.unheard_sd_db is None for term in self.model.terms):
             return mean_db, whole, np.zeros(len(whole))
         scatter_sd_db = self.model._scatter_sd_db(slice(None))
         known = replace(self.model.regression(), random_effect_sd_db=scatter_sd_db)
@@ -315,17 +301,19 @@ def _joined_sd_db(parts: list[np.ndarray | None], rows: np.ndarray | slice) -> n
     return np.sqrt(sum(each[rows] ** 2 for each in parts if each is not None))
 
 
-def response(effects: list[AppliedEffect], stage: str, rows: np.ndarray | slice) -> Response | None:
-    """Return the response of all effects of a stage, one after the other; None without any."""
-    effects = [each for each in effects if each.effect.stage == stage]
+def response(effects: Sequence[tuple[Effect, Any]]) -> Response | None:
+    """Return what effects make of levels, one after the other; None without any.
+
+    Args:
+        effects: each with the inputs (n, …) of its term.
+    """
     if not effects:
         return None
-    inputs = [None if each.term.inputs is None else each.term.inputs[rows] for each in effects]
 
     def chained(level_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope = np.ones_like(level_db)
-        for each, own_inputs in zip(effects, inputs, strict=True):
-            level_db, own = each.effect.response(level_db, each.params, own_inputs)  # type: ignore[attr-defined]
+        for each, inputs in effects:
+            level_db, own = each.response(level_db, inputs)  # type: ignore[attr-defined]
             slope = slope * own
         return level_db, slope
     return chained
@@ -339,7 +327,7 @@ def _view(fit: Fit) -> ResidualView:
     links = model.links if model.train.all() else model.links.select(model.train)
     return ResidualView(links, model.training.residual_db(fit),
                         predicted.scale_db, predicted.mean_db, model.level_at,
-                        tuple((each.effect.name, each.params) for each in model.effects))
+                        model.effects)
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,11 +353,11 @@ class Unheard:
             device_sd_db: as of `FittedModel` [dB].
         """
         links, own_db, declared = fit.links, np.zeros(len(fit.links)), set[int]()
-        for number, each in enumerate(fit.effects):
-            if each.effect.is_declared:
+        for number, (each, term) in enumerate(zip(fit.effects, fit.model.terms, strict=True)):
+            if each.is_declared:
                 declared |= set(getattr(each.params, "devices", ()))
-            elif each.effect.of_device:
-                own_db += each.term.offset_db + each.term.columns @ fit.coefficients_of(number)
+            elif each.of_device:
+                own_db += term.offset_db + term.columns @ fit.coefficients_of(number)
         device = links.device[fit.train]
         heard = np.unique(device)
         devices = sorted(set(range(len(links.device_m))) - set(heard.tolist()) - declared)
@@ -388,7 +376,8 @@ class FittedModel:
 
     Attributes:
         channel: fitted.
-        effects: fitted; they count devices and receivers by their rows at the fit.
+        effects: as they were found; they count devices and receivers by their rows at the fit.
+        coefficients: (q,) of the columns of each effect's term.
         level_coefficients: (p0,) of `ChannelModel.level_columns`.
         scale_db: (groups,) error scales [dB].
         dof: degrees of freedom of the errors.
@@ -407,7 +396,8 @@ class FittedModel:
     """
 
     channel: ChannelModel
-    effects: tuple[FittedEffect, ...]
+    effects: tuple[Effect, ...]
+    coefficients: tuple[np.ndarray, ...]
     level_coefficients: np.ndarray
     scale_db: np.ndarray
     dof: float
@@ -429,8 +419,13 @@ class FittedModel:
         link), and curves without a cause, which describe devices whose positions are known. How far
         their lack displaces devices is in `radius_factor`.
         """
-        return replace(self, effects=tuple(each for each in self.effects
-                                           if each.effect.is_cause and not each.effect.in_paths))
+        return self._without(lambda each: not each.is_cause or each.in_paths)
+
+    def _without(self, left_out: Callable[[Effect], bool]) -> FittedModel:
+        """Return the same without some effects."""
+        kept = [number for number, each in enumerate(self.effects) if not left_out(each)]
+        return replace(self, effects=tuple(self.effects[number] for number in kept),
+                       coefficients=tuple(self.coefficients[number] for number in kept))
 
     def on_links(self, links: Links) -> Fit:
         """Return these coefficients on other links (n,), all of which are in `train`.
@@ -438,12 +433,14 @@ class FittedModel:
         Where the links have no receivers (a map's have none) those are faultless: effects of
         receivers are left out.
         """
-        effects = [each for each in self.effects
-                   if links.receiver_names or each.effect.is_on_maps(each.params)]
-        model = Model.build(links, self.channel, self.dof)
-        model = model.with_effects([model.apply(each.effect, each.params) for each in effects])
-        coefficients = [self.level_coefficients, *(each.coefficients for each in effects)]
-        needed = [model.level_columns, *(each.term.columns for each in model.effects)]
+        if not links.receiver_names:
+            return self._without(lambda each: not each.is_on_maps())._on_links(links)
+        return self._on_links(links)
+
+    def _on_links(self, links: Links) -> Fit:
+        model = Model.build(links, self.channel, self.dof).with_effects(self.effects)
+        coefficients = [self.level_coefficients, *self.coefficients]
+        needed = [model.level_columns, *(term.columns for term in model.terms)]
         for own, columns in zip(coefficients, needed, strict=True):
             if len(own) != columns.shape[1]:
                 raise BadInput(f"the twin has {len(own)} coefficients where {columns.shape[1]} are "

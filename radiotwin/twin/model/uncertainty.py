@@ -20,7 +20,7 @@ from radiotwin.inference import student
 from radiotwin.inference.censored_regression import CensoredRegression, Linearisation
 from radiotwin.inference.sandwich import Scores
 from radiotwin.links import evidence_blocks, places
-from radiotwin.twin.model.model import AppliedEffect, Fit, Model
+from radiotwin.twin.model.model import Fit
 
 MIN_FLIGHTS = 4  # that clusters of flights are made of
 STEP_SHARES = (0.02, 3.0)  # of `Variation.steps`, least and greatest secant
@@ -82,7 +82,7 @@ def linearise(fit: Fit, known: Mapping[int, list[Secant]] | None = None) -> Line
         fit: of the model with its effects.
         known: secants of effects, by their place in the model, that are not computed again.
     """
-    variations = [each.effect.variation(each.params) for each in fit.effects]
+    variations = [each.variation() for each in fit.effects]
     fit = _as_varied(fit, variations)
     # A design effect of the whole stands in for what each prior counts beside links.
     design_effect = fit.view.design_effect
@@ -119,9 +119,10 @@ def estimates(linearised: Linearised) -> list[Estimate]:
 
 def _as_varied(fit: Fit, variations: list[Variation | None]) -> Fit:
     """Return the model as its variations have it: of quick levels, where those vary quickly."""
-    effects = [each if variation is None or variation.params(variation.values) == each.params
-               else fit.model.apply(each.effect, variation.params(variation.values))
-               for each, variation in zip(fit.effects, variations, strict=True)]
+    varied = [each if variation is None else variation.effect(variation.values)
+              for each, variation in zip(fit.effects, variations, strict=True)]
+    effects = [old if old.is_same(new) else new
+               for new, old in zip(varied, fit.effects, strict=True)]
     if all(new is old for new, old in zip(effects, fit.effects, strict=True)):
         return fit
     return fit.with_effects(effects)
@@ -148,10 +149,10 @@ def _secants(fit: Fit, number: int, variation: Variation | None,
 
 def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) -> Secant:
     model = fit.model
-    applied, problem = model.effects[number], model.training
-    blanking = isinstance(applied.effect, DetectionEffect | LimitEffect)
+    effect, problem = model.effects[number], model.training
+    blanking = isinstance(effect, DetectionEffect | LimitEffect)
     here = problem.predict(fit)
-    nll, prior = problem.nll(fit), applied.effect.neg_log_prior(applied.params)
+    nll, prior = problem.nll(fit), effect.neg_log_prior()
     n = len(nll)
     sides, priors = [], []
     for sign in (-1.0, 1.0):
@@ -160,7 +161,9 @@ def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) ->
         moved_by = numbers[i] - variation.values[i]
         if moved_by == 0:
             continue
-        moved = _moved(model, number, model.apply(applied.effect, variation.params(numbers)))
+        other = variation.effect(numbers)
+        moved = model.with_effects([*model.effects[:number], other,
+                                    *model.effects[number + 1:]]).training
         there = moved.predict(fit)
         change = np.zeros((3, n))
         if blanking:
@@ -169,7 +172,7 @@ def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) ->
             change[0] = there.mean_db - here.mean_db
             change[1] = np.log(there.scale_db / here.scale_db)
         sides.append(change / moved_by)
-        priors.append(applied.effect.neg_log_prior(variation.params(numbers)) - prior)
+        priors.append(other.neg_log_prior() - prior)
     if not sides:
         return Secant(np.zeros(n), np.zeros(n), np.zeros(n))
     mean_db, log_scale, score = np.mean(sides, axis=0)
@@ -183,12 +186,6 @@ def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) ->
            for side in sides]
     below, above = (float(np.sqrt(np.mean(own) / each)) for each in own)
     return replace(secant, sides=(below, above))
-
-
-def _moved(model: Model, number: int, applied: AppliedEffect) -> CensoredRegression:
-    effects = list(model.effects)
-    effects[number] = applied
-    return model.with_effects(effects).training
 
 
 def _information(fit: Fit, secant: Secant) -> float:
