@@ -8,6 +8,7 @@ from scipy.special import expit
 
 from marl.figures import COLOURS
 from radiotwin.closeloop.verdict import posterior
+from radiotwin.closeloop.verdict.criteria import NATS
 from studies.tables import make_panels, markdown
 
 PHYSICS = ("wall_reflection", "diffraction")  # in every traced world
@@ -47,7 +48,7 @@ def fitted(rows: list[dict]) -> dict:
     without = [row["results"] for row in rows
                if not any(inside for _, inside in row["results"]["hidden"])]
     steps = np.array([each["steps"][0] for each in without])
-    inputs = np.column_stack([np.arcsinh(steps[:, :2] / posterior.NATS),
+    inputs = np.column_stack([np.arcsinh(steps[:, :2] / NATS),
                               np.log(np.maximum(steps[:, 2:], 0.1))])
     nothing = logistic(inputs, np.array([not each["hidden"] for each in without]),
                        np.zeros(4), np.full(4, NOTHING_SD), [(None, 0.0)] * 3 + [(None, None)])

@@ -48,7 +48,8 @@ class Crane(GainEffect):
         grid = np.meshgrid(*np.linspace(ends_m.min(axis=0), ends_m.max(axis=0), PLACES).T)
         tried = [self.Params(place_m=place_m)
                  for place_m in zip(*(axis.ravel().tolist() for axis in grid), strict=True)]
-        nats = [view.score(self.term(view.links, each, view.level_at)) for each in tried]
+        nats = [view.score(self.with_params(each).term(view.links, view.level_at))
+                for each in tried]
         best = int(np.argmax(nats))
         return [tried[best]] if nats[best] > MIN_NATS else []
 

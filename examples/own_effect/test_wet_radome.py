@@ -78,14 +78,14 @@ def test_a_crane_has_a_place(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     from crane import Crane
     links = prepare_links(made(0.0), None)
-    crane, params = Crane(), Crane.Params(place_m=(200.0, 200.0))
-    through = crane.term(links, params, None).columns[:, 0] < 0
-    assert 10 < through.sum() < 0.2 * len(links) and crane.reach(links, params)[through].all()
+    crane = Crane().with_params(Crane.Params(place_m=(200.0, 200.0)))
+    through = crane.term(links, None).columns[:, 0] < 0
+    assert 10 < through.sum() < 0.2 * len(links) and crane.reach(links)[through].all()
     residual_db = np.random.default_rng(1).normal(0, 2, len(links)) - 9.0 * through
     view = ResidualView(links, residual_db, np.full(len(links), 2.0), links.level_db - residual_db,
                         None)
     (found,) = crane.propose(view)
-    assert np.hypot(*np.subtract(found.place_m, params.place_m)) < 25
+    assert np.hypot(*np.subtract(found.place_m, crane.params.place_m)) < 25
     assert all(pattern.change_db.min() == -1 for pattern in crane.typical_patterns(view))
-    assert crane.mark(links, found).text == "crane"
-    assert len(crane.correction(links, found).boxes) == 1
+    assert crane.with_params(found).mark(links).text == "crane"
+    assert len(crane.with_params(found).correction(links).boxes) == 1

@@ -43,7 +43,8 @@ class WetRadome(GainEffect):
         edges_s = np.linspace(view.links.first_s, view.links.last_s, 25).tolist()
         episodes = [self.Params(start_s=start_s, end_s=end_s) for number, start_s in
                     enumerate(edges_s) for end_s in edges_s[number + 1:]]
-        gains = [view.score(self.term(view.links, each, view.level_at)) for each in episodes]
+        gains = [view.score(self.with_params(each).term(view.links, view.level_at))
+                 for each in episodes]
         return [episodes[int(np.argmax(gains))]]
 
     @override
@@ -58,9 +59,9 @@ class WetRadome(GainEffect):
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
         start_s, end_s = np.nanquantile(view.links.time_s, [0.45, 0.55])
-        rain = self.Params(start_s=start_s, end_s=end_s)
+        rain = self.with_params(self.Params(start_s=start_s, end_s=end_s))
         yield Pattern("receiver", "dB", "during a tenth of the time",
-                      self.term(view.links, rain, view.level_at).columns[:, 0], high=10.0)
+                      rain.term(view.links, view.level_at).columns[:, 0], high=10.0)
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:

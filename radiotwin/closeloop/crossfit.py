@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 from weakref import WeakKeyDictionary
@@ -244,14 +244,12 @@ class CrossFit:
         folds: learnt from all but one fold each.
         index: (n,) fold of each link.
         twin: the base as it was fitted to all links.
-        shadowing: the whole's, then the folds', of what all effects leave over; empty = none.
     """
 
     whole: Fit
     folds: tuple[Fit, ...]
     index: np.ndarray
     twin: Twin
-    shadowing: list[CorrelatedShadowing] = field(default_factory=list)
 
     @property
     def each(self) -> tuple[Fit, ...]:
@@ -264,7 +262,7 @@ class CrossFit:
         return self.whole.links
 
     def extended(self, whole: Fit, folds: Iterable[Fit]) -> CrossFit:
-        """Return the same base with other effects, without interpolated shadowing."""
+        """Return the same base with other effects."""
         return CrossFit(whole, tuple(folds), self.index, self.twin)
 
     def map(self, function: Callable[[Fit], Fit]) -> CrossFit:
@@ -274,7 +272,9 @@ class CrossFit:
 
     def with_shadowing(self, shadowing: list[CorrelatedShadowing]) -> CrossFit:
         """Return the same with interpolated shadowing: the whole's, then the folds'."""
-        return replace(self, shadowing=shadowing)
+        whole, *folds = (replace(each, shadowing=own)
+                         for each, own in zip(self.each, shadowing, strict=True))
+        return self.extended(whole, folds)
 
     def held_out(self, of: Callable[[Fit], np.ndarray]) -> np.ndarray:
         """Return a value (n,) of each link, from the fold that has not seen it."""
@@ -344,9 +344,10 @@ class CrossFit:
     def held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
         """(n,) what shadowing adds [error scales], and (n,) the share left of the scale."""
         shift, left = np.zeros(len(self.index)), np.ones(len(self.index))
-        for number, shadowing in enumerate(self.shadowing[1:]):
+        for number, fold in enumerate(self.folds):
             own = np.flatnonzero(self.index == number)
-            shift[own], left[own] = shadowing.at(self.folds[number].links.select(own))
+            if fold.shadowing is not None:
+                shift[own], left[own] = fold.shadowing.at(fold.links.select(own))
         return shift, left
 
 
@@ -402,7 +403,7 @@ def without_quality(model: CrossFit) -> CrossFit:
                       for effect, term in zip(each.effects, each.model.terms, strict=True))
         return replace(each, model=replace(each.model, links=links, terms=terms))
 
-    return model.map(blind).with_shadowing(model.shadowing)
+    return model.map(blind)
 
 
 def training_parts(links: Links, folds: Folds) -> list[Links]:

@@ -179,7 +179,7 @@ def collect(loop: Loop) -> LoopData:
     dependences = [*significant(before, loop.criteria), *loop.remaining]
     in_base = sum(each.is_declared for each in model.whole.effects)  # they come first
     interpolated_db = None
-    if model.shadowing:
+    if model.whole.shadowing:
         interpolated_db = model.held_out_shadowing[0] * model.held_out_scales[0]
     return LoopData(
         links, loop.base, loop.before.held_out_mean_db, model.held_out_mean_db,

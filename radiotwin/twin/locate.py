@@ -132,8 +132,8 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
                 for each in range(channel.error_groups(probes))]
     scale_db = np.array(usual_db) * np.sqrt((PLAIN_DOF - 2) / PLAIN_DOF)
     levels = np.zeros(channel.level_columns(probes)[0].shape[1])
-    return FittedModel(channel, (), (), levels, scale_db, PLAIN_DOF, np.nan_to_num(twin.device_m), (),
-                       links.first_s, 0.0)
+    return FittedModel(channel, (), (), levels, scale_db, PLAIN_DOF,
+                       np.nan_to_num(twin.device_m), (), links.first_s, 0.0)
 
 
 def _widening(model: FittedModel, links: Links, found: list[DeviceEstimate]) -> float:

@@ -319,7 +319,7 @@ def test_a_moved_anchor_stands_in_the_corrected_scene_where_it_was_found(small_s
     devices.loc[3, "x_m"] = 110.0
     declared = Scene.load(tmp_path / "declared")
     loop = close_loop(Measurements(links, devices), declared, "twin", criteria=SelectionCriteria(min_probability=0.0))
-    assert loop.after.whole.effects[0].effect.name == "device_position_error"
+    assert loop.after.whole.effects[0].name == "device_position_error"
     (said,) = write_corrected_scene(loop, declared, tmp_path / "corrected")
     assert said.startswith("d3 is moved from (110, 120)")
     found_m = Scene.load(tmp_path / "corrected").device_m[3]

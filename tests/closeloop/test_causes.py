@@ -90,7 +90,7 @@ def test_what_an_improbable_candidate_has_outdone_is_asked_as_well(open_ground, 
     world.gain_db[world.receiver == 1] += 6.0
     measurements = open_ground.measured(world)
     loop = close_loop(measurements, base="log-distance")
-    assert [each.effect.name for each in loop.after.whole.effects][:1] == ["receiver_gain_offset"]
+    assert [each.name for each in loop.after.whole.effects][:1] == ["receiver_gain_offset"]
     outdone = {score.name for score in loop.found.log.trials if score.step == 0 and "gains more on" in score.reason}
     believed = posterior.probability_of
     monkeypatch.setattr(posterior, "probability_of", lambda name, values: (
@@ -124,7 +124,7 @@ def test_what_may_be_nothing_at_all_is_not_named(open_ground, monkeypatch):
     monkeypatch.setattr(causes, "effect_size_db", uncertain)
     monkeypatch.setattr("radiotwin.closeloop.run.catalogue", lambda: [ReceiverGainOffset, DeviceGainOffset])
     loop = close_loop(open_ground.measured(world), base="log-distance")
-    assert loop.verdict != "effect" and not [each for each in loop.after.whole.effects if each.effect.is_cause]
+    assert loop.verdict != "effect" and not [each for each in loop.after.whole.effects if each.is_cause]
     (score, *_) = [each for each in loop.found.log.trials if each.name == "receiver_gain_offset"]
     assert not score.kept and "may show nothing of it: 3.0 dB (-17.0 to 23.0)" in score.reason
 

@@ -127,7 +127,7 @@ def test_an_anchor_with_no_free_place_near_stays_and_that_is_said(small_scene, t
     monkeypatch.setattr(CityMap, "inside", lambda city, points_m: np.ones(len(points_m), dtype=bool))
     loop = loop_of(small_scene, (DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}))
     (moved,), links = loop.after.whole.effects, loop.after.whole.links
-    config, changes = _moved([moved.effect.correction(links, moved.params)], links, small_scene, small_scene.city)
+    config, changes = _moved([moved.correction(links)], links, small_scene, small_scene.city)
     assert config.devices[0] == small_scene.config.devices[0]
     assert "d0 is not moved from (80, 40) to (80, 60) m: there is no place" in changes[0]
 

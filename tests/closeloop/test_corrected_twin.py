@@ -31,7 +31,7 @@ def test_devices_that_the_loop_found_elsewhere_are_not_located_against_their_dec
     _, held_out, *_ = asked(model, monkeypatch)
     assert all(each.anchors == model.links.anchors for each in held_out)
     effect = DevicePositionError()
-    moved = model.whole.model.apply(effect, effect.Params(device=1, move_m=(20.0, 5.0)))
+    moved = effect.with_params(effect.Params(device=1, move_m=(20.0, 5.0)))
     whole = replace(model.whole, model=model.whole.model.with_effects([*model.whole.effects, moved]))
     _, held_out, *_ = asked(model.extended(whole, model.folds), monkeypatch)
     assert all(each.anchors == model.links.anchors - {1} for each in held_out)
@@ -41,11 +41,11 @@ def test_what_only_describes_the_rest_does_not_locate(model, monkeypatch):
     trend = UnexplainedTrend("distance_m")
     folds = []
     for fold in model.folds:
-        applied = fold.model.apply(trend, trend.propose(fold.view)[0])
+        applied = trend.with_params(trend.propose(fold.view)[0])
         folds.append(replace(fold, model=fold.model.with_effects([*fold.effects, applied]), coefficients=np.r_[
             fold.coefficients, np.zeros(applied.term.columns.shape[1])]))
     models, *_ = asked(model.extended(model.whole, folds), monkeypatch)
-    assert all([own.effect.name for own in each.effects] == ["receiver_gain_offset"] for each in models)
+    assert all([own.name for own in each.effects] == ["receiver_gain_offset"] for each in models)
 
 
 def test_over_a_map_devices_are_sought_where_the_command_seeks_them(model, monkeypatch):

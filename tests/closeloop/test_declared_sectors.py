@@ -71,10 +71,10 @@ def taken(measurements):
     result = search(base, [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
     whole, parameters = result.model.whole, {}
     for each, estimate in zip(whole.effects, estimates(linearise(whole)), strict=True):
-        parameters |= each.effect.parameters(links, each.params, estimate)
+        parameters |= each.parameters(links, estimate)
     return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.log.trials,
                            params=whole.effects[0].params if whole.effects else None, parameters=parameters,
-                           variants=[each.effect.variant for each in whole.effects],
+                           variants=[each.variant for each in whole.effects],
                            note=([*result.model.links.notes, *result.notes] or [""])[-1])
 
 
@@ -126,7 +126,7 @@ def test_a_sector_that_is_only_planned_is_predicted_by_the_stored_twin(tmp_path)
     everything = network(6, points=200)
     planned = (everything.table["device"] == "B2").to_numpy()
     loop = rt.close_loop(everything.select(~planned), base="log-distance", hold_out="block")
-    assert loop.after.whole.effects[0].effect.is_declared
+    assert loop.after.whole.effects[0].is_declared
     corrected_twin(loop, None).save(tmp_path / "twin")
     later = prepare_links(everything.select(planned), None)
     expected = rt.Twin.load(tmp_path / "twin").predict(later)
@@ -146,7 +146,7 @@ def test_of_a_sector_that_nothing_tells_the_twin_knows_that_it_knows_little(tmp_
     for name in ("A0", "A1", "A2", "B2"):
         planned = (everything.table["device"] == name).to_numpy()
         loop = rt.close_loop(everything.select(~planned), base="log-distance", hold_out="block")
-        assert "antenna_pattern" in {each.effect.name for each in loop.after.whole.effects}
+        assert "antenna_pattern" in {each.name for each in loop.after.whole.effects}
         corrected_twin(loop, None).save(tmp_path / name)
         twin = rt.Twin.load(tmp_path / name)
         assert twin.fitted.unheard.devices == (NAMES.index(name),)
@@ -203,12 +203,12 @@ def test_all_sectors_share_a_pattern_and_a_level_and_keep_their_azimuths():
     shape = SectorPattern(beamwidth_deg=80.0)
     params = DeclaredSectors.Params(devices={device: shape.model_copy(update={"azimuth_deg": azimuth})
                                            for device, azimuth in enumerate(links.boresight_deg)})
-    variation = DeclaredSectors().variation(params)
-    wider = variation.params(variation.values + np.array([3.0, 2.0, 5.0, 0, 0, 0]))
+    variation = DeclaredSectors().with_params(params).variation()
+    wider = variation.effect(variation.values + np.array([3.0, 2.0, 5.0, 0, 0, 0])).params
     assert [each.azimuth_deg for each in wider.devices.values()] == [23, 143, 263] * 2
     assert {each.beamwidth_deg for each in wider.devices.values()} == {85.0}
     assert {each.tilt_deg for each in wider.devices.values()} == {2.0}
-    term = DeclaredSectors().term(links, params, None)
+    term = DeclaredSectors().with_params(params).term(links, None)
     np.testing.assert_allclose(term.columns[:, 0], 1.0)  # of a sector without a reading, too
     np.testing.assert_allclose(term.columns[:, 1:].sum(axis=1), 1.0)
     assert term.prior_sd_db[0] > 2.5 * term.prior_sd_db[1:].max()
@@ -241,7 +241,7 @@ def test_of_two_forms_held_out_links_choose(forms):
     model = cross_validate(links, kind, folds, training_parts(links, folds))
     result = search(model, [add_declared], SearchInputs(links, kind, folds, tuple(form() for form in forms)))
     [effect] = result.model.whole.effects
-    assert effect.effect.variant == "all of it"
+    assert effect.variant == "all of it"
     assert [each.reason for each in result.log.trials if not each.kept] == ["all of it gain more"]
     assert len(result.log.kept) == 1
 

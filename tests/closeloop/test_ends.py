@@ -11,7 +11,6 @@ from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverG
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
 from radiotwin.links import prepare_links
-from radiotwin.twin.model.model import FittedEffect
 
 
 @pytest.mark.parametrize("effect, params, coefficients, devices, receivers", [
@@ -23,7 +22,6 @@ from radiotwin.twin.model.model import FittedEffect
     (Foliage(), {"box": (0.0, 0.0, 9.0, 9.0, 9.0, 0.0)}, [], [], [])])
 def test_names_are_of_the_ends_that_parameters_belong_to(open_ground, effect, params, coefficients, devices, receivers):
     links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
-    fitted = FittedEffect(effect, effect.Params(**params), np.array(coefficients))
     names = {"d": list(links.device_names), "r": list(links.receiver_names)}
     expected = [tuple(names[each[0]][int(each[1:])] for each in ends) for ends in (devices, receivers)]
-    assert list(ends_of(fitted, links)) == expected
+    assert list(ends_of(effect.with_params(effect.Params(**params)), np.array(coefficients), links)) == expected

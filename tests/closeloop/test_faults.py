@@ -25,7 +25,6 @@ from radiotwin.effects.catalogue.gain_drift import Drift, ReceiverDrift
 from radiotwin.effects.params import Estimate
 from radiotwin.links import prepare_links
 from radiotwin.links.measurements import Measurements
-from radiotwin.twin.model.model import AppliedEffect
 from tests.worlds import shortened
 
 LOSS_DB, BEGIN_S, END_S = 9.0, 330.0, 365.0
@@ -96,18 +95,23 @@ def test_a_step_is_somewhere_between_two_readings():
                             time_s=np.tile([0.0, 10.0, 20.0, 80.0, 90.0, np.nan], 2), level_db=np.zeros(12))
     links.level_db[2] = np.nan  # which shows nothing
     params = ReceiverDrift.Params(receivers={0: Drift("step", 50.0)})
-    when = ReceiverDrift().parameters(links, params, Estimate(np.zeros(2), [np.eye(2)], np.zeros((2, 0))))["step_time_s[u0]"]
+    when = ReceiverDrift().with_params(params).parameters(links, Estimate(np.zeros(2), [np.eye(2)], np.zeros((2, 0))))["step_time_s[u0]"]
     assert (when.low, when.value, when.high) == (10.0, 50.0, 80.0)
 
 
 def on_links(effect, first, last):
-    """An effect that acts on the links of two numbers, of a hundred."""
+    """A found effect and its term, which acts on the links of two numbers, of a hundred."""
     number = np.arange(100)
-    return AppliedEffect(effect, None, Term.of_offset(-9.0 * ((number >= first) & (number < last))))
+    return effect.with_params(None), Term.of_offset(-9.0 * ((number >= first) & (number < last)))
 
 
-def model_of(*effects):
-    return SimpleNamespace(effects=list(effects), with_effects=lambda left: model_of(*left))
+def model_of(*found):
+    """A model, and its own fit."""
+    effects, terms = [each for each, _ in found], [term for _, term in found]
+    model = SimpleNamespace(effects=effects, terms=terms, with_effects=lambda left: model_of(
+        *((each, terms[effects.index(each)]) for each in left)))
+    model.model = model
+    return model
 
 
 @pytest.mark.parametrize("effect", [FaultyFlight(), Episode()])
@@ -139,7 +143,7 @@ def test_a_step_that_other_effects_explain_is_taken_back(step_db):
     base = make_bases(None, 0)["log-distance"]
     model = cross_validate(links, base, folds, training_parts(links, folds))
     step = ReceiverDrift.Params(receivers={0: Drift("step", 600.0)})
-    found = SearchState(model).keep(Trial("receiver_drift"), with_effect(model, ReceiverDrift(True), step))
+    found = SearchState(model).keep(Trial("receiver_drift"), with_effect(model, ReceiverDrift(True).with_params(step)))
     result = drop_idle_faults(found, SearchInputs(links, base, folds, ()))
     stays = step_db > 0
     assert result.step == len(result.log.kept) == stays
@@ -160,7 +164,7 @@ def test_a_fault_that_its_own_search_would_not_find_beside_the_others_is_taken_b
     episode = Episode.Params(receiver=0, flight=None, start_s=BEGIN_S, end_s=END_S, start_within_s=(BEGIN_S - 1, BEGIN_S),
                              end_within_s=(END_S, END_S + 1), form="loss", frequency_hz=2.4e9)
     inputs = SearchInputs(links, base, folds, ())
-    found = SearchState(model).keep(Trial("episode"), with_effect(model, Episode(), episode))
+    found = SearchState(model).keep(Trial("episode"), with_effect(model, Episode().with_params(episode)))
     assert model.whole.objective - found.model.whole.objective > inputs.criteria.min_training_gain_nats
     result = drop_idle_faults(found, inputs)
     assert result.step == len(result.log.kept) == (not always)
@@ -175,7 +179,7 @@ def test_only_the_fault_that_is_taken_back_leaves_a_fold():
     effect = Episode()
     first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
     whole, fold = model_of(first, second), model_of(second)
-    assert _without(fold, same_effects(whole, fold)[0]).effects == [second]
+    assert _without(fold, same_effects(whole, fold)[0]).effects == [second[0]]
     assert _without(fold, same_effects(whole, fold)[1]).effects == []
 
 
@@ -184,4 +188,4 @@ def test_of_two_faults_each_is_unforeseen_where_its_flight_was_held_out():
     first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
     folds = model_of(second), model_of(first)  # each learnt from the other half
     model = CrossFit(model_of(first, second), folds, index, None)
-    np.testing.assert_array_equal(model.unforeseen, first.acts | second.acts)
+    np.testing.assert_array_equal(model.unforeseen, first[1].acts | second[1].acts)

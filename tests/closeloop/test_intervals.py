@@ -96,7 +96,7 @@ def test_folds_follow_no_paths_of_their_own_for_intervals(monkeypatch):
     effect = DevicePositionError()
     model = fitted(drive(1), effect, devices_m=moved_m)
     model = model.map(lambda fit: fit.model.with_effects(
-        [fit.model.apply(effect, effect.exact(fit.effects[0].params))]).fit())
+        [fit.effects[0].exactly()]).fit())
     own = [np.concatenate(estimates(linearise(fold))[0].sides_sd) for fold in model.folds]
 
     moves_m, term = [], DevicePositionError.term

@@ -29,6 +29,6 @@ def test_one_fault_has_one_name(open_ground, off_db, limit_moves, named):
     base = LogDistanceBase(None, 0)
     model = cross_validate(links, base, folds, training_parts(links, folds))
     result = search(model, [add_causes], SearchInputs(links, base, folds, (ReceiverGainOffset(), DetectionLimit())))
-    assert [each.effect.name for each in result.model.whole.effects] == named
+    assert [each.name for each in result.model.whole.effects] == named
     used_db = [float(np.median(result.model.whole.model.limit_db[links.receiver == receiver])) for receiver in (0, 1)]
     assert used_db == pytest.approx([LIMIT_DB, LIMIT_DB + 6.0 * limit_moves], abs=1.0)

@@ -71,11 +71,10 @@ def test_evidence_is_that_of_all_numbers_an_effect_may_have(open_ground, monkeyp
     by_laplace = hypotheses.of_named(found)
     monkeypatch.setattr("radiotwin.closeloop.verdict.hypotheses._slopes",
                         lambda fit: Columns(np.zeros((int(fit.train.sum()), 0)), np.zeros(0)))
-    applied = found.effects[-1]
-    varied = effect.variation(applied.params)
+    varied = found.effects[-1].variation()
 
     def nats(numbers):
-        return hypotheses.of_named(found.with_effects([found.model.apply(effect, varied.params(numbers))]))
+        return hypotheses.of_named(found.with_effects([varied.effect(numbers)]))
 
     # Of a uniform prior: the sum over a grid around the best, wide enough to hold what is likely.
     best, reach = nats(varied.values), []

@@ -25,7 +25,7 @@ def misplaced(seed, device=1):
         device_m = unknown.device_m.copy()
         device_m[device, :2] += WRONG_M
         built = Model.build(unknown, each.channel, each.model.dof, device_m=device_m, train=each.train)
-        return built.with_effects([built.apply(effect.effect, effect.params) for effect in each.effects]).fit()
+        return built.with_effects(each.effects).fit()
     return model.map(moved)
 
 

@@ -41,7 +41,7 @@ def test_each_effect_has_its_own_name_and_a_score_that_was_kept(open_ground, mon
     world.gain_db[world.receiver == 1] += 6.0
     loop = close_loop(open_ground.measured(world).select(world.slot % 4 == 0), base="log-distance")
     (only,) = make_report(loop)["effects"]
-    assert only["name"] == loop.after.whole.effects[0].effect.name == "receiver_gain_offset"
+    assert only["name"] == loop.after.whole.effects[0].name == "receiver_gain_offset"
     refused = loop.found.log.supersede(*(each.refuse("") for each in loop.found.log.kept))
     with pytest.raises(ValueError, match="zip"):
         make_report(replace(loop, found=replace(loop.found, log=refused)))

@@ -45,7 +45,7 @@ def moved(make_links):
 class Sentenced(DevicePositionError):
     """A position that its map speaks against."""
 
-    def contradicted(self, params, links):
+    def contradicted(self, links):
         return "a lake is there"
 
 
@@ -69,7 +69,7 @@ def test_no_paths_are_followed_for_what_the_map_speaks_against(moved):
 class OfUsable(DevicePositionError):
     """A position that remembers of which devices the links are that the map is asked about."""
 
-    def contradicted(self, params, links):
+    def contradicted(self, links):
         self.asked = set(links.device.tolist())
 
 
@@ -92,7 +92,7 @@ class OverMap(MissingObstacle):
     def propose(self, view):
         return [self.Params(box=Box(90.0, 60.0, 20.0, 20.0, 15.0, 0.0))]
 
-    def contradicted(self, params, links):
+    def contradicted(self, links):
         self.heights_m.append(float(links.city.height_at(40.0, 60.0)))
         return "it is noted"
 
@@ -103,7 +103,7 @@ def test_a_building_that_was_found_is_in_the_map_that_the_next_is_held_against(m
     whole = replace(model.whole.model, links=model.whole.links.with_city(CityMap(house.vertices, house.faces)))
     for found, height_m in (([], 0.0), ([Box(40.0, 60.0, 20.0, 20.0, 25.0, 0.0)], 25.0)):
         effect = OverMap()
-        applied = [whole.apply(MissingObstacle(), MissingObstacle.Params(box=box)) for box in found]
+        applied = [MissingObstacle().with_params(MissingObstacle.Params(box=box)) for box in found]
         base = whole.with_effects(applied).fit()
         over = SimpleNamespace(whole=base, links=base.links)
         refused = fit_candidate(over, effect, SelectionCriteria(), None)

@@ -136,7 +136,7 @@ def test_an_effect_of_ones_own_has_a_size_that_would_have_been_seen_and_a_kind_o
             return np.where(links.receiver == 1, -3.0, 0.0)
 
         def typical_patterns(self, view):
-            return [Pattern("hum", "dB", "of one receiver", self.gain_db(view.links, None) / 3)]
+            return [Pattern("hum", "dB", "of one receiver", self.gain_db(view.links) / 3)]
 
     view, hypotheses = nothing_hidden
     *_, last = detectable(view, hypotheses, CRITERIA, [Hum(), FaultyFlight()])

@@ -128,13 +128,13 @@ def test_walls_that_are_off_are_no_cause_but_part_of_the_base(small_scene, tmp_p
 
     measured = survey(small_scene, 0, blocked)
     loop = close_loop(measured, small_scene, "twin")
-    assert [each.effect.name for each in loop.before.whole.effects] == ["uncertain_sight"]
+    assert [each.name for each in loop.before.whole.effects] == ["uncertain_sight"]
     report = make_report(loop)
     assert report["verdict"] != "effect" and report["effects"][0]["is_declared"]
     assert "uncertain_sight" not in collect(loop).kept
     corrected_twin(loop, small_scene).save(tmp_path / "twin")
     twin = Twin.load(tmp_path / "twin")
-    assert [each.effect.name for each in twin.fitted.effects] == ["uncertain_sight"]
+    assert [each.name for each in twin.fitted.effects] == ["uncertain_sight"]
     plain = Twin(twin.channel, twin.devices, twin.level, twin.limit_db)
     before = error_db(plain.radio_map(small_scene), small_scene, blocked)
     assert error_db(twin.radio_map(small_scene), small_scene, blocked) < 0.98 * before

@@ -31,6 +31,6 @@ def loop():
         with shortened():
             closed = rt.close_loop(measurements, base="log-distance")
         return SimpleNamespace(error={"before": scores(closed.before), "after": scores(closed.after)},
-                               names=[each.effect.name for each in closed.after.whole.effects],
+                               names=[each.name for each in closed.after.whole.effects],
                                first=(closed.parameters or [{}])[0])
     return run

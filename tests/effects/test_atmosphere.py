@@ -70,7 +70,7 @@ def test_the_bound_is_the_sum_of_what_there_is():
     (None, 5000.0, 30.0, False)])
 def test_more_than_there_is_to_absorb_is_refused(frequency_hz, scale_height_m, db_km, refused):
     params = ExcessAttenuation.Params(scale_height_m=scale_height_m, frequency_hz=frequency_hz)
-    reason = ExcessAttenuation().implausible(params, np.array([db_km]))
+    reason = ExcessAttenuation().with_params(params).implausible(np.array([db_km]))
     assert (reason is not None) == refused
     assert not refused or "P.676, P.838, P.833" in reason
 

@@ -29,7 +29,7 @@ def angle_deg(links, azimuth_deg, elevation_deg):
 @pytest.mark.parametrize("azimuth_deg, elevation_deg", [(60.0, 0.0), (200.0, 30.0), (0.0, 90.0)])
 def test_it_takes_its_depth_in_its_middle_nothing_opposite_and_half_across(links, azimuth_deg, elevation_deg):
     body = Body(depth_db=8.0, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
-    gain_db = BodyShadowing().gain_db(links, BodyShadowing.Params(receivers={1: body}))
+    gain_db = BodyShadowing().with_params(BodyShadowing.Params(receivers={1: body})).gain_db(links)
     off_deg, mine = angle_deg(links, azimuth_deg, elevation_deg), links.receiver == 1
     expected_db = np.interp(np.cos(np.radians(off_deg)), [-1, 0, 1], [0, -4, -8])
     np.testing.assert_allclose(gain_db, np.where(mine, expected_db, 0.0), atol=1e-9)
@@ -80,9 +80,9 @@ def test_a_narrow_one_is_proposed_as_narrow(links, view):
 
 def test_what_was_found_is_reported_for_each_receiver(links):
     params = BodyShadowing.Params(receivers={1: Body(depth_db=8.0, azimuth_deg=420.0, elevation_deg=5.0)})
-    variation = BodyShadowing().variation(params)
-    assert variation.params(variation.values) == params and len(variation.members) == 1
-    found = BodyShadowing().parameters(links, params, Estimate(np.zeros(0), [np.zeros((0, 0))], np.ones((2, 4))))
+    variation = BodyShadowing().with_params(params).variation()
+    assert variation.effect(variation.values).params == params and len(variation.members) == 1
+    found = BodyShadowing().with_params(params).parameters(links, Estimate(np.zeros(0), [np.zeros((0, 0))], np.ones((2, 4))))
     assert {name: parameter.value for name, parameter in found.items()} == {
         "body_depth_db[r1]": 8, "body_azimuth_deg[r1]": 60, "body_elevation_deg[r1]": 5,
         "body_width_deg[r1]": 180}

@@ -44,13 +44,13 @@ def test_only_links_that_enter_lose(indoors, view):
     effect = BuildingEntry()
     assert effect.unavailable(indoors) is None
     traditional, efficient = effect.propose(view(indoors, np.zeros(80), 1.0))
-    term = effect.term(indoors, traditional, None)
+    term = effect.with_params(traditional).term(indoors, None)
     expected_db = entry_loss_db(2.4e9, indoors.elevation_deg, "traditional")
     chance = -term.columns[:, 0]
     assert (chance[:40] > 0.8).all() and (chance[:40] == 1.0).mean() > 0.3 and (chance[40:] == 0.0).all()
     np.testing.assert_allclose(term.offset_db, -chance * expected_db)
     assert 8 < term.prior_sd_db[0] < 12  # sigma_1 of traditional buildings is 9.6 + 2 log f
-    assert (effect.term(indoors, efficient, None).offset_db[:40] < term.offset_db[:40] - 10).all()
+    assert (effect.with_params(efficient).term(indoors, None).offset_db[:40] < term.offset_db[:40] - 10).all()
 
 
 def test_near_a_wall_it_is_a_matter_of_chance(indoors, make_links, view):
@@ -59,13 +59,13 @@ def test_near_a_wall_it_is_a_matter_of_chance(indoors, make_links, view):
     receiver_m = np.column_stack([130.0 - depth_m, np.zeros(60), np.full(60, 1.5)])
     links = make_links([[0.0, 0, 1.5]], receiver_m, city=indoors.city)
     effect = BuildingEntry()
-    chance = -effect.term(links, effect.propose(view(links, np.zeros(60), 1.0))[0], None).columns[:, 0]
+    chance = -effect.with_params(effect.propose(view(links, np.zeros(60), 1.0))[0]).term(links, None).columns[:, 0]
     np.testing.assert_allclose(chance, norm.cdf(depth_m, scale=4.0), atol=0.05)
     exact = links.with_columns(receiver=np.full(60, -1))  # points of a map
-    np.testing.assert_array_equal(effect.term(exact, effect.propose(view(links, np.zeros(60), 1.0))[0], None).columns[:, 0],
+    np.testing.assert_array_equal(effect.with_params(effect.propose(view(links, np.zeros(60), 1.0))[0]).term(exact, None).columns[:, 0],
                                   -(depth_m > 0).astype(float))
     seen = make_links([[0.0, 40.0, 1.5]], [[60.0, 40.0, 1.5], [69.0, 33.0, 1.5]], city=indoors.city)
-    assert seen.los.all() and (effect.term(seen, effect.propose(view(seen, np.zeros(2), 1.0))[0], None).columns == 0).all()
+    assert seen.los.all() and (effect.with_params(effect.propose(view(seen, np.zeros(2), 1.0))[0]).term(seen, None).columns == 0).all()
 
 
 def test_loss_and_scatter_are_found(make_links):
@@ -98,5 +98,5 @@ def test_it_needs_a_map_a_frequency_and_links_indoors(indoors, make_links):
 @pytest.mark.parametrize("more_db, message", [(0.0, None), (-30.0, "amplify"), (-15.0, "lose 0.2 dB only"), (60.0, "99 %")])
 def test_what_no_building_does_is_implausible(more_db, message):
     params = BuildingEntry.Params(building="traditional", frequency_hz=2.4e9)
-    reason = BuildingEntry().implausible(params, np.array([more_db]))
+    reason = BuildingEntry().with_params(params).implausible(np.array([more_db]))
     assert reason is None if message is None else message in reason

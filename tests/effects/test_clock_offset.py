@@ -39,13 +39,13 @@ def late_db(links, offset_s):
 
 def test_the_level_is_that_of_where_the_receiver_is_at_the_other_time(links):
     params = ReceiverClockOffset.Params(receiver=1, offset_s=2.5, speed_m_s=SPEED_M_S)
-    term = ReceiverClockOffset().term(links, params, law_db)
+    term = ReceiverClockOffset().with_params(params).term(links, law_db)
     assert np.abs(term.offset_db[links.receiver == 0]).max() == 0
     inside = links.time_s % 1000 < SLOTS - 3  # beyond the end of its track its position is unknown
     np.testing.assert_allclose(term.offset_db[inside], (late_db(links, 2.5) - law_db(links))[inside], atol=0.05)
     assert np.abs(term.offset_db[inside]).max() > 1
     part = links.select(np.arange(0, len(links), 7))  # gaps in the selection are none in the tracks
-    some = ReceiverClockOffset().term(part, params, law_db)
+    some = ReceiverClockOffset().with_params(params).term(part, law_db)
     np.testing.assert_allclose(some.offset_db, term.offset_db[::7], atol=1e-9)
 
 

@@ -30,9 +30,9 @@ def test_the_less_sensitive_receiver_is_found_with_its_limit(seen):
     given = seen([DECLARED_DB, -108.0])
     (params,) = DetectionLimit().propose(given)
     assert list(params.receivers) == [1]
-    limits_db = DetectionLimit().limits_db(given.links, params)
+    limits_db = DetectionLimit().with_params(params).limits_db(given.links)
     assert np.all(limits_db[given.links.receiver == 0] == -np.inf)
-    parameter = DetectionLimit().parameters(given.links, params, None)["limit[r1]"]
+    parameter = DetectionLimit().with_params(params).parameters(given.links, None)["limit[r1]"]
     assert parameter.low <= -108.0 <= parameter.high and parameter.high - parameter.low < 2
     assert parameter.value == pytest.approx(-108.0, abs=0.5)
 

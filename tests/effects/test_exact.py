@@ -47,39 +47,39 @@ def links(make_links):
 def test_links_near_a_removed_building_have_the_level_without_it(links):
     channel, effect = CountingChannel(), RemovedObstacle()
     building = int(only_blocker(links)[0])
-    params = effect.exact(effect.Params(building=building, centre_m=(0.0, 0.0, 40.0)))
-    np.testing.assert_allclose(effect.term(links, params, channel).offset_db, [20.0, 0.0], atol=0.01)
+    exactly = effect.with_params(effect.Params(building=building, centre_m=(0.0, 0.0, 40.0))).exactly()
+    np.testing.assert_allclose(exactly.term(links, channel).offset_db, [20.0, 0.0], atol=0.01)
     assert channel.links == 2  # one link, before and after
 
 
 def test_a_missing_building_is_in_the_map_that_the_channel_predicts_over(links):
     channel, effect = CountingChannel(), MissingObstacle()
-    params = effect.exact(effect.Params(box=(30.0, 0.0, 10.0, 30.0, 25.0, 90.0)))
-    np.testing.assert_allclose(effect.term(links, params, channel).offset_db, [-30.0, 0.0], atol=0.01)
+    exactly = effect.with_params(effect.Params(box=(30.0, 0.0, 10.0, 30.0, 25.0, 90.0))).exactly()
+    np.testing.assert_allclose(exactly.term(links, channel).offset_db, [-30.0, 0.0], atol=0.01)
     assert channel.links == 2
-    variation = effect.variation(params)
-    known = params.model_copy(update={"exact": False, "known_paths": True})
-    assert variation.params(variation.values) == known  # refined with paths that are followed once
-    assert effect.exact(known) == params and (variation.resolution_sd > 0).all()
-    assert len(variation.values) == 6 and len(effect.variation(params.model_copy(update={"exact": False})).values) == 7
+    variation = exactly.variation()
+    known = exactly.with_params(exactly.params, "known_paths")
+    assert variation.effect(variation.values).is_same(known)  # refined with paths that are followed once
+    assert known.exactly().is_same(exactly) and (variation.resolution_sd > 0).all()
+    assert len(variation.values) == 6 and len(exactly.with_params(exactly.params, "quick").variation().values) == 7
 
 
 def test_a_moved_anchor_has_the_level_of_its_true_position(links):
     channel, effect = CountingChannel(), DevicePositionError()
-    params = effect.exact(effect.Params(device=0, move_m=(0.0, 80.0)))
+    exactly = effect.with_params(effect.Params(device=0, move_m=(0.0, 80.0))).exactly()
     before_m = np.linalg.norm(np.array([NEAR_M, FAR_M]) - [-60, 0, 10], axis=1)
     after_m = np.linalg.norm(np.array([NEAR_M, FAR_M]) - [-60, 80, 10], axis=1)
-    offset_db = effect.term(links, params, channel).offset_db
+    offset_db = exactly.term(links, channel).offset_db
     assert offset_db[0] == pytest.approx(20 - 0.1 * (after_m[0] - before_m[0]), abs=0.01)
     assert abs(offset_db[1]) > 1
 
 
 def test_a_moved_receiver_has_the_level_of_its_true_position(links):
     channel, effect = CountingChannel(), ReceiverPositionError()
-    params = effect.exact(effect.Params(receiver=0, move_m=(0.0, 60.0, 0.0)))
-    assert effect.term(links, params, channel).offset_db[0] == pytest.approx(
+    exactly = effect.with_params(effect.Params(receiver=0, move_m=(0.0, 60.0, 0.0))).exactly()
+    assert exactly.term(links, channel).offset_db[0] == pytest.approx(
         20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01)
-    assert effect.variation(params).follows_paths
+    assert exactly.variation().follows_paths
 
 
 def test_at_another_time_a_receiver_is_elsewhere_along_its_way(make_links):
@@ -87,10 +87,10 @@ def test_at_another_time_a_receiver_is_elsewhere_along_its_way(make_links):
     way_m = [[60.0, 10.0 * slot, 10] for slot in range(12)]
     links = make_links([[-60.0, 0, 10]], way_m, city=boxes((0, 0)), time_s=np.arange(12.0))
     channel, effect = CountingChannel(), ReceiverClockOffset()
-    params = effect.exact(effect.Params(receiver=0, offset_s=6.0, speed_m_s=10.0))
-    offset_db = effect.term(links, params, channel).offset_db
+    exactly = effect.with_params(effect.Params(receiver=0, offset_s=6.0, speed_m_s=10.0)).exactly()
+    offset_db = exactly.term(links, channel).offset_db
     assert offset_db[0] == pytest.approx(20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01)
-    assert effect.variation(params).follows_paths
+    assert exactly.variation().follows_paths
 
 
 class TwoAnswers(LogDistance):
@@ -133,9 +133,9 @@ def test_a_position_whose_exact_optimum_lies_beside_the_quick_one_is_found(make_
     """At the quick optimum the exact levels fit worse, so they were not looked at there."""
     model = two_answers_model(make_links, seed)
     found = found_along_paths(model)
-    params = found.effects[-1].params
-    assert params.exact and params.device == 0
-    assert params.move_m == pytest.approx(MOVE_M, abs=2.0)
+    effect = found.effects[-1]
+    assert effect.is_exact and effect.params.device == 0
+    assert effect.params.move_m == pytest.approx(MOVE_M, abs=2.0)
 
 
 def test_paths_of_more_links_than_can_be_followed_are_not(make_links, monkeypatch):
@@ -143,7 +143,7 @@ def test_paths_of_more_links_than_can_be_followed_are_not(make_links, monkeypatc
     monkeypatch.setattr(fitting, "MAX_FOLLOWED_LINKS", 699)
     model = two_answers_model(make_links, 0)
     found = found_along_paths(model)
-    params = found.effects[-1].params
-    assert not params.exact and params.device == 0
+    effect = found.effects[-1]
+    assert not effect.is_exact and effect.params.device == 0
     monkeypatch.setattr(fitting, "MAX_FOLLOWED_LINKS", 700)
-    assert found_along_paths(model).effects[-1].params.exact
+    assert found_along_paths(model).effects[-1].is_exact

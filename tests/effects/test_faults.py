@@ -102,14 +102,12 @@ def test_what_is_compared_once_is_remembered_and_cannot_be_changed(flown):
 def test_its_term_acts_on_that_flight_only(flown):
     given = flown(0, FAULTS["noise"])
     (params,) = FaultyFlight().propose(given)
-    term = FaultyFlight().term(given.links, params, lambda links, exact=False: -40 - 22 * np.log10(links.distance_m))
+    term = FaultyFlight().with_params(params).term(given.links, lambda links, exact=False: -40 - 22 * np.log10(links.distance_m))
     there = on_flight(given.links)
     np.testing.assert_array_equal(term.columns[:, 0], there)
     np.testing.assert_array_equal(term.random_effect_sd_db > 0, there)
     elsewhere = given.links.select(~there)
-    assert FaultyFlight().propose_like(
-        flown(0).__class__(elsewhere, given.residual_db[~there], given.scale_db[~there], given.mean_db[~there], None),
-        params) == []
+    assert FaultyFlight().with_params(params).propose_like(flown(0).__class__(elsewhere, given.residual_db[~there], given.scale_db[~there], given.mean_db[~there], None)) == []
 
 
 OTHERS = {
@@ -164,9 +162,9 @@ def test_where_clocks_restart_an_episode_names_its_flight(flown):
 def test_an_attenuation_is_held_against_rain():
     params = Episode.Params(receiver=None, start_s=0, end_s=1, start_within_s=(0, 0), end_within_s=(1, 1),
                             form="attenuation", frequency_hz=28e9)
-    assert Episode().implausible(params, np.array([20.0])) is None
-    assert "air and rain" in Episode().implausible(params, np.array([60.0]))
-    assert "amplify" in Episode().implausible(params, np.array([-2.0]))
+    assert Episode().with_params(params).implausible(np.array([20.0])) is None
+    assert "air and rain" in Episode().with_params(params).implausible(np.array([60.0]))
+    assert "amplify" in Episode().with_params(params).implausible(np.array([-2.0]))
 
 
 @pytest.mark.parametrize("seed", range(3))

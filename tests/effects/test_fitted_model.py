@@ -11,15 +11,15 @@ from radiotwin.effects.catalogue.roof_heights import RoofHeights
 from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.scene.citymap import CityMap
-from radiotwin.twin.model.model import Fit, FittedEffect, FittedModel, Model, device_sd_db
+from radiotwin.twin.model.model import Fit, FittedModel, Model, device_sd_db
 
 
 def test_positions_are_sought_without_what_follows_paths_or_many_maps():
     """Each of thousands of places would need its own paths."""
-    effects = tuple(FittedEffect(effect(), None, np.zeros(0)) for effect in (LockLoss, WallReflection, RoofHeights))
-    model = FittedModel(LogDistance(LogDistanceLine(-40.0, 2.2, 3.0)), effects, np.zeros(2), np.array([2.0]), 5.0,
+    effects = LockLoss(), WallReflection(), RoofHeights()
+    model = FittedModel(LogDistance(LogDistanceLine(-40.0, 2.2, 3.0)), effects, (np.zeros(0),) * 3, np.zeros(2), np.array([2.0]), 5.0,
                         np.zeros((1, 3)), ("u0",), np.nan, 0.0)
-    assert [each.effect.name for each in model.for_positions().effects] == ["lock_loss"]
+    assert [each.name for each in model.for_positions().effects] == ["lock_loss"]
     assert len(model.effects) == 3
 
 

@@ -12,7 +12,7 @@ def lost_db(make_links):
     """Loss of level links at 5 m through a grove that is `depth_m` long, 20 m wide and 12 m high."""
     def make(depth_m, law, device_m=(-200.0, 0, 5), receiver_m=(200.0, 0, 5)):
         params = Foliage.Params(box=(0.0, 0.0, depth_m, 20.0, 12.0, 0.0), law=VegetationLoss(*law))
-        return -Foliage().term(make_links([device_m], [receiver_m]), params, None).offset_db[0]
+        return -Foliage().with_params(params).term(make_links([device_m], [receiver_m]), None).offset_db[0]
     return make
 
 
@@ -47,10 +47,10 @@ def test_no_grove_costs_more_than_the_recommendation_has_at_the_frequency(make_l
                        np.column_stack([rng.uniform(-200, 200, (150, 2)), np.full(150, 8.0)]),
                        frequency_hz=frequency_hz)
     grove = Foliage.Params(box=(0.0, 0.0, 70.0, 70.0, 15.0, 0.0), law=VegetationLoss(1.0, 20.0))
-    links.level_db[:] = -80.0 + Foliage().gain_db(links, grove) + rng.normal(0, 2.0, len(links))
+    links.level_db[:] = -80.0 + Foliage().with_params(grove).gain_db(links) + rng.normal(0, 2.0, len(links))
     proposed = Foliage().propose(view(links, np.full(len(links), -80.0), 3.0))
     assert proposed
     for params in proposed:
-        variation = Foliage().variation(params)
-        most = variation.params(variation.high)
+        variation = Foliage().with_params(params).variation()
+        most = variation.effect(variation.high).params
         assert most.law.max_db == pytest.approx(ceiling_db, abs=0.1) and params.law.max_db <= ceiling_db + 0.1

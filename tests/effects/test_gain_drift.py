@@ -33,7 +33,7 @@ SHAPES = {
 @pytest.mark.parametrize("form", SHAPES)
 def test_a_form_has_its_shape_on_its_receivers_links_only(flown, form):
     links, (number, shape) = flown(), SHAPES[form]
-    term = ReceiverDrift().term(links, ReceiverDrift.Params(receivers={1: Drift(form, number)}), None)
+    term = ReceiverDrift().with_params(ReceiverDrift.Params(receivers={1: Drift(form, number)})).term(links, None)
     mine = links.receiver == 1
     np.testing.assert_allclose(term.columns[mine, 0], shape(links.time_s, links.flight)[mine], atol=1e-9)
     np.testing.assert_array_equal(term.columns[:, 1], mine)
@@ -64,7 +64,7 @@ def test_ageing_continues_as_learnt_for_any_links(flown, view):
     form, middle_s = params.receivers[1]
     assert form == "ageing"
     two = links.select(np.flatnonzero(links.receiver == 1)[-2:])  # 2 s apart
-    column = ReceiverDrift().term(two, params, None).columns[:, 0]
+    column = ReceiverDrift().with_params(params).term(two, None).columns[:, 0]
     np.testing.assert_allclose(column, (two.time_s - middle_s) / 998, atol=1e-9)  # from 1000 to 1998 s
 
 
@@ -86,7 +86,7 @@ def test_a_device_that_ages_or_has_changed_is_proposed_and_mapped_in_its_latest_
     assert list(params.devices) == [1] and params.devices[1].form == form
     # A map has no time: it is of the latest state.
     timeless = heard.with_columns(time_s=np.full(len(heard), np.nan))
-    columns = DeviceDrift().term(timeless, params, None).columns
+    columns = DeviceDrift().with_params(params).term(timeless, None).columns
     mine = heard.device == 1
     np.testing.assert_allclose(columns[mine], [[shape(1998.0), 1.0]] * mine.sum(), atol=0.02)
     assert np.abs(columns[~mine]).max() == 0
@@ -111,8 +111,8 @@ def test_parameters_of_version_0_1_are_read_and_written_alike(effect, old):
 
 def test_a_time_constant_is_refined_on_a_logarithmic_scale():
     params = ReceiverDrift.Params(receivers={0: Drift("step", 90.0), 1: Drift("warm_up", 80.0)})
-    variation = ReceiverDrift().variation(params)
+    variation = ReceiverDrift().with_params(params).variation()
     np.testing.assert_array_equal(variation.values, np.log([80.0]))
-    changed = variation.params(np.array([2.0]))
+    changed = variation.effect(np.array([2.0])).params
     assert changed.receivers == {0: ("step", 90.0), 1: ("warm_up", float(np.exp(2.0)))}
-    assert DeviceDrift().variation(DeviceDrift.Params(devices={0: Drift("step", 90.0)})) is None
+    assert DeviceDrift().with_params(DeviceDrift.Params(devices={0: Drift("step", 90.0)})).variation() is None

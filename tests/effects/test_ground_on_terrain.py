@@ -70,6 +70,5 @@ def test_an_emitter_stands_on_the_ground(make_links):
         return np.zeros(len(moved))
 
     emitter = Interference()
-    emitter.term(links, emitter.Params(place_m=(0.0, 0.0), level_db=0.0, within_m=(-9, -9, 9, 9), through_channel=True),
-                 level_at)
+    emitter.with_params(emitter.Params(place_m=(0.0, 0.0), level_db=0.0, within_m=(-9, -9, 9, 9), through_channel=True)).term(links, level_at)
     np.testing.assert_allclose(asked_m, [[[0.0, 0.0, float(links.city.ground_height_m(0.0, 0.0)) + 1.5]]])

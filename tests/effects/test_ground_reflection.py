@@ -9,7 +9,7 @@ from radiotwin.effects.catalogue.lock_loss import LockLoss
 from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin import Twin, TwinDevice
-from radiotwin.twin.model.model import FittedEffect, FittedModel
+from radiotwin.twin.model.model import FittedModel
 
 FREQUENCY_HZ = 2.4e9
 
@@ -70,7 +70,7 @@ def test_links_without_line_of_sight_do_not_get_it(make_links):
     links = make_links([[0.0, 0, 1.5]], ends(2)[1])
     los = np.arange(len(links)) % 3 > 0
     params = GroundReflection.Params(strength=1.0, roughness_m=0.0, ground_m=0.0, wavelength_m=0.125)
-    term = GroundReflection().term(links.with_los(los), params, None)
+    term = GroundReflection().with_params(params).term(links.with_los(los), None)
     assert np.abs(term.offset_db[~los]).max() == 0 and np.abs(term.offset_db[los]).max() > 1
 
 
@@ -85,7 +85,7 @@ def test_a_bounce_that_a_building_hides_is_none(make_links, small_scene):
     links = make_links(roof_m[len(roof_m) // 2], [receiver_m], city=city)
     assert links.los.all()
     params = GroundReflection.Params(strength=1.0, roughness_m=0.0, ground_m=0.0, wavelength_m=0.125)
-    np.testing.assert_array_equal(GroundReflection().term(links, params, None).offset_db, 0)
+    np.testing.assert_array_equal(GroundReflection().with_params(params).term(links, None).offset_db, 0)
 
 
 def test_a_map_has_it_and_does_not_have_what_belongs_to_receivers(small_scene):
@@ -98,8 +98,8 @@ def test_a_map_has_it_and_does_not_have_what_belongs_to_receivers(small_scene):
 
     def mapped(effects):
         channel = LogDistance(LogDistanceLine(-40.0, 2.2, 3.0))
-        fitted = FittedModel(channel, tuple(FittedEffect(effect, params, np.zeros(0)) for effect, params in effects),
-                             np.zeros(2), np.array([2.0]), 5.0, small_scene.device_m, ("g0",), np.nan, 0.0)
+        fitted = FittedModel(channel, tuple(effect.with_params(params) for effect, params in effects),
+                             (np.zeros(0),) * len(effects), np.zeros(2), np.array([2.0]), 5.0, small_scene.device_m, ("g0",), np.nan, 0.0)
         return Twin(channel, devices, "gain_db", None, {}, fitted).radio_map(small_scene)
 
     plain, corrected = mapped([]), mapped(found)

@@ -22,11 +22,11 @@ def test_powers_add_and_the_slope_is_known(make_links):
     links = make_links([[0.0, 0, 1.5], [90, 40, 1.5]], np.column_stack([rng.uniform(0, 300, (50, 2)), np.full(50, 60.0)]))
     params = Interference.Params(place_m=(120.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300))
     level_db = rng.uniform(-120, -60, len(links))
-    inputs = Interference().term(links, params, None).inputs
-    read_db, slope = Interference().response(level_db, params, inputs)
+    inputs = Interference().with_params(params).term(links, None).inputs
+    read_db, slope = Interference().with_params(params).response(level_db, inputs)
     power = heard(links.receiver_m, np.array([120.0, 80.0, 1.5]), -90.0)
     np.testing.assert_allclose(watts(read_db), watts(level_db) + power, rtol=1e-9)
-    more_db, less_db = (Interference().response(level_db + step, params, inputs)[0] for step in (1e-4, -1e-4))
+    more_db, less_db = (Interference().with_params(params).response(level_db + step, inputs)[0] for step in (1e-4, -1e-4))
     np.testing.assert_allclose(slope, (more_db - less_db) / 2e-4, atol=1e-6)
 
 
@@ -38,8 +38,8 @@ def test_receivers_that_stay_at_few_positions_cannot_locate_an_emitter(make_link
 
 def test_an_emitter_at_the_edge_of_the_searched_area_is_implausible():
     params = Interference.Params(place_m=(300.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300))
-    assert "edge" in Interference().implausible(params, np.zeros(0))
-    assert Interference().implausible(params.model_copy(update={"place_m": (250.0, 80.0)}), np.zeros(0)) is None
+    assert "edge" in Interference().with_params(params).implausible(np.zeros(0))
+    assert Interference().with_params(params.model_copy(update={"place_m": (250.0, 80.0)})).implausible(np.zeros(0)) is None
 
 
 @pytest.mark.whole_loop
@@ -80,7 +80,7 @@ def test_over_a_map_its_power_falls_as_that_of_a_device(make_links, walled):
     receiver_m = np.array([[50.0, 80, 30], [250.0, 80, 30], [250.0, 80, 400]])  # beside it, behind the wall, above it
     links = make_links([[0.0, 0, 1.5], [0.0, 200, 20.0]], receiver_m, city=walled)
     params = Interference.Params(place_m=(120.0, 80.0), level_db=-10.0, within_m=(0, 0, 300, 300), through_channel=True)
-    power = Interference().term(links, params, walled_level_db).inputs
+    power = Interference().with_params(params).term(links, walled_level_db).inputs
     expected = heard(links.receiver_m, np.array([120.0, 80.0, 1.5]), -40.0 - 40.0 - 10.0)
     np.testing.assert_allclose(10 * np.log10(power / expected), np.where(links.receiver_m[:, 2] == 400, 0, np.where(
         links.receiver_m[:, 0] == 250, -17, 0)), atol=1e-9)
@@ -106,4 +106,4 @@ def test_a_part_of_the_links_is_searched_where_all_of_them_found_it(make_links, 
     links = make_links([[0.0, 0, 1.5]], np.column_stack([rng.uniform(0, 300, (60, 2)), np.full(60, 60.0)]))
     params = Interference.Params(place_m=(120.0, 80.0), level_db=-190.0, within_m=(0, 0, 300, 300))
     seen = view(links, np.zeros(60), 2.0)
-    assert Interference().propose(seen) == [] and Interference().propose_like(seen, params) == [params]
+    assert Interference().propose(seen) == [] and Interference().with_params(params).propose_like(seen) == [params]

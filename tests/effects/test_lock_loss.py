@@ -35,7 +35,7 @@ def test_the_dropout_probability_is_the_share_of_blanks_far_above_the_limit(seen
     strong = (given.links.receiver == 1) & (given.mean_db > LIMIT_DB + 10)
     counted = np.isnan(given.links.level_db[strong]).mean()
     assert params.receivers[1] == pytest.approx(counted, rel=0.25)
-    losses = LockLoss().losses(given.links, params)
+    losses = LockLoss().with_params(params).losses(given.links)
     np.testing.assert_array_equal(losses.blank, np.where(given.links.receiver == 1, params.receivers[1], 0.0))
     assert not losses.drop.any()
 

@@ -66,7 +66,7 @@ def test_a_wood_that_costs_nothing_is_not_plausible(world):
     better = add_effect(fit, MappedVegetation())
     params = better.effects[-1].params
     gain = fit.objective - better.objective
-    assert gain < 5 or MappedVegetation().implausible(params, np.zeros(0)) is not None
+    assert gain < 5 or MappedVegetation().with_params(params).implausible(np.zeros(0)) is not None
 
 
 def test_it_is_not_looked_for_without_vegetation(world):

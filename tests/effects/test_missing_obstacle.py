@@ -30,7 +30,7 @@ def test_a_map_with_a_box_in_it_keeps_its_woods():
     house = trimesh.creation.box(bounds=[[200, 0, 0], [230, 30, 12]])
     city = CityMap(house.vertices, house.faces, vegetation=Vegetation.of([wood]))
     params = MissingObstacle.Params(box=Box(100.0, 150.0, 20.0, 10.0, 30.0, 0.0))
-    corrected = MissingObstacle().corrected_map(city, params)
+    corrected = MissingObstacle().with_params(params).corrected_map(city)
     assert corrected.height_at(100.0, 150.0) == pytest.approx(30.0)
     assert corrected.vegetation.height_m.tolist() == [15.0]
 
@@ -53,7 +53,7 @@ def test_a_narrow_building_is_proposed_with_its_shape_and_turn(make_links, view,
                     level_at=lambda links, exact=False: np.zeros(len(links)))
 
     every = np.arange(len(links))
-    gains = [residual.gain_nats(every, MissingObstacle().term(residual.links, params, residual.level_at).offset_db).sum()
+    gains = [residual.gain_nats(every, MissingObstacle().with_params(params).term(residual.links, residual.level_at).offset_db).sum()
              for params in MissingObstacle().propose(residual)]
     assert max(gains) > 0.5 * residual.gain_nats(every, -lost_db).sum()
 
@@ -69,7 +69,7 @@ def test_in_a_shadow_is_what_reaches_it_on_other_ways(make_links):
         return np.where(of.los, 0.0, left_db)
 
     around = [Box(30.0, 0.0, 10.0, 60.0, 200.0, 0.0), Box(0.0, 30.0, 60.0, 10.0, 200.0, 0.0)]
-    lost_db = [MissingObstacle().term(links, MissingObstacle.Params(box=box), level_at).offset_db for box in around]
+    lost_db = [MissingObstacle().with_params(MissingObstacle.Params(box=box)).term(links, level_at).offset_db for box in around]
     assert lost_db[0][0] == pytest.approx(-3.0, abs=0.3) and lost_db[0][1] == 0
     assert lost_db[1][1] < -20 and lost_db[1][0] == 0
 
@@ -85,17 +85,17 @@ def test_a_search_begins_at_the_best_of_both_models_of_a_shadow(make_links, view
 
     hidden = Box(60.0, 10.0, 24.0, 24.0, 30.0, 0.0)
     effect = MissingObstacle()
-    lost_db = effect.term(links, effect.Params(box=hidden, by_class=True), level_at).offset_db
+    lost_db = effect.with_params(effect.Params(box=hidden, by_class=True)).term(links, level_at).offset_db
     assert lost_db.min() < -15 and (lost_db < -5).sum() > 30
     noise_db = np.random.default_rng(0).normal(0, 1.5, len(links))
     residual = view(links.with_columns(level_db=noise_db + lost_db), np.zeros(len(links)), 1.5, level_at)
     proposed = effect.propose(residual)
-    assert {effect.kind(params) for params in proposed} == {False, True}
+    assert {effect.with_params(params).kind() for params in proposed} == {False, True}
     every = np.arange(len(links))
-    gains = {kind: max(residual.gain_nats(every, effect.term(residual.links, params, level_at).offset_db).sum()
-                       for params in proposed if effect.kind(params) == kind) for kind in (False, True)}
+    gains = {kind: max(residual.gain_nats(every, effect.with_params(params).term(residual.links, level_at).offset_db).sum()
+                       for params in proposed if effect.with_params(params).kind() == kind) for kind in (False, True)}
     assert gains[True] > 1.5 * gains[False] > 0
-    assert not effect.exact(effect.Params(box=hidden, by_class=True)).by_class
+    assert not effect.with_params(effect.Params(box=hidden, by_class=True)).exactly().params.by_class
 
 
 @pytest.mark.parametrize(("box", "refused"), [
@@ -106,7 +106,7 @@ def test_a_search_begins_at_the_best_of_both_models_of_a_shadow(make_links, view
 def test_a_box_in_a_building_of_the_map_or_along_its_wall_is_no_missing_building(make_links, box, refused):
     house = trimesh.creation.box(bounds=[[200, 0, 0], [230, 30, 12]])
     links = make_links([[0.0, 0, 2.0]], [[100.0, 0, 20.0]], city=CityMap(house.vertices, house.faces))
-    why = MissingObstacle().contradicted(MissingObstacle.Params(box=box), links)
+    why = MissingObstacle().with_params(MissingObstacle.Params(box=box)).contradicted(links)
     assert bool(why) == refused
     if refused:
         assert "walls or roofs are off" in why
@@ -118,7 +118,7 @@ def test_what_hides_devices_that_may_be_elsewhere_alone_is_refused(make_links, e
     links = make_links([[0.0, 0, 2.0], [5.0, -15.0, 2.0], [0.0, 80.0, 2.0]], receiver_m)
     params = effect.Params(box=Box(20.0, -5.0, 10.0, 20.0, 10.0, 0.0))  # before devices 0 and 1
     for known, refused in (({0, 1, 2}, False), ({2}, True), ({0}, False)):
-        why = effect.contradicted(params, links.with_ends(anchors=frozenset(known)))
+        why = effect.with_params(params).contradicted(links.with_ends(anchors=frozenset(known)))
         assert ("may be elsewhere" in (why or "")) == refused and bool(why) == refused
 
 
@@ -128,12 +128,12 @@ def test_a_box_that_is_seen_from_one_place_is_no_building(make_links, other_m, r
     receiver_m = np.column_stack([np.linspace(90, 110, 20), np.zeros(20), np.full(20, 20.0)])
     links = make_links([[0.0, 0, 2.0], other_m], receiver_m)
     params = MissingObstacle.Params(box=Box(20.0, -5.0, 10.0, 20.0, 16.0, 0.0))
-    assert bool(MissingObstacle().contradicted(params, links)) == refused
+    assert bool(MissingObstacle().with_params(params).contradicted(links)) == refused
 
 
 def test_without_a_map_no_building_is_in_the_way_of_a_missing_one(make_links):
     links = make_links([[0.0, 0, 2.0]], [[100.0, 0, 20.0]])
-    assert MissingObstacle().contradicted(MissingObstacle.Params(box=Box(50.0, 0.0, 9.0, 9.0, 9.0, 0.0)), links) is None
+    assert MissingObstacle().with_params(MissingObstacle.Params(box=Box(50.0, 0.0, 9.0, 9.0, 9.0, 0.0))).contradicted(links) is None
 
 
 def test_a_search_may_stay_where_it_begins():
@@ -141,7 +141,7 @@ def test_a_search_may_stay_where_it_begins():
     effect = MissingObstacle()
     for (length_m, width_m), turn_deg in SHAPES:
         box = Box(0.0, 0.0, length_m, width_m, 20.0, turn_deg)
-        variation = effect.variation(effect.Params(box=box))
+        variation = effect.with_params(effect.Params(box=box)).variation()
         assert ((variation.low <= variation.values) & (variation.values <= variation.high)).all()
 
 
@@ -157,8 +157,8 @@ def test_past_known_paths_is_what_the_box_does_not_block(make_links):
         line = (wavelength_m / (4 * np.pi * np.linalg.norm(of.receiver_m - [0.0, 0, 5], axis=1)))**2
         return 10 * np.log10(np.where(of.receiver_m[:, 1] == 8, 10.0, 1.3) * line)
 
-    params = MissingObstacle.Params(box=Box(30.0, 0.0, 10.0, 60.0, 200.0, 0.0), known_paths=True)
-    lost_db = MissingObstacle().term(links, params, level_at).offset_db
+    params = MissingObstacle.Params(box=Box(30.0, 0.0, 10.0, 60.0, 200.0, 0.0))
+    lost_db = MissingObstacle().with_params(params, "known_paths").term(links, level_at).offset_db
     assert lost_db[0] < -5  # a third of the power of the straight line, in part by way of the ground, is left at most
     assert 10 * np.log10(8 / 10) - 0.1 < lost_db[1] < 10 * np.log10(9 / 10) + 0.1
     assert lost_db[2] == pytest.approx(0, abs=1e-3)
@@ -173,17 +173,17 @@ def test_along_paths_a_box_is_found_that_quick_levels_turned(make_links, seed):
     receiver_m = np.column_stack([rng.uniform(70, 200, 500), rng.uniform(-90, 55, 500), rng.uniform(5, 35, 500)])
     links = make_links([[0.0, 0, 2.0], [20.0, -60, 2.0], [110.0, -70, 2.0]], receiver_m, city=city)
     effect = MissingObstacle()
-    there = links.with_city(effect.corrected_map(city, effect.Params(box=true)))
+    there = links.with_city(effect.with_params(effect.Params(box=true)).corrected_map(city))
     level_db = 10 * np.log10(path_gains(there.geometry) + 1e-13) + rng.normal(0, 1.0, len(links))
     channel = ImagePaths().fit(links.geometry, level_db, None)
     model = Model.build(links.with_columns(level_db=level_db), channel, 5.0)
     def fitted(box):
-        return model.with_effects([model.apply(effect, effect.Params(box=box, exact=True))]).fit()
+        return model.with_effects([effect.with_params(effect.Params(box=box), "exact")]).fit()
 
     without, start = model.fit(), fitted(Box(62.0, 7.0, 18.0, 18.0, 26.0, 52.0))
     found = along_paths(start, without)
     gain, most = without.objective - found.objective, without.objective - fitted(true).objective
-    assert found.effects[-1].params.exact
+    assert found.effects[-1].is_exact
     assert gain > 0.8 * most > 0.8 * 1000 and without.objective - start.objective < 0.65 * most
 
 
@@ -193,8 +193,8 @@ def test_a_box_that_no_link_comes_near_stays_where_it_is(make_links):
     links = make_links([[0.0, 0, 2.0]], receiver_m, city=CityMap(house.vertices, house.faces),
                        level_db=np.linspace(-80, -70, len(receiver_m)))
     model = Model.build(links, ImagePaths().fit(links.geometry, links.level_db, None), 5.0)
-    far = MissingObstacle.Params(box=Box(-300.0, 0.0, 20.0, 20.0, 30.0, 0.0), known_paths=True)
-    there = model.with_effects([model.apply(MissingObstacle(), far)]).fit()
+    far = MissingObstacle.Params(box=Box(-300.0, 0.0, 20.0, 20.0, 30.0, 0.0))
+    there = model.with_effects([MissingObstacle().with_params(far, "known_paths")]).fit()
     assert refine(there) is there
 
 
@@ -211,7 +211,7 @@ def test_where_a_building_was_found_no_other_is_proposed(make_links, view):
     before = MissingObstacle().propose(residual)
     box = before[0].box
     assert np.hypot(box.x_m - 60, box.y_m) < 25
-    found = replace(residual, found=(("missing_obstacle", before[0]),))
+    found = replace(residual, found=(MissingObstacle().with_params(before[0]),))
     x_m, y_m = np.meshgrid(np.linspace(-100, 300, 801), np.linspace(-200, 200, 801))
     again = MissingObstacle().propose(found)
     for params in again:

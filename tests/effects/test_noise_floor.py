@@ -70,16 +70,16 @@ def test_weak_links_that_scatter_widely_read_no_floor(make_links):
     found = add_effect(model.fit(), NoiseFloor()).effects[-1]
     for own, floor_db in found.params.receivers.items():
         assert (links.level_db[receiver == own] < floor_db - 6.1).mean() <= 0.011
-    assert "it is no floor" in NoiseFloor().implausible(NoiseFloor.Params(receivers={1: -80.0}, highest={1: -80.0}), np.zeros(0))
-    assert NoiseFloor().implausible(NoiseFloor.Params(receivers={1: -80.0}), np.zeros(0)) is None
+    assert "it is no floor" in NoiseFloor().with_params(NoiseFloor.Params(receivers={1: -80.0}, highest={1: -80.0})).implausible(np.zeros(0))
+    assert NoiseFloor().with_params(NoiseFloor.Params(receivers={1: -80.0})).implausible(np.zeros(0)) is None
 
 
 @pytest.mark.parametrize("alone", [False, True])
 def test_the_usual_floor_is_not_that_of_receivers_that_have_none(make_links, alone):
     links = make_links([[0.0, 0, 1.5]], np.ones((5, 3)), receiver=np.arange(5))
     params = NoiseFloor.Params(receivers={0: -90.0, 1: -91.0, 2: -92.0}, alone=alone)
-    for each in (params, NoiseFloor().variation(params).params(np.array([-90.0, -91.0, -92.0]))):
-        floors_db = 10 * np.log10(np.maximum(NoiseFloor().inputs(links, each), 1e-30))
+    for each in (params, NoiseFloor().with_params(params).variation().effect(np.array([-90.0, -91.0, -92.0])).params):
+        floors_db = 10 * np.log10(np.maximum(NoiseFloor().with_params(each).inputs(links), 1e-30))
         np.testing.assert_allclose(floors_db, [-90, -91, -92, *[-300 if alone else -91] * 2])
 
 
@@ -94,10 +94,11 @@ def test_receivers_that_gain_nothing_by_a_floor_are_left_without(make_links):
     level_db = 10 * np.log10(10 ** (level_db / 10) + 10 ** (noise_db / 10))
     links.level_db[:] = np.where(level_db < LIMIT_DB, np.nan, level_db)
     model = Model.build(links, KnownLevels(LogDistanceLine(-20.0, -3.0, 3.0)), 5.0)
-    found = add_effect(model.fit(), NoiseFloor()).effects[-1]
+    fit = add_effect(model.fit(), NoiseFloor())
+    found, inputs = fit.effects[-1], fit.model.terms[-1].inputs
     assert set(found.params.receivers) == {0, 1, 2} and found.params.alone
     assert all(floor_db == pytest.approx(FLOOR_DB, abs=1.0) for floor_db in found.params.receivers.values())
-    assert not found.term.inputs[receiver >= 3].any() and found.term.inputs[receiver < 3].all()
+    assert not inputs[receiver >= 3].any() and inputs[receiver < 3].all()
 
 
 def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
@@ -120,6 +121,6 @@ def test_a_floor_that_begins_as_high_as_it_may_be_is_still_searched_below(flown)
     model = Model.build(flown, KnownLevels(LogDistanceLine(-40.0, -2.5, 4.0)), 5.0)
     highest_db = FLOOR_DB + 4.0
     params = NoiseFloor.Params(receivers={RAISED: highest_db}, highest={RAISED: highest_db}, alone=True)
-    with_floor = model.with_effects([model.apply(NoiseFloor(), params)])
+    with_floor = model.with_effects([NoiseFloor().with_params(params)])
     refined = refine(with_floor.fit())
     assert refined.effects[-1].params.receivers[RAISED] == pytest.approx(FLOOR_DB, abs=0.7)

@@ -35,7 +35,7 @@ def test_a_hidden_receiver_hears_the_antenna_in_the_direction_of_the_reflection(
     mesh = trimesh.util.concatenate(walls)
     links = make_links([[0.0, 0, 10]], [[0.0, 40, 10]], city=CityMap(mesh.vertices, mesh.faces))
     pattern = SectorPattern(azimuth_deg=boresight_deg, beamwidth_deg=30.0, front_to_back_db=30.0, scattered_db=-80.0)
-    added_db = SectorAntenna().term(links, SectorAntenna.Params(devices={0: pattern}), None).offset_db
+    added_db = SectorAntenna().with_params(SectorAntenna.Params(devices={0: pattern})).term(links, None).offset_db
     off_deg = abs(boresight_deg - np.degrees(np.arctan2(29, 20)))  # the wall's face is 29 m away
     assert not links.los[0]
     assert added_db[0] == pytest.approx(-min(12 * (off_deg / 30) ** 2, 30), abs=1.5)
@@ -56,10 +56,10 @@ def test_patterns_that_version_0_1_wrote_are_read():
 
 def test_patterns_are_refined_each_by_itself():
     devices = {3: SectorPattern(azimuth_deg=40), 7: SectorPattern(azimuth_deg=160)}
-    variation = SectorAntenna().variation(SectorAntenna.Params(devices=devices))
+    variation = SectorAntenna().with_params(SectorAntenna.Params(devices=devices)).variation()
     numbers = variation.values.copy()
     numbers[variation.members[1][0]] += 5
-    assert variation.params(numbers).devices == {3: devices[3], 7: SectorPattern(azimuth_deg=165)}
+    assert variation.effect(numbers).params.devices == {3: devices[3], 7: SectorPattern(azimuth_deg=165)}
 
 
 def towards(azimuth_deg, elevation_deg):
@@ -120,7 +120,8 @@ def test_the_floor_adds_as_power_and_knows_its_slope():
 def test_a_receivers_fault_is_in_its_own_readings(make_links, effect, params, expected_db):
     """At the floor the reading is twice the power, at the level of saturation with smoothness 1 half of it."""
     links = make_links([[0.0, 0, 1.5]], np.ones((4, 3)), receiver=np.array([0, 1, 0, 1]))
-    read_db, slope = effect.response(np.full(4, -80.0), params, effect.inputs(links, params))
+    found = effect.with_params(params)
+    read_db, slope = found.response(np.full(4, -80.0), found.inputs(links))
     np.testing.assert_allclose(read_db, [-80, expected_db, -80, expected_db])
     np.testing.assert_allclose(slope, [1, 0.5, 1, 0.5])
 

@@ -28,7 +28,7 @@ def moved_db(links, device_m, receiver_m):
 
 
 def test_a_device_elsewhere_changes_its_own_links(links):
-    term = DevicePositionError().term(links, DevicePositionError.Params(device=1, move_m=(30.0, -20.0)), law_db)
+    term = DevicePositionError().with_params(DevicePositionError.Params(device=1, move_m=(30.0, -20.0))).term(links, law_db)
     expected_db = moved_db(links, (DEVICES_M + [(0, 0, 0), (30, -20, 0)])[links.device], links.receiver_m)
     np.testing.assert_allclose(term.offset_db, expected_db, atol=1e-9)
     assert np.abs(term.offset_db[links.device == 0]).max() == 0 and np.abs(expected_db).max() > 3
@@ -36,7 +36,7 @@ def test_a_device_elsewhere_changes_its_own_links(links):
 
 def test_a_receiver_elsewhere_changes_its_own_links(links):
     params = ReceiverPositionError.Params(receiver=0, move_m=(0.0, 5.0, -25.0))
-    term = ReceiverPositionError().term(links, params, law_db)
+    term = ReceiverPositionError().with_params(params).term(links, law_db)
     position_m = links.receiver_m + np.where(links.receiver == 0, 1.0, 0.0)[:, None] * (0, 5, -25)
     np.testing.assert_allclose(term.offset_db, moved_db(links, DEVICES_M[links.device], position_m), atol=1e-9)
 
@@ -69,21 +69,21 @@ def test_sectors_on_one_mast_move_together_and_count_as_one(make_links, view):
     moved_m = (sectors_m + [(0, 0, 0), (36, -22, 0), (36, -22, 0)])[links.device]
     expected_db = -22 * np.log10(np.linalg.norm(receiver_m.repeat(3, axis=0) - moved_m, axis=1)
                                  / np.linalg.norm(links.receiver_m - sectors_m[links.device], axis=1))
-    term = DevicePositionError().term(links, DevicePositionError.Params(device=1, move_m=(36.0, -22.0)), law_db)
+    term = DevicePositionError().with_params(DevicePositionError.Params(device=1, move_m=(36.0, -22.0))).term(links, law_db)
     np.testing.assert_allclose(term.offset_db, expected_db, atol=1e-9)
     links.level_db[:] = law_db(links) + expected_db + rng.normal(0, 0.5, len(links))
     (params,) = DevicePositionError().propose(view(links, law_db(links), 0.5, law_db))
     assert params.device == 1 and np.hypot(params.move_m[0] - 36, params.move_m[1] + 22) < 15
-    given = replace(view(links, law_db(links), 0.5, law_db), found=(("device_position_error", params),))
+    given = replace(view(links, law_db(links), 0.5, law_db), found=(DevicePositionError().with_params(params),))
     assert all(other.device == 0 for other in DevicePositionError().propose(given))
 
 
 def test_an_end_that_is_off_by_metres_is_no_effect():
     """Surveys, and the walls of maps, are off by as much."""
     for move_m, size_m in (((3.0, 3.0), "4.2 m"), ((3.0, 4.2), None)):
-        why = DevicePositionError().implausible(DevicePositionError.Params(device=0, move_m=move_m), np.zeros(0))
+        why = DevicePositionError().with_params(DevicePositionError.Params(device=0, move_m=move_m)).implausible(np.zeros(0))
         assert why is None if size_m is None else size_m in why
     near = ReceiverPositionError.Params(receiver=0, move_m=(0.0, 0.0, 4.9))
-    assert "4.9 m" in ReceiverPositionError().implausible(near, np.zeros(0))
+    assert "4.9 m" in ReceiverPositionError().with_params(near).implausible(np.zeros(0))
     far = near.model_copy(update={"move_m": (3.0, 0.0, 4.9)})
-    assert ReceiverPositionError().implausible(far, np.zeros(0)) is None
+    assert ReceiverPositionError().with_params(far).implausible(np.zeros(0)) is None

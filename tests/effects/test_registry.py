@@ -84,10 +84,10 @@ def test_the_effect_of_the_guide_works(installed, make_links):
     exec(re.search(r"```python\n(.*?)```", guide, re.DOTALL)[1], {})
     effect, links = effect_named("altitude_loss", ""), make_links([[0.0, 0, 1.5]], [[0, 0, 50], [0, 0, 200]])
     (params,) = effect.propose(None)
-    np.testing.assert_allclose(effect.term(links, params, None).offset_db, [-0.5, -2.0])
-    variation = effect.variation(params)
+    np.testing.assert_allclose(effect.with_params(params).term(links, None).offset_db, [-0.5, -2.0])
+    variation = effect.with_params(params).variation()
     assert (variation.values, variation.low, variation.high) == (1.0, 0.0, 20.0)
-    assert effect.neg_log_prior(variation.params(np.array([6.0]))) == pytest.approx(0.5)
+    assert variation.effect(np.array([6.0])).neg_log_prior() == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("effect", registry.BUILT_IN, ids=lambda effect: effect.__name__)

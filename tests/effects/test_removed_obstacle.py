@@ -37,7 +37,7 @@ def suspected(make_links, view, true_boxes, seed=0):
         return np.where(of.los, 0.0, -LOSS_DB)
 
     effect, residual, every = RemovedObstacle(), view(measured, level_at(measured), 3.0, level_at), np.arange(len(links))
-    gains = {params.building: residual.gain_nats(every, effect.term(measured, params, level_at).offset_db).sum()
+    gains = {params.building: residual.gain_nats(every, effect.with_params(params).term(measured, level_at).offset_db).sum()
              for params in effect.propose(residual)}
     best = max(gains, key=gains.get, default=None)
     return best if gains and gains[best] > MIN_NATS else None
@@ -68,11 +68,11 @@ def test_each_of_several_buildings_that_are_gone_is_gone_whatever_else_has_chang
     """By the numbers of the map as it was given, while buildings go and come before them."""
     row = city_of([(x, 0.0, x + 20.0, 20.0, 20.0) for x in (0.0, 100.0, 200.0, 300.0)])
     centres_m, effect = buildings(row)[1], RemovedObstacle()
-    params = [effect.Params(building=number, centre_m=tuple(centres_m[number].tolist()), exact=True) for number in range(4)]
+    params = [effect.Params(building=number, centre_m=tuple(centres_m[number].tolist())) for number in range(4)]
     there, added = MissingObstacle(), Box(-100.0, 10.0, 10.0, 10.0, 15.0, 0.0)
     left = {(0, 1): [210, 310], (0, 3): [110, 210], (3, 0): [110, 210], (2, 2): [10, 110, 310]}
     for gone, left_x_m in left.items():
-        city = there.corrected_map(row, there.Params(box=added))
+        city = there.with_params(there.Params(box=added)).corrected_map(row)
         for number in gone:
-            city = effect.corrected_map(city, params[number])
+            city = effect.with_params(params[number]).corrected_map(city)
         np.testing.assert_allclose(np.sort(buildings(city)[1][:, 0]), [-100.0, *left_x_m])

@@ -81,7 +81,7 @@ def test_roofs_that_are_off_are_found_and_explain_the_links(world, seed):
     sure = surely_off(better.effects[-1].params.roofs)
     assert {round(roof.height_m) for roof in sure} <= {20, 18, 22} and len(sure) >= 2
     assert sd_m[:3].min() > 1.5  # other worlds have other edges than this one
-    named = better.effects[-1].effect.parameters(better.links, better.effects[-1].params, None)
+    named = better.effects[-1].parameters(better.links, None)
     assert list(named) == [f"true_minus_mapped_height_m[{roof.x_m:.0f}, {roof.y_m:.0f}]" for roof in sure]
     off_by_place = {(round(x + 15), round(y + 15)): off_m for (x, y), off_m in zip(CORNERS_M, true_m, strict=True)}
     for roof, parameter in zip(sure, named.values(), strict=True):
@@ -143,7 +143,7 @@ def test_only_links_over_a_roof_change_and_by_no_more_than_both_classes_differ(w
     links = world(MAPPED_M)
     fit, _ = fitted(links)
     params = RoofHeights.Params(roofs=(Roof(_number((-80.0, -20.0)), -65.0, -5.0, 20.0, 5.0, 1.0),))
-    change_db = RoofHeights().term(links, params, fit.model.level_at).offset_db
+    change_db = RoofHeights().with_params(params).term(links, fit.model.level_at).offset_db
     a_m, b_m = links.device_m[links.device], links.receiver_m
     newly = blocked(a_m, b_m, (25.0, *MAPPED_M[1:])) & ~blocked(a_m, b_m, MAPPED_M)
     far = (np.maximum(a_m[:, 0], b_m[:, 0]) < -82) | (np.minimum(a_m[:, 0], b_m[:, 0]) > -48)
@@ -167,4 +167,4 @@ def test_it_needs_a_map_a_frequency_and_the_map_that_it_was_found_on(world, make
     fit, _ = fitted(links)
     params = RoofHeights.Params(roofs=(Roof(99, 0.0, 0.0, 10.0, 2.0, 1.0),))
     with pytest.raises(BadInput, match="building 99, but the map has"):
-        RoofHeights().term(links, params, fit.model.level_at)
+        RoofHeights().with_params(params).term(links, fit.model.level_at)

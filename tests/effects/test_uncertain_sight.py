@@ -61,7 +61,7 @@ def test_where_walls_are_off_links_beside_them_are_likelier_with_larger_errors(w
     links = world(seed, city((-8.5, 11.5)))
     fit, better = fitted(links)
     assert fit.objective - better.objective > 15
-    chance = better.effects[-1].effect._chance(links)
+    chance = better.effects[-1]._chance(links)
     scale_db, sure = better.readings().scale_db, (chance == 0) | (chance == 1)
     assert scale_db[~sure].min() > 1.2 * scale_db[sure].max()
     assert better.effects[-1].params.contrast_db == pytest.approx(BEHIND_DB, rel=0.6)

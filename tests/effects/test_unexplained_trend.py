@@ -14,7 +14,7 @@ from radiotwin.errors import BadInput
     ("heading_deg", [None], False), ("quality", [None], False), ("distance_m", [None], True)])
 def test_a_map_has_what_depends_on_places_alone(variable, receivers, is_on_maps):
     trend = UnexplainedTrend(variable)
-    assert trend.is_on_maps(trend.Params(knots=[0.0, 1.0], receivers=receivers)) == is_on_maps
+    assert trend.with_params(trend.Params(knots=[0.0, 1.0], receivers=receivers)).is_on_maps() == is_on_maps
 
 
 def test_only_such_curves_are_read_from_a_twin():
@@ -41,6 +41,6 @@ def test_times_since_1970_have_a_curve(make_links, view):
     trend = UnexplainedTrend("time_s")
     (params,) = trend.propose(view(links, np.full(400, -80.0), 2.0, lambda of, exact=False: np.full(len(of), -80.0)))
     assert 1.7e9 <= params.knots[0] < params.knots[-1] <= 1.7e9 + 4000
-    columns = trend.term(links, params, lambda of, exact=False: np.full(len(of), -80.0)).columns
+    columns = trend.with_params(params).term(links, lambda of, exact=False: np.full(len(of), -80.0)).columns
     left_db = wave_db - columns @ np.linalg.lstsq(columns, wave_db, rcond=None)[0]
     assert np.sqrt(np.mean(left_db**2)) < 1.0

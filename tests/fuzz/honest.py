@@ -206,7 +206,7 @@ def _write_effects(folder: Path) -> None:
         record = json.loads(path.read_text())
         record["fitted"]["effects"] = [
             {key: value for key, value in part.items() if key != "over"} for part in parts
-            if part["over"] == over and (over == "links" or part["params"].get("exact"))]
+            if part["over"] == over and (over == "links" or part["name"] == "removed_obstacle" or "levels" in part)]
         path.write_text(json.dumps(record))
     shutil.copytree(source / "links", folder / "links")
     devices = pd.read_csv(folder / "links" / "devices.csv")

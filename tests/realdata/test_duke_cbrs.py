@@ -15,7 +15,7 @@ def loop(duke):
 
 def test_antennas_are_named_first_and_look_where_they_do(loop):
     off_deg = azimuth_errors_deg(make_report(loop))
-    assert loop.after.whole.effects[0].effect.name == "antenna_pattern"
+    assert loop.after.whole.effects[0].name == "antenna_pattern"
     assert set(off_deg) == set(AZIMUTHS_DEG) and max(map(abs, off_deg.values())) <= 20
 
 
@@ -32,4 +32,4 @@ def test_with_boresights_turned_round_the_gain_is_gone(loop):
 def test_of_permuted_levels_only_what_the_permutation_leaves_is_named(duke):
     """Each sector keeps its mean level, and the sectors differ by ten decibels; nothing else is left."""
     loop = close_loop(permuted(duke, 0), base="log-distance", hold_out="block")
-    assert [each.effect.name for each in loop.after.whole.effects] == ["device_gain_offset"]
+    assert [each.name for each in loop.after.whole.effects] == ["device_gain_offset"]

@@ -28,8 +28,8 @@ def day_mean_db(loop, model) -> float:
 
 def test_gains_floors_and_the_step_of_one_receiver_are_named(loop):
     effects = loop.after.whole.effects
-    assert {"receiver_gain_offset", "noise_floor_censoring"} <= {each.effect.name for each in effects}
-    form, when_s = next(drift for each in effects if each.effect.name == "receiver_drift"
+    assert {"receiver_gain_offset", "noise_floor_censoring"} <= {each.name for each in effects}
+    form, when_s = next(drift for each in effects if each.name == "receiver_drift"
                         for receiver, drift in each.params.receivers.items()
                         if loop.links.receiver_names[receiver] == CHANGED)
     assert form == "step"
@@ -65,4 +65,4 @@ def test_transmitters_of_days_that_are_held_out_are_located_better(loop):
 
 def test_of_permuted_levels_nothing_is_named(powder):
     loop = close_loop(permuted(powder, 0), base="log-distance", hold_out="flight")
-    assert not [each for each in loop.after.whole.effects if each.effect.is_cause]
+    assert not [each for each in loop.after.whole.effects if each.is_cause]

@@ -15,7 +15,7 @@ from radiotwin.effects import catalogue
 from radiotwin.effects.catalogue.roof_heights import Roof
 from radiotwin.errors import BadInput
 from radiotwin.twin import Twin, check_twin_target, fit_twin
-from radiotwin.twin.model.model import FittedEffect, FittedModel
+from radiotwin.twin.model.model import FittedModel
 
 STORED = Path(__file__).parent / "stored"
 NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)
@@ -46,7 +46,7 @@ def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, tmp_pa
     measurements = open_ground.measured(world).select(world.slot % 2 == 0)
     loop = close_loop(measurements, base="log-distance")
     twin = corrected_twin(loop, None)
-    assert {each.effect.name for each in twin.effects} == {"device_gain_offset", "receiver_gain_offset"}
+    assert {each.name for each in twin.effects} == {"device_gain_offset", "receiver_gain_offset"}
     twin.save(tmp_path / "twin")
     again = Twin.load(tmp_path / "twin")
     assert again.description == twin.description and again.limit_db == twin.limit_db
@@ -66,7 +66,7 @@ def test_a_curve_that_only_describes_is_drawn_on_the_maps_of_a_stored_twin(open_
     assert loop.verdict == "unexplained"
     corrected_twin(loop, None).save(tmp_path / "twin")
     twin = Twin.load(tmp_path / "twin")
-    assert [each.effect.variant for each in twin.effects] == ["over azimuth_deg"]
+    assert [each.variant for each in twin.effects] == ["over azimuth_deg"]
     # Round each device, far from what was measured: a wave three times round, as far as eight knots follow one.
     around_deg = np.arange(0, 360, 5.0)
     offset_m = 150.0 * np.column_stack([np.sin(np.radians(around_deg)), np.cos(np.radians(around_deg)), 0.3 + 0 * around_deg])
@@ -132,8 +132,8 @@ def test_every_effect_that_needs_a_map_is_tried():
 def test_a_twin_with_an_effect_that_needs_a_map_comes_back_without_one(twin, tmp_path, name):
     effect = next(each() for each in catalogue() if each.name == name)
     params = effect.Params(**OF_MAPS[name])
-    fitted = FittedModel(twin.channel, (FittedEffect(effect, params, np.zeros(0)),), np.zeros(2), np.array([3.0]), 5.0,
+    fitted = FittedModel(twin.channel, (effect.with_params(params),), (np.zeros(0),), np.zeros(2), np.array([3.0]), 5.0,
                          twin.device_m, ("r0",), np.nan, 0.0)
     replace(twin, fitted=fitted).save(tmp_path / "twin")
     (again,) = Twin.load(tmp_path / "twin").effects
-    assert type(again.effect) is type(effect) and again.params == params
+    assert type(again) is type(effect) and again.params == params

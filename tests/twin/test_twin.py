@@ -19,7 +19,7 @@ LINE = LogDistanceLine(-40.0, -2.5, 2.0)
 def twin(channel, classes):
     """Return a twin as close-loop makes it, of a law with a level and a slope for each class of line of sight."""
     device = TwinDevice.anchor("a", 10.0, 10.0, 1.5)
-    fitted = FittedModel(channel, (), np.zeros(2 * classes), np.full(classes, 2.0), 5.0,
+    fitted = FittedModel(channel, (), (), np.zeros(2 * classes), np.full(classes, 2.0), 5.0,
                          np.array([[10.0, 10.0, 1.5]]), (), np.nan, 0.0)
     return Twin(channel, [device], "gain_db", -110.0, {}, fitted)
 

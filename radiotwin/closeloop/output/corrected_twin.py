@@ -25,7 +25,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
         scene: that it was found in, if there was one.
     """
     model = loop.for_twin
-    shadowing = model.shadowing[0] if model.shadowing else None
+    shadowing = model.whole.shadowing
     if shadowing is None and needs_rest(loop.prediction):
         shadowing = CorrelatedShadowing.fit(model.whole, loop.seed)
     fitted = replace(model.whole.learnt,

@@ -87,7 +87,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
                for rank, (trial, each, parameters, size) in enumerate(
                    zip(named, loop.after.whole.effects, loop.parameters, loop.sizes_db,
                        strict=True), start=1)]
-    if loop.after.shadowing:
+    if loop.after.whole.shadowing:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
     candidates = [{"name": trial.name, "variant": trial.variant, "step": trial.step + 1,
                    "heldout_rmse_db": trial.rmse_db,
@@ -220,8 +220,10 @@ def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:
 
 
 def _shadowing(trial: Trial, model: CrossFit, rank: int) -> dict[str, Any]:
-    field, relatives = model.shadowing[0].field, model.shadowing[0].relatives
-    sd_db = model.shadowing[0].relative_sd * float(model.whole.scale_db.mean())
+    shadowing = model.whole.shadowing
+    assert shadowing is not None
+    field, relatives = shadowing.field, shadowing.relatives
+    sd_db = shadowing.relative_sd * float(model.whole.scale_db.mean())
     numbers = {"length_m": (field.length_m, "m"), "share": (field.share, "of the variance"),
                "receiver_share": (field.kind_share, "of the variance"), "sigma_db": (sd_db, "dB")}
     if relatives is not None:

@@ -152,15 +152,14 @@ def combined_prediction(model: CrossFit, with_rest: bool, criteria: SelectionCri
     parts = [Part(each.links) for each in model.folds]
     baselines, kriging = held_out_baselines(model, parts, criteria, seed)
     laws = [kind.name for kind in laws_for(links, criteria) if kind is not LogDistance]
-    rest_too = [REST] if with_rest or model.shadowing else []
+    rest_too = [REST] if with_rest or model.whole.shadowing else []
     names = [NAMED, *FORESTS, *TREES_ALONE, *rest_too, *laws]
 
     def of_fold(number: int) -> tuple[_Learnt, np.ndarray, np.ndarray, np.ndarray]:
         """Return what is learnt outside a fold; its rows (m,), their members and far shares."""
         fold, part, rest = model.folds[number], parts[number], None
         if REST in names:
-            rest = model.shadowing[number + 1] if model.shadowing else CorrelatedShadowing.fit(
-                fold, seed)
+            rest = fold.shadowing or CorrelatedShadowing.fit(fold, seed)
         learnt = _Learnt(fold, rest, kriging[number] if kriging else None, part, names)
         test = np.flatnonzero((model.index == number) & fold.usable)
         members = np.column_stack([physics_db(fold, rest, part, test, seed),

@@ -22,6 +22,7 @@ import numpy as np
 from scipy.stats import t
 
 from radiotwin.closeloop.crossfit import CrossFit, same_effects
+from radiotwin.closeloop.verdict.criteria import LEVELS_DB, MAX_SHARE, MIN_CLUSTERS, MIN_FOLDS
 from radiotwin.effects.params import Estimate, Parameter
 from radiotwin.inference.sandwich import MAX_WIDTH
 from radiotwin.links import evidence_blocks
@@ -29,11 +30,7 @@ from radiotwin.twin.model.model import Fit
 from radiotwin.twin.model.uncertainty import Linearised, Secant, estimates, linearise
 
 QUANTILE = 0.95  # upper end of a 90 % interval
-MAX_SHARE = 0.5  # of what is allowed, which an interval may span: more is less than one bit learnt
-LEVELS_DB = 120.0  # span of changes of a level that can be at all, where no bounds are given
-MIN_FOLDS = 0.5  # share of the folds that must have found the parameter, too
 MIN_CHANGE_DB = 1e-6  # of a reading that an effect acts on
-MIN_CLUSTERS = 3  # effective ones, of which a spread can be told
 DOF = 4.0  # degrees of freedom of the errors, by which outliers count less
 
 

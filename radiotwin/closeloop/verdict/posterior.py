@@ -22,12 +22,10 @@ from scipy.special import expit
 
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.search.trials import Trial
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.criteria import LEAST_RATIO, NATS, SelectionCriteria
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 from radiotwin.effects.registry import effects_named
 
-LEAST_RATIO = 0.2  # of what belongs to places to noise; less is none
-NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
 NONE, OTHER = "none", "not in the catalogue"
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import brentq
 
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.criteria import EXPLAINED, SelectionCriteria
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 from radiotwin.closeloop.verdict.posterior import features, probability_of
 from radiotwin.effects.base import Effect, ResidualView, Term
@@ -24,7 +24,6 @@ from radiotwin.effects.patterns import Pattern
 
 MAX_NATS = 1e4  # more are not looked for
 LARGER, MAX_TRIALS = 2.0, 5  # times the size before, where a search does not find it
-EXPLAINED = 0.3  # of what the true pattern explains; what is found so is refined later
 MAX_SIZE = 1e3  # in any unit
 
 

@@ -210,9 +210,11 @@ class Fit(FitResult):
 
     Attributes:
         model: that was fitted.
+        shadowing: what is interpolated over the ground of what it leaves; None = nothing.
     """
 
     model: Model
+    shadowing: CorrelatedShadowing | None = None
 
     @property
     def links(self) -> Links:
@@ -271,7 +273,7 @@ class Fit(FitResult):
             tuple(self.coefficients_of(number) for number in range(len(model.effects))),
             self.coefficients[:model.level_columns.shape[1]],
             self.scale_db, model.dof, model.links.device_m, tuple(model.links.receiver_names),
-            model.links.first_s, sd_db, unheard=Unheard.of(self, sd_db))
+            model.links.first_s, sd_db, shadowing=self.shadowing, unheard=Unheard.of(self, sd_db))
 
     def predict(self, links: Links) -> Prediction:
         """Return the levels that are expected of any links, with the same devices and receivers."""

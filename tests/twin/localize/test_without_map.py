@@ -10,7 +10,7 @@ from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.links import prepare_links
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.twin.localize.without_map import locate
-from radiotwin.twin.model.model import FittedEffect, FittedModel
+from radiotwin.twin.model.model import FittedModel
 from tests.worlds import shortened
 
 AREA_M = (-200.0, 700.0, -200.0, 700.0)
@@ -42,9 +42,9 @@ class Counting(LogDistance):
         return super().predict(links)
 
 
-def model_of(channel, *effects, device_sd_db=0.0):
+def model_of(channel, effects=(), coefficients=(), device_sd_db=0.0):
     """Return a model that knows three devices."""
-    return FittedModel(channel, effects, np.zeros(2), np.array([2.0]), 5.0, np.zeros((3, 3)), ("r0", "r1"), 0.0,
+    return FittedModel(channel, effects, coefficients, np.zeros(2), np.array([2.0]), 5.0, np.zeros((3, 3)), ("r0", "r1"), 0.0,
                        device_sd_db)
 
 
@@ -58,9 +58,9 @@ def alone(open_ground, seed):
 
 def test_effects_of_devices_that_the_file_does_not_list_do_not_matter(open_ground):
     links, true_m = alone(open_ground, 14)
-    offsets = FittedEffect(DeviceGainOffset(), DeviceGainOffset.Params(members=[0, 1, 2], offsets_sd_db=0.5),
-                           np.array([9.0, -9.0, 9.0]))
-    (found,) = locate(model_of(Counting(), offsets), links, AREA_M)
+    offsets = DeviceGainOffset().with_params(DeviceGainOffset.Params(members=[0, 1, 2], offsets_sd_db=0.5))
+    model = model_of(Counting(), (offsets,), (np.array([9.0, -9.0, 9.0]),))
+    (found,) = locate(model, links, AREA_M)
     assert np.hypot(found.x_m - true_m[0], found.y_m - true_m[1]) <= found.credible_radius_m < 40
 
 
