@@ -7,7 +7,6 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from marl.figures import COLOURS
-from radiotwin.closeloop.verdict import posterior
 from radiotwin.closeloop.verdict.criteria import NATS
 from studies.tables import make_panels, markdown
 
