@@ -38,7 +38,7 @@ BOX = [130.0, 45.0, 24.0, 14.0, 70.0, 30.0]  # on a street of the small scene
 def loop_of(scene, *found):
     """Return what `write_corrected_scene` reads of a loop that found these: (effect, its parameters by name)."""
     links = SimpleNamespace(device_names=[d.device for d in scene.config.devices], device_m=scene.device_m)
-    effects = [SimpleNamespace(effect=effect(), params=effect.Params(**params)) for effect, params in found]
+    effects = [effect().with_params(effect.Params(**params)) for effect, params in found]
     return SimpleNamespace(after=SimpleNamespace(whole=SimpleNamespace(effects=effects, links=links)))
 
 

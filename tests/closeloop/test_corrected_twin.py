@@ -41,9 +41,9 @@ def test_what_only_describes_the_rest_does_not_locate(model, monkeypatch):
     trend = UnexplainedTrend("distance_m")
     folds = []
     for fold in model.folds:
-        applied = trend.with_params(trend.propose(fold.view)[0])
-        folds.append(replace(fold, model=fold.model.with_effects([*fold.effects, applied]), coefficients=np.r_[
-            fold.coefficients, np.zeros(applied.term.columns.shape[1])]))
+        curved = fold.model.with_effects([*fold.effects, trend.with_params(trend.propose(fold.view)[0])])
+        folds.append(replace(fold, model=curved, coefficients=np.r_[
+            fold.coefficients, np.zeros(curved.terms[-1].columns.shape[1])]))
     models, *_ = asked(model.extended(model.whole, folds), monkeypatch)
     assert all([own.name for own in each.effects] == ["receiver_gain_offset"] for each in models)
 

@@ -222,14 +222,14 @@ def antenna_db(links):
 class Half(GainEffect):
     name, variant, is_declared = "thing", "half of it", True
 
-    def gain_db(self, links, params):
+    def gain_db(self, links):
         return 0.5 * antenna_db(links)
 
 
 class All(Half):
     variant = "all of it"
 
-    def gain_db(self, links, params):
+    def gain_db(self, links):
         return antenna_db(links)
 
 

@@ -100,8 +100,8 @@ def test_folds_follow_no_paths_of_their_own_for_intervals(monkeypatch):
     own = [np.concatenate(estimates(linearise(fold))[0].sides_sd) for fold in model.folds]
 
     moves_m, term = [], DevicePositionError.term
-    monkeypatch.setattr(DevicePositionError, "term", lambda self, links, params, level_at: (
-        moves_m.append(params.move_m), term(self, links, params, level_at))[1])
+    monkeypatch.setattr(DevicePositionError, "term", lambda self, links, level_at: (
+        moves_m.append(self.params.move_m), term(self, links, level_at))[1])
     (found,) = effect_parameters(model)
     assert holds(found["x_m[d1]"], MASTS_M[1, 0]) and holds(found["y_m[d1]"], MASTS_M[1, 1])
     around = np.array(model.whole.effects[0].params.move_m)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -69,8 +70,10 @@ def test_no_paths_are_followed_for_what_the_map_speaks_against(moved):
 class OfUsable(DevicePositionError):
     """A position that remembers of which devices the links are that the map is asked about."""
 
+    asked: ClassVar[set[int]] = set()
+
     def contradicted(self, links):
-        self.asked = set(links.device.tolist())
+        self.asked.update(links.device.tolist())
 
 
 def test_links_of_devices_that_are_nowhere_do_not_speak_against_anything(moved):

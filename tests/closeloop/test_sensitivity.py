@@ -132,7 +132,7 @@ def test_an_effect_of_ones_own_has_a_size_that_would_have_been_seen_and_a_kind_o
     class Hum(GainEffect):
         name = "hum"
 
-        def gain_db(self, links, params):
+        def gain_db(self, links):
             return np.where(links.receiver == 1, -3.0, 0.0)
 
         def typical_patterns(self, view):

@@ -18,7 +18,7 @@ class Hail(GainEffect):
 
     name = "hail"
 
-    def gain_db(self, links, params):
+    def gain_db(self, links):
         return np.full(len(links), -1.0)
 
 
