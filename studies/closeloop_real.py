@@ -135,7 +135,8 @@ def locate_held_out(loop: Loop, model: CrossFit) -> dict[str, dict]:
         chosen = rng.permutation(np.unique(fold.device))[:DEVICES_A_FOLD]
         asked = fold.select(np.isin(fold.device, chosen))
         for found in locate(replace(learnt, **vars(known)), asked, area_m):
-            away_m = loop.links.device_m[found.device, :2] - (found.x_m, found.y_m)
+            row = loop.links.device_names.index(found.device)
+            away_m = loop.links.device_m[row, :2] - (found.x_m, found.y_m)
             rows.append((fold.flight_names[fold.flight[0]], np.hypot(*away_m),
                          found.credible_radius_m))
     located = pd.DataFrame(rows, columns=["flight", "error_m", "radius_m"])

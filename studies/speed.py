@@ -194,7 +194,8 @@ def _localisation(rng: np.random.Generator, scene: Scene, settings: dict) -> dic
     for name, search in (("search", LocalizeSettings()), ("exhaustive 1 m scan", exhaustive)):
         started = time.perf_counter()
         estimates = localize(
-            flown.receiver_m[~anchor], device[~anchor], level_db[~anchor], channel, devices=unknown,
+            flown.receiver_m[~anchor], device[~anchor], level_db[~anchor], channel,
+            devices={int(row): scene.config.devices[row].device for row in unknown},
             bounds=scene.config.extent.bounds, z_m=scene.device_m[unknown, 2], city=scene.city,
             limit_db=limit_db, seed=0, settings=search)
         found[f"{name} [s]"] = time.perf_counter() - started

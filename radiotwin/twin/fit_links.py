@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,13 +17,7 @@ from radiotwin.propagation.laws.base import MIN_DETECTED
 from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
-from radiotwin.twin.localize import (
-    DeviceEstimate,
-    LocalizeSettings,
-    TwinDevice,
-    localize,
-    read_device,
-)
+from radiotwin.twin.localize import LocalizeSettings, TwinDevice, localize
 from radiotwin.twin.twin import Twin
 
 
@@ -88,8 +82,7 @@ def reliable_m(devices: list[TwinDevice], max_radius_m: float = np.inf) -> np.nd
     """
     located = np.array([each.located and each.credible_radius_m <= max_radius_m
                         for each in devices])
-    positions_m = [(each.x_m, each.y_m, each.z_m) for each in devices]
-    return np.where(located[:, None], positions_m, np.nan)
+    return np.where(located[:, None], [each.position_m for each in devices], np.nan)
 
 
 def _fit_channel(links: Links, device_m: np.ndarray, channel: type[ChannelModel],
@@ -150,21 +143,14 @@ def _locate(links: Links, scene: Scene, channel: ChannelModel, unknown: np.ndarr
     rows = np.isin(links.device, unknown) & (known | np.isfinite(links.level_db))
     measured = links.receiver_m[rows], links.device[rows], links.level_db[rows], channel
     options: dict[str, Any] = {
-        "devices": unknown, "bounds": scene.config.extent.bounds, "city": links.city,
+        "devices": {int(index): links.device_names[index] for index in unknown},
+        "bounds": scene.config.extent.bounds, "city": links.city,
         "z_m": np.nan_to_num(links.device_m[unknown, 2], nan=ASSUMED_HEIGHT_M),
         "limit_db": limit_db, "seed": seed,
         "start_m": start_m, "settings": settings}
-    names = [links.device_names[index] for index in unknown]
-    return kept("positions", (*measured, options, names),
-                lambda: [_device(name, each) for name, each in
-                         zip(names, localize(*measured, **options), strict=True)],
-                lambda found: ({}, [asdict(each) for each in found]),
-                lambda _, content: [read_device(each) for each in content])
-
-
-def _device(name: str, found: DeviceEstimate) -> TwinDevice:
-    return TwinDevice(name, found.x_m, found.y_m, found.z_m, "unknown", bool(found.located),
-                      float(found.credible_radius_m), found.second_mode)
+    return kept("positions", (*measured, options), partial(localize, *measured, **options),
+                lambda found: ({}, [each.record for each in found]),
+                lambda _, content: [TwinDevice.from_record(each) for each in content])
 
 
 def level_of(links: Links) -> str:

@@ -16,7 +16,7 @@ from radiotwin.links.links import Columns, Ends
 from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
-from radiotwin.twin.localize import DeviceEstimate, locate, misfit, whole_area
+from radiotwin.twin.localize import TwinDevice, locate, misfit, whole_area
 from radiotwin.twin.model.model import FittedModel
 from radiotwin.twin.twin import Twin
 
@@ -100,10 +100,11 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
                      "learnt holds less where these devices are; radii are that much wider")
         found = [replace(each, credible_radius_m=widening * each.credible_radius_m)
                  for each in found]
-    table = pd.DataFrame({"device": [links.device_names[each.device] for each in found],
+    count = dict(zip(links.device_names, np.bincount(links.device)))
+    table = pd.DataFrame({"device": [each.device for each in found],
                           "x_m": [each.x_m for each in found], "y_m": [each.y_m for each in found],
                           "radius_m": [each.credible_radius_m for each in found],
-                          "links": [each.n_links for each in found]})
+                          "links": [count[each.device] for each in found]})
     table = table.round(1)
     if measurements.origin is not None:
         east_deg, north_deg = to_geographic(measurements.origin, table["x_m"], table["y_m"])
@@ -136,11 +137,13 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
                        np.nan_to_num(twin.device_m), (), links.first_s, 0.0)
 
 
-def _widening(model: FittedModel, links: Links, found: list[DeviceEstimate]) -> float:
+def _widening(model: FittedModel, links: Links, found: list[TwinDevice]) -> float:
     """Return how much larger residuals are than they were at home; 1 where they are much alike."""
     if np.isnan(model.typical_misfit) or not found:
         return 1.0
-    misfits = [misfit(model, links.select(links.device == each.device), each) for each in found]
+    row = {name: row for row, name in enumerate(links.device_names)}
+    misfits = [misfit(model, links.select(links.device == row[each.device]), each)
+               for each in found]
     ratio = float(np.sqrt(np.nanmedian(misfits) / model.typical_misfit))
     return ratio if ratio > MIN_WIDENING else 1.0
 

@@ -17,13 +17,13 @@ from radiotwin.effects.params import Seconds
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_folder, require_writable
-from radiotwin.io.forms import MAX_POSITION_M, Origin
+from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import parse_json, read_bytes, read_text, require_within
 from radiotwin.links.links import Columns, Ends, Flown, Links, World
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB
 from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_channel
-from radiotwin.twin.localize import TwinDevice
+from radiotwin.twin.localize.estimate import Name, TwinDevice
 from radiotwin.twin.model.blend import Blend
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
 from radiotwin.twin.model.model import FittedModel, Unheard
@@ -33,10 +33,8 @@ if TYPE_CHECKING:
 
 SCHEMA = "radiotwin.twin/2"
 CHANNEL_FILE = "channel.safetensors"
-_Coordinate = Annotated[float, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 _Decibels = Annotated[float, Field(ge=-MAX_DB, le=MAX_DB)]
 _SdDb = Annotated[float, Field(ge=1e-9, le=MAX_SD_DB)]
-_Name = Annotated[str, Field(min_length=1, max_length=1000)]
 _Scalar = str | int | float | bool | None
 _Json = _Scalar | list[_Scalar] | dict[str, _Scalar]
 TWIN_FILE = "twin.json"
@@ -45,19 +43,6 @@ TWIN_FILES = {TWIN_FILE, CHANNEL_FILE, "report.html"}  # the last is what `radio
 
 class _Strict(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
-
-
-class DeviceRecord(_Strict):
-    """A device; null where a position or a radius is not known."""
-
-    device: _Name
-    x_m: _Coordinate | None
-    y_m: _Coordinate | None
-    z_m: _Coordinate | None
-    role: Literal["anchor", "unknown"]
-    located: bool
-    credible_radius_m: Annotated[float, Field(ge=0, le=MAX_POSITION_M)] | None
-    second_mode: Annotated[list[_Coordinate], Field(min_length=3, max_length=3)] | None
 
 
 class FittedEffectRecord(_Strict):
@@ -85,7 +70,7 @@ class FittedRecord(_Strict):
     scale_db: Annotated[list[_SdDb], Field(min_length=1, max_length=2)]
     dof: Annotated[float, Field(gt=2, le=1e6)]
     effects: list[FittedEffectRecord]
-    receivers: list[_Name]
+    receivers: list[Name]
     first_s: Seconds | None
     device_sd_db: Annotated[float, Field(ge=0, le=MAX_SD_DB)]
     likelihood_power: Annotated[float, Field(gt=0, le=1)]
@@ -125,7 +110,7 @@ class TwinRecord(_Strict):
 
     schema_: Literal["radiotwin.twin/2"] = Field(alias="schema")
     channel: ChannelRecord
-    devices: Annotated[list[DeviceRecord], Field(min_length=1)]
+    devices: Annotated[list[TwinDevice], Field(min_length=1)]
     level: Literal["gain_db", "rssi_dbm"]
     limit_db: _Decibels | None
     provenance: dict[str, _Json]
@@ -133,7 +118,7 @@ class TwinRecord(_Strict):
 
     @field_validator("devices")
     @classmethod
-    def _unique(cls, devices: list[DeviceRecord]) -> list[DeviceRecord]:
+    def _unique(cls, devices: list[TwinDevice]) -> list[TwinDevice]:
         names = [device.device for device in devices]
         if len(set(names)) < len(names):
             raise ValueError("a device is listed twice")
@@ -166,7 +151,7 @@ def encode_twin(twin: Twin) -> tuple[str, bytes]:
     beside = fitted.blend.state()[0] if fitted and fitted.blend else None
     record = {"schema": SCHEMA, "channel": {"model": twin.channel.name, "file": CHANNEL_FILE},
               "level": twin.level, "limit_db": twin.limit_db,
-              "devices": [_device_record(device) for device in twin.devices],
+              "devices": [device.record for device in twin.devices],
               "fitted": _fitted_record(fitted) if fitted else None, "provenance": twin.provenance}
     return json.dumps(record, indent=1, allow_nan=False), encode_channel(twin.channel, beside)
 
@@ -214,10 +199,9 @@ def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
         content = TwinRecord.model_validate(given)
         if content.channel.model != model.name:
             raise ValueError(f"the channel is {model.name}, not {content.channel.model[:60]}")
-        devices = [_device(device) for device in content.devices]
         fitted = None if content.fitted is None else _fitted(
-            content.fitted, model, devices, beside)
-        return {"channel": model, "devices": devices, "level": content.level,
+            content.fitted, model, content.devices, beside)
+        return {"channel": model, "devices": content.devices, "level": content.level,
                 "limit_db": content.limit_db, "provenance": content.provenance, "fitted": fitted}
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise BadInput(f"{source} is damaged ({type(error).__name__}: {str(error)[:500]}); run "
@@ -330,17 +314,3 @@ def _check_levels(record: FittedRecord, channel: ChannelModel) -> None:
     given = len(record.level_coefficients), len(record.scale_db)
     if given not in allowed:
         raise ValueError(f"{given[0]} levels and {given[1]} scales do not fit {channel.name}")
-
-
-def _device_record(device: TwinDevice) -> dict[str, Any]:
-    """Return a device for JSON, which has neither NaN nor infinity: they are null."""
-    return {name: None if isinstance(value, float) and not np.isfinite(value) else value
-            for name, value in vars(device).items()}
-
-
-def _device(record: DeviceRecord) -> TwinDevice:
-    x_m, y_m, z_m = (np.nan if each is None else each
-                     for each in (record.x_m, record.y_m, record.z_m))
-    radius_m = np.inf if record.credible_radius_m is None else record.credible_radius_m
-    mode = None if record.second_mode is None else (*record.second_mode,)
-    return TwinDevice(record.device, x_m, y_m, z_m, record.role, record.located, radius_m, mode)  # type: ignore[arg-type]

@@ -110,8 +110,7 @@ class Twin(Summarised):
     @property
     def device_m(self) -> np.ndarray:
         """(k, 3) positions [m]; NaN where nothing is known of a device's."""
-        positions_m = [(each.x_m, each.y_m, each.z_m) for each in self.devices]
-        return np.array(positions_m, dtype=float).reshape(-1, 3)
+        return np.array([each.position_m for each in self.devices], dtype=float).reshape(-1, 3)
 
     @property
     def effects(self) -> tuple[Effect, ...]:

@@ -55,7 +55,8 @@ def test_transmitters_of_days_that_are_held_out_are_located_better(loop):
             day, learnt = loop.links.select(model.index == number), fold.learnt
             devices = np.random.default_rng(0).permutation(np.unique(day.device))[:DEVICES_A_DAY]
             asked = day.select(np.isin(day.device, devices))
-            off_m += [np.hypot(*(loop.links.device_m[each.device, :2] - (each.x_m, each.y_m)))
+            row = {name: row for row, name in enumerate(loop.links.device_names)}
+            off_m += [np.hypot(*(loop.links.device_m[row[each.device], :2] - (each.x_m, each.y_m)))
                       for each in locate(learnt, asked, whole_area(learnt, asked))]
         return np.array(off_m)
     before_m, after_m = errors_m(loop.before), errors_m(loop.after)

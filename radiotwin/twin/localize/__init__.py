@@ -2,19 +2,9 @@
 
 from radiotwin.twin.localize.along_paths import Relocation
 from radiotwin.twin.localize.calibration import RadiusCalibration, calibrate_radii, misfit
-from radiotwin.twin.localize.estimate import (
-    DeviceEstimate,
-    LocalizeSettings,
-    TwinDevice,
-    read_device,
-)
+from radiotwin.twin.localize.estimate import LocalizeSettings, TwinDevice
 from radiotwin.twin.localize.on_map import localize
-from radiotwin.twin.localize.without_map import (
-    locate,
-    position_log_likelihood,
-    whole_area,
-)
+from radiotwin.twin.localize.without_map import locate, position_log_likelihood, whole_area
 
-__all__ = ["DeviceEstimate", "LocalizeSettings", "RadiusCalibration", "Relocation", "TwinDevice",
-           "calibrate_radii", "localize", "locate", "misfit", "position_log_likelihood",
-           "read_device", "whole_area"]
+__all__ = ["LocalizeSettings", "RadiusCalibration", "Relocation", "TwinDevice", "calibrate_radii",
+           "localize", "locate", "misfit", "position_log_likelihood", "whole_area"]

@@ -10,7 +10,7 @@ The powers along paths that were followed are kept for other parts of the same l
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -27,7 +27,7 @@ from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept_with_name
 from radiotwin.runtime.processes import in_threads
 from radiotwin.scene.citymap import CityMap
-from radiotwin.twin.localize.estimate import TwinDevice, read_device
+from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.model.model import Fit, Model
 
 Followed = dict[tuple[float, ...], dict[int, float]]
@@ -111,7 +111,7 @@ class Relocation:
         unknown = sum(device.role == "unknown" for device in devices)
         if unknown > MAX_DEVICES:
             return list(devices)
-        device_m = np.array([(each.x_m, each.y_m, each.z_m) for each in devices])
+        device_m = np.array([each.position_m for each in devices])
         fits = [Model.build(links, each, DOF, device_m=device_m).fit()
                 for each in (channel.law, channel)]
         searches: dict[int, _Question] = {}
@@ -161,10 +161,10 @@ class Relocation:
         known = {position_m: len(powers) for position_m, powers in followed.items()}
 
         def write(found: TwinDevice) -> Piece:
-            return followed_since(known, followed), asdict(found)
+            return followed_since(known, followed), found.record
 
         def read(arrays: dict[str, np.ndarray], content: Any) -> TwinDevice:
-            found = read_device(content)
+            found = TwinDevice.from_record(content)
             add_followed(arrays, followed)
             return found
 
@@ -385,7 +385,7 @@ class _Searches:
         found = replace(search, relocation=alone, tried={}).from_law(device, before)
         city = search.by_law.fit.links.city
         assert city is not None
-        return followed_since({}, alone.powers.get(city, {})), asdict(found)
+        return followed_since({}, alone.powers.get(city, {})), found.record
 
 
 def _apart(positions_m: np.ndarray, apart_m: float, maximum: int) -> list[np.ndarray]:

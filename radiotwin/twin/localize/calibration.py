@@ -17,7 +17,7 @@ import numpy as np
 
 from radiotwin.effects.arrays import subsample
 from radiotwin.links import Links
-from radiotwin.twin.localize.estimate import DeviceEstimate
+from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.localize.without_map import (
     CREDIBLE,
     MIN_LINKS,
@@ -109,14 +109,13 @@ def radius_factor(ratios: np.ndarray) -> float:
     return max(float(np.sqrt(square / (PRIOR_TRIALS + len(ratios)))), 1.0)
 
 
-def misfit(model: FittedModel, own: Links, place: DeviceEstimate) -> float:
+def misfit(model: FittedModel, own: Links, place: TwinDevice) -> float:
     """Return the mean square of residuals over their scale, of the links of a located device.
 
     The device's own level, as far as it may have one, counts as no misfit.
     """
-    device_m = np.array([[place.x_m, place.y_m, place.z_m]])
     known = len(model.device_m)
-    there = own.of_devices(np.full(len(own), known), np.vstack([model.device_m, device_m]),
+    there = own.of_devices(np.full(len(own), known), np.vstack([model.device_m, place.position_m]),
                            [f"device {i}" for i in range(known + 1)],
                            frozenset()).since(model.first_s)
     fit = model.on_links(there)

@@ -6,7 +6,7 @@ of all devices in one batch, then search for the most likely positions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.runtime.console import progress
-from radiotwin.twin.localize.estimate import DeviceEstimate, LocalizeSettings
+from radiotwin.twin.localize.estimate import LocalizeSettings, TwinDevice
 from radiotwin.twin.localize.likelihood import Likelihood, design_effect, residual_correlation
 from radiotwin.twin.localize.observations import (
     Channel,
@@ -254,7 +254,7 @@ def localize(
     level_db: np.ndarray,
     channel: Channel,
     *,
-    devices: np.ndarray,
+    devices: Mapping[int, str],
     bounds: Bounds,
     z_m: np.ndarray | float,
     city: CityMap | None = None,
@@ -262,7 +262,7 @@ def localize(
     seed: int,
     settings: LocalizeSettings | None = None,
     start_m: np.ndarray | None = None,
-) -> list[DeviceEstimate]:
+) -> list[TwinDevice]:
     """Estimate every device's position with the channel as it is.
 
     Repeated measurements are merged (`Observations`, `Likelihood`); the map is scanned with every
@@ -276,7 +276,7 @@ def localize(
         device: (n,) int, device of each measurement.
         level_db: (n,) gain [dB] or received power [dBm]; NaN: not detected.
         channel: fitted, with the same device indices in its links.
-        devices: (k,) indices of the devices to locate; rows of others are not used.
+        devices: index and name of the k devices to locate; rows of others are not used.
         bounds: x_min, x_max, y_min, y_max within which they are [m].
         z_m: their heights, (k,) or one for all [m].
         city: 3D map; None: every link has line of sight.
@@ -284,28 +284,26 @@ def localize(
             were not detected are left out.
         seed: of the swarms; the same seed gives the same estimates.
         settings: of the search; None: the defaults.
-        start_m: (k, 2 or 3) an earlier estimate of each, where one more swarm starts [m]; NaN:
-            none.
+        start_m: (k, 2) an earlier estimate of each, where one more swarm starts [m]; NaN: none.
 
     Returns:
-        one estimate a device, in their order.
+        the devices in their order.
 
     Raises:
-        BadInput: shapes, values or bounds that cannot be used, or buildings leave no position.
+        BadInput: buildings leave no position.
     """
     settings = settings or LocalizeSettings()
-    devices = _checked_devices(devices)
-    _check_bounds(bounds)
-    z_m = _heights(z_m, len(devices))
-    start_m = _starts(start_m, len(devices))
-    observations = merge_repeats(receiver_m, device, level_db, devices,
+    z_m = np.broadcast_to(z_m, len(devices))
+    if start_m is None:
+        start_m = np.full((len(devices), 2), np.nan)
+    observations = merge_repeats(receiver_m, device, level_db, np.array(list(devices)),
                                  use_missed=limit_db is not None)
     rng = np.random.default_rng(seed)
     usable = np.array([data.usable for data in observations.devices], bool)
     searches = [Search(observations, channel, np.flatnonzero(usable & (z_m == z)), z, bounds, city,
                        limit_db, settings, rng)
                 for z in np.unique(z_m[usable])]
-    found: dict[int, tuple[Posterior, float, Search]] = {}
+    found: dict[int, tuple[Posterior, Search]] = {}
     with progress("locating", total=settings.iterations + 3 * len(devices)) as advance:
         _set_repeat_share(searches, observations)
         advance(len(devices))
@@ -322,9 +320,10 @@ def localize(
                 effect = design_effect(residuals[k], correlation)
                 posterior = refine(partial(search.log_likelihood, k), scan.centre_m, scan.point_m,
                                    scan.value[i], scan.width_m, peaks[k], 1.0 / effect)
-                found[k] = (posterior, effect, search)
+                found[k] = (posterior, search)
                 advance(1)
-    return [_estimate(data, z_m[k], found.get(k)) for k, data in enumerate(observations.devices)]
+    return [_estimate(data, devices[data.device], z_m[k], found.get(k))
+            for k, data in enumerate(observations.devices)]
 
 
 def _set_repeat_share(searches: list[Search], observations: Observations) -> None:
@@ -380,49 +379,14 @@ def _run_swarms(
     return {k: best_m[order][devices[order] == k] for k in search_of}
 
 
-def _estimate(data: DeviceObservations, z_m: float,
-              found: tuple[Posterior, float, Search] | None) -> DeviceEstimate:
+def _estimate(data: DeviceObservations, name: str, z_m: float,
+              found: tuple[Posterior, Search] | None) -> TwinDevice:
     x_m = y_m = np.nan
-    radius_m, other, effect, located = np.inf, None, 1.0, False
+    radius_m, other, located = np.inf, None, False
     if found is not None:
-        posterior, effect, search = found
+        posterior, search = found
         modes = posterior.modes(search.allowed)
         x_m, y_m = map(float, modes[0][0])
         radius_m, other = posterior.radius(modes[0][0]), second_mode(modes)
-        located = data.n_detected > 0 and posterior.region_share() < VAGUE_SHARE
-    return DeviceEstimate(data.device, x_m, y_m, float(z_m), radius_m, other, data.n_detected,
-                          data.n_links, effect, located)
-
-
-def _checked_devices(devices: np.ndarray) -> np.ndarray:
-    devices = np.atleast_1d(devices)
-    if (devices.ndim != 1 or not np.issubdtype(devices.dtype, np.integer)
-            or len(np.unique(devices)) < len(devices)):
-        raise BadInput(f"devices to locate {devices.tolist()}: expected different integers, as in "
-                       "`device`")
-    return devices
-
-
-def _check_bounds(bounds: Bounds) -> None:
-    good = len(bounds) == 4 and np.isfinite(bounds).all()
-    if not good or bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
-        raise BadInput(f"bounds {tuple(bounds)}: expected finite (x_min, x_max, y_min, y_max) [m] "
-                       "with min < max")
-
-
-def _heights(z_m: np.ndarray | float, n_devices: int) -> np.ndarray:
-    z_m = np.asarray(z_m, float)
-    if z_m.shape not in ((), (n_devices,)) or not np.isfinite(z_m).all():
-        raise BadInput(f"device heights of shape {z_m.shape}: expected {n_devices} finite heights "
-                       "[m], or one for all")
-    return np.broadcast_to(z_m, n_devices).copy()
-
-
-def _starts(start_m: np.ndarray | None, n_devices: int) -> np.ndarray:
-    if start_m is None:
-        return np.full((n_devices, 2), np.nan)
-    start_m = np.asarray(start_m, float)
-    if start_m.ndim != 2 or len(start_m) != n_devices or start_m.shape[1] not in (2, 3):
-        raise BadInput(f"earlier estimates of shape {start_m.shape}: expected ({n_devices}, 2) or "
-                       f"({n_devices}, 3)")
-    return start_m[:, :2]
+        located = len(data.seen) > 0 and posterior.region_share() < VAGUE_SHARE
+    return TwinDevice(name, x_m, y_m, float(z_m), "unknown", located, radius_m, other)

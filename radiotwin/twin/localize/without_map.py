@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from radiotwin.links import Links
-from radiotwin.twin.localize.estimate import DeviceEstimate
+from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.model.model import FittedModel
 
 COARSE_CELLS, MAX_FINE_CELLS, MAX_SPLIT = 1500, 640, 4
@@ -35,23 +35,20 @@ class PositionPosterior:
     """Likelihood of the links of one device over the cells where nearly all probability is.
 
     Attributes:
-        device: row of the links' devices.
+        device: its name.
         cells_m: (c, 2) their centres [m].
         width_m: their width [m].
         log_likelihood: (c,) of the links.
         apart_m: (c, c) distance between cells [m].
         z_m: height of the device [m].
-        n_detected, n_links: links that were detected, and all.
     """
 
-    device: int
+    device: str
     cells_m: np.ndarray
     width_m: float
     log_likelihood: np.ndarray
     apart_m: np.ndarray
     z_m: float
-    n_detected: int
-    n_links: int
 
     @classmethod
     def of(cls, model: FittedModel, own: Links, area_m: Area, power: float
@@ -61,11 +58,11 @@ class PositionPosterior:
         coarse = position_log_likelihood(model, own, coarse_m)
         cells_m, width_m = _finer(coarse, power, coarse_m, width_m)
         device = int(own.device[0])
-        return cls(device, cells_m, width_m, position_log_likelihood(model, own, cells_m),
-                   cdist(cells_m, cells_m), float(own.device_m[device, 2]),
-                   int(np.isfinite(own.level_db).sum()), len(own))
+        return cls(own.device_names[device], cells_m, width_m,
+                   position_log_likelihood(model, own, cells_m), cdist(cells_m, cells_m),
+                   float(own.device_m[device, 2]))
 
-    def estimate(self, power: float) -> DeviceEstimate:
+    def estimate(self, power: float) -> TwinDevice:
         """Return the position by the likelihood as it is, and the radius by its power."""
         best = int((self.apart_m @ _share(self.log_likelihood)).argmin())
         order = np.argsort(self.apart_m[best])
@@ -73,12 +70,11 @@ class PositionPosterior:
         reached = int(np.searchsorted(cumulated, CREDIBLE))
         radius_m = self.apart_m[best][order[min(reached, len(order) - 1)]] + self.width_m / 2
         x_m, y_m = self.cells_m[best].tolist()
-        return DeviceEstimate(self.device, x_m, y_m, self.z_m, float(radius_m), None,
-                              self.n_detected, self.n_links, 1 / power, True)
+        return TwinDevice(self.device, x_m, y_m, self.z_m, "unknown", True, float(radius_m), None)
 
 
 def locate(model: FittedModel, links: Links, area_m: Area,
-           on_progress: Callable[[], None] = lambda: None) -> Iterator[DeviceEstimate]:
+           on_progress: Callable[[], None] = lambda: None) -> Iterator[TwinDevice]:
     """Locate the devices of some links, whatever position the links have them at but for height.
 
     Args:

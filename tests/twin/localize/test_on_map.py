@@ -18,7 +18,7 @@ def all_over(n, rng):
 
 
 def one(receiver_m, level_db, channel, **others):
-    others = {"bounds": BOUNDS, "z_m": 1.5, "seed": 0, "settings": QUICK, "devices": [0]} | others
+    others = {"bounds": BOUNDS, "z_m": 1.5, "seed": 0, "settings": QUICK, "devices": {0: "d"}} | others
     return localize(receiver_m, np.zeros(len(level_db), int), level_db, channel, **others)[0]
 
 
@@ -30,14 +30,13 @@ def test_free_space_without_map_or_anchors(free_space):
     levels = [free_space_levels(at[:2], receiver_m, rng, 0.3, at[2]) for at in truth.values()]
     found = localize(
         np.tile(receiver_m, (2, 1)), np.repeat([7, 3], 200), np.concatenate(levels), free_space,
-        devices=[7, 3], bounds=BOUNDS, z_m=[1.5, 20.0], seed=0, settings=QUICK,
+        devices={7: "near", 3: "high"}, bounds=BOUNDS, z_m=[1.5, 20.0], seed=0, settings=QUICK,
     )  # fmt: skip
-    assert [e.device for e in found] == [7, 3]
+    assert [e.device for e in found] == ["near", "high"]
     assert [e.z_m for e in found] == [1.5, 20.0]
     for estimate, at in zip(found, truth.values()):
         assert np.hypot(estimate.x_m - at[0], estimate.y_m - at[1]) < 2.0
         assert estimate.located and estimate.second_mode is None
-        assert (estimate.n_detected, estimate.n_links) == (200, 200)
 
 
 def test_mirror_image_is_a_second_mode(free_space):
@@ -119,13 +118,13 @@ def test_a_start_helps_a_search_that_is_too_coarse(
     def worst_m(start_m):
         found = localize(
             *data, published_law,
-            devices=np.arange(20), bounds=(0, 600, 0, 800), z_m=1.5, city=city, limit_db=-120.0, seed=0,
+            devices={row: f"d{row}" for row in range(20)}, bounds=(0, 600, 0, 800), z_m=1.5, city=city, limit_db=-120.0, seed=0,
             start_m=start_m,
             settings=LocalizeSettings(scan_step_m=80.0, swarms=1, particles=3, iterations=2),
         )  # fmt: skip
         return max(np.hypot(e.x_m - x, e.y_m - y) for e, (x, y) in zip(found, xy_m))
 
-    assert worst_m(np.column_stack([xy_m + [1.5, -1.5], np.full(20, 1.5)])) < 10.0
+    assert worst_m(xy_m + [1.5, -1.5]) < 10.0
     assert worst_m(None) > 20.0
 
 
@@ -137,7 +136,7 @@ def test_same_seed_same_estimates_whatever_the_chunks(city, flown, measured, pub
         settings = LocalizeSettings(scan_step_m=20.0, swarms=2, iterations=5, chunk_links=chunk_links)
         return localize(
             *data, published_law,
-            devices=[0, 1], bounds=(0, 600, 0, 800), z_m=1.5, city=city, limit_db=-120.0, seed=3, settings=settings,
+            devices={0: "a", 1: "b"}, bounds=(0, 600, 0, 800), z_m=1.5, city=city, limit_db=-120.0, seed=3, settings=settings,
         )  # fmt: skip
 
     assert run(1 << 18) == run(1 << 18) == run(1000)
@@ -160,7 +159,7 @@ def test_a_channel_that_differs_between_devices(free_space):
         levels.append(free_space_levels(xy_m, receiver_m, rng, 1.0) - 15.0 * device + 6.0 * np.cos(azimuth))
     found = localize(
         np.tile(receiver_m, (2, 1)), np.repeat([0, 1], 120), np.concatenate(levels), Directional(),
-        devices=[0, 1], bounds=BOUNDS, z_m=1.5, seed=0, settings=QUICK,
+        devices={0: "a", 1: "b"}, bounds=BOUNDS, z_m=1.5, seed=0, settings=QUICK,
     )  # fmt: skip
     assert np.hypot(found[0].x_m - 100, found[0].y_m - 300) < 6
     assert np.hypot(found[1].x_m - 300, found[1].y_m - 150) < 6
@@ -172,11 +171,10 @@ def test_never_detected_is_not_located(free_space):
     blank = np.full(2, np.nan)
     silent = one(receiver_m, blank, free_space)
     assert not silent.located and np.isnan(silent.x_m) and np.isinf(silent.credible_radius_m)
-    assert (silent.n_detected, silent.n_links) == (0, 2)
     vague = one(receiver_m, blank, free_space, limit_db=-80.0)
     assert not vague.located and vague.credible_radius_m > 150
     nothing = one(np.empty((0, 3)), np.empty(0), free_space)
-    assert not nothing.located and nothing.n_links == 0
+    assert not nothing.located
 
 
 def test_one_link_is_too_little(free_space):
@@ -187,21 +185,4 @@ def test_one_link_is_too_little(free_space):
             return free_space.predict(links)[0], np.full(len(links), 30.0)
 
     estimate = one(np.array([[200.0, 200.0, 60.0]]), np.array([-85.0]), Vague())
-    assert not estimate.located and estimate.n_detected == 1
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"bounds": (0, 0, 0, 400)}, "bounds"),
-        ({"bounds": (0, np.nan, 0, 400)}, "bounds"),
-        ({"z_m": [1.5, 1.5]}, "1 finite heights"),
-        ({"z_m": np.nan}, "finite heights"),
-        ({"devices": [0, 0]}, "different integers"),
-        ({"devices": [0.5]}, "different integers"),
-        ({"start_m": [[1.0]]}, r"\(1, 2\) or \(1, 3\)"),
-    ],
-)
-def test_bad_arguments(free_space, change, message):
-    with pytest.raises(BadInput, match=message):
-        one(np.array([[0.0, 0.0, 60.0]]), np.array([-80.0]), free_space, **change)
+    assert not estimate.located

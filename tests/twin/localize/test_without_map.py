@@ -19,7 +19,8 @@ AREA_M = (-200.0, 700.0, -200.0, 700.0)
 def errors_m(model, links, truth_m):
     """Return distance to the true position and radius of each device."""
     found = locate(model, links, AREA_M)
-    return np.array([[np.hypot(each.x_m - truth_m[each.device, 0], each.y_m - truth_m[each.device, 1]), each.credible_radius_m]
+    true_m = dict(zip(links.device_names, truth_m))
+    return np.array([[np.hypot(each.x_m - true_m[each.device][0], each.y_m - true_m[each.device][1]), each.credible_radius_m]
                      for each in found])
 
 
