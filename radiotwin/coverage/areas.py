@@ -74,17 +74,19 @@ class CoverageGrid:
                    step_m, height_m)
 
     @classmethod
-    def of_map(cls, lattice: Lattice) -> "CoverageGrid":
-        """Return the cells around the positions of a radio map.
-
-        Args:
-            lattice: equally spaced, with one altitude.
+    def of_map(cls, lattice: Lattice, level: int) -> "CoverageGrid":
+        """Return the cells around the positions of a radio map at one of its altitudes.
 
         Raises:
-            BadInput: there are too many.
+            BadInput: they are not equally far apart, so that they have no cells, or too many.
         """
+        step_m = lattice.step_m
+        if not step_m or any(not np.allclose(np.diff(axis), step_m, rtol=0, atol=1e-6 * step_m)
+                             for axis in (lattice.x_m, lattice.y_m)):
+            raise BadInput("the radio map's positions are not equally far apart, so that shares of "
+                           "an area cannot be told; make a map with one step")
         COVERAGE_CELLS.check(len(lattice.x_m) * len(lattice.y_m), "the radio map's positions")
-        return cls(lattice.x_m, lattice.y_m, lattice.step_m, float(lattice.z_m[0]),
+        return cls(lattice.x_m, lattice.y_m, step_m, float(lattice.z_m[level]),
                    lattice.ground_m is not None)
 
     @property
@@ -106,12 +108,7 @@ class CoverageGrid:
             yield slice(start, min(start + rows, len(self.y_m)))
 
     def receivers_m(self, rows: slice, ground: CityMap | None) -> np.ndarray:
-        """Return the positions (n, 3) of the receivers of some rows [m].
-
-        Args:
-            rows: of cells.
-            ground: 3D map of the ground that they stand on; None: the datum.
-        """
+        """Return the positions (n, 3) of the receivers of some rows [m], see `at_height`."""
         x, y = (each.ravel() for each in np.meshgrid(self.x_m, self.y_m[rows]))
         return self.at_height(x, y, ground)
 
@@ -121,7 +118,7 @@ class CoverageGrid:
         Args:
             x_m: (n,) to the east [m].
             y_m: (n,) to the north [m].
-            ground: as of `receivers_m`.
+            ground: 3D map of the ground that they stand on; None: the datum.
         """
         bottom_m: np.ndarray | float = 0.0
         if ground is not None and self.above_ground:

@@ -7,6 +7,7 @@ import io
 import json
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,6 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import local_crs, to_geographic
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_file, atomic_path
-from radiotwin.io.forms import Origin
 from radiotwin.maps.export.geotiff import GDAL_OPTIONS, georeference, require_rasterio
 from radiotwin.maps.export.kmz import OPACITY, Overlay, enlarged_png, write_overlays
 from radiotwin.scene import Scene
@@ -36,39 +36,24 @@ RASTERS = ("received_power_dbm", "received_power_sd_db", "best_server", "snr_db"
            "rate_bps", "coverage_probability")
 
 
-def require_vectors(path: Path) -> Any:
-    """Return the packages rasterio's features and pyogrio.
-
-    Args:
-        path: of the GeoPackage, for the message.
-
-    Raises:
-        BadInput: one is not installed.
-    """
+def _require_vectors() -> Any:
+    """Return the packages rasterio's features and pyogrio; raise BadInput if one is missing."""
     try:
         import pyogrio
         from rasterio import features
     except ImportError as error:
-        raise BadInput(f"{path}: GeoPackages are written with the packages rasterio and pyogrio, "
-                       f"and {error.name} is not installed; install both with `pip install "
-                       "'radiotwin[gis]'`") from None
+        raise BadInput("coverage.gpkg: GeoPackages are written with the packages rasterio and "
+                       f"pyogrio, and {error.name} is not installed; install both with `pip "
+                       "install 'radiotwin[gis]'`") from None
     return features, pyogrio
 
 
-def write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
+def _write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
     """Write a layer for each raster, with a multipolygon for each class, and one of transmitters.
 
     Coordinates are WGS84 degrees; local metres, without a system, where the scene has no origin.
-
-    Args:
-        coverage: of the network.
-        scene: whose origin places it on the globe.
-        path: of the .gpkg file.
-
-    Raises:
-        BadInput: a package is not installed.
     """
-    features, pyogrio = require_vectors(path)
+    features, pyogrio = _require_vectors()
     grid, origin = coverage.grid, scene.config.origin
     transform = georeference(grid.x_m, grid.y_m, grid.step_m, origin)["transform"]
 
@@ -116,20 +101,15 @@ def _write(pyogrio: Any, path: Path, layer: str, shapes: np.ndarray, kind: str,
 
 
 def write_tables(coverage: Coverage, folder: Path) -> None:
-    """Write `coverage.json`, with everything, and `coverage.csv`, a row for each share.
-
-    Args:
-        coverage: of the network.
-        folder: to write to.
-    """
+    """Write `coverage.json`, with everything, and `coverage.csv`, a row for each share."""
     with atomic_file(folder / "coverage.json") as file:
         file.write(json.dumps(coverage.summary, indent=1, allow_nan=False,
                               ensure_ascii=False).encode())
     with atomic_file(folder / "coverage.csv") as file:
-        write_csv(share_table(coverage), file)
+        write_csv(_share_table(coverage), file)
 
 
-def share_table(coverage: Coverage) -> pd.DataFrame:
+def _share_table(coverage: Coverage) -> pd.DataFrame:
     """Return a row for each area, quantity and threshold: shares of the area, and square metres."""
     rows = []
     for area in coverage.summary["areas"]:
@@ -144,14 +124,8 @@ def share_table(coverage: Coverage) -> pd.DataFrame:
     return pd.DataFrame(rows).reindex(columns=columns)
 
 
-def write_netcdf(coverage: Coverage, scene: Scene, path: Path) -> None:
-    """Write all rasters as NetCDF-4 after the CF conventions, for `xarray.open_dataset`.
-
-    Args:
-        coverage: of the network.
-        scene: whose origin places it on the globe.
-        path: of the .nc file.
-    """
+def _write_netcdf(coverage: Coverage, scene: Scene, path: Path) -> None:
+    """Write all rasters as NetCDF-4 after the CF conventions, for `xarray.open_dataset`."""
     dataset, origin = coverage.dataset.copy(), scene.config.origin
     dataset["indoor"] = dataset["indoor"].astype(np.int8)
     dataset.attrs["Conventions"] = "CF-1.11"
@@ -170,17 +144,8 @@ def write_netcdf(coverage: Coverage, scene: Scene, path: Path) -> None:
         file.write(data.getbuffer())
 
 
-def write_geotiffs(coverage: Coverage, scene: Scene, folder: Path) -> None:
-    """Write a GeoTIFF for each raster, north up: a band in its unit, NaN or -1 for no data.
-
-    Args:
-        coverage: of the network.
-        scene: whose origin places it on the globe.
-        folder: to write to.
-
-    Raises:
-        BadInput: rasterio is not installed.
-    """
+def _write_geotiffs(coverage: Coverage, scene: Scene, folder: Path) -> None:
+    """Write a GeoTIFF for each raster, north up: a band in its unit, NaN or -1 for no data."""
     rasterio = require_rasterio(folder / "received_power.tif")
     grid = coverage.grid
     tags = {name: str(value) for name, value in coverage.dataset.attrs.items()}
@@ -203,34 +168,23 @@ def write_geotiffs(coverage: Coverage, scene: Scene, folder: Path) -> None:
                 out.write(memory.getbuffer())
 
 
-def write_kmz(coverage: Coverage, scene: Scene, path: Path) -> None:
-    """Write an overlay for each raster, with the colours of its classes, for Google Earth.
+def _write_kmz(coverage: Coverage, scene: Scene, path: Path) -> None:
+    """Write an overlay for each raster, with the colours of its classes, for Google Earth."""
+    legends = {name: legend_of(name, coverage) for name in drawn_rasters(coverage)}
 
-    Args:
-        coverage: of the network.
-        scene: with an origin.
-        path: of the .kmz file.
-    """
-    names = drawn_rasters(coverage)
-    legends = {name: legend_of(name, coverage) for name in names}
-
-    def draw(name: str) -> bytes:
-        legend = legends[name]
+    def draw(name: str, legend: Legend) -> bytes:
         classes = legend.classes(coverage.dataset[name].values)
         colours = (to_rgba_array(legend.colours) * 255).astype(np.uint8)
         pixels = colours[np.maximum(classes, 0)]
         pixels[..., 3] = np.where(classes >= 0, OPACITY, 0)
         return enlarged_png(pixels)
 
-    def drawer(name: str) -> Callable[[], bytes]:
-        return lambda: draw(name)
-
-    overlays = [Overlay("coverage", legends[name].title, not row, drawer(name))
-                for row, name in enumerate(names)]
+    overlays = [Overlay("coverage", legend.title, not row, partial(draw, name, legend))
+                for row, (name, legend) in enumerate(legends.items())]
     marks = {each.name: (float(each.position_m[0]), float(each.position_m[1]))
              for each in coverage.transmitters if np.isfinite(each.position_m).all()}
     write_overlays(path, scene, coverage.grid.bounds_m, overlays, marks,
-                   _legend_png([legends[name] for name in names]))
+                   _legend_png([*legends.values()]))
 
 
 def _legend_png(legends: list[Legend]) -> bytes:
@@ -286,26 +240,25 @@ def write_formats(coverage: Coverage, scene: Scene, folder: Path, formats: list[
         formats: names of `FORMATS`; `png` is left to `radiotwin.report`.
     """
     if "nc" in formats:
-        write_netcdf(coverage, scene, folder / "coverage.nc")
+        _write_netcdf(coverage, scene, folder / "coverage.nc")
     if "tif" in formats:
-        write_geotiffs(coverage, scene, folder)
+        _write_geotiffs(coverage, scene, folder)
     if "gpkg" in formats:
-        write_geopackage(coverage, scene, folder / "coverage.gpkg")
+        _write_geopackage(coverage, scene, folder / "coverage.gpkg")
     if "kmz" in formats:
-        write_kmz(coverage, scene, folder / "coverage.kmz")
+        _write_kmz(coverage, scene, folder / "coverage.kmz")
 
 
-def _check_origin(scene: Scene) -> Origin:
+def _check_origin(scene: Scene) -> None:
     if scene.config.origin is None:
         raise BadInput(f"coverage.kmz: Google Earth needs the position of the scene, and "
                        f"{scene.folder / 'scene.toml'} has no [origin]; add one with latitude_deg "
                        "and longitude_deg of x = y = 0")
-    return scene.config.origin
 
 
 FORMATS: dict[str, Callable[[Scene], object]] = {
     "nc": lambda scene: None, "tif": lambda scene: require_rasterio(Path("received_power.tif")),
-    "gpkg": lambda scene: require_vectors(Path("coverage.gpkg")), "kmz": _check_origin,
+    "gpkg": lambda scene: _require_vectors(), "kmz": _check_origin,
     "png": lambda scene: None}
 """Formats, and what raises BadInput where one cannot be written for a scene."""
 FILES = frozenset({

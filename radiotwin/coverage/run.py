@@ -20,11 +20,10 @@ from radiotwin.coverage.radio import (
 )
 from radiotwin.coverage.sources import (
     GainSource,
-    MapSource,
-    TwinSource,
-    altitude_of,
-    map_grid,
-    over_scene,
+    altitude_row,
+    source_of_map,
+    source_of_twin,
+    source_over,
     twin_transmitters,
 )
 from radiotwin.coverage.transmitters import (
@@ -44,12 +43,13 @@ SCHEMA = "radiotwin.coverage/1"
 DEFAULT_HEIGHT_M, DEFAULT_STEP_M = 1.5, 5.0
 NOTED_RECEIVERS = 1_000  # whose links are compared with the range of a published law
 _ATTRIBUTES = {
-    "received_power": ("dBm", "received power of the best server (NaN: not detected, or left out)"),
-    "received_power_sd": ("dB", "standard deviation of the received power"),
+    "received_power_dbm": (
+        "dBm", "received power of the best server (NaN: not detected, or left out)"),
+    "received_power_sd_db": ("dB", "standard deviation of the received power"),
     "best_server": ("", "row of the best server among the transmitters (-1: none)"),
-    "snr": ("dB", "signal-to-noise ratio"),
-    "sinr": ("dB", "signal-to-interference-and-noise ratio"),
-    "rate": ("bit/s", "rate of one user"),
+    "snr_db": ("dB", "signal-to-noise ratio"),
+    "sinr_db": ("dB", "signal-to-interference-and-noise ratio"),
+    "rate_bps": ("bit/s", "rate of one user"),
     "coverage_probability": ("1", "probability that the received power reaches the threshold"),
     "indoor": ("", "the cell's receiver is inside a building"),
 }
@@ -127,38 +127,34 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene,
 def _transmitters(source: Twin | RadioMap | str, scene: Scene,
                   given: Sequence[Transmitter] | None, devices: list[str] | None,
                   settings: CoverageSettings) -> list[Transmitter]:
-    declared = scene_transmitters(scene)
-    if given is not None:
-        found = list(given)
-    elif isinstance(source, Twin):
-        found = twin_transmitters(source, declared)
-    else:
-        found = declared
-    if isinstance(source, RadioMap):
-        known = set(source.devices)
-        if given is None:  # where a device of the map is does not matter, and may not be declared
-            by_name = {each.name: each for each in declared}
-            found = [by_name.get(name, Transmitter(name, np.full(3, np.nan)))
-                     for name in source.devices]
-        for each in select(found, devices):
-            if each.name not in known:
-                raise BadInput(f"device {each.name!r} is not in the radio map, which holds no "
-                               "other transmitters than it was made for; leave it out with "
-                               "--devices, or give a twin or a scene")
+    found = scene_transmitters(scene) if given is None else list(given)
+    if given is None and isinstance(source, Twin):
+        found = twin_transmitters(source, found)
+    elif given is None and isinstance(source, RadioMap):
+        by_name = {each.name: each for each in found}
+        # Where a device of the map is does not matter, and may not be declared.
+        found = [by_name.get(name, Transmitter(name, np.full(3, np.nan)))
+                 for name in source.devices]
     if not found:
         raise BadInput(f"there is no transmitter: {scene.folder / 'scene.toml'} declares no "
                        "[[devices]]; add some, or give a table with --transmitters")
     found = select(found, devices)
+    if isinstance(source, RadioMap):
+        known = set(source.devices)
+        for each in found:
+            if each.name not in known:
+                raise BadInput(f"device {each.name!r} is not in the radio map, which holds no "
+                               "other transmitters than it was made for; leave it out with "
+                               "--devices, or give a twin or a scene")
     if given is not None:
         _check_outdoors(found, scene)
+    tx_power_dbm = settings.tx_power_dbm
     if isinstance(source, Twin) and source.level == "rssi_dbm":
-        if settings.tx_power_dbm is not None:
+        if tx_power_dbm is not None:
             raise BadInput("the twin's levels are received powers, with the transmit power in "
                            "them; leave --tx-power-dbm out")
-        found = with_defaults(found, scene, scene.config.radio.tx_power_dbm, settings.load)
-    else:
-        found = with_defaults(found, scene, settings.tx_power_dbm, settings.load)
-    return found
+        tx_power_dbm = scene.config.radio.tx_power_dbm
+    return with_defaults(found, scene, tx_power_dbm, settings.load)
 
 
 def _check_outdoors(transmitters: list[Transmitter], scene: Scene) -> None:
@@ -181,20 +177,20 @@ def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Tra
                 raise BadInput(f"a radio map has a grid of its own, and its {name} cannot be "
                                f"chosen: leave --{name} out, or make the map over a scene that "
                                f"was built with build-scene --{name}")
-        altitude_m = altitude_of(source, settings.height_m)
-        return (CoverageGrid.of_map(map_grid(source, altitude_m)),
-                MapSource(source, altitude_m, transmitters))
+        level = altitude_row(source, settings.height_m)
+        return (CoverageGrid.of_map(source.lattice, level),
+                source_of_map(source, level, transmitters))
     _refuse_elsewhere(settings.extent_m, scene)
     grid = CoverageGrid.over(
         settings.extent_m or scene.config.extent.bounds, settings.step_m or DEFAULT_STEP_M,
         settings.height_m or DEFAULT_HEIGHT_M)
     if isinstance(source, Twin):
-        return grid, TwinSource(source, scene, transmitters)
+        return grid, source_of_twin(source, scene, transmitters)
     if source == "raytrace" and settings.indoor_loss_db is not None:
         raise BadInput("no path over the map goes into a building, so there is nothing that an "
                        "indoor loss could be taken off; leave --indoor-loss-db out, or take a law "
                        "or a twin")
-    return grid, over_scene(source, scene, transmitters)
+    return grid, source_over(source, scene, transmitters)
 
 
 def _refuse_elsewhere(extent_m: Bounds | None, scene: Scene) -> None:
@@ -272,13 +268,10 @@ def _dataset(values: dict[str, np.ndarray], transmitters: list[Transmitter], gri
     dataset = xr.Dataset({name: (("y", "x"), value) for name, value in values.items()},
                          coords={"y": grid.y_m, "x": grid.x_m,
                                  "transmitter": np.array([each.name for each in transmitters],
-                                                         dtype=object)}, attrs=attributes)
-    dataset.attrs |= origin_attributes(scene.config.origin)
+                                                         dtype=object)},
+                         attrs=attributes | origin_attributes(scene.config.origin))
     for name in dataset.data_vars:
-        key = str(name)
-        for ending in ("_dbm", "_db", "_bps"):
-            key = key.removesuffix(ending)
-        unit, long_name = _ATTRIBUTES[key]
+        unit, long_name = _ATTRIBUTES[str(name)]
         dataset[name].attrs |= ({"units": unit} if unit else {}) | {"long_name": long_name}
     for axis, long_name in (("x", "east"), ("y", "north")):
         dataset[axis].attrs |= {"units": "m", "long_name": long_name}

@@ -1,10 +1,9 @@
 """Sources of gains: a twin, a radio map, or a published law or paths over a scene's 3D map."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from typing_extensions import override
 
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
@@ -16,118 +15,96 @@ from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
-from radiotwin.scene.lattice import Lattice
 from radiotwin.twin import Twin
 
 NOTED_TRANSMITTERS = 100  # of a frequency, whose links are compared with a law's validity
 PATH_RECEIVERS = 5_000  # whose paths are followed at a time: bounds the memory
+Levels = tuple[np.ndarray, np.ndarray | None]
+"""(n,) mean [dB], NaN where it is not detected; and (n,) standard deviation [dB], None where it is
+not known."""
 
 
-class GainSource(ABC):
+@dataclass(frozen=True, eq=False)
+class GainSource:
     """Levels between transmitters and receivers.
 
     Attributes:
         description: of the model, for people.
+        predict: gains with antennas, or received powers where `has_power`; of the row of a
+            transmitter, (n, 3) positions of the receivers [m], and the flat (y, x) index (n,) of
+            their cells.
+        notes: how far the levels can be trusted, a sentence each; of some receivers (n, 3) [m].
         has_power: whether its levels are received powers, with the transmit power in them.
     """
 
     description: str
+    predict: Callable[[int, np.ndarray, np.ndarray], Levels]
+    notes: Callable[[np.ndarray], list[str]] = lambda receiver_m: []
     has_power: bool = False
 
-    @abstractmethod
-    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
-                ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return gains with antennas, or received powers where `has_power`.
 
-        Args:
-            row: of the transmitter.
-            receiver_m: (n, 3) positions of the receivers [m].
-            index: (n,) flat (y, x) index of their cells.
-
-        Returns:
-            (n,) mean [dB], NaN where it is not detected; and (n,) standard deviation [dB], None
-            where it is not known.
-        """
-
-    def notes(self, receiver_m: np.ndarray) -> list[str]:
-        """Return how far the levels can be trusted, a sentence each.
-
-        Args:
-            receiver_m: (n, 3) some of the receivers [m].
-        """
-        return []
-
-
-class LawSource(GainSource):
-    """A published law, and the pattern of each antenna along the straight line.
+def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
+    """Return the source for a scene without measurements.
 
     Args:
-        model: name of the law.
-        scene: whose 3D map decides line of sight.
-        transmitters: each with a frequency.
-    """
-
-    def __init__(self, model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> None:
-        kind = channel_named(model)
-        if not issubclass(kind, PublishedLaw):
-            raise BadInput(f"model {model!r} is learnt from measurements, and a scene has none: "
-                           "fit a twin with it and give that, or take raytrace, or a published "
-                           "law, such as p1411, tr36777_umi, al_hourani_urban or cost231_wi")
-        self._scene, self._transmitters = scene, transmitters
-        self._device_m = np.array([each.position_m for each in transmitters])
-        self._laws = {frequency_hz: kind().fit(self._links(np.empty((0, 3)), frequency_hz, 0),
-                                               np.empty(0), None)
-                      for frequency_hz in {each.frequency_hz for each in transmitters}}
-        self.description = f"{kind.name} ({kind.source})"
-
-    @override
-    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
-                ) -> tuple[np.ndarray, np.ndarray | None]:
-        each = self._transmitters[row]
-        law = self._laws[each.frequency_hz]
-        links = self._links(receiver_m, each.frequency_hz, row)
-        mean_db, sd_db = law.predict(links)
-        return mean_db + antenna_gain_db(each, receiver_m), sd_db
-
-    @override
-    def notes(self, receiver_m: np.ndarray) -> list[str]:
-        """Return where links lie outside what the law was published for."""
-        found = []
-        for frequency_hz, law in self._laws.items():
-            rows = [row for row, each in enumerate(self._transmitters)
-                    if each.frequency_hz == frequency_hz][:NOTED_TRANSMITTERS]
-            device = np.repeat(rows, len(receiver_m))
-            links = link_geometry(self._device_m, np.tile(receiver_m, (len(rows), 1)), device, None)
-            found += law.outside(links) if len(links) else []
-        return list(dict.fromkeys(found))
-
-    def _links(self, receiver_m: np.ndarray, frequency_hz: float | None, row: int) -> LinkGeometry:
-        return link_geometry(self._device_m, receiver_m, np.full(len(receiver_m), row),
-                             self._scene.city, float(frequency_hz or np.nan))
-
-
-class PathSource(GainSource):
-    """The sum of the powers of all paths over the 3D map, through the antennas; nothing is fitted.
-
-    Args:
+        model: name of a published law, or `raytrace` for paths over the map.
         scene: 3D map.
         transmitters: each with a frequency.
+
+    Raises:
+        BadInput: no such model, or one that is learnt.
     """
+    kind = channel_named(model)
+    if kind is ImagePaths:
+        return _source_of_paths(scene, transmitters)
+    if issubclass(kind, PublishedLaw):
+        return _source_of_law(kind, scene, transmitters)
+    raise BadInput(f"model {model!r} is learnt from measurements, and a scene has none: fit a twin "
+                   "with it and give that, or take raytrace, or a published law, such as p1411, "
+                   "tr36777_umi, al_hourani_urban or cost231_wi")
 
-    def __init__(self, scene: Scene, transmitters: Sequence[Transmitter]) -> None:
-        self._city, self._transmitters = scene.city, transmitters
-        self.description = "raytrace: paths over the 3D map, powers added"
 
-    @override
-    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
-                ) -> tuple[np.ndarray, np.ndarray | None]:
+def _source_of_law(kind: type[PublishedLaw], scene: Scene,
+                   transmitters: Sequence[Transmitter]) -> GainSource:
+    """Return a published law, and the pattern of each antenna along the straight line."""
+    device_m = np.array([each.position_m for each in transmitters])
+
+    def links(receiver_m: np.ndarray, frequency_hz: float | None, row: int) -> LinkGeometry:
+        return link_geometry(device_m, receiver_m, np.full(len(receiver_m), row), scene.city,
+                             float(frequency_hz or np.nan))
+
+    laws = {frequency_hz: kind().fit(links(np.empty((0, 3)), frequency_hz, 0), np.empty(0), None)
+            for frequency_hz in {each.frequency_hz for each in transmitters}}
+
+    def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
+        each = transmitters[row]
+        mean_db, sd_db = laws[each.frequency_hz].predict(links(receiver_m, each.frequency_hz, row))
+        return mean_db + antenna_gain_db(each, receiver_m), sd_db
+
+    def notes(receiver_m: np.ndarray) -> list[str]:
+        """Return where links lie outside what the law was published for."""
+        found = []
+        for frequency_hz, law in laws.items():
+            rows = [row for row, each in enumerate(transmitters)
+                    if each.frequency_hz == frequency_hz][:NOTED_TRANSMITTERS]
+            device = np.repeat(rows, len(receiver_m))
+            some = link_geometry(device_m, np.tile(receiver_m, (len(rows), 1)), device, None)
+            found += law.outside(some) if len(some) else []
+        return list(dict.fromkeys(found))
+
+    return GainSource(f"{kind.name} ({kind.source})", predict, notes)
+
+
+def _source_of_paths(scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
+    """Return the sum of the powers of all paths, through the antennas; nothing is fitted."""
+    def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
         from radiotwin.propagation.paths.powers import path_powers  # numba is large
 
-        each = self._transmitters[row]
+        each = transmitters[row]
         parts = [np.empty(0)]
         for start in range(0, len(receiver_m), PATH_RECEIVERS):
             ends_m = receiver_m[start:start + PATH_RECEIVERS]
-            found = path_powers(self._city, each.position_m[None], ends_m,
+            found = path_powers(scene.city, each.position_m[None], ends_m,
                                 np.zeros(len(ends_m), int), float(each.frequency_hz or np.nan),
                                 "vertical")
             parts.append(found.total if each.antenna is None else
@@ -135,6 +112,8 @@ class PathSource(GainSource):
         with np.errstate(divide="ignore"):
             gain_db = 10 * np.log10(np.concatenate(parts))
         return np.where(np.isfinite(gain_db), gain_db, np.nan), None
+
+    return GainSource("raytrace: paths over the 3D map, powers added", predict)
 
 
 def _through_antenna(departures: np.ndarray, power: np.ndarray, antenna: Antenna) -> np.ndarray:
@@ -150,8 +129,8 @@ def _through_antenna(departures: np.ndarray, power: np.ndarray, antenna: Antenna
     return power * weighted.sum(axis=1) / np.maximum(in_sector.sum(axis=1), 1e-300)
 
 
-class TwinSource(GainSource):
-    """A twin: of its own devices, or its law for transmitters elsewhere.
+def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
+    """Return the source of a twin: of its own devices, or its law for transmitters elsewhere.
 
     Measured levels hold the antennas of the twin's devices. Transmitters that were not measured
     get the law of all devices, and the pattern of their antenna along the straight line.
@@ -159,130 +138,91 @@ class TwinSource(GainSource):
     Args:
         twin: learnt in the scene.
         scene: its 3D map.
-        transmitters: each is a device of the twin where it has the name and the place of one.
+        transmitters: each is a device of the twin where it has the name and, to a metre, the place
+            of one.
+
+    Raises:
+        BadInput: the twin is of another map, or of received powers and knows not all transmitters.
     """
+    twin.require_map(scene)
+    twin.warn_of_another_scene(scene, scene.content_hash())
+    has_power, known = twin.level == "rssi_dbm", len(twin.devices)
+    located = {each.device: (row, each.position_m) for row, each in enumerate(twin.devices)
+               if each.located}
+    rows = []
+    for each in transmitters:
+        row, position_m = located.get(each.name, (known, (np.nan, np.nan, np.nan)))
+        rows.append(row if np.allclose(position_m, each.position_m, atol=1.0) else known)
+    new = [each.name for each, row in zip(transmitters, rows) if row == known]
+    if new and has_power:
+        raise BadInput(f"{new[0]} is not a device of the twin, whose levels are received "
+                       "powers: what another transmitter would send is not known; import the "
+                       "measurements as gains, or leave it out with --devices")
+    found = []
+    if new:
+        found.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
+                     "the twin's law for any device is used")
+    if any(each.frequency_hz not in (None, scene.config.radio.frequency_hz)
+           for each in transmitters):
+        found.append("transmitters of other frequencies get the twin's law, which was "
+                     f"learnt at {scene.config.radio.frequency_hz / 1e9:g} GHz")
 
-    def __init__(self, twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> None:
-        twin.require_map(scene)
-        twin.warn_of_another_scene(scene, scene.content_hash())
-        self._twin, self._scene, self._transmitters = twin, scene, transmitters
-        self.has_power = twin.level == "rssi_dbm"
-        self.description = f"twin: {twin.description}"
-        own = {each.device: row for row, each in enumerate(twin.devices) if each.located}
-        self._row = [own.get(each.name) if is_device(twin, each) else None
-                     for each in transmitters]
-        new = [each.name for each, row in zip(transmitters, self._row) if row is None]
-        if new and self.has_power:
-            raise BadInput(f"{new[0]} is not a device of the twin, whose levels are received "
-                           "powers: what another transmitter would send is not known; import the "
-                           "measurements as gains, or leave it out with --devices")
-        self._notes = []
-        if new:
-            self._notes.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
-                              "the twin's law for any device is used")
-        if any(each.frequency_hz not in (None, scene.config.radio.frequency_hz)
-               for each in transmitters):
-            self._notes.append("transmitters of other frequencies get the twin's law, which was "
-                               f"learnt at {scene.config.radio.frequency_hz / 1e9:g} GHz")
-
-    @override
-    def notes(self, receiver_m: np.ndarray) -> list[str]:
-        """Return which transmitters get the law of other devices, or of another frequency."""
-        return self._notes
-
-    @override
-    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
-                ) -> tuple[np.ndarray, np.ndarray | None]:
-        known, each = self._row[row], self._transmitters[row]
-        if known is not None:
-            links = self._twin.links(receiver_m, np.full(len(receiver_m), known), self._scene)
-            found = self._twin.predict(links)
-            return found.mean_db, found.sd_db
-        twin = self._twin
+    def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
+        each, device = transmitters[row], np.full(len(receiver_m), rows[row])
+        if rows[row] < known:
+            levels = twin.predict(twin.links(receiver_m, device, scene))
+            return levels.mean_db, levels.sd_db
         device_m = np.vstack([np.nan_to_num(twin.device_m), each.position_m])
-        device = np.full(len(receiver_m), len(twin.devices))
         links = Links(
             columns=Columns.unmeasured(receiver_m, device, twin.limit_db),
             ends=Ends(device_names=[*(device.device for device in twin.devices), each.name],
                       device_m=device_m, anchors=frozenset(range(len(device_m)))),
-            world=World(frequency_hz=self._scene.config.radio.frequency_hz,
-                        city=self._scene.city, is_gain=True))
+            world=World(frequency_hz=scene.config.radio.frequency_hz, city=scene.city,
+                        is_gain=True))
         if twin.fitted is None:
             mean_db, sd_db = twin.channel.trend.predict(links.geometry)
         else:
-            found = twin.predict(links)
-            mean_db, sd_db = found.mean_db, found.sd_db
+            levels = twin.predict(links)
+            mean_db, sd_db = levels.mean_db, levels.sd_db
         return mean_db + antenna_gain_db(each, receiver_m), sd_db
 
+    return GainSource(f"twin: {twin.description}", predict, lambda receiver_m: found, has_power)
 
-class MapSource(GainSource):
-    """A radio map at one of its altitudes, with the antennas that it was made with.
+
+def source_of_map(radio_map: RadioMap, level: int,
+                  transmitters: Sequence[Transmitter]) -> GainSource:
+    """Return the source of a radio map, with the antennas that it was made with.
 
     Args:
         radio_map: of the scene.
-        altitude_m: of the map to use [m].
+        level: number of the altitude to use.
         transmitters: which must be in the map.
     """
+    row_of = {name: row for row, name in enumerate(radio_map.devices)}
+    dataset = radio_map.dataset
 
-    def __init__(self, radio_map: RadioMap, altitude_m: float,
-                 transmitters: Sequence[Transmitter]) -> None:
-        self._level = int(np.flatnonzero(radio_map.lattice.z_m == altitude_m)[0])
-        row_of = {name: row for row, name in enumerate(radio_map.devices)}
-        self._rows = [row_of[each.name] for each in transmitters]
-        self._dataset = radio_map.dataset
-        self.description = f"radio map: {radio_map.attributes.get('source', 'unknown source')}"
-
-    @override
-    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
-                ) -> tuple[np.ndarray, np.ndarray | None]:
-        sd_db = self._at("sigma_db", row, index) if "sigma_db" in self._dataset else None
-        return self._at("gain_db", row, index), sd_db
-
-    def _at(self, name: str, row: int, index: np.ndarray) -> np.ndarray:
+    def read(name: str, row: int, index: np.ndarray) -> np.ndarray:
         """Return a variable at cells (n,); only the rows with them are read."""
         if not len(index):
             return np.empty(0)
-        columns = self._dataset.sizes["x"]
+        columns = dataset.sizes["x"]
         first, last = int(index.min()) // columns, int(index.max()) // columns
-        part = self._dataset[name].variable[self._rows[row], self._level, first:last + 1]
+        part = dataset[name].variable[row_of[transmitters[row].name], level, first:last + 1]
         return part.values.ravel()[index - first * columns].astype(float)
 
+    def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
+        sd_db = read("sigma_db", row, index) if "sigma_db" in dataset else None
+        return read("gain_db", row, index), sd_db
 
-def over_scene(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the source for a scene without measurements.
-
-    Args:
-        model: name of a published law, or `raytrace` for paths over the map.
-        scene: 3D map.
-        transmitters: each with a frequency.
-
-    Raises:
-        BadInput: no such model, or one that is learnt.
-    """
-    if channel_named(model) is ImagePaths:
-        return PathSource(scene, transmitters)
-    return LawSource(model, scene, transmitters)
-
-
-def is_device(twin: Twin, transmitter: Transmitter) -> bool:
-    """Return whether a transmitter has the name and, to a metre, the place of a twin's device."""
-    return any(each.device == transmitter.name and each.located and np.allclose(
-        (each.x_m, each.y_m, each.z_m), transmitter.position_m, atol=1.0)
-        for each in twin.devices)
+    return GainSource(f"radio map: {radio_map.attributes.get('source', 'unknown source')}", predict)
 
 
 def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Transmitter]:
     """Return the located devices of a twin, with power and load of those declared by that name."""
     by_name = {each.name: each for each in declared}
-    found = []
-    for each in twin.devices:
-        if each.located:
-            other = by_name.get(each.device)
-            found.append(Transmitter(
-                each.device, np.array([each.x_m, each.y_m, each.z_m], dtype=float),
-                *((other.tx_power_dbm, other.antenna, other.load, other.frequency_hz)
-                  if other else ())))
-    return found
+    return [replace(by_name.get(each.device, Transmitter(each.device, np.empty(0))),
+                    position_m=np.array(each.position_m, dtype=float))
+            for each in twin.devices if each.located]
 
 
 def antenna_gain_db(transmitter: Transmitter, receiver_m: np.ndarray) -> np.ndarray | float:
@@ -292,31 +232,16 @@ def antenna_gain_db(transmitter: Transmitter, receiver_m: np.ndarray) -> np.ndar
     return transmitter.antenna.gain_dbi(receiver_m - transmitter.position_m)
 
 
-def altitude_of(radio_map: RadioMap, height_m: float | None) -> float:
-    """Return the altitude of a map that a height names; its lowest for None.
+def altitude_row(radio_map: RadioMap, height_m: float | None) -> int:
+    """Return the number of the altitude of a map that a height names; its lowest for None.
 
     Raises:
         BadInput: the map has no such altitude.
     """
     altitudes_m = radio_map.lattice.z_m
     if height_m is None:
-        return float(altitudes_m[0])
+        return 0
     if not (altitudes_m == height_m).any():
         known = ", ".join(f"{each:g}" for each in altitudes_m[:20])
         raise BadInput(f"the radio map has no altitude of {height_m:g} m; it has {known} m")
-    return height_m
-
-
-def map_grid(radio_map: RadioMap, altitude_m: float) -> Lattice:
-    """Return the positions of a map at one altitude.
-
-    Raises:
-        BadInput: they are not equally far apart, so that they have no cells.
-    """
-    lattice = radio_map.lattice
-    step_m = lattice.step_m
-    if not step_m or any(not np.allclose(np.diff(axis), step_m, rtol=0, atol=1e-6 * step_m)
-                         for axis in (lattice.x_m, lattice.y_m)):
-        raise BadInput("the radio map's positions are not equally far apart, so that shares of "
-                       "an area cannot be told; make a map with one step")
-    return Lattice(lattice.x_m, lattice.y_m, np.array([altitude_m]), lattice.ground_m)
+    return int(np.flatnonzero(altitudes_m == height_m)[0])

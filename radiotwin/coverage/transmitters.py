@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from radiotwin.display import some
 from radiotwin.errors import BadInput
 from radiotwin.geo import between_frames, is_same_frame, read_frame, to_local
 from radiotwin.io.budgets import DEVICES
@@ -109,7 +110,7 @@ def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Tra
     for name in names:
         if name not in known:
             raise BadInput(f"device {name!r} is not among the transmitters; there are "
-                           f"{_some(list(known))}")
+                           f"{some(known, _NAMED)}")
     return [known[name] for name in dict.fromkeys(names)]
 
 
@@ -132,18 +133,14 @@ def with_defaults(transmitters: list[Transmitter], scene: Scene, tx_power_dbm: f
     unknown = [each.name for each in transmitters if each.tx_power_dbm is None]
     if unknown and tx_power_dbm is None:
         raise BadInput(
-            f"the transmit power of {_some(unknown)} is not known: {scene.folder / 'scene.toml'} "
-            f"has the default tx_power_dbm = {radio.tx_power_dbm:g}; give --tx-power-dbm, or a "
-            "table --transmitters with the column tx_power_dbm")
+            f"the transmit power of {some(unknown, _NAMED)} is not known: "
+            f"{scene.folder / 'scene.toml'} has the default tx_power_dbm = "
+            f"{radio.tx_power_dbm:g}; give --tx-power-dbm, or a table --transmitters with the "
+            "column tx_power_dbm")
     return [replace(each, tx_power_dbm=tx_power_dbm if each.tx_power_dbm is None
                     else each.tx_power_dbm, load=load if each.load is None else each.load,
                     frequency_hz=each.frequency_hz or radio.frequency_hz)
             for each in transmitters]
-
-
-def _some(names: list[str]) -> str:
-    more = f", … ({len(names):,} in all)" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
 
 
 def _positions(path: Path, table: pd.DataFrame, scene: Scene) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Comparison of channel models on held-out flights and on the whole truth map."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -168,7 +169,7 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
     _check_names([*(twins or {}), *(maps or {})], models)
     for twin in (twins or {}).values():
         twin.require_map(scene)  # refuses before the others are fitted, which takes long
-    job = Job("comparing models", with_pieces(_FitModel(train, scene, seed)),
+    job = Job("comparing models", with_pieces(partial(_fit_model, train, scene, seed)),
               Resources(WORKER_BYTES, False))
     fitted = dict(zip(models, (executor or Executor()).run(job, models), strict=True))
     fitted |= twins or {}
@@ -195,16 +196,8 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
     return Comparison(pd.DataFrame(scores), pd.DataFrame(locations), fitted, predictions)
 
 
-@dataclass(frozen=True)
-class _FitModel:
-    """Fits models, by their names; arguments as of `fit_twin`."""
-
-    train: Measurements
-    scene: Scene
-    seed: int
-
-    def __call__(self, model: str) -> Twin:
-        return fit_twin(self.train, self.scene, model=model, seed=self.seed)
+def _fit_model(train: Measurements, scene: Scene, seed: int, model: str) -> Twin:
+    return fit_twin(train, scene, model=model, seed=seed)
 
 
 def _check(test: Measurements, scene: Scene, truth: RadioMap | None,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -46,9 +45,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         measurements: links to anchors and unknown devices.
         scene: its map and extent, and the receivers' sensitivity.
         model: name of a channel model (`radiotwin.propagation.laws.channel_models`); `raytrace`
-        stands for
-            `image_paths`, which follows paths over the 3D map, and `path_kriging` allows for errors
-            of that.
+            stands for `image_paths`, which follows paths over the 3D map, and `path_kriging` allows
+            for errors of that.
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
         allow_indoor: whether unknown devices may be inside buildings.
@@ -72,23 +70,22 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         start.require_frame(scene)
         start.warn_of_another_scene(scene, scene.content_hash())
     channel = channel_named(model)
-    if channel in (ImagePaths, PathKriging):
-        if allow_indoor:
-            raise BadInput(f"model {model} follows paths outside buildings only; take another "
-                           "model where unknown devices may be indoors")
-        links = prepare_links(measurements, scene)
-        refuse_misplaced_anchors(links, scene)
-        _warn(links.notes)
+    along_paths = channel in (ImagePaths, PathKriging)
+    if along_paths and allow_indoor:
+        raise BadInput(f"model {model} follows paths outside buildings only; take another model "
+                       "where unknown devices may be indoors")
+    if not along_paths:
+        _check_heights(measurements)
+    links = (prepare_links if along_paths else join_links)(measurements, scene)
+    refuse_misplaced_anchors(links, scene)
+    for note in links.notes:
+        warnings.warn(note, stacklevel=2)
+    if along_paths:
         fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
         twin = fit(links, scene, seed, start, executor)
-        twin.provenance.update(flights=flights, seed=seed)
-        return twin
-    _check_heights(measurements)
-    settings = LocalizeSettings(allow_indoor=allow_indoor)
-    links = join_links(measurements, scene)
-    refuse_misplaced_anchors(links, scene)
-    _warn(links.notes)
-    twin = fit_links(links, scene, channel, seed, start, settings)
+    else:
+        settings = LocalizeSettings(allow_indoor=allow_indoor)
+        twin = fit_links(links, scene, channel, seed, start, settings)
     twin.provenance.update(flights=flights, seed=seed)
     return twin
 
@@ -101,11 +98,6 @@ def _usable(measurements: Measurements) -> Measurements:
         return measurements
     warnings.warn(f"{copied.sum():,} of {len(copied):,} links left out: {COPIED}", stacklevel=3)
     return measurements.select(~copied)
-
-
-def _warn(notes: Sequence[str]) -> None:
-    for note in notes:
-        warnings.warn(note, stacklevel=3)
 
 
 def _thinned(measurements: Measurements, seed: int) -> Measurements:

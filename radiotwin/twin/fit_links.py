@@ -55,7 +55,7 @@ def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int
     if isinstance(fitted, PublishedLaw):
         for note in fitted.outside(_known_links(links, reliable_m(devices))[0]):
             warnings.warn(note, stacklevel=3)
-    return Twin(fitted, devices, level_of(links), links.usual_limit_db, provenance(links, scene))
+    return make_twin(links, scene, fitted, devices)
 
 
 def fit_known(links: Links, channel: type[ChannelModel], seed: int) -> Twin:
@@ -70,7 +70,7 @@ def fit_known(links: Links, channel: type[ChannelModel], seed: int) -> Twin:
     fitted = fit_once(channel, geometry, links.level_db, links.limit_db, seed)
     devices = [TwinDevice.anchor(name, *position_m)
                for name, position_m in zip(links.device_names, links.device_m, strict=True)]
-    return Twin(fitted, devices, level_of(links), links.usual_limit_db, provenance(links, None))
+    return make_twin(links, None, fitted, devices)
 
 
 def reliable_m(devices: list[TwinDevice], max_radius_m: float = np.inf) -> np.ndarray:
@@ -153,16 +153,14 @@ def _locate(links: Links, scene: Scene, channel: ChannelModel, unknown: np.ndarr
                 lambda _, content: [TwinDevice.from_record(each) for each in content])
 
 
-def level_of(links: Links) -> str:
-    """Return the name of what links hold, as of `Twin.level`."""
-    return "gain_db" if links.is_gain else "rssi_dbm"
-
-
-def provenance(links: Links, scene: Scene | None) -> dict[str, Any]:
-    """Return what a twin says of what it was made of."""
-    own: dict[str, Any] = {}
+def make_twin(links: Links, scene: Scene | None, channel: ChannelModel,
+              devices: list[TwinDevice]) -> Twin:
+    """Return a twin that says what it was made of: links in a scene, or without a map."""
+    provenance: dict[str, Any] = {}
     if scene is not None:
-        own = {"scene": scene.config.name, "scene_hash": scene.content_hash()}
+        provenance = {"scene": scene.config.name, "scene_hash": scene.content_hash()}
         if scene.config.origin is not None:
-            own["origin"] = scene.config.origin.model_dump()
-    return own | {"links": len(links), "radiotwin_version": radiotwin.__version__}
+            provenance["origin"] = scene.config.origin.model_dump()
+    provenance |= {"links": len(links), "radiotwin_version": radiotwin.__version__}
+    level = "gain_db" if links.is_gain else "rssi_dbm"
+    return Twin(channel, devices, level, links.usual_limit_db, provenance)

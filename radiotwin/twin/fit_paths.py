@@ -26,12 +26,9 @@ from radiotwin.runtime.execution import Executor
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap, perturbed_map
-from radiotwin.twin.fit_links import fit_links, provenance, reliable_m
-from radiotwin.twin.localize import (
-    Relocation,
-)
+from radiotwin.twin.fit_links import fit_links, make_twin, reliable_m
+from radiotwin.twin.localize import Relocation, TwinDevice
 from radiotwin.twin.localize.along_paths import CREDIBLE, MAX_DEVICES
-from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.model.model import Model
 from radiotwin.twin.twin import Twin
 
@@ -101,7 +98,7 @@ def fit_paths(links: Links, scene: Scene, law: Twin, relocation: Relocation) -> 
     channel = _image_paths(links, law, law.device_m)
     devices = relocation.relocate(links, law.devices, channel)
     channel = _image_paths(links, law, reliable_m(devices, LOST_M))
-    return Twin(channel, devices, law.level, links.usual_limit_db, provenance(links, scene))
+    return make_twin(links, scene, channel, devices)
 
 
 def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None,
@@ -179,8 +176,7 @@ def fit_over_wrong_map(links: Links, scene: Scene, seed: int, start: Twin | None
         devices = [replace(each, credible_radius_m=float(np.hypot(each.credible_radius_m, more)))
                    for each, more in zip(devices, more_m, strict=True)]
     devices = [_moved_device(each, shift_m) for each in _calibrated(devices, on_map)]
-    channel = _channel(links, devices, found, seed)
-    return Twin(channel, devices, by_paths.level, links.usual_limit_db, provenance(links, scene))
+    return make_twin(links, scene, _channel(links, devices, found, seed), devices)
 
 
 def _shift(links: Links, seed: int) -> Shift:

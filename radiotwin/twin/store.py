@@ -16,9 +16,9 @@ from radiotwin.effects.base import Effect, Levels
 from radiotwin.effects.params import Seconds
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
-from radiotwin.io.files import atomic_folder, require_writable
+from radiotwin.io.files import require_writable
 from radiotwin.io.forms import Origin
-from radiotwin.io.inputs import parse_json, read_bytes, read_text, require_within
+from radiotwin.io.inputs import parse_json
 from radiotwin.links.links import Columns, Ends, Flown, Links, World
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB
@@ -131,20 +131,6 @@ class TwinRecord(_Strict):
         return provenance
 
 
-def write_twin(folder: Path | str, twin: Twin) -> None:
-    """Write a twin's folder, whole or not at all; a twin that is in it is replaced.
-
-    Raises:
-        BadInput: the folder exists and is not a twin's.
-    """
-    folder = Path(folder)
-    check_twin_target(folder)
-    record, content = encode_twin(twin)
-    with atomic_folder(folder) as temporary:
-        (temporary / CHANNEL_FILE).write_bytes(content)
-        (temporary / TWIN_FILE).write_text(record, encoding="utf-8")
-
-
 def encode_twin(twin: Twin) -> tuple[str, bytes]:
     """Return the contents of a twin's two files: the record, and the channel."""
     fitted = twin.fitted
@@ -156,35 +142,8 @@ def encode_twin(twin: Twin) -> tuple[str, bytes]:
     return json.dumps(record, indent=1, allow_nan=False), encode_channel(twin.channel, beside)
 
 
-def read_twin(folder: Path | str) -> dict[str, Any]:
-    """Read a twin's folder.
-
-    Returns:
-        the attributes of `Twin` by name.
-
-    Raises:
-        BadInput: not a twin's folder, a damaged one, or effects that are not installed.
-    """
-    folder = Path(folder)
-    path = folder / TWIN_FILE
-    if not path.exists():
-        raise BadInput(f"{folder} is not a twin's folder (no {TWIN_FILE}); `radiotwin fit` makes "
-                       "one")
-    record, channel = (require_within(folder, folder / name, str(folder))
-                       for name in (TWIN_FILE, CHANNEL_FILE))
-    return decode_twin(read_text(record, "twin"), read_bytes(channel, "channel model"), path)
-
-
 def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
-    """Return what `encode_twin` described.
-
-    Args:
-        record: content of `twin.json`.
-        channel: content of the channel's file.
-        source: where they are from, for the message.
-
-    Returns:
-        the attributes of `Twin` by name.
+    """Return the attributes of `Twin` by name, from what `encode_twin` described.
 
     Raises:
         BadInput: they are damaged, or have effects that are not installed.

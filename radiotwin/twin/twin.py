@@ -27,7 +27,9 @@ from radiotwin.effects.base import Effect
 from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, place
 from radiotwin.inference.gaussian import detection_probability
+from radiotwin.io.files import atomic_folder
 from radiotwin.io.forms import Origin
+from radiotwin.io.inputs import read_bytes, read_text, require_within
 from radiotwin.links.links import Columns, Ends, Links, Prediction, World
 from radiotwin.maps.form import MapStream
 from radiotwin.maps.radiomap import RadioMap
@@ -40,7 +42,13 @@ from radiotwin.scene.plot import MARKS, draw_outlines
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 from radiotwin.twin.model.model import FittedModel
-from radiotwin.twin.store import decode_twin, encode_twin, read_twin, write_twin
+from radiotwin.twin.store import (
+    CHANNEL_FILE,
+    TWIN_FILE,
+    check_twin_target,
+    decode_twin,
+    encode_twin,
+)
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
@@ -228,12 +236,17 @@ class Twin(Summarised):
                          make).placed(scene.config.origin)
 
     def save(self, folder: Path | str) -> None:
-        """Write the twin's folder, whole or not at all.
+        """Write the twin's folder, whole or not at all; a twin that is in it is replaced.
 
         Raises:
             BadInput: the folder exists and is not a twin's.
         """
-        write_twin(folder, self)
+        folder = Path(folder)
+        check_twin_target(folder)
+        record, channel = self.encode()
+        with atomic_folder(folder) as temporary:
+            (temporary / CHANNEL_FILE).write_bytes(channel)
+            (temporary / TWIN_FILE).write_text(record, encoding="utf-8")
 
     @classmethod
     def load(cls, folder: Path | str) -> Twin:
@@ -242,7 +255,14 @@ class Twin(Summarised):
         Raises:
             BadInput: not a twin's folder, a damaged one, or effects that are not installed.
         """
-        return cls(**read_twin(folder))
+        folder = Path(folder)
+        path = folder / TWIN_FILE
+        if not path.exists():
+            raise BadInput(f"{folder} is not a twin's folder (no {TWIN_FILE}); `radiotwin fit` "
+                           "makes one")
+        record, channel = (require_within(folder, folder / name, str(folder))
+                           for name in (TWIN_FILE, CHANNEL_FILE))
+        return cls.decode(read_text(record, "twin"), read_bytes(channel, "channel model"), path)
 
     def plot(self, ax: Axes | None = None, *, scene: Scene | None = None,
              geographic: bool | None = None) -> Axes:

@@ -22,5 +22,5 @@ def test_cells_of_a_map_above_the_ground_are_above_it():
     city = terrain_map(height)
     for lattice, z_m in ((Lattice(axis_m, axis_m, np.array([30.0]), ground_m), ground_m.ravel() + 30),
                          (Lattice(axis_m, axis_m, np.array([150.0])), np.full(121, 150.0))):
-        at_m = CoverageGrid.of_map(lattice).receivers_m(slice(None), ground_of(city))
+        at_m = CoverageGrid.of_map(lattice, 0).receivers_m(slice(None), ground_of(city))
         assert at_m[:, 2] == pytest.approx(z_m, abs=0.01)

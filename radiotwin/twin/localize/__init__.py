@@ -2,8 +2,8 @@
 
 from radiotwin.twin.localize.along_paths import Relocation
 from radiotwin.twin.localize.calibration import RadiusCalibration, calibrate_radii, misfit
-from radiotwin.twin.localize.estimate import LocalizeSettings, TwinDevice
-from radiotwin.twin.localize.on_map import localize
+from radiotwin.twin.localize.estimate import TwinDevice
+from radiotwin.twin.localize.on_map import LocalizeSettings, localize
 from radiotwin.twin.localize.without_map import locate, position_log_likelihood, whole_area
 
 __all__ = ["LocalizeSettings", "RadiusCalibration", "Relocation", "TwinDevice", "calibrate_radii",

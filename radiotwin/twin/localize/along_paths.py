@@ -144,8 +144,9 @@ class Relocation:
         for search, device, before in searches:
             inputs.append((history, self.bounds, search.by_law, search.by_paths, device, before))
             history = parts.name(len(inputs) - 1)
-        self.executor.run_ahead(Job("looking for devices along paths", _Searches(searches),
-                                    Resources(WORKER_BYTES, False)), range(len(searches)), parts)
+        job = Job("looking for devices along paths", partial(_search_alone, searches),
+                  Resources(WORKER_BYTES, False))
+        self.executor.run_ahead(job, range(len(searches)), parts)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Leave out what was followed, and where: another process follows what it needs."""
@@ -373,19 +374,14 @@ class _Search:
 _Question = tuple[_Search, TwinDevice, list[tuple[float, float]]]  # where, which, known positions
 
 
-@dataclass(frozen=True)
-class _Searches:
-    """Searches by their number, each as if it were the only one."""
-
-    searches: list[_Question]
-
-    def __call__(self, number: int) -> Piece:
-        search, device, before = self.searches[number]
-        alone = replace(search.relocation, powers=WeakKeyDictionary())
-        found = replace(search, relocation=alone, tried={}).from_law(device, before)
-        city = search.by_law.fit.links.city
-        assert city is not None
-        return followed_since({}, alone.powers.get(city, {})), found.record
+def _search_alone(searches: list[_Question], number: int) -> Piece:
+    """Return the result of a search by its number, as if it were the only one."""
+    search, device, before = searches[number]
+    alone = replace(search.relocation, powers=WeakKeyDictionary())
+    found = replace(search, relocation=alone, tried={}).from_law(device, before)
+    city = search.by_law.fit.links.city
+    assert city is not None
+    return followed_since({}, alone.powers.get(city, {})), found.record
 
 
 def _apart(positions_m: np.ndarray, apart_m: float, maximum: int) -> list[np.ndarray]:

@@ -23,6 +23,7 @@ from radiotwin.twin.localize.without_map import (
     MIN_LINKS,
     Area,
     PositionPosterior,
+    fit_elsewhere,
 )
 from radiotwin.twin.model.model import FittedModel
 
@@ -114,11 +115,7 @@ def misfit(model: FittedModel, own: Links, place: TwinDevice) -> float:
 
     The device's own level, as far as it may have one, counts as no misfit.
     """
-    known = len(model.device_m)
-    there = own.of_devices(np.full(len(own), known), np.vstack([model.device_m, place.position_m]),
-                           [f"device {i}" for i in range(known + 1)],
-                           frozenset()).since(model.first_s)
-    fit = model.on_links(there)
+    fit = fit_elsewhere(model, own, np.array([[place.x_m, place.y_m]]))
     problem = fit.model.regression()
     residual_db, scale_db = problem.residual_db(fit), problem.predict(fit).scale_db
     seen = np.isfinite(own.level_db)

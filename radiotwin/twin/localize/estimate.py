@@ -1,4 +1,4 @@
-"""Settings of a localisation, and its result: a device with an estimated position."""
+"""The result of a localisation: a device with an estimated position."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import ConfigDict, Field, StrictBool, StrictStr, TypeAdapter, WrapValidator
 
 from radiotwin.io.forms import MAX_POSITION_M, Number
-from radiotwin.twin.localize.likelihood import CHUNK_LINKS
 
 Name = Annotated[StrictStr, Field(min_length=1, max_length=1000)]
 _Coordinate = Annotated[Number, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
@@ -18,29 +17,6 @@ _Coordinate = Annotated[Number, Field(ge=-MAX_POSITION_M, le=MAX_POSITION_M)]
 def _null_as(number: float) -> WrapValidator:
     """Return what reads null as a number that JSON has no other form for."""
     return WrapValidator(lambda value, check: number if value is None else check(value))
-
-
-@dataclass(frozen=True)
-class LocalizeSettings:
-    """Extent of the search.
-
-    Attributes:
-        scan_step_m: width of a cell of the first scan over the map [m].
-        scan_links: links that the scan may evaluate, beyond which its cells grow.
-        swarms: number for each device.
-        particles: of each swarm.
-        iterations: of every swarm.
-        allow_indoor: whether a device may be inside a building.
-        chunk_links: links in memory at once (about 100 bytes each).
-    """
-
-    scan_step_m: float = 5.0
-    scan_links: int = 15_000_000
-    swarms: int = 6
-    particles: int = 12
-    iterations: int = 25
-    allow_indoor: bool = False
-    chunk_links: int = CHUNK_LINKS
 
 
 @dataclass(frozen=True)

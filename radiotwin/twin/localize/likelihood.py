@@ -12,7 +12,7 @@ section 2.3.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -114,6 +114,7 @@ def design_effect(residuals: DeviceResiduals, correlation: np.ndarray) -> float:
     return float(max(1.0, widening) * max(1.0, np.mean(residuals.z**2)))
 
 
+@dataclass(eq=False)
 class Likelihood:
     """Log-likelihood of positions for devices that share one height.
 
@@ -126,77 +127,46 @@ class Likelihood:
     outliers.
 
     Attributes:
-        devices: (k,) indices in `Observations.devices`, by which the methods identify them.
+        observations: of all devices.
+        channel: predicts links to the receivers of the observations.
+        devices: (k,) indices in `observations.devices`, by which the methods identify them.
         z_m: height of the devices [m].
-        receiver_m: (r, 3) as in `Observations` [m].
+        city: 3D map; None: every link has line of sight.
+        limit_db: limit of detection [dB]; None only where nothing is `missed`.
         repeat_share: f, 1 until it is set.
     """
 
-    def __init__(
-        self,
-        observations: Observations,
-        channel: LinkTable | DirectChannel,
-        devices: np.ndarray,
-        z_m: float,
-        city: CityMap | None,
-        limit_db: float | None,
-        chunk_links: int = CHUNK_LINKS,
-    ) -> None:
-        """Prepare the likelihood of some devices.
+    observations: Observations
+    channel: LinkTable | DirectChannel
+    devices: np.ndarray
+    z_m: float
+    city: CityMap | None
+    limit_db: float | None
+    repeat_share: float = 1.0
 
-        Args:
-            observations: of all devices.
-            channel: predicts links to the receivers of the observations.
-            devices: (k,) indices in `observations.devices`.
-            z_m: their height [m].
-            city: 3D map; None: every link has line of sight.
-            limit_db: limit of detection [dB]; None only where nothing is `missed`.
-            chunk_links: links in memory at once.
-        """
-        self.devices, self.z_m, self._channel, self._city = devices, z_m, channel, city
-        self.receiver_m, self._all = observations.receiver_m, observations.devices
-        self._limit_db, self._chunk_links = limit_db, chunk_links
-        self.repeat_share = 1.0
-
-    def of_device(self, k: int, xy_m: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood of one device's data at positions.
-
-        Args:
-            k: index in `Observations.devices`.
-            xy_m: (p, 2) [m].
-
-        Returns:
-            (p,) [nats]
-        """
-        data = self._all[k]
-        rows = np.union1d(data.seen, data.missed)
-        total = np.zeros(len(xy_m))
-        for part, los in self._sight(xy_m, rows):
-            link = self._channel.look_up(xy_m[part], rows, los, data.device)
-            total[part] = self._score(data, rows, *link)
-        return total
-
-    def of_all(self, xy_m: np.ndarray) -> np.ndarray:
-        """Return the log-likelihood of each device's data at the same positions.
+    def of_devices(self, devices: Sequence[int] | np.ndarray, xy_m: np.ndarray) -> np.ndarray:
+        """Return the log-likelihood of the data of some devices at the same positions.
 
         Lines of sight are computed once for all, and so is the channel where it does not
         distinguish devices.
 
         Args:
+            devices: (k,) indices in `observations.devices`.
             xy_m: (p, 2) [m].
 
         Returns:
             (k, p) [nats]
         """
-        used = [np.concatenate([self._all[k].seen, self._all[k].missed]) for k in self.devices]
-        rows = np.unique(np.concatenate(used))
-        total = np.zeros((len(self.devices), len(xy_m)))
-        for part, los in self._sight(xy_m, rows):
-            link = None
-            for i, k in enumerate(self.devices):
-                data = self._all[k]
-                if link is None or self._channel.by_device:
-                    link = self._channel.look_up(xy_m[part], rows, los, data.device)
+        every = [self.observations.devices[k] for k in devices]
+        rows = np.unique(np.concatenate([part for data in every
+                                         for part in (data.seen, data.missed)]))
+        total = np.zeros((len(every), len(xy_m)))
+        step = max(1, CHUNK_LINKS // max(len(rows), 1))
+        for part in (slice(start, start + step) for start in range(0, len(xy_m), step)):
+            los, link = self._line_of_sight(xy_m[part], rows), None
+            for i, data in enumerate(every):
+                if link is None or self.channel.by_device:
+                    link = self.channel.look_up(xy_m[part], rows, los, data.device)
                 total[i, part] = self._score(data, rows, *link)
         return total
 
@@ -204,56 +174,51 @@ class Likelihood:
         """Return the channel between one position of a device and the receivers that detected it.
 
         Args:
-            k: index in `Observations.devices`.
+            k: index in `observations.devices`.
             xy_m: (2,) position [m].
 
         Returns:
             (n,) mean [dB], and (n,) standard deviation [dB].
         """
-        data = self._all[k]
+        data = self.observations.devices[k]
         los = self._line_of_sight(xy_m[None], data.seen)
-        mean_db, sd_db = self._channel.look_up(xy_m[None], data.seen, los, data.device)
+        mean_db, sd_db = self.channel.look_up(xy_m[None], data.seen, los, data.device)
         return mean_db[0], sd_db[0]
 
     def residuals(self, k: int, xy_m: np.ndarray) -> DeviceResiduals:
         """Return standardised residuals of a device's merged levels, and their slopes.
 
         Args:
-            k: index in `Observations.devices`.
+            k: index in `observations.devices`.
             xy_m: (2,) position of the device [m].
 
         Returns:
             n residuals, with slopes at constant line of sight.
         """
-        data = self._all[k]
+        data = self.observations.devices[k]
         mean_db, sd_db = self.link_at(k, xy_m)
         merged_sd_db = sd_db * np.sqrt(self.variance_share(data.count))
         los = np.repeat(self._line_of_sight(xy_m[None], data.seen), 4, axis=0)
         steps = SLOPE_STEP_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
-        around, _ = self._channel.look_up(xy_m + steps, data.seen, los, data.device)
+        around, _ = self.channel.look_up(xy_m + steps, data.seen, los, data.device)
         slope = np.column_stack([around[0] - around[1], around[2] - around[3]])
         slope = slope / (2 * SLOPE_STEP_M)
-        return DeviceResiduals(self.receiver_m[data.seen], (data.level_db - mean_db) / merged_sd_db,
+        return DeviceResiduals(self.observations.receiver_m[data.seen],
+                               (data.level_db - mean_db) / merged_sd_db,
                                slope / merged_sd_db[:, None])
 
     def variance_share(self, count: np.ndarray) -> np.ndarray:
         """Return the variance of the mean of `count` repeats over the channel's variance."""
         return 1.0 - self.repeat_share + self.repeat_share / count
 
-    def _sight(self, xy_m: np.ndarray, rows: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
-        step = max(1, self._chunk_links // max(len(rows), 1))
-        for start in range(0, len(xy_m), step):
-            part = slice(start, start + step)
-            yield part, self._line_of_sight(xy_m[part], rows)
-
     def _line_of_sight(self, xy_m: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return line of sight (p, c) between positions (p, 2) and rows (c,) of the receivers."""
         p, c = len(xy_m), len(rows)
-        if self._city is None:
+        if self.city is None:
             return np.ones((p, c), bool)
         ends_m = np.repeat(np.column_stack([xy_m, np.full(p, self.z_m)]), c, axis=0)
-        others_m = np.tile(self.receiver_m[rows], (p, 1))
-        return self._city.line_of_sight(ends_m, others_m).reshape(p, c)
+        others_m = np.tile(self.observations.receiver_m[rows], (p, 1))
+        return self.city.line_of_sight(ends_m, others_m).reshape(p, c)
 
     def _score(self, data: DeviceObservations, rows: np.ndarray, mean_db: np.ndarray,
                sd_db: np.ndarray) -> np.ndarray:
@@ -279,7 +244,7 @@ class Likelihood:
             # k misses at one position count k only as far as repeats are independent (design
             # effect).
             weight = data.missed_count / (1 + (data.missed_count - 1) * (1 - self.repeat_share))
-            below = ndtr((np.float32(self._limit_db) - mean_db[:, columns]) / sd_db[:, columns])
+            below = ndtr((np.float32(self.limit_db) - mean_db[:, columns]) / sd_db[:, columns])
             below *= np.float32(1 - OUTLIER_SHARE)
             below += np.float32(OUTLIER_SHARE / 2)
             total += np.log(below, out=below) @ weight

@@ -15,7 +15,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.runtime.console import progress
-from radiotwin.twin.localize.estimate import LocalizeSettings, TwinDevice
+from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.localize.likelihood import Likelihood, design_effect, residual_correlation
 from radiotwin.twin.localize.observations import (
     Channel,
@@ -47,6 +47,27 @@ VAGUE_SHARE = 0.5  # of the map: a device with a larger credible region is not l
 
 
 @dataclass(frozen=True)
+class LocalizeSettings:
+    """Extent of the search.
+
+    Attributes:
+        scan_step_m: width of a cell of the first scan over the map [m].
+        scan_links: links that the scan may evaluate, beyond which its cells grow.
+        swarms: number for each device.
+        particles: of each swarm.
+        iterations: of every swarm.
+        allow_indoor: whether a device may be inside a building.
+    """
+
+    scan_step_m: float = 5.0
+    scan_links: int = 15_000_000
+    swarms: int = 6
+    particles: int = 12
+    iterations: int = 25
+    allow_indoor: bool = False
+
+
+@dataclass(frozen=True)
 class Scan:
     """Log-likelihoods over a grid of square cells, which covers the bounds.
 
@@ -65,56 +86,29 @@ class Scan:
     value: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
 class Search:
     """Devices of one height, with their data, on a map.
 
     Attributes:
-        devices: (k,) indices in `Observations.devices`, by which the methods identify them.
-        z_m: height of the devices [m].
         likelihood: of their data.
+        bounds: within which they are.
+        settings: of the search.
     """
 
-    def __init__(
-        self,
-        observations: Observations,
-        channel: Channel,
-        devices: np.ndarray,
-        z_m: float,
-        bounds: Bounds,
-        city: CityMap | None,
-        limit_db: float | None,
-        settings: LocalizeSettings,
-        rng: np.random.Generator,
-    ) -> None:
-        """Prepare the search for some devices.
-
-        Args:
-            observations: of all devices.
-            channel: fitted.
-            devices: (k,) indices in `observations.devices` of those at `z_m`.
-            z_m: their height [m].
-            bounds: within which they are.
-            city: 3D map; None: every link has line of sight.
-            limit_db: limit of detection [dB]; None: unknown.
-            settings: of the search.
-            rng: random state, which is drawn from.
-        """
-        self.devices, self.z_m = devices, z_m
-        self._bounds, self._city, self._settings = bounds, city, settings
-        index = np.array([observations.devices[k].device for k in devices])
-        links = tabulate(channel, observations.receiver_m, z_m, bounds, index, rng)
-        self._direct = isinstance(links, DirectChannel)
-        self.likelihood = Likelihood(observations, links, devices, z_m, city, limit_db,
-                                     settings.chunk_links)
+    likelihood: Likelihood
+    bounds: Bounds
+    settings: LocalizeSettings
 
     def allowed(self, xy_m: np.ndarray) -> np.ndarray:
         """Return whether (p,) a device may be at positions (p, 2) [m]."""
-        x_min, x_max, y_min, y_max = self._bounds
+        x_min, x_max, y_min, y_max = self.bounds
+        city, z_m = self.likelihood.city, self.likelihood.z_m
         x, y = xy_m.T
         allowed = (x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)
-        if self._city is not None and not self._settings.allow_indoor and allowed.any():
-            at = np.column_stack([xy_m[allowed], np.full(allowed.sum(), self.z_m)])
-            allowed[allowed] = ~self._city.inside(at)
+        if city is not None and not self.settings.allow_indoor and allowed.any():
+            at = np.column_stack([xy_m[allowed], np.full(allowed.sum(), z_m)])
+            allowed[allowed] = ~city.inside(at)
         return allowed
 
     def log_likelihood(self, k: int, xy_m: np.ndarray) -> np.ndarray:
@@ -129,7 +123,7 @@ class Search:
         """
         value = np.full(len(xy_m), -np.inf)
         allowed = self.allowed(xy_m)
-        value[allowed] = self.likelihood.of_device(k, xy_m[allowed])
+        value[allowed] = self.likelihood.of_devices([k], xy_m[allowed])[0]
         return value
 
     def scan(self, coarser: float = 1.0) -> Scan:
@@ -146,11 +140,12 @@ class Search:
         Raises:
             BadInput: there is no point outside buildings.
         """
-        x_min, x_max, y_min, y_max = self._bounds
-        links = self._settings.scan_links // (DIRECT_SAVING if self._direct else 1)
+        x_min, x_max, y_min, y_max = self.bounds
+        is_direct = isinstance(self.likelihood.channel, DirectChannel)
+        links = self.settings.scan_links // (DIRECT_SAVING if is_direct else 1)
         area = (x_max - x_min) * (y_max - y_min)
-        width = max(self._settings.scan_step_m,
-                    np.sqrt(area * len(self.likelihood.receiver_m) / links)) * coarser
+        receivers = len(self.likelihood.observations.receiver_m)
+        width = max(self.settings.scan_step_m, np.sqrt(area * receivers / links)) * coarser
         axes = _centres(x_min, x_max, width), _centres(y_min, y_max, width)
         centre = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
         point, placed = centre.copy(), np.zeros(len(centre), bool)
@@ -161,11 +156,12 @@ class Search:
             point[todo[good]], placed[todo[good]] = tried[good], True
         if not placed.any():
             raise BadInput(
-                f"no position for a device at height {self.z_m} m within x {x_min} … {x_max} and y "
-                f"{y_min} … {y_max} m: all of it is inside buildings; widen the bounds, check the "
-                "heights, or set allow_indoor")
+                f"no position for a device at height {self.likelihood.z_m} m within x {x_min} … "
+                f"{x_max} and y {y_min} … {y_max} m: all of it is inside buildings; widen the "
+                "bounds, check the heights, or set allow_indoor")
         centre, point = centre[placed], point[placed]
-        return Scan(centre, width, point, self.likelihood.of_all(point))
+        return Scan(centre, width, point,
+                    self.likelihood.of_devices(self.likelihood.devices, point))
 
 
 def _centres(low: float, high: float, width: float) -> np.ndarray:
@@ -300,9 +296,13 @@ def localize(
                                  use_missed=limit_db is not None)
     rng = np.random.default_rng(seed)
     usable = np.array([data.usable for data in observations.devices], bool)
-    searches = [Search(observations, channel, np.flatnonzero(usable & (z_m == z)), z, bounds, city,
-                       limit_db, settings, rng)
-                for z in np.unique(z_m[usable])]
+    searches: list[Search] = []
+    for z in np.unique(z_m[usable]):
+        rows = np.flatnonzero(usable & (z_m == z))
+        index = np.array([observations.devices[k].device for k in rows])
+        links = tabulate(channel, observations.receiver_m, z, bounds, index, rng)
+        likelihood = Likelihood(observations, links, rows, z, city, limit_db)
+        searches.append(Search(likelihood, bounds, settings))
     found: dict[int, tuple[Posterior, Search]] = {}
     with progress("locating", total=settings.iterations + 3 * len(devices)) as advance:
         _set_repeat_share(searches, observations)
@@ -313,10 +313,10 @@ def localize(
         if searches:
             peaks = _run_swarms(searches, scans, start_m, settings, rng, advance)
         residuals = {k: search.likelihood.residuals(k, peaks[k][0]).thinned()
-                     for search in searches for k in search.devices}
+                     for search in searches for k in search.likelihood.devices}
         correlation = residual_correlation(list(residuals.values()))
         for search, scan in zip(searches, scans, strict=True):
-            for i, k in enumerate(search.devices):
+            for i, k in enumerate(search.likelihood.devices):
                 effect = design_effect(residuals[k], correlation)
                 posterior = refine(partial(search.log_likelihood, k), scan.centre_m, scan.point_m,
                                    scan.value[i], scan.width_m, peaks[k], 1.0 / effect)
@@ -338,7 +338,7 @@ def _set_repeat_share(searches: list[Search], observations: Observations) -> Non
     within = 0.0
     for search in searches:
         scan = search.scan(COARSE_SCAN)
-        for k, value in zip(search.devices, scan.value, strict=True):
+        for k, value in zip(search.likelihood.devices, scan.value, strict=True):
             sd_db = search.likelihood.link_at(k, scan.point_m[value.argmax()])[1]
             within += float((observations.devices[k].squares / sd_db**2).sum())
     for search in searches:
@@ -354,10 +354,10 @@ def _run_swarms(
     advance: Callable[[int], None],
 ) -> dict[int, np.ndarray]:
     """Return the best positions (s, 2) [m] of each device's swarms, best first."""
-    search_of = {k: search for search in searches for k in search.devices}
+    search_of = {k: search for search in searches for k in search.likelihood.devices}
     centres, whose = [], []
     for search, scan in zip(searches, scans, strict=True):
-        for k, value in zip(search.devices, scan.value, strict=True):
+        for k, value in zip(search.likelihood.devices, scan.value, strict=True):
             modes = distinct_modes(scan.point_m, value, settings.swarms,
                                    MODE_SPACING_CELLS * scan.width_m)
             if np.isfinite(start_m[k]).all():

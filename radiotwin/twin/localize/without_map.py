@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 
 from radiotwin.links import Links
 from radiotwin.twin.localize.estimate import TwinDevice
-from radiotwin.twin.model.model import FittedModel
+from radiotwin.twin.model.model import Fit, FittedModel
 
 COARSE_CELLS, MAX_FINE_CELLS, MAX_SPLIT = 1500, 640, 4
 HELD = 0.999  # of the probability, by the coarse cells that are split
@@ -119,14 +119,7 @@ def position_log_likelihood(model: FittedModel, own: Links,
 def _log_likelihood_at(model: FittedModel, own: Links, positions_m: np.ndarray) -> np.ndarray:
     """Return the same for few enough positions, all at once."""
     n, cells, sd_db = len(own), len(positions_m), model.device_sd_db
-    height_m = np.full(cells, own.device_m[own.device[0], 2])
-    candidates_m = np.column_stack([positions_m, height_m])
-    known = len(model.device_m)
-    # Effects count devices as the model does, so the candidates come after those that it knows.
-    every = own.select(np.tile(np.arange(n), cells)).of_devices(
-        known + np.repeat(np.arange(cells), n), np.vstack([model.device_m, candidates_m]),
-        [f"device {i}" for i in range(known + cells)], frozenset()).since(model.first_s)
-    fit = model.on_links(every)
+    fit = fit_elsewhere(model, own, positions_m)
     problem = fit.model.regression()
     nodes, weights = np.polynomial.hermite_e.hermegauss(NODES if sd_db > 0 else 1)
     values = []
@@ -134,6 +127,27 @@ def _log_likelihood_at(model: FittedModel, own: Links, positions_m: np.ndarray) 
         moved = replace(problem, gain_db=problem.gain_db + node * sd_db)
         values.append(np.log(weight) - moved.nll(fit).reshape(cells, n).sum(axis=1))
     return np.logaddexp.reduce(values, axis=0)
+
+
+def fit_elsewhere(model: FittedModel, own: Links, positions_m: np.ndarray) -> Fit:
+    """Return a model on the links of one device, again for each position (c, 2) that it may have.
+
+    Args:
+        model: counts receivers as the links do.
+        own: n links of one device.
+        positions_m: where it might be, at the height that the links have it [m].
+
+    Returns:
+        of c * n links, positions slowest.
+    """
+    n, cells, known = len(own), len(positions_m), len(model.device_m)
+    height_m = np.full(cells, own.device_m[own.device[0], 2])
+    candidates_m = np.column_stack([positions_m, height_m])
+    # Effects count devices as the model does, so the candidates come after those that it knows.
+    every = own.select(np.tile(np.arange(n), cells)).of_devices(
+        known + np.repeat(np.arange(cells), n), np.vstack([model.device_m, candidates_m]),
+        [f"device {i}" for i in range(known + cells)], frozenset()).since(model.first_s)
+    return model.on_links(every)
 
 
 def _finer(log_likelihood: np.ndarray, power: float, coarse_m: np.ndarray,

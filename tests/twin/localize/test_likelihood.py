@@ -25,8 +25,7 @@ def test_equals_the_formula_written_out(free_space):
         expected += np.log((1 - OUTLIER_SHARE) * norm.pdf(y, m, 2 * np.sqrt(0.5 + 0.5 / n)) + floor)
     for m, weight in [(mean[3], 2 / 1.5), (mean[4], 1)]:
         expected += weight * np.log((1 - OUTLIER_SHARE) * norm.cdf(-95, m, 2) + OUTLIER_SHARE / 2)
-    assert np.isclose(likelihood.of_device(0, xy_m)[0], expected, atol=0.02)
-    assert np.isclose(likelihood.of_all(xy_m)[0, 0], expected, atol=0.02)
+    assert np.isclose(likelihood.of_devices([0], xy_m)[0, 0], expected, atol=0.02)
 
 
 def test_table_is_used_only_where_it_is_exact(free_space, published_law):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.twin.localize import LocalizeSettings, localize, posterior
+from radiotwin.twin.localize import LocalizeSettings, likelihood, localize, posterior
 
 QUICK = LocalizeSettings(scan_step_m=10.0, swarms=3, particles=8, iterations=12)
 BOUNDS = (0.0, 400.0, 0.0, 400.0)
@@ -128,12 +128,13 @@ def test_a_start_helps_a_search_that_is_too_coarse(
     assert worst_m(None) > 20.0
 
 
-def test_same_seed_same_estimates_whatever_the_chunks(city, flown, measured, published_law):
+def test_same_seed_same_estimates_whatever_the_chunks(city, flown, measured, published_law, monkeypatch):
     rng = np.random.default_rng(7)
     data = measured([[460.0, 200.0], [20.0, 200.0]], flown(rng)[::6], rng)
 
     def run(chunk_links):
-        settings = LocalizeSettings(scan_step_m=20.0, swarms=2, iterations=5, chunk_links=chunk_links)
+        monkeypatch.setattr(likelihood, "CHUNK_LINKS", chunk_links)
+        settings = LocalizeSettings(scan_step_m=20.0, swarms=2, iterations=5)
         return localize(
             *data, published_law,
             devices={0: "a", 1: "b"}, bounds=(0, 600, 0, 800), z_m=1.5, city=city, limit_db=-120.0, seed=3, settings=settings,
