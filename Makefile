@@ -68,7 +68,7 @@ check: $(INSTALLED)
 	@$(MAKE) --no-print-directory -j 2 lint fast
 
 fast: $(INSTALLED)
-	$(PYTEST) -m "not slow and not llvm and not whole_loop" $(FAST_TESTS)
+	$(PYTEST) -m "not slow and not llvm and not seconds" $(FAST_TESTS)
 
 # In a folder of its own, where the examples leave what they make.
 docs: $(INSTALLED)

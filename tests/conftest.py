@@ -1,4 +1,4 @@
-"""Skips what a machine cannot run, with the reason."""
+"""Skips what a machine cannot run, with the reason; the order of the tests."""
 
 import uuid
 
@@ -6,10 +6,17 @@ import pytest
 
 from radiotwin.runtime import cuda, llvm
 
+LONG = ("examples", "tests/test_api", "tests/test_examples", "tests/marl", "tests/cli", "tests/twin", "tests/closeloop",
+        "tests/trace", "tests/runtime", "tests/studies")
+"""What has the longest tests; they come first, so that at the end no worker waits for one of them."""
 GPU_TRIALS = {"tracing": cuda.tracing_refusal, "training": cuda.torch_refusal}
 
 
 def pytest_collection_modifyitems(items):
+    def place(item):
+        return next((number for number, start in enumerate(LONG) if item.nodeid.startswith(start)), len(LONG))
+
+    items.sort(key=place)
     needs_llvm = [item for item in items if item.get_closest_marker("llvm")]
     if needs_llvm and not llvm.available():
         for item in needs_llvm:

@@ -14,6 +14,7 @@ import pytest
 
 import radiotwin as rt
 from radiotwin.cli.commands import app
+from tests.worlds import quickened
 
 ROOT = Path(__file__).parents[1]
 # Command -> functions of `rt` that do its work; a command calls them, or (after the arrow) what they call, too.
@@ -51,7 +52,7 @@ def documented(tmp_path_factory):
     assert len(snippets) == text.count("```") / 2 == 7
     matplotlib.use("Agg")
     names, printed = {}, io.StringIO()
-    with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
+    with quickened(), contextlib.chdir(folder), contextlib.redirect_stdout(printed):
         for snippet in snippets:
             exec(compile(snippet, "docs/python.md", "exec"), names)
     return names, folder / "quick", printed.getvalue()

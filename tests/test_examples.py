@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.worlds import quickened
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -36,7 +38,8 @@ def test_find_devices(run, tmp_path):
 
 
 def test_close_the_loop(run):
-    out = run("close_the_loop")
+    with quickened():
+        out = run("close_the_loop")
     assert "verdict: effect" in out and "receiver_gain_offset" in out
     before, after = map(float, re.search(r"([\d.]+) dB before, ([\d.]+) dB after", out).groups())
     assert after < before

@@ -10,6 +10,7 @@ import pytest
 
 from radiotwin.closeloop.predict.baselines import grow_trees
 from radiotwin.closeloop.predict.predictor import CombinedPrediction
+from radiotwin.effects.registry import catalogue
 from radiotwin.links.links import Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
@@ -87,15 +88,33 @@ def short_report():
         yield
 
 
-@pytest.fixture
-def quick_report(monkeypatch):
+@contextmanager
+def quickened():
     """A report as ever, from forests of five trees and a few patterns: they take two thirds of the time of a small loop."""
     def grown(kind, features, target, seed, *_):
         return grow_trees(kind, features, target, seed, 5)
-    for module in ("baselines", "predictor"):
-        monkeypatch.setattr(f"radiotwin.closeloop.predict.{module}.grow_trees", grown)
-    for most in ("MAX_MEMBERS", "MAX_PLACES"):
-        monkeypatch.setattr(f"radiotwin.effects.patterns.{most}", 1)
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("baselines", "predictor"):
+            patch.setattr(f"radiotwin.closeloop.predict.{module}.grow_trees", grown)
+        for most in ("MAX_MEMBERS", "MAX_PLACES"):
+            patch.setattr(f"radiotwin.effects.patterns.{most}", 1)
+        yield
+
+
+@pytest.fixture
+def quick_report():
+    with quickened():
+        yield
+
+
+@pytest.fixture
+def only_effects(monkeypatch):
+    """Function that leaves some effects in the catalogue of a loop, by their names: to look for all of them takes seconds."""
+    def leave(*names):
+        few = [each for each in catalogue() if each.name in names]
+        assert {each.name for each in few} == set(names)
+        monkeypatch.setattr("radiotwin.closeloop.run.catalogue", lambda: few)
+    return leave
 
 
 @pytest.fixture(scope="session")

@@ -56,6 +56,7 @@ def test_rain_is_found_with_its_loss(effect):
     assert found["params"]["end_s"] == pytest.approx(END_S, abs=60)
 
 
+@pytest.mark.slow
 def test_without_rain_nothing_is_found(effect):
     report = rt.make_report(rt.close_loop(made(0.0), base="log-distance"))
     assert report["verdict"] == "none"

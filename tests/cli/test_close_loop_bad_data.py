@@ -178,10 +178,26 @@ THIN = {
 }
 
 
-# What has nothing to be noted runs with `make test-all`, but for the least that there can be.
-@pytest.mark.parametrize(("edit", "parts"), [
-    pytest.param(*given, id=name, marks=[pytest.mark.slow] * (not given[1] and name != "sixty links"))
-    for name, given in THIN.items()])
+TOGETHER = {
+    "little is told": ("no heading column", "no time column", "no frequency", "one receiver", "no scene", "empty device heights"),
+    "cells are empty": ("empty headings", "empty times", "empty receiver heights", "a device never detected"),
+    "little was measured": ("a heading that never changes", "a dead receiver", "a device never measured"),
+    "there are few links": ("sixty links",), "one device": ("one device",), "a stuck receiver": ("a stuck receiver",),
+    "rows twice": ("rows twice",), "names differ in case only": ("names that differ in case only",),
+    "receivers in degrees": ("receivers in degrees",),
+    "unknown devices without a scene": ("unknown devices without a scene",)}
+"""Each loop takes seconds."""
+
+
+@pytest.mark.parametrize("names", TOGETHER.values(), ids=TOGETHER)
+def test_thin_data_gives_a_result_that_says_all_of_it(close_loop, tmp_path, names):
+    links, devices, _ = open_ground()
+    links, devices = each(*(THIN[name][0] for name in names))(links, devices)
+    went_on(tmp_path, close_loop(links, devices), *(part for name in names for part in THIN[name][1]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("edit", "parts"), THIN.values(), ids=THIN)
 def test_thin_data_gives_a_result_that_says_so(close_loop, tmp_path, edit, parts):
     links, devices, _ = open_ground()
     went_on(tmp_path, close_loop(*edit(links, devices)), *parts)
@@ -268,7 +284,9 @@ IN_THE_CITY = {
 }
 
 
-@pytest.mark.parametrize(("edit", "parts"), IN_THE_CITY.values(), ids=IN_THE_CITY)
+@pytest.mark.parametrize(("edit", "parts"), [
+    pytest.param(*given, id=name, marks=[pytest.mark.slow] * (name in ("nothing implausible", "receivers in degrees")))
+    for name, given in IN_THE_CITY.items()])
 def test_thin_data_with_a_map_gives_a_result_that_says_so(close_loop, small_scene, tmp_path, edit, parts):
     links, devices = edit(*in_the_city(small_scene))
     done = close_loop(links, devices, f"--scene {small_scene.folder} --base log-distance")

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from radiotwin.trace import SolverSettings
+
 MATERIAL = '<bsdf type="itu-radio-material" id="concrete"><string name="type" value="concrete"/></bsdf>'
 SHAPE = ('<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>'
          '<ref id="concrete" name="bsdf"/></shape>')
@@ -30,6 +32,7 @@ def city_xml(tmp_path):
 def test_the_whole_chain_ends_in_a_page(run, city_xml, monkeypatch):
     monkeypatch.setattr("radiotwin.cli.demo.DEVICES", 4)
     monkeypatch.setattr("radiotwin.cli.demo.FLIGHTS", 3)
+    monkeypatch.setattr("radiotwin.cli.demo.SolverSettings.of_quality", lambda _, **others: SolverSettings(samples_per_src=3_000, **others))
     folder = city_xml.parent
     result = run("demo --scene city.xml -o out", cwd=folder)
     assert result.returncode == 0, result.stderr

@@ -36,7 +36,7 @@ def test_the_run_in_the_truth_ends_where_the_page_says(folder):
     assert last["truth_ratio"] == pytest.approx(float(share), abs=0.05)  # another machine rounds otherwise
 
 
-def test_programs_are_whole(folder):
+def test_programs_are_whole():
     for program in fences(PAGE, "python"):
         compile(program, "program", "exec")
     assert [out_of(each) for each in TRAIN] == ["runs/qmix", "runs/fedqmix", "runs/truth", "runs/short"]

@@ -87,7 +87,7 @@ def test_a_sector_that_was_not_measured_is_predicted_by_its_declared_azimuth(see
     assert f"{found.after_db:.2f} dB, and {found.before_db:.2f} dB without them" in found.note
 
 
-@pytest.mark.parametrize("turn_deg", [60.0, 180.0])
+@pytest.mark.parametrize("turn_deg", [pytest.param(60.0, marks=pytest.mark.slow), 180.0])
 def test_azimuths_that_the_readings_contradict_are_left_out_and_told(turn_deg):
     """Between the neighbours, or backwards: the table is wrong, and is not believed."""
     measurements = network(2)
@@ -121,6 +121,7 @@ def test_the_loop_begins_with_what_is_declared_and_calls_it_no_cause():
     assert labels == ["before: log-distance with its own effects"]
 
 
+@pytest.mark.usefixtures("quick_report")
 def test_a_sector_that_is_only_planned_is_predicted_by_the_stored_twin(tmp_path):
     """B2 is in the table of devices and was never on air; its readings are those of the year after."""
     everything = network(6, points=200)
@@ -159,7 +160,8 @@ def test_of_a_sector_that_nothing_tells_the_twin_knows_that_it_knows_little(tmp_
     assert abs(np.mean(error_db)) < 4.0
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
 def test_declared_tilts_that_differ_predict_better_than_one_for_all(seed):
     measurements = network(seed, tilts_deg=(-3.0, -20.0))
     told = measurements.devices.assign(tilt_deg=np.repeat([-3.0, -20.0], 3))

@@ -81,6 +81,7 @@ def test_nobody_knew_the_episode_before_its_flight_and_nothing_else_is_judged_by
     assert "time_s" not in {each.variable for each in found.remaining}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_report")
 def test_a_faulty_flight_is_no_less_one_because_another_receiver_has_changed():
     report = rt.make_report(rt.close_loop(campaign(1, loss_db=0.0, fault_db=8.0, step_db=15.0), base="log-distance",

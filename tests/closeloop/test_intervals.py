@@ -46,6 +46,7 @@ def offset_of_receivers(seed):
     return holds(away, np.copysign(4.0, away.value))
 
 
+@pytest.mark.slow
 def test_nine_in_ten_intervals_hold_with_errors_along_tracks():
     """20 worlds: 90 % +- 2 * 6.7 %; intervals of independent links hold 30 %."""
     assert 0.77 <= np.mean([offset_of_receivers(seed) for seed in range(20)]) <= 1.0

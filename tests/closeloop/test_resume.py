@@ -43,8 +43,9 @@ def searches(monkeypatch):
 
 
 @pytest.fixture
-def measured(open_ground, monkeypatch):
+def measured(open_ground, only_effects, monkeypatch):
     monkeypatch.setattr("radiotwin.closeloop.run.detectable", lambda *_: [])  # keeps no parts
+    only_effects("receiver_gain_offset", "receiver_drift", "device_gain_offset", "faulty_flight")
     world = open_ground.fly(2)
     world.gain_db[world.receiver == 1] += 5.0
     world.gain_db[(world.receiver == 0) & (world.time_s > 530)] -= 6.0

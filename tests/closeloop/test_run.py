@@ -45,6 +45,7 @@ def test_a_receiver_that_reads_too_much_is_named_and_measured(open_ground):
     assert report["error"]["after"]["rmse_db"] < 1.05 * 2.0 < report["error"]["before"]["rmse_db"]
 
 
+@pytest.mark.slow
 def test_a_receiver_that_warms_up_is_named_and_not_an_offset(open_ground):
     world = open_ground.fly(3)
     mine = world.receiver == 0
@@ -54,6 +55,7 @@ def test_a_receiver_that_warms_up_is_named_and_not_an_offset(open_ground):
     assert value(report, "receiver_drift", "warm_up_each_flight_db[r0]") == pytest.approx(7.0, abs=1.5)
 
 
+@pytest.mark.slow
 def test_a_step_in_time_is_found_where_it_is(open_ground):
     world = open_ground.fly(4)
     world.gain_db[(world.receiver == 1) & (world.time_s > 530)] -= 6.0
@@ -82,6 +84,7 @@ def test_a_warm_up_that_only_the_first_flight_shows_is_no_step(open_ground):
     assert value(report, "receiver_drift", "time_constant_s[r1]") == pytest.approx(40.0, abs=10.0)
 
 
+@pytest.mark.slow
 def test_a_device_that_has_changed_is_named(open_ground):
     world = open_ground.fly(10)
     world.gain_db[(world.device == 2) & (world.time_s > 530)] -= 7.0
@@ -90,6 +93,7 @@ def test_a_device_that_has_changed_is_named(open_ground):
     assert value(report, "device_drift", "step_db[d2]") == pytest.approx(-7.0, abs=1.0)
 
 
+@pytest.mark.slow
 def test_a_receiver_whose_clock_is_wrong_is_named(open_ground):
     world = open_ground.fly(11)
     mine, late_s = world.receiver == 1, 3  # each level is written beside the position of three seconds before
@@ -123,6 +127,7 @@ def test_what_no_effect_explains_is_filled_in_over_the_variable_that_it_depends_
     assert report["error"]["after"]["rmse_db"] < 1.1 * 2.0 < report["error"]["before"]["rmse_db"]
 
 
+@pytest.mark.slow
 def test_a_sector_antenna_is_named_and_its_direction_found(open_ground):
     world = open_ground.fly(5)
     mine = world.device == np.abs(world.device_m[:, :2] - 250).max(axis=1).argmin()  # seen from all sides
@@ -146,6 +151,7 @@ def test_an_anchor_that_is_elsewhere_is_found(open_ground):
     assert value(report, "device_position_error", "y_m[d1]") == pytest.approx(world.device_m[1, 1], abs=10)
 
 
+@pytest.mark.slow
 def test_what_no_effect_explains_is_called_unexplained_and_what_it_depends_on_is_named(open_ground):
     world = open_ground.fly(7)
     world.gain_db += 3.0 * np.sign(np.sin(2 * np.pi * world.receiver_m[:, 0] / 160)
@@ -187,6 +193,7 @@ def test_devices_can_be_held_out(open_ground):
         close_loop(open_ground.measured(world), base="log-distance", hold_out="colour")
 
 
+@pytest.mark.slow
 def test_when_a_receiver_changed_a_flight_that_is_held_out_does_not_tell(open_ground):
     world = open_ground.fly(4)
     world.gain_db[(world.receiver == 1) & (world.flight >= 3)] -= 6.0

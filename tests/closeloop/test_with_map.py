@@ -99,6 +99,7 @@ def test_a_building_that_the_map_lacks_is_found_and_goes_into_the_twin(small_sce
     assert error_db(corrected.radio_map(small_scene), small_scene, blocked) < 0.75 * before
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_report")
 def test_a_building_that_is_gone_is_named(small_scene):
     from radiotwin.effects.boxes import buildings
@@ -119,6 +120,7 @@ def test_a_building_that_is_gone_is_named(small_scene):
     assert (parameters["x_m"]["value"], parameters["y_m"]["value"]) == pytest.approx(tuple(centres_m[gone, :2]))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_report")
 def test_walls_that_are_off_are_no_cause_but_part_of_the_base(small_scene, tmp_path):
     moved = small_scene.city.with_vertices(small_scene.city.vertices + [1.5, -1.0, 0.0])

@@ -88,7 +88,7 @@ def test_what_was_found_is_reported_for_each_receiver(links):
         "body_width_deg[r1]": 180}
 
 
-@pytest.mark.whole_loop
+@pytest.mark.slow
 def test_a_body_is_found_in_a_flight(open_ground, loop):
     """One receiver of two loses 9 dB behind, 0 in front; the other is clear."""
     world = open_ground.fly(31)

@@ -29,6 +29,7 @@ def inside(box, points_m):
     return np.array(result)
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("turn_deg", [0.0, 30.0, -75.0])
 def test_metres_inside_are_those_of_points_along_the_link(turn_deg):
     rng = np.random.default_rng(0)

@@ -128,6 +128,7 @@ def test_what_is_no_fault_of_a_flight_is_not_called_one(flown, other, seed):
         assert Episode().propose(given) == []
 
 
+@pytest.mark.seconds
 def test_ten_draws_of_nothing_have_no_fault(flown):
     found = [FaultyFlight().propose(given) + Episode().propose(given) for given in map(flown, range(10, 20))]
     assert sum(map(bool, found)) == 0
@@ -179,6 +180,7 @@ def test_what_all_links_have_in_common_shows_in_the_few_with_line_of_sight(flown
     assert (params.receiver, params.flight) == (1, "f3")
 
 
+@pytest.mark.seconds
 def test_without_a_fault_links_without_line_of_sight_make_none(flown):
     found = [FaultyFlight().propose(given) + Episode().propose(given)
              for given in (flown(seed, hidden_share=0.75) for seed in range(10))]

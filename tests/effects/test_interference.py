@@ -42,7 +42,7 @@ def test_an_emitter_at_the_edge_of_the_searched_area_is_implausible():
     assert Interference().with_params(params.model_copy(update={"place_m": (250.0, 80.0)})).implausible(np.zeros(0)) is None
 
 
-@pytest.mark.whole_loop
+@pytest.mark.slow
 def test_an_emitter_is_found_at_its_position(open_ground, loop):
     world = open_ground.fly(21)
     power = heard(world.receiver_m, np.array([330.0, 140.0, 3.0]), -99.0)
@@ -54,7 +54,7 @@ def test_an_emitter_is_found_at_its_position(open_ground, loop):
     assert found.error["after"]["nll"] < found.error["before"]["nll"] - 0.1
 
 
-@pytest.mark.whole_loop
+@pytest.mark.seconds
 def test_a_floor_that_is_the_same_everywhere_is_no_emitter(open_ground, loop):
     world = open_ground.fly(22)
     world.gain_db = 10 * np.log10(watts(world.gain_db) + watts(-97.0))

@@ -58,7 +58,7 @@ def test_what_is_low_for_other_reasons_is_not_lost_lock(low, seen):
     assert LockLoss().propose(seen(low)) == []
 
 
-@pytest.mark.whole_loop
+@pytest.mark.slow
 def test_drops_are_named_with_their_size(open_ground, loop):
     world, rng = open_ground.fly(29), np.random.default_rng(29)
     measurements = open_ground.measured(world)

@@ -145,6 +145,7 @@ def test_a_search_may_stay_where_it_begins():
         assert ((variation.low <= variation.values) & (variation.values <= variation.high)).all()
 
 
+@pytest.mark.seconds
 def test_past_known_paths_is_what_the_box_does_not_block(make_links):
     """A high box hides two receivers; of one most power is diffuse, nine times that of its straight line."""
     house = trimesh.creation.box(bounds=[[400, 400, 0], [410, 410, 10]])
@@ -164,6 +165,7 @@ def test_past_known_paths_is_what_the_box_does_not_block(make_links):
     assert lost_db[2] == pytest.approx(0, abs=1e-3)
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("seed", [0, 1])
 def test_along_paths_a_box_is_found_that_quick_levels_turned(make_links, seed):
     """From 17° and some metres off a search finds most of what the true box explains, and that in a few seconds."""

@@ -54,6 +54,7 @@ def test_sheets_by_name(bring_in, book):
         bring_in(book.read_bytes(), "log.xlsx", sheet="leer", **given)
 
 
+@pytest.mark.seconds
 def test_workbooks_that_are_bombs(bring_in, book, monkeypatch):
     given = {"columns": COLUMNS, "length_unit": "m"}
     declared = rewritten(book, lambda name, data: b'<!DOCTYPE a [<!ENTITY b "c">]>' + data if "sheet1" in name else data)

@@ -59,6 +59,7 @@ def test_no_position_in_time_is_preferred(links, small_sample):
     assert np.abs(often - often.mean()).max() < 0.25 and often.min() > 0
 
 
+@pytest.mark.seconds
 @pytest.mark.usefixtures("short_report")
 def test_the_report_says_so_and_finds_what_all_links_show(open_ground, small_sample):
     world = open_ground.fly(2)

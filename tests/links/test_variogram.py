@@ -49,6 +49,7 @@ def test_levels_of_flights_and_trends_are_nothing_of_a_residual():
     np.testing.assert_allclose(trend.taken_from(common), 0.0, atol=1e-9)
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize(("length_m", "within"), [(20.0, 1.4), (40.0, 1.5), (80.0, 1.9)])
 def test_a_length_that_trends_take_much_of_is_recovered(length_m, within):
     """Flights are 150 to 450 m long, a few lengths."""

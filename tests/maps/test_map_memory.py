@@ -64,6 +64,7 @@ def make(folder, small_scene, devices, step_m):
     return 9 * devices * int(np.prod(lattice.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="the unit of the peak of the memory is that of Linux")
 def test_a_map_three_times_the_memory(small_scene, tmp_path):
     make(tmp_path / "small", small_scene, 2, 10.0)

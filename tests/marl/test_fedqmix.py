@@ -15,6 +15,7 @@ import pytest
 from marl.checkpoint import load_checkpoint
 from marl.settings import settings_of
 from radiotwin.runtime import cuda
+from tests.command_line import run_planning
 
 SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "
          "--planner-iterations 300 ")
@@ -42,15 +43,22 @@ def metrics(path):
         return [{name: value for name, value in row.items() if not name.endswith("_s")} for row in csv.DictReader(file)]
 
 
-def test_a_whole_run_writes_everything_and_ends_in_the_table(scene_option, tmp_path):
-    status, out, err = run(scene_option + SMALL + "--out result", tmp_path)
+@pytest.fixture(scope="module")
+def unbroken(scene_option, tmp_path_factory):
+    """The folder of a whole run, and what it printed."""
+    folder = tmp_path_factory.mktemp("unbroken")
+    status, out, err = run(scene_option + SMALL + "--out result", folder)
     assert status == 0, err
+    return folder / "result", out
+
+
+def test_a_whole_run_writes_everything_and_ends_in_the_table(unbroken):
+    folder, out = unbroken
     lines = [line for line in out.splitlines() if line.strip().startswith(("fedqmix", "planner", "greedy", "random"))]
     assert [line.split()[:2] for line in lines] == [["fedqmix", "NN"], ["fedqmix", "log-distance"], ["fedqmix", "the"],
                                                     ["planner", "NN"], ["greedy", "2"], ["random", "0"]]
     # Trained in the truth, every episode of both replicas is a real one, and so are three looks at the policy.
     assert lines[2].split()[3] == str(160 + 3 * 64)
-    folder = tmp_path / "result"
     for name in ("config.json", "metrics.csv", "checkpoint.safetensors", "comparison.csv", "curve.png", "trajectories.png",
                  "flights.csv", "twin/twin.json", "compare/truth/metrics.csv"):
         assert (folder / name).is_file(), name
@@ -62,10 +70,8 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(scene_option, tmp_p
     assert all(0 < ratio <= 1 for ratio in ratios.values()) and ratios["planner", "NN twin"] > ratios["random", ""]
 
 
-def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_path):
-    words = scene_option + SMALL + "--compare false "
-    status, _, err = run(words + "--out unbroken", tmp_path)
-    assert status == 0, err
+def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(unbroken, scene_option, tmp_path):
+    words = scene_option + SMALL + "--compare false "  # the comparison comes after it
     process = start(words + "--out killed", tmp_path)
     checkpoint = tmp_path / "killed" / "checkpoint.safetensors"
     for _ in range(1200):
@@ -77,12 +83,13 @@ def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_p
     assert process.returncode == -signal.SIGKILL and len(load_checkpoint(checkpoint)["rows"]) < 2
     status, _, err = run(words + "--out killed --resume", tmp_path)
     assert status == 0, err
-    assert metrics(tmp_path / "killed" / "metrics.csv") == metrics(tmp_path / "unbroken" / "metrics.csv")
-    ends = [load_checkpoint(tmp_path / name / "checkpoint.safetensors") for name in ("killed", "unbroken")]
+    killed, whole = tmp_path / "killed", unbroken[0]
+    assert metrics(killed / "metrics.csv") == metrics(whole / "metrics.csv")
+    ends = [load_checkpoint(folder / "checkpoint.safetensors") for folder in (killed, whole)]
     for one, other in zip(*(flat(end["strategy"]) for end in ends), strict=True):
         assert one == other
-    for name in ("trajectories.png", "curve.png", "twin/twin.json"):
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "unbroken" / name).read_bytes()
+    for name in ("trajectories.png", "flights.csv", "twin/twin.json"):
+        assert (killed / name).read_bytes() == (whole / name).read_bytes()
     status, _, err = run(words + "--out killed --resume --learning-rate 0.1", tmp_path)
     assert status == 2 and "--learning-rate 0.1" in err and "0.002" in err
     status, _, err = run(words + "--out killed", tmp_path)
@@ -128,9 +135,9 @@ def flat(value):
     ("--out result --resume", ["nothing to resume"])])
 def test_bad_input_is_one_message_and_leaves_nothing(words, parts, small_scene, tmp_path):
     given = words if "--scene" in words else f"--scene {shlex.quote(str(small_scene.folder))} --truth segmented {words}"
-    status, out, err = run(given, tmp_path)
-    assert status == 2 and "Traceback" not in err and not out
-    assert all(part in err for part in parts), err
+    done = run_planning(shlex.split(given), tmp_path)
+    assert done.returncode == 2 and "Traceback" not in done.stderr and not done.stdout
+    assert all(part in done.stderr for part in parts), done.stderr
     assert not list(tmp_path.iterdir())
 
 

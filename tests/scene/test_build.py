@@ -47,6 +47,7 @@ def test_town(town, tmp_path):
     assert scene.city.height_at(-60.0, -60.0) == pytest.approx(8.0)
 
 
+@pytest.mark.seconds
 def test_same_seed_same_scene_from_anywhere(town, tmp_path):
     path = town.write()
     build_scene(path, tmp_path / "a", BuildOptions(devices=6, seed=1))
@@ -135,6 +136,7 @@ def test_impossible_options(town, options, message):
         check(town.write(), **options)
 
 
+@pytest.mark.seconds
 def test_sub_gigahertz_scene_keeps_constants_that_sionna_can_load(town, tmp_path):
     report = build_scene(town.write(), tmp_path / "out", BuildOptions(frequency_hz=868e6))
     assert "1-100 GHz" in found(report, "warning") and not report.materials[0].in_range
@@ -316,6 +318,7 @@ def test_part_of_a_city(town, tmp_path):
     assert report.extent_m == (-75, 0, -75, 40)
 
 
+@pytest.mark.seconds
 def test_other_files_are_never_erased(town, tmp_path):
     out = tmp_path / "out"
     build_scene(town.write(), out)
@@ -356,6 +359,7 @@ def test_street_canyon_of_sionna(tmp_path):
     assert {use.name for use in report.materials} == {"glass", "marble", "wood", "brick", "concrete"}
 
 
+@pytest.mark.seconds
 def test_munich_of_sionna(tmp_path):
     """Rationale: a real city of 2367 meshes, roofs apart from open-bottomed walls.
 

@@ -135,6 +135,7 @@ def test_a_trace_writes_nothing_outside(small_scene, tmp_path):
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
+@pytest.mark.seconds
 def test_declarations_that_a_user_has_edited_are_kept_beside_a_new_scene(tmp_path):
     build_preset("small", tmp_path / "scene")
     declared = tmp_path / "scene" / "scene.toml"

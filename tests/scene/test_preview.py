@@ -24,6 +24,7 @@ def test_height_grid_lies_where_the_houses_are(scene):
     assert (height_m > 1).mean() == pytest.approx(9 * 400 / 160**2, abs=0.01)
 
 
+@pytest.mark.seconds
 def test_picture_shows_heights_devices_and_starts(scene, tmp_path):
     draw_preview(scene, tmp_path / "a.png")
     picture = matplotlib.image.imread(tmp_path / "a.png")[..., :3]

@@ -88,13 +88,13 @@ def test_the_same_actions_collect_the_same_in_a_twin_without_error(small_scene):
 
 
 def test_every_method_flies_where_things_are_not_as_thought(small_scene):
-    quick = {"episodes": 100, "flights": 6, "truths": 2, "planner_iterations": 500, "replan_iterations": 50}
+    quick = {"episodes": 40, "flights": 6, "truths": 2, "planner_iterations": 200, "replan_iterations": 20}
     settings = {name.replace("rbm", "small"): {key: quick.get(key, value) for key, value in each.items()}
                 for name, each in disturbances.pays_cases(0).items() if name.startswith("rbm-everything")}
     rows = rows_of(disturbances.fly_disturbed, small_scene, settings)
     assert len(rows) == 8 and all(len(ratios) == 6 for ratios in rows["ratios"])
     by_name = rows.set_index("name")
-    assert by_name["curve"]["small-everything-policy"]["episodes"] == [100]
+    assert by_name["curve"]["small-everything-policy"]["episodes"] == [40]
     table = disturbances.pays_table(rows)
     assert f"{np.mean(by_name['ratios']['small-everything-plan']):.3f}" in table and "| all three |" in table
 

@@ -13,7 +13,7 @@ import pytest
 from radiotwin.runtime.execution import open_executor
 from radiotwin.scene import Scene
 from radiotwin.trace import SolverSettings, trace_gains, trace_map
-from tests.runtime.execution.jobs import PLACES, processes_with, two_workers, wait_until
+from tests.runtime.execution.jobs import needs_ray, processes_with, two_workers, wait_until
 
 pytestmark = pytest.mark.llvm
 
@@ -35,7 +35,7 @@ def rbm():
     return scene, points_m, trace_gains(scene, scene.device_m[:2], points_m, SETTINGS)
 
 
-@pytest.mark.parametrize("place", PLACES[1:])
+@pytest.mark.parametrize("place", ["local", pytest.param("ray", marks=[pytest.mark.slow, needs_ray])])
 def test_gains_are_equal_to_the_bit_also_after_a_worker_was_killed(rbm, place):
     scene, points_m, expected = rbm
     with two_workers(place) as (executor, killed):

@@ -5,9 +5,9 @@ import pytest
 from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 from tests.command_line import run
-from tests.worlds import narrow_street, open_ground, quick_report
+from tests.worlds import narrow_street, only_effects, open_ground, quick_report
 
-__all__ = ["narrow_street", "open_ground", "quick_report", "run"]
+__all__ = ["narrow_street", "only_effects", "open_ground", "quick_report", "run"]
 
 
 @pytest.fixture(scope="session")

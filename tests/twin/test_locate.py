@@ -52,7 +52,8 @@ def test_a_device_is_found_by_three_packets_of_each_gateway_and_by_the_silence_o
 
 
 @pytest.mark.usefixtures("quick_report")
-def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(run, tmp_path, open_ground):
+def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(run, tmp_path, open_ground, only_effects):
+    only_effects("device_gain_offset", "receiver_drift", "receiver_gain_offset")
     world = open_ground.fly(12)
     world.gain_db[world.receiver == 0] -= 6.0
     data = open_ground.measured(world)

@@ -39,7 +39,8 @@ def assert_equal(one, other):
 
 
 @pytest.mark.usefixtures("quick_report")
-def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, tmp_path):
+def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, only_effects, tmp_path):
+    only_effects("device_gain_offset", "receiver_gain_offset")
     world = open_ground.fly(20)
     world.gain_db[world.receiver == 1] += 6.0
     world.gain_db[world.device == 2] -= 7.0
@@ -57,7 +58,8 @@ def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, tmp_pa
 
 
 @pytest.mark.usefixtures("quick_report")
-def test_a_curve_that_only_describes_is_drawn_on_the_maps_of_a_stored_twin(open_ground, tmp_path):
+def test_a_curve_that_only_describes_is_drawn_on_the_maps_of_a_stored_twin(open_ground, only_effects, tmp_path):
+    only_effects("antenna_pattern", "device_gain_offset")
     world = open_ground.fly(8)
     azimuth_deg = np.degrees(np.arctan2(world.offset_m[:, 0], world.offset_m[:, 1]))
     world.gain_db += 5.0 * np.sin(np.radians(3 * azimuth_deg))  # no effect of the catalogue does so at all devices

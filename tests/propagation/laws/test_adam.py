@@ -3,9 +3,12 @@
 import subprocess
 import sys
 
+import pytest
 import torch
 
 from radiotwin.propagation.laws.adam import Adam
+
+pytestmark = pytest.mark.seconds
 
 
 def test_it_steps_as_torchs_own_does_also_after_a_stop():

@@ -24,6 +24,7 @@ def test_where_all_links_without_line_of_sight_are_blank_the_diffuse_power_is_as
     assert fitted.diffuse == DIFFUSE_DEFAULT
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("frequency_hz", [0.9e9, 28e9])
 def test_diffuse_power_stays_below_that_of_free_space(frequency_hz):
     """Levels behind a wall fall with distance only: how deep a receiver is in its shadow does not matter."""

@@ -215,8 +215,9 @@ with open_executor("2", sys.argv[2] or None) as executor:
 """
 
 
-@pytest.mark.parametrize("cluster", ["", pytest.param("auto", marks=needs_ray)])
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize(("number", "cluster"), [
+    (signal.SIGKILL, ""), (signal.SIGTERM, ""), pytest.param(signal.SIGKILL, "auto", marks=needs_ray),
+    pytest.param(signal.SIGTERM, "auto", marks=[needs_ray, pytest.mark.slow])])
 def test_nothing_is_left_of_a_killed_driver(tmp_path, cluster, number):
     """No process, whatever it was doing; so no port either."""
     mark = f"mark-{tmp_path.name}-{number}"

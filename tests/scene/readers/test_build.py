@@ -115,6 +115,7 @@ def test_a_box_of_degrees(tmp_path):
     assert x_max - x_min < x_m[1] - x_m[0] + 40 and report.extent_m == scene.config.extent.bounds
 
 
+@pytest.mark.seconds
 def test_only_a_scene_is_replaced(tmp_path, empty_map):
     path = empty_map.box(0, 0, 20, 20, height="5").write(tmp_path / "a.osm")
     for _ in range(2):

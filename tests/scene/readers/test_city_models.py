@@ -91,6 +91,7 @@ def test_an_outline_is_extruded_to_its_attribute(tmp_path):
     assert mesh.volume == pytest.approx(120 * 8.5, rel=2e-3)
 
 
+@pytest.mark.seconds
 def test_an_outline_of_citygml(tmp_path):
     points = made.corners(691_000, 5_336_000, 500)[:4]
     for name, dimension, attributes, top_m in (

@@ -62,6 +62,7 @@ def test_a_device_stays_where_the_law_is_too_uncertain_or_no_position_explains_i
         assert fit_paths(links, scene, law, relocation_from(scene, max_radius_m)).devices == law.devices
 
 
+@pytest.mark.slow
 def test_as_many_threads_as_there_are_find_the_same_to_the_bit(narrow_street, monkeypatch):
     scene = narrow_street.scene
     links = prepare_links(narrow_street.measured, scene)
