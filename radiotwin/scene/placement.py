@@ -8,7 +8,6 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from radiotwin.errors import BadInput
-from radiotwin.io.budgets import DEVICES, UAVS
 from radiotwin.io.forms import MAX_COORDINATE_M
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import (
@@ -175,9 +174,8 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
     `ground` is a map of the ground alone; None: flat at the datum.
 
     Raises:
-        BadInput: There is not enough free ground, or too many are asked for.
+        BadInput: There is not enough free ground.
     """
-    DEVICES.check(count, "--devices")
     if count == 0:
         return []
     rows, columns = np.nonzero(grid.clearance_m() >= _DEVICE_CLEARANCE_M)
@@ -251,9 +249,8 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
     lattice is above the datum.
 
     Raises:
-        BadInput: No lattice position is free at an altitude, or too many are asked for.
+        BadInput: No lattice position is free at an altitude.
     """
-    UAVS.check(count, "--uavs")
     x_min, x_max, y_min, y_max = extent.bounds
     positions = Lattice.over(*extent.bounds, lattice.step_m, lattice.altitudes_m)
     x, y = np.meshgrid(positions.x_m, positions.y_m)

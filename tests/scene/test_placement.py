@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
+from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import Extent, LatticeConfig
 from radiotwin.scene.placement import (
@@ -119,10 +120,9 @@ def test_many_devices_and_uavs_take_little_time():
     devices = place_devices(2_000, grid, None, np.random.default_rng(0))
     uavs = place_uavs(2_000, extent, LatticeConfig(altitudes_m=[50.0, 60.0]), None)
     assert len({(device.x_m, device.y_m) for device in devices}) == 2_000 and len(uavs) == 2_000
-    for call in (lambda: place_devices(10**9, grid, None, np.random.default_rng(0)),
-                 lambda: place_uavs(10**9, extent, LatticeConfig(altitudes_m=[50.0]), None)):
+    for options in (BuildOptions(devices=10**9), BuildOptions(uavs=10**9)):
         with pytest.raises(BadInput, match="1,000,000,000 .* at most"):
-            call()
+            options.check()
 
 
 def test_an_extent_like_a_line_is_refused():

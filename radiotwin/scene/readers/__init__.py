@@ -53,7 +53,7 @@ def build_scene(
             ground's altitude [m]. None: of a map its middle, of a city model unknown.
         step_m: of the lattice [m]; None: 20, or less where the extent is small.
         altitudes_m: of the lattice [m]; None: three above the roofs.
-        extent_m: of the lattice: (x_min, y_min, x_max, y_max) [m]; None: around the buildings.
+        extent_m: of the lattice: (x_min, x_max, y_min, y_max) [m]; None: around the buildings.
         scale: of a city model: factor from the file's unit to metres.
         up: of a city model: axis of the file that points up, `x`, `y` or `z`.
         default_height_m: of a map: height of buildings without one [m]; None: 10, with a warning.
