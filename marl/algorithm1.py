@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marl.checkpoint import NAME, restored, save_checkpoint
+from marl.checkpoint import NAME, keep_twin, restored, save_checkpoint
 from marl.environment import Environment
 from marl.flights import Flights, Policy, evaluate, fly
 from marl.heuristics import HeuristicPolicy, waypoint_actions
@@ -16,7 +16,6 @@ from marl.learner import Learner, make_learner
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy
 from marl.settings import LearnerSettings, RunSettings, stream
-from radiotwin.errors import BadInput
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import declared_devices, heading_deg, link_table
@@ -103,10 +102,10 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
                 mission = reality.mission(known)
             else:
                 reality.fly(measuring_policy(run, reality, twin, known, learner, rng), known)
-                twin = learn_twin(reality, run.twin, run.seed, twin)
+                measured = reality.measurements()
+                twin = fit_twin(measured, scene, model=TWINS[run.twin], seed=run.seed, start=twin)
                 known = known if true_positions else Known.of(twin.devices)
-                lasting = reality.measurements() if run.twin_shadowing == "fitted" else None
-                mission = twin_mission(scene, run, twin, known, lasting)
+                mission = twin_mission(scene, run, twin, known, measured)
             learned_s = time.perf_counter() - started
             blocks += [{"round": number + 1} | block
                        for block in learner.prepare(mission, on_progress)]
@@ -128,10 +127,7 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
                 state = {"rows": rows, "blocks": blocks, "tables": reality.tables,
                          "strategy": learner.state(last=number + 1 == run.real_episodes)}
                 if twin is not None:
-                    twin.save(folder / "twin")
-                    record, channel = twin.encode()
-                    state["twin"] = {"record": record,
-                                     "channel": np.frombuffer(channel, np.uint8)}
+                    state["twin"] = keep_twin(twin, folder)
                 save_checkpoint(state, checkpoint)
             on_round(rows, blocks)
         real = reality.mission(known)
@@ -201,24 +197,6 @@ class Reality:
         return pd.concat(tables, ignore_index=True)
 
 
-def learn_twin(reality: Reality, kind: str, seed: int, before: Twin | None) -> Twin:
-    """Learn the channel and the positions from all measurements.
-
-    Args:
-        reality: with its measurements.
-        kind: a key of `TWINS`.
-        seed: of the fit.
-        before: the twin of the round before, whose positions the search also starts from.
-
-    Raises:
-        BadInput: no such kind of twin.
-    """
-    if kind not in TWINS:
-        raise BadInput(f"twin {kind!r} is unknown; allowed are {', '.join(TWINS)}")
-    return fit_twin(reality.measurements(), reality.scene, model=TWINS[kind], seed=seed,
-                    start=before)
-
-
 def twin_mission(scene: Scene, run: RunSettings, twin: Twin, known: Known,
                  measurements: Measurements | None) -> Mission:
     """Return the mission in a twin.
@@ -231,7 +209,7 @@ def twin_mission(scene: Scene, run: RunSettings, twin: Twin, known: Known,
         measurements: errors of the map last as long as their residuals say; None: for a slot.
     """
     radio_map = twin.radio_map(scene)
-    if measurements is not None:
+    if measurements is not None and run.twin_shadowing == "fitted":
         radio_map = with_shadowing(radio_map, twin, measurements, scene.config.gain_limit_db,
                                    run.seed)
     return make_mission(scene, radio_map, known, run.assignment)
@@ -259,12 +237,12 @@ def measuring_policy(run: RunSettings, reality: Reality, twin: Twin | None, know
 
 def round_row(run: RunSettings, learner: Learner, number: int, in_twin: np.ndarray,
               real: np.ndarray, errors_m: np.ndarray) -> dict:
-    """Return the row of a round in the log.
+    """Return the row of a round (from 1) in the log.
 
     Args:
         run: settings of the run.
         learner: that has been prepared in so many rounds.
-        number: of the round, from 1.
+        number: of the round.
         in_twin: (E,) shares collected in the twin.
         real: (E,) shares collected in the truth.
         errors_m: see `location_errors_m`.

@@ -23,7 +23,7 @@ from marl.learner import Learner
 from marl.mission import COSTS, MOVES, Mission
 from marl.settings import RunSettings
 from radiotwin.errors import BadInput
-from radiotwin.io.array_file import parse_arrays, write_arrays
+from radiotwin.io.array_file import pack_arrays, parse_arrays
 from radiotwin.io.budgets import CHECKPOINT_BYTES
 from radiotwin.io.files import atomic_file
 from radiotwin.io.inputs import parse_json, read_bytes
@@ -49,23 +49,15 @@ class Damaged(ValueError):
 
 
 def save_checkpoint(state: dict, path: Path) -> None:
-    """Write a checkpoint.
-
-    Args:
-        state: nested dicts and lists of numbers, texts, arrays, tensors and tables; keys are texts.
-        path: of the file.
-    """
+    """Write dicts and lists of numbers, texts, arrays, tensors and tables; all keys are texts."""
     arrays: dict[str, np.ndarray] = {}
     text = json.dumps({"format": FORMAT, "state": _packed(state, arrays)}, allow_nan=False)
     with atomic_file(path) as file:
-        write_arrays(file, arrays, _KEY, text)
+        file.write(pack_arrays(arrays, _KEY, text))
 
 
 def load_checkpoint(path: Path) -> dict:
-    """Read a checkpoint of `save_checkpoint`; what it means is for the reader to check.
-
-    Returns:
-        the state; arrays are read-only.
+    """Return what `save_checkpoint` was given; what it means is for the reader to check.
 
     Raises:
         BadInput: it is damaged, or of another version.
@@ -86,11 +78,7 @@ def load_checkpoint(path: Path) -> dict:
 
 
 def refuse_damaged(path: Path, error: Exception) -> NoReturn:
-    """Raise the message of a damaged checkpoint.
-
-    Raises:
-        BadInput: always.
-    """
+    """Raise the message of a damaged checkpoint, BadInput."""
     raise BadInput(f"{path} is damaged ({type(error).__name__}: {str(error)[:200]}); remove the "
                    "run's folder and start again") from None
 
@@ -151,38 +139,23 @@ def _unpacked(value: Any, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def require_fields(state: Any, names: Collection[str]) -> dict:
-    """Return a dict after a check that it has these names and no others.
-
-    Raises:
-        Damaged: it has not.
-    """
+    """Return a dict that has these names and no others; raise Damaged for anything else."""
     if not isinstance(state, dict) or set(state) != set(names):
         raise Damaged(f"a part should have the fields {', '.join(sorted(names))}")
     return state
 
 
 def require_count(value: Any, high: int = MAX_COUNT) -> int:
-    """Return a whole number from 0 to `high` after a check.
-
-    Raises:
-        Damaged: it is none.
-    """
+    """Return a whole number from 0 to `high`; raise Damaged for anything else."""
     if type(value) is not int or not 0 <= value <= high:
         raise Damaged(f"{str(value)[:40]} should be a whole number from 0 to {high}")
     return value
 
 
 def require_array(value: Any, like: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
-    """Return an array after a check of type, shape and range.
+    """Return an array of a type and shape, and within a range; raise Damaged for anything else.
 
-    Args:
-        value: to check.
-        like: of the same type and shape.
-        low: least value; NaN is none.
-        high: greatest value.
-
-    Raises:
-        Damaged: it differs.
+    NaN is outside every range.
     """
     if not isinstance(value, np.ndarray) or value.dtype != like.dtype or value.shape != like.shape:
         raise Damaged(f"an array should be {like.dtype.name} of the shape {like.shape}")
@@ -192,11 +165,7 @@ def require_array(value: Any, like: np.ndarray, low: ArrayLike, high: ArrayLike)
 
 
 def require_tensors(given: Any, like: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return named tensors after a check of names, types and shapes; all numbers are finite.
-
-    Raises:
-        Damaged: they differ.
-    """
+    """Return finite tensors of these names, types and shapes; raise Damaged for anything else."""
     for name, tensor in require_fields(given, like).items():
         if not isinstance(tensor, torch.Tensor) or tensor.dtype != like[name].dtype \
                 or tensor.shape != like[name].shape or not tensor.isfinite().all():
@@ -206,11 +175,7 @@ def require_tensors(given: Any, like: Mapping[str, torch.Tensor]) -> dict[str, t
 
 
 def require_generator(state: Any) -> dict:
-    """Return the state of numpy's default generator after a check.
-
-    Raises:
-        Damaged: it is none.
-    """
+    """Return a state of numpy's default generator; raise Damaged for anything else."""
     require_fields(state, ("bit_generator", "state", "has_uint32", "uinteger"))
     require_fields(state["state"], ("state", "inc"))
     for name, end in _GENERATOR.items():
@@ -222,14 +187,9 @@ def require_generator(state: Any) -> dict:
 
 
 def require_plan(actions: Any, mission: Mission) -> np.ndarray:
-    """Return (T, U) actions of a plan after a check that they can be flown.
+    """Return (T, U) actions that can be flown in a mission; raise Damaged for anything else.
 
-    Args:
-        actions: to check.
-        mission: to be flown; its map does not matter.
-
-    Raises:
-        Damaged: one of them is not feasible.
+    The mission's map does not matter.
     """
     like = np.zeros((mission.longest, mission.uavs), np.int8)
     require_array(actions, like, 0, ACTION_COUNT - 1)
@@ -248,12 +208,6 @@ def require_plan(actions: Any, mission: Mission) -> np.ndarray:
 def restored(path: Path, run: RunSettings, scene: Scene,
              learner: Learner) -> tuple[list[dict], list[dict], list[pd.DataFrame], Twin | None]:
     """Read a checkpoint, and have the learner go on from it.
-
-    Args:
-        path: of the checkpoint.
-        run: settings of the run.
-        scene: its devices and UAVs.
-        learner: its state is loaded.
 
     Returns:
         rows and blocks of the log, the measurements, and the twin; None where none is needed.
@@ -279,11 +233,7 @@ def restored(path: Path, run: RunSettings, scene: Scene,
 
 
 def check_rows(rows: Any, least: int, most: int) -> list[dict]:
-    """Return the rows of a log after a check that there are `least` to `most` of them.
-
-    Raises:
-        Damaged: there are not, or they are none.
-    """
+    """Return `least` to `most` rows of a log; raise Damaged for anything else."""
     if not isinstance(rows, list) or not least <= len(rows) <= most:
         raise Damaged(f"a run has {least} to {most} rounds")
     for number, row in enumerate(rows):
@@ -313,11 +263,7 @@ def _blocks(blocks: Any) -> list[dict]:
 
 
 def require_number(value: Any) -> float:
-    """Return a number of a log after a check.
-
-    Raises:
-        Damaged: it is none.
-    """
+    """Return a number of a log, which may be NaN; raise Damaged for anything else."""
     if type(value) not in (int, float) or not (math.isnan(value) or abs(value) <= _MAX_NUMBER):
         raise Damaged(f"{str(value)[:40]} should be a number")
     return value
@@ -348,12 +294,15 @@ def check_table(table: Any, number: int, scene: Scene) -> None:
             raise Damaged(f"{name} of a measurement is no number from {low:g} to {high:g}")
 
 
-def stored_twin(content: Any, path: Path, scene: Scene) -> Twin:
-    """Return the twin of a checkpoint after a check that it is of the scene's devices.
+def keep_twin(twin: Twin, folder: Path) -> dict:
+    """Write a twin to the folder `twin` in a run's; return it as a checkpoint has it."""
+    twin.save(folder / "twin")
+    record, channel = twin.encode()
+    return {"record": record, "channel": np.frombuffer(channel, np.uint8)}
 
-    Raises:
-        Damaged: it is not.
-    """
+
+def stored_twin(content: Any, path: Path, scene: Scene) -> Twin:
+    """Return the twin of a checkpoint; raise Damaged if it is not of the scene's devices."""
     require_fields(content, ("record", "channel"))
     channel = content["channel"]
     if not isinstance(content["record"], str) or not isinstance(channel, np.ndarray) \

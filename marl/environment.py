@@ -113,11 +113,6 @@ class CorrelatedField:
 
     Drawn by circulant embedding (Dietrich and Newsam 1997, SIAM J. Sci. Comput. 18); the
     correlation is that of Gudmundson 1991, Electronics Letters 27.
-
-    Args:
-        shape: (rows, columns).
-        step_m: of the grid [m].
-        length_m: of the correlation [m].
     """
 
     def __init__(self, shape: tuple[int, int], step_m: float, length_m: float) -> None:
@@ -143,15 +138,7 @@ def feasible(mission: Mission, uav: int, row: int, column: int, battery: int,
              out: np.ndarray) -> None:
     """Find the safe actions (paper, Sec. II-A): on the map, and with battery enough to fly home.
 
-    With an empty battery that is no-op alone.
-
-    Args:
-        mission: the rules.
-        uav: its terminal is home.
-        row: cell of the UAV.
-        column: cell of the UAV.
-        battery: left [hovers].
-        out: (6,) bool, overwritten.
+    With an empty battery [hovers] that is no-op alone; `out` (6,) bool is overwritten.
     """
     ny, nx = mission.steps_home.shape[1:]
     move_cost = COSTS[1]
@@ -164,17 +151,10 @@ def feasible(mission: Mission, uav: int, row: int, column: int, battery: int,
 
 
 def safe_actions(action: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Replace actions that are not feasible by the first feasible one.
+    """Replace actions (E, U) that are not in the mask (E, U, 6) by the first feasible one.
 
     That is hovering where the battery allows it, otherwise a move after which home can still be
     reached, and no-op after landing.
-
-    Args:
-        action: (E, U) int, of any policy.
-        mask: (E, U, 6) bool, feasible actions, as `marl.environment.observe` returns them.
-
-    Returns:
-        (E, U) int64 feasible actions.
     """
     action = np.asarray(action, dtype=np.int64)
     allowed = np.take_along_axis(mask, action[..., None], axis=-1)[..., 0]
@@ -283,15 +263,7 @@ def state_size(mission: Mission) -> int:
 
 
 def observe(mission: Mission, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Return observations and feasible actions.
-
-    Args:
-        mission: that the frames belong to.
-        frame: E frames.
-
-    Returns:
-        (E, U, observation_size) float32, and (E, U, 6) bool.
-    """
+    """Return (E, U, observation_size) float32 observations, and (E, U, 6) bool feasible actions."""
     shape = frame.battery.shape
     observation = np.empty((*shape, observation_size(mission)), dtype=np.float32)
     mask = np.empty((*shape, ACTION_COUNT), dtype=np.bool_)

@@ -40,13 +40,7 @@ class EventLog:
             raise self._failed(error) from error
 
     def add(self, group: str, step: int, values: Mapping[str, float]) -> None:
-        """Add the numbers of one step; those that are not finite are left out.
-
-        Args:
-            group: name before the slash, under which TensorBoard shows them.
-            step: number of the round, or of episodes so far.
-            values: name -> number.
-        """
+        """Add the finite numbers of one step, in a group that TensorBoard shows together."""
         summary = Summary(value=[Summary.Value(tag=f"{group}/{name}", simple_value=value)
                                  for name, value in values.items() if np.isfinite(value)])
         self._events.append(Event(wall_time=time.time(), step=step, summary=summary))

@@ -32,12 +32,6 @@ def choose_flight(flights: Flights, mission: Mission) -> int:
     return int(np.abs(ratio - np.median(ratio)).argmin())
 
 
-def draw_trajectories(scene: Scene, mission: Mission, flights: Flights, flight: int, known: Known,
-                      path: Path | str) -> None:
-    """Write `trajectories_figure` as PNG."""
-    save(trajectories_figure(scene, mission, flights, flight, known), path)
-
-
 def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight: int,
                         known: Known) -> Figure:
     """Draw one flight over the city, a panel for each UAV.

@@ -43,26 +43,6 @@ class Policy(Protocol):
         """Return (E, U) feasible actions."""
 
 
-class Replayed:
-    """Repeat the actions of earlier flights: as many flights, in missions where they are feasible.
-
-    Args:
-        action: (E, T, U).
-    """
-
-    def __init__(self, action: np.ndarray) -> None:
-        self._action = action
-
-    def start(self, mission: Mission, flights: int) -> None:
-        """See `Policy`."""
-        self._slot = 0
-
-    def act(self, frame: Frame) -> np.ndarray:
-        """See `Policy`."""
-        self._slot += 1
-        return self._action[:, self._slot - 1]
-
-
 def fly(environment: Environment, policy: Policy) -> Flights:
     """Fly from take-off until all batteries are empty, and record everything."""
     mission, frame = environment.mission, environment.reset()
@@ -93,12 +73,6 @@ def evaluate(mission: Mission, policy: Policy, flights: int, rng: np.random.Gene
 
 def track_table(scene: Scene, mission: Mission, flights: Flights, flight: int) -> pd.DataFrame:
     """Return one flight as a table, a row for every slot until the UAV's battery is empty.
-
-    Args:
-        scene: names of UAVs and devices, and the lattice.
-        mission: that was flown.
-        flights: a record.
-        flight: index of the flight in it.
 
     Returns:
         flight, uav, time_s, x_m, y_m, z_m, device (that served the UAV there, empty for none),

@@ -56,17 +56,9 @@ class Greedy(Random):
 
 
 def waypoint_actions(scene: Scene, mission: Mission, rng: np.random.Generator) -> np.ndarray:
-    """Return flights of all UAVs that measure: straight from one random cell to the next.
+    """Return flights (T, U) of all UAVs that measure: straight from one random cell to the next.
 
     Battery that is left when no other cell can be flown to and home from is used to hover.
-
-    Args:
-        scene: its UAVs and buildings.
-        mission: the same, as arrays.
-        rng: of the paths.
-
-    Returns:
-        (T, U) int8 feasible actions.
     """
     moves = {tuple(move): action for action, move in enumerate(MOVES)
              if action not in (HOVER, NO_OP)}

@@ -88,17 +88,6 @@ class Learner(ABC):
 
 def make_learner(run: RunSettings, settings: LearnerSettings, mission: Mission, rounds: int,
                  device: str = "cpu") -> Learner:
-    """Make the learner that `run.algorithm` names.
-
-    Args:
-        run: settings of the run.
-        settings: settings of learning.
-        mission: gives the sizes; its map is hidden from the learner.
-        rounds: number of calls of `prepare` to come.
-        device: torch device.
-
-    Raises:
-        BadInput: no learner has this name.
-    """
+    """Make the learner that `run.algorithm` names; the mission's map is hidden from it."""
     blank = mission._replace(snr_db=np.full_like(mission.snr_db, -np.inf))
     return learner_class(run.algorithm)(Setup(run, settings, blank, rounds, device))

@@ -113,13 +113,7 @@ class Planner(Learner):
 
 
 def plan(mission: Mission, iterations: int, seed: int) -> Plan:
-    """Search a plan.
-
-    Args:
-        mission: in the map that is known.
-        iterations: plans that are tried; the annealing is spread over them.
-        seed: of the search.
-    """
+    """Search a plan in the map that is known; the annealing is spread over so many tried plans."""
     rng = stream(seed, "planning")
     value = expected_data(mission)
     tour = np.zeros((mission.uavs, MAX_WAYPOINTS, 3), dtype=np.int64)
@@ -162,13 +156,10 @@ def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.nda
 
 
 def expected_data(mission: Mission) -> np.ndarray:
-    """Return the data units that one slot on each link is expected to bring.
+    """Return the data units (U, K, ny, nx) that one slot on each link is expected to bring.
 
     The probability that the SNR reaches the threshold times the rate at the mean SNR of the cases
     in which it does.
-
-    Returns:
-        (U, K, ny, nx) float64.
     """
     mean_db = mission.snr_db.astype(float)
     sigma_db = np.maximum(mission.sigma_db.astype(float), 1e-6)
@@ -203,17 +194,8 @@ def next_action(mission: Mission, uav: int, row: int, column: int, battery: int,
                 count: int, reached: int, hovered: int, mask: np.ndarray) -> tuple[int, int, int]:
     """Follow a tour; at its end, or for lack of battery, stay as long as possible, then go home.
 
-    Args:
-        mission: the rules.
-        uav: that flies.
-        row: its cell.
-        column: its cell.
-        battery: left [hovers].
-        tour: (MAX_WAYPOINTS, 3) waypoints.
-        count: number of waypoints.
-        reached: waypoints passed.
-        hovered: hovers flown at the next one.
-        mask: (6,) scratch.
+    The tour (MAX_WAYPOINTS, 3) has `count` waypoints; the UAV has passed `reached` of them, and has
+    hovered so long at the next one. `battery` is in hovers, `mask` (6,) is scratch.
 
     Returns:
         Action, and the new `reached` and `hovered`.

@@ -55,11 +55,11 @@ MIN_GAIN = 0.02  # of the collected share, for a new plan to replace the one bef
 def gru(x: Tensor, memory: Tensor | None, unit: torch.nn.GRU) -> tuple[Tensor, Tensor]:
     """Return `unit(x, memory)`, for one layer in one direction.
 
-    Differentiable by x and the parameters.
+    It is differentiable by x and the parameters; the memory is taken as a constant.
 
     Args:
         x: (T, B, inputs) float32
-        memory: (1, B, hidden), zero where None; taken as a constant.
+        memory: (1, B, hidden), zero where None.
         unit: gives the parameters.
 
     Returns:
@@ -207,11 +207,7 @@ def _backward(gradient: np.ndarray, recurrent: np.ndarray, memories: np.ndarray,
 class Agent(nn.Module):
     """Action values of one UAV from what it has seen so far; all UAVs share the weights.
 
-    Args:
-        observation_size: of one UAV.
-        uavs: their number; each sees its own number as a one-hot vector.
-        hidden: width.
-        generator: of the initial weights.
+    Each sees its own number as a one-hot vector.
     """
 
     def __init__(self, observation_size: int, uavs: int, hidden: int,
@@ -249,14 +245,7 @@ class Agent(nn.Module):
 
 
 class Mixer(nn.Module):
-    """Q_tot of all UAVs from the values of their actions and the state; monotonic in each value.
-
-    Args:
-        state_size: of the mission.
-        uavs: of the mission.
-        width: of the mixing layer.
-        generator: of the initial weights.
-    """
+    """Q_tot of all UAVs from the values of their actions and the state; monotonic in each value."""
 
     def __init__(self, state_size: int, uavs: int, width: int,
                  generator: torch.Generator) -> None:
@@ -319,10 +308,7 @@ class QNetworks:
     def update(self, flights: Flights, mission: Mission, learning_rate: float) -> dict[str, float]:
         """Make one step of gradient descent on the squared TD errors of some flights.
 
-        Args:
-            flights: a batch, recorded in this mission's map or an earlier one.
-            mission: makes the features.
-            learning_rate: of this step.
+        They may be recorded in an earlier map; features are made by the present mission.
 
         Returns:
             `loss`, `gradient_norm` and `mean_value` (mean of Q_tot).
@@ -456,6 +442,10 @@ class QMIX(Learner):
 
     After every block of `federate_every` episodes the current policy is evaluated in the map that
     it is trained in; the best one there, earlier rounds included, is the one that flies.
+
+    Attributes:
+        mission: of the present map.
+        episodes: of training so far.
     """
 
     networks: Callable[..., QNetworks] = QNetworks
@@ -466,7 +456,7 @@ class QMIX(Learner):
         self.replicas = len(numbers)
         self._current = self.networks(settings, mission, run.seed, setup.device).agent
         self._best = copy.deepcopy(self._current)
-        self._episodes, self._highest, self._mission = 0, -np.inf, mission
+        self.episodes, self._highest, self.mission = 0, -np.inf, mission
         self._actions: np.ndarray | None = None  # of the guide's plan
         horizon = setup.rounds * run.episodes
         self._trainers = Replicas([(self.networks, settings, mission, horizon, run.seed, number,
@@ -475,29 +465,29 @@ class QMIX(Learner):
     @override
     def prepare(self, mission: Mission,
                 on_progress: Callable[[int], None]) -> list[dict[str, float]]:
-        self._enter(mission)
+        self.enter(mission)
         records, left = [], self.setup.run.episodes
         while left:
             block = min(left, self.setup.settings.federate_every)
             trained, weights = self._train(block)
-            left, self._episodes = left - block, self._episodes + block
-            ratio = self._judge(weights)
-            records.append({"episodes": self._episodes, "twin_ratio": ratio} | trained)
+            left, self.episodes = left - block, self.episodes + block
+            ratio = self.judge(weights)
+            records.append({"episodes": self.episodes, "twin_ratio": ratio} | trained)
             on_progress(block)
         return records
 
-    def _enter(self, mission: Mission) -> None:
+    def enter(self, mission: Mission) -> None:
         """Go on in another map."""
-        self._mission = mission
+        self.mission = mission
         if self.setup.run.guide == "planner":
             self._actions = self._better_plan(mission)
         self._trainers.call("enter", mission, self._actions)
-        self._highest = self._ratio(mission, self._best) if self._episodes else -np.inf
+        self._highest = self._ratio(mission, self._best) if self.episodes else -np.inf
 
-    def _judge(self, weights: dict[str, np.ndarray]) -> float:
+    def judge(self, weights: dict[str, np.ndarray]) -> float:
         """Return the share that these weights collect in the map; keep the best ones."""
         _load(self._current, weights)
-        ratio = self._ratio(self._mission, self._current)
+        ratio = self._ratio(self.mission, self._current)
         if not ratio <= self._highest:  # also where it is NaN, so that the last one flies
             self._highest = ratio
             _load(self._best, weights)
@@ -543,14 +533,14 @@ class QMIX(Learner):
     @override
     def state(self, last: bool) -> dict:
         # The replicas' memories are most of a checkpoint.
-        return {"episodes": self._episodes, "best": self._best.state_dict(),
+        return {"episodes": self.episodes, "best": self._best.state_dict(),
                 "actions": self._actions, "selection_flights": self.selection_flights,
                 "replicas": None if last else self._trainers.call("state")}
 
     @override
     def load_state(self, state: dict) -> None:
         require_fields(state, ("episodes", "best", "actions", "selection_flights", "replicas"))
-        self._episodes = require_count(state["episodes"])
+        self.episodes = require_count(state["episodes"])
         self.selection_flights = require_count(state["selection_flights"])
         self._best.load_state_dict(require_tensors(state["best"], self._best.state_dict()))
         if state["actions"] is not None:

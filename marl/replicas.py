@@ -54,12 +54,7 @@ def keep_memory() -> None:
 
 
 def check_sizes(run: RunSettings, settings: LearnerSettings, mission: Mission) -> None:
-    """Refuse settings that take more memory than `TRAINING_BYTES`.
-
-    Args:
-        run: settings of the run.
-        settings: settings of learning.
-        mission: gives the sizes.
+    """Refuse settings that take more memory than `TRAINING_BYTES`; the mission gives the sizes.
 
     Raises:
         BadInput: names the option.

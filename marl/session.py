@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 
 from marl.algorithm1 import Outcome, run_algorithm
-from marl.figures import choose_flight, draw_curve, draw_trajectories
+from marl.checkpoint import NAME
+from marl.figures import choose_flight, draw_curve, save, trajectories_figure
 from marl.flights import evaluate, track_table
 from marl.learner import make_learner
 from marl.mission import Known, Mission, make_mission
@@ -86,8 +87,16 @@ class Session:
 
     def _claim_folder(self, world: dict[str, str]) -> None:
         """Make the folder of a new run, or check that it holds the run that is to be resumed."""
-        path, config = self.out / "config.json", self._config() | {"world": world}
+        path = self.out / "config.json"
+        config = {"run": self.run.model_dump(mode="json"),
+                  "learner": self.learner.model_dump(mode="json"), "world": world}
         if self.resume:
+            old = self.out / "checkpoint.pt"
+            if old.exists() and not (self.out / NAME).exists():
+                raise BadInput(f"{old} is of an earlier version of radiotwin, in a form that this "
+                               "one does not read, so the run in it cannot be resumed; finish it "
+                               "with that version, or start it anew without --resume and with "
+                               "another --out")
             try:
                 before = read_json(path)
                 if not isinstance(before, dict) or not all(
@@ -116,10 +125,6 @@ class Session:
         with atomic_file(path) as file:
             file.write(json.dumps(config, indent=1).encode())
 
-    def _config(self) -> dict:
-        return {"run": self.run.model_dump(mode="json"),
-                "learner": self.learner.model_dump(mode="json")}
-
     def _write(self, scene: Scene, truth: RadioMap, outcomes: dict[str, Outcome]) -> None:
         main = outcomes[self.run.twin]
         real = make_mission(scene, truth, main.known, self.run.assignment)
@@ -143,7 +148,8 @@ class Session:
         flights, typical = main.flights, choose_flight(main.flights, real)
         with atomic_path(self.out / "flights.csv") as temporary:
             write_csv(track_table(scene, real, flights, typical), temporary)
-        draw_trajectories(scene, real, flights, typical, main.known, self.out / "trajectories.png")
+        save(trajectories_figure(scene, real, flights, typical, main.known),
+             self.out / "trajectories.png")
         print_rows(f"Collected in the truth ({self.run.truth}), of all data; mean and standard "
                    f"deviation of {self.run.flights} flights",
                    {"method": "left", "trained in": "left", "real episodes": "right",

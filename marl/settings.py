@@ -7,7 +7,7 @@ stream of random numbers for every purpose, all from one seed.
 import functools
 import importlib
 import inspect
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
@@ -37,16 +37,7 @@ Settings = TypeVar("Settings", bound=BaseModel)
 
 
 def learner_class(name: str) -> Any:
-    """Return the class of a learner.
-
-    Args:
-        name: a key of `LEARNERS`.
-
-    Raises:
-        BadInput: no learner has this name.
-    """
-    if name not in LEARNERS:
-        raise BadInput(f"algorithm {name!r} is unknown; allowed are {', '.join(LEARNERS)}")
+    """Return the class of a learner, by its name in `LEARNERS`."""
     found = LEARNERS[name]
     if isinstance(found, str):
         module, _, attribute = found.partition(":")
@@ -206,18 +197,12 @@ def stream(seed: int, purpose: str, number: int = 0) -> np.random.Generator:
     return np.random.default_rng([seed, PURPOSES.index(purpose) + 1, number + 1])
 
 
-def with_settings(*models: type[BaseModel], without: Collection[str] = (),
-                  ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Decorate a command: one option for each field of some settings.
+def with_settings(*models: type[BaseModel]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorate a command: one option for each field of some classes of settings.
 
     The command gets them as one keyword `given`: field -> text, as `checked` takes it.
-
-    Args:
-        models: classes of settings.
-        without: fields that get no option.
     """
-    fields = {name: field for model in models for name, field in model.model_fields.items()
-              if name not in without}
+    fields = {name: field for model in models for name, field in model.model_fields.items()}
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)
@@ -234,10 +219,10 @@ def with_settings(*models: type[BaseModel], without: Collection[str] = (),
 
 
 def checked(given: Mapping[str, str], defaults: Settings) -> Settings:
-    """Return settings with the given values in place of the defaults.
+    """Return settings with values of the command line in place of the defaults.
 
     Args:
-        given: field -> text from the command line; fields of other settings are ignored.
+        given: field -> text; fields of other settings are ignored.
         defaults: values of the fields that are not given.
 
     Raises:

@@ -61,12 +61,7 @@ class Trainer:
         self._rng = stream(seed, "learning", number)
 
     def enter(self, mission: Mission, plan: np.ndarray | None = None) -> None:
-        """Go on in another map of the same mission.
-
-        Args:
-            mission: with its map.
-            plan: (T, U) actions of a good flight in it, to learn from; None: no help.
-        """
+        """Go on in another map of the mission, maybe with a plan (T, U) in it to learn from."""
         self.mission, self._plan = mission, plan
 
     @property
@@ -225,14 +220,9 @@ class Exploration:
         self._left = np.zeros((flights, uavs), dtype=np.int64)
 
     def change(self, action: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Return the actions to be flown in this slot.
+        """Return the actions (E, U) to be flown in this slot, instead of those of the policy.
 
-        Args:
-            action: (E, U) of the policy.
-            mask: (E, U, 6) feasible actions.
-
-        Returns:
-            (E, U) feasible actions.
+        The mask (E, U, 6) has the feasible ones.
         """
         begins = (self._rng.random(action.shape) < self._begin) & (self._left == 0)
         lots = np.where(mask, self._rng.random(mask.shape), -1.0).argmax(axis=-1)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from marl.algorithm1 import Reality, location_errors_m, twin_mission
 from marl.environment import Environment, Frame
 from marl.figures import COLOURS, MARKERS
-from marl.flights import Flights, Replayed, evaluate, fly
+from marl.flights import Flights, evaluate, fly
 from marl.heuristics import PATTERN, HeuristicPolicy
 from marl.learner import make_learner
 from marl.mission import Known, Mission
@@ -135,6 +135,22 @@ def train_and_fly(reality: Reality, twin: Twin | None, run: RunSettings, learner
         trained.close()
     return result | {"curve": {"episodes": [check["episodes"] for check in checks],
                                "ratio": [check["twin_ratio"] for check in checks]}}, inside
+
+
+class Replayed:
+    """Repeat actions (E, T, U) of earlier flights: as many, in missions where they are feasible."""
+
+    def __init__(self, action: np.ndarray) -> None:
+        self._action = action
+
+    def start(self, mission: Mission, flights: int) -> None:
+        """See `marl.flights.Policy`."""
+        self._slot = 0
+
+    def act(self, frame: Frame) -> np.ndarray:
+        """See `marl.flights.Policy`."""
+        self._slot += 1
+        return self._action[:, self._slot - 1]
 
 
 class Mixed:

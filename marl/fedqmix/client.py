@@ -20,7 +20,6 @@ from typing_extensions import override
 from marl.algorithm1 import (
     TWINS,
     Reality,
-    learn_twin,
     location_errors_m,
     measuring_policy,
     round_row,
@@ -31,6 +30,7 @@ from marl.checkpoint import (
     Damaged,
     check_rows,
     check_table,
+    keep_twin,
     load_checkpoint,
     refuse_damaged,
     require_count,
@@ -57,12 +57,7 @@ from radiotwin.twin import Twin, fit_twin
 
 
 class ProximalNetworks(QNetworks):
-    """QMIX's networks with the proximal term µ/2 ‖w - w^t‖² (Li et al., MLSys 2020, Eq. 2).
-
-    Args:
-        *arguments: of `QNetworks`.
-        mu: µ.
-    """
+    """QMIX's networks with the proximal term µ/2 ‖w - w^t‖² (Li et al., MLSys 2020, Eq. 2)."""
 
     def __init__(self, *arguments: Any, mu: float) -> None:
         super().__init__(*arguments)
@@ -161,7 +156,7 @@ class Client:
                 refuse_damaged(path, error)
 
     def train(self, number: int, mean: Weights) -> tuple[Weights, int]:
-        """Train for a round, and write the checkpoint.
+        """Train for a round from a mean, and write the checkpoint.
 
         Args:
             number: of the round, from 1; rounds may have been missed.
@@ -195,10 +190,7 @@ class Client:
         return weights, episodes
 
     def finish(self, mean: Weights) -> int:
-        """Evaluate the policy, and write its row of the log and the checkpoint.
-
-        Args:
-            mean: of the last round.
+        """Evaluate the last mean's policy; write its row of the log and the checkpoint.
 
         Returns:
             The number of flights of the evaluation.
@@ -231,14 +223,15 @@ class Client:
     def _learn(self, replica: "_Replica | None") -> None:
         """Learn the twin from one more flight, or from the measurements."""
         started, run, reality = time.perf_counter(), self._run, self._reality
-        if self._measured is not None:
-            self._twin = fit_twin(self._measured, self._scene, model=TWINS[run.twin], seed=run.seed)
-        else:
+        measured, before = self._measured, self._twin
+        if measured is None:
             assert reality is not None and replica is not None
             rng = stream(run.seed, "decisions", len(reality.tables))
-            reality.fly(measuring_policy(run, reality, self._twin, self._known, replica, rng),
+            reality.fly(measuring_policy(run, reality, before, self._known, replica, rng),
                         self._known)
-            self._twin = learn_twin(reality, run.twin, run.seed, self._twin)
+            measured = reality.measurements()
+        self._twin = fit_twin(measured, self._scene, model=TWINS[run.twin], seed=run.seed,
+                              start=before)
         if not self._true_positions:
             self._known = Known.of(self._twin.devices)
         self._spent["learn_twin_s"] = time.perf_counter() - started
@@ -248,13 +241,11 @@ class Client:
         if self._twin is None:
             assert self._reality is not None
             return self._reality.mission(self._known)
-        lasting = None
-        if self._run.twin_shadowing == "fitted":
-            lasting = self._measured
-            if lasting is None:
-                assert self._reality is not None
-                lasting = self._reality.measurements()
-        return twin_mission(self._scene, self._run, self._twin, self._known, lasting)
+        measured = self._measured
+        if measured is None:
+            assert self._reality is not None
+            measured = self._reality.measurements()
+        return twin_mission(self._scene, self._run, self._twin, self._known, measured)
 
     def _log(self) -> None:
         """Evaluate the policy of a real episode, in the twin and in the truth if there is one."""
@@ -287,14 +278,11 @@ class Client:
         tables = []
         if self._measured is None and self._reality is not None:
             tables = self._reality.tables
-        state = {"done": self._done, "entered": self._entered, "rows": self._rows,
-                 "spent": dict(self._spent), "tables": tables,
-                 "replica": self._replica.state(last=False), "twin": None}
-        if self._twin is not None:
-            self._twin.save(self._party.folder / "twin")
-            record, channel = self._twin.encode()
-            state["twin"] = {"record": record, "channel": np.frombuffer(channel, np.uint8)}
-        save_checkpoint(state, self._party.folder / NAME)
+        twin = None if self._twin is None else keep_twin(self._twin, self._party.folder)
+        save_checkpoint({"done": self._done, "entered": self._entered, "rows": self._rows,
+                         "spent": dict(self._spent), "tables": tables,
+                         "replica": self._replica.state(last=False), "twin": twin},
+                        self._party.folder / NAME)
 
     def _restore(self, state: dict, path: Path) -> None:
         try:
@@ -329,29 +317,11 @@ class _Replica(QMIX):
             self.networks = partial(ProximalNetworks, mu=proximal_mu)
         super().__init__(setup, [number])
 
-    @property
-    def mission(self) -> Mission:
-        """Of the present twin."""
-        return self._mission
-
-    @property
-    def episodes(self) -> int:
-        """Training episodes so far."""
-        return self._episodes
-
-    def enter(self, mission: Mission) -> None:
-        """Go on in another map."""
-        self._enter(mission)
-
-    def judge(self, weights: Weights) -> None:
-        """Keep weights as the policy if they collect most in this map."""
-        self._judge(weights)
-
     def train(self, mean: Weights, episodes: int) -> Weights:
         """Train for some episodes from a mean, and return the weights."""
         self._trainers.call("set_weights", mean)
         _, weights = self._train(episodes)
-        self._episodes += episodes
+        self.episodes += episodes
         return weights
 
     def weights(self) -> Weights:
@@ -361,7 +331,7 @@ class _Replica(QMIX):
     def go_on(self, mission: Mission, state: dict) -> None:
         """Go on from a checkpoint, in the map of that time."""
         self.load_state(state)
-        self._mission = mission
+        self.mission = mission
         self._trainers.call("enter", mission, self._actions)
 
     @override

@@ -23,12 +23,9 @@ def average(replicas: list[Weights]) -> Weights:
 def weighted_mean(replicas: Sequence[Weights], counts: Sequence[int]) -> Weights:
     """Return the mean of each weight in double precision, whatever the order of the replicas.
 
-    Federated averaging (McMahan et al., AISTATS 2017). Products and sums of a few weights in single
-    precision are exact in double precision, but for weights of very different sizes.
-
-    Args:
-        replicas: the same names and shapes in each.
-        counts: of the episodes behind each.
+    Federated averaging by the counts of the episodes behind each (McMahan et al., AISTATS 2017).
+    Products and sums of a few weights in single precision are exact in double precision, but for
+    weights of very different sizes.
     """
     return {name: sum((weights[name].astype(float) * count
                        for weights, count in zip(replicas, counts, strict=True)),
@@ -37,11 +34,7 @@ def weighted_mean(replicas: Sequence[Weights], counts: Sequence[int]) -> Weights
 
 
 def require_weights(given: Mapping[str, np.ndarray], like: Weights) -> None:
-    """Refuse weights that are not those of these networks: they come from somebody else.
-
-    Args:
-        given: name -> array.
-        like: of the right names, types and shapes.
+    """Refuse weights that are not like those of these networks: they come from somebody else.
 
     Raises:
         BadInput: they differ, are not finite, or are negative where squares are averaged.

@@ -241,11 +241,7 @@ class _FedProx(_Checked, FedProx):
 def make_strategy(shared: Shared, like: Weights, most: list[int], record: Record) -> FedAvg:
     """Return Flower's strategy, with its replies checked.
 
-    Args:
-        shared: settings.
-        like: weights of the right names and shapes.
-        most: training episodes of each round.
-        record: is told how many parties a round heard.
+    Weights are to be like the given ones, and episodes at most those of each round.
     """
     federation = shared.federation
     made: dict[str, tuple[type[_Checked], dict[str, Any]]] = {

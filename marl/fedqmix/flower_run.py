@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import tomli_w
@@ -38,52 +37,35 @@ SHORT_S = 0.05
 _LAST_LINES = 15  # of a log, in a message
 
 
-@dataclass(frozen=True)
-class Certificates:
-    """Files in PEM: the authority that all trust, and what the server proves itself with."""
+def make_certificate(folder: Path) -> tuple[Path, Path]:
+    """Write a certificate for this machine's loopback, which is its own authority, and its key.
 
-    authority: Path
-    certificate: Path
-    key: Path
-
-
-def make_certificates(folder: Path) -> Certificates:
-    """Write an authority and a server's certificate for this machine's loopback.
-
-    Args:
-        folder: to be written into; it exists.
+    Returns:
+        paths of both, in PEM.
     """
-    made = Certificates(folder / "ca.crt", folder / "server.pem", folder / "server.key")
-    authority, server = (ec.generate_private_key(ec.SECP256R1()) for _ in range(2))
+    key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "radiotwin federation")])
-    loopback = x509.SubjectAlternativeName(
-        [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))])
-    root = _builder(name, name, authority).add_extension(
+    now = datetime.datetime.now(datetime.UTC)
+    certificate = x509.CertificateBuilder(
+        name, name, key.public_key(), x509.random_serial_number(),
+        now - datetime.timedelta(minutes=5), now + LIFETIME).add_extension(
         x509.BasicConstraints(ca=True, path_length=0), critical=True).add_extension(
-        x509.SubjectKeyIdentifier.from_public_key(authority.public_key()), critical=False).sign(
-        authority, hashes.SHA256())
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")])
-    leaf = _builder(subject, name, server).add_extension(
-        x509.BasicConstraints(ca=False, path_length=None), critical=True).add_extension(
-        loopback, critical=False).add_extension(
-        x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()),
-        critical=False).sign(authority, hashes.SHA256())
-    made.authority.write_bytes(root.public_bytes(serialization.Encoding.PEM))
-    made.certificate.write_bytes(leaf.public_bytes(serialization.Encoding.PEM))
-    _write_secret(made.key, server.private_bytes(
+        x509.SubjectAlternativeName([x509.DNSName("localhost"),
+                                     x509.IPAddress(ipaddress.ip_address(HOST))]),
+        critical=False).sign(key, hashes.SHA256())
+    paths = folder / "ca.crt", folder / "server.key"
+    paths[0].write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
+    _write_secret(paths[1], key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8,
         serialization.NoEncryption()))
-    return made
+    return paths
 
 
 def make_node_key(path: Path) -> Path:
     """Write a SuperNode's private key, in the form of `ssh-keygen -t ecdsa -b 384`.
 
-    Args:
-        path: of the private key; the public one gets the suffix `.pub`.
-
     Returns:
-        The path of the public key, which the coordinator registers.
+        The path of the public key, with the suffix `.pub`, which the coordinator registers.
     """
     key = ec.generate_private_key(ec.SECP384R1())
     _write_secret(path, key.private_bytes(
@@ -93,14 +75,6 @@ def make_node_key(path: Path) -> Path:
     public.write_bytes(key.public_key().public_bytes(
         serialization.Encoding.OpenSSH, serialization.PublicFormat.OpenSSH))
     return public
-
-
-def _builder(subject: x509.Name, issuer: x509.Name,
-             key: ec.EllipticCurvePrivateKey) -> x509.CertificateBuilder:
-    now = datetime.datetime.now(datetime.UTC)
-    return x509.CertificateBuilder(
-        issuer, subject, key.public_key(), x509.random_serial_number(),
-        now - datetime.timedelta(minutes=5), now + LIFETIME)
 
 
 def _write_secret(path: Path, content: bytes) -> None:
@@ -118,8 +92,7 @@ class Processes:
     """
 
     def __init__(self, home: Path, logs: Path, environment: dict[str, str]) -> None:
-        self._logs, self._running = logs, dict[str, subprocess.Popen]()
-        self._sessions = set[int]()
+        self._home, self._logs, self._running = home, logs, dict[str, subprocess.Popen]()
         binaries = str(Path(sys.executable).parent)
         self._environment = os.environ | {
             "PATH": os.pathsep.join([binaries, os.environ.get("PATH", os.defpath)]),
@@ -133,7 +106,6 @@ class Processes:
             self._running[name] = subprocess.Popen(
                 command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                 start_new_session=True, preexec_fn=lambda: die_with_parent(parent))
-        self._sessions.add(self._running[name].pid)
 
     def call(self, command: Sequence[str]) -> str:
         """Run a command to its end, and return what it printed.
@@ -163,27 +135,17 @@ class Processes:
         """End a process as a power cut would; what it has started notices by itself."""
         self._running[name].kill()
 
-    def stop(self, name: str) -> None:
-        """End a process and all that it has started."""
-        process = self._running.pop(name)
-        others = _descendants(process.pid)
-        process.terminate()
-        try:
-            process.wait(END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-        for pid, began in others.items():
-            if _began(pid) == began:  # and not another one with its number
-                with suppress(ProcessLookupError):
-                    os.kill(pid, 9)
-
     def close(self) -> None:
-        """End all of them, the last started first, and what those that have ended left behind."""
-        for name in reversed(list(self._running)):
-            self.stop(name)
+        """End all of them, the last started first, and whatever they have started."""
+        for process in reversed(self._running.values()):
+            process.terminate()
+            try:
+                process.wait(END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
         end = time.monotonic() + END_S
-        while (left := _in_sessions(self._sessions)) and time.monotonic() < end:
+        while (left := _processes_with(f"FLWR_HOME={self._home}")) and time.monotonic() < end:
             for pid in left:
                 with suppress(ProcessLookupError):
                     os.kill(pid, 9)
@@ -211,13 +173,13 @@ class Federation:
             (home / "parties.json").write_text(json.dumps(configs))
             environment[PARTIES] = str(home / "parties.json")
         self.processes = Processes(home, logs, environment)
-        self._certificates = made = make_certificates(home)
+        self._certificate, self._key = make_certificate(home)
         self._port = free_port()
         self.ports = [self._port]  # that were opened
         self._link = f"{HOST}:{self._port}"
         (home / "config.toml").write_text(tomli_w.dumps({"superlink": {
             "default": LINK,
-            LINK: {"address": self._link, "root-certificates": str(made.authority)}}}))
+            LINK: {"address": self._link, "root-certificates": str(self._certificate)}}}))
         for number, config in enumerate(configs):
             (home / f"node-{number}.toml").write_text(tomli_w.dumps(config))
 
@@ -227,11 +189,11 @@ class Federation:
         Raises:
             RunFailed: one of them does not start.
         """
-        made = self._certificates
+        certificate = str(self._certificate)
         self.processes.start("superlink", [
             "flower-superlink", "--host", HOST, "--port", str(self._port),
-            "--ssl-ca-certfile", str(made.authority), "--ssl-certfile", str(made.certificate),
-            "--ssl-keyfile", str(made.key), "--disable-runtime-dependency-installation",
+            "--ssl-ca-certfile", certificate, "--ssl-certfile", certificate,
+            "--ssl-keyfile", str(self._key), "--disable-runtime-dependency-installation",
             "--simulation" if self._simulation else "--enable-supernode-auth"])
         self._wait_for_superlink()
         if not self._simulation:
@@ -246,7 +208,7 @@ class Federation:
         self.ports.append(free_port())
         self.processes.start(f"supernode-{number}", [
             "flower-supernode", "--superlink", self._link, "--root-certificates",
-            str(self._certificates.authority), "--auth-supernode-private-key",
+            str(self._certificate), "--auth-supernode-private-key",
             str(self._home / f"node-{number}"), "--host", HOST, "--port", str(self.ports[-1]),
             "--node-config", str(self._home / f"node-{number}.toml")])
 
@@ -321,7 +283,10 @@ class Federation:
 
     def _wait_for_superlink(self) -> None:
         end = time.monotonic() + START_S
-        while not _listens(self._port):
+        while True:
+            with socket.socket() as caller:
+                if caller.connect_ex((HOST, self._port)) == 0:
+                    return
             self._require_superlink()
             if time.monotonic() > end:
                 raise RunFailed(f"the SuperLink does not answer for {START_S:.0f} s")
@@ -335,11 +300,6 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
-def _listens(port: int) -> bool:
-    with socket.socket() as caller:
-        return caller.connect_ex((HOST, port)) == 0
-
-
 def _config_of(party: Party) -> dict[str, str | int]:
     config: dict[str, str | int] = {
         "scene": str(party.scene.absolute()), "out": str(party.folder.absolute()),
@@ -349,33 +309,11 @@ def _config_of(party: Party) -> dict[str, str | int]:
     return config
 
 
-def _descendants(root: int) -> dict[int, str]:
-    """Return processes that come from one: number -> time of their start (Linux only)."""
-    parents = {int(path.name): _stat(int(path.name)) for path in Path("/proc").glob("[0-9]*")}
-    found, new = dict[int, str](), [root]
-    while new:
-        parent = new.pop()
-        children = [pid for pid, stat in parents.items() if stat and int(stat[1]) == parent]
-        found |= {pid: _began(pid) for pid in children}
-        new += children
+def _processes_with(variable: str) -> list[int]:
+    """Return processes with a variable in their environment, `NAME=VALUE` (Linux only)."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # somebody else's, or it has ended
+            if variable.encode() in (path / "environ").read_bytes().split(b"\0"):
+                found.append(int(path.name))
     return found
-
-
-def _in_sessions(sessions: set[int]) -> list[int]:
-    """Return running processes of these sessions (Linux only), whose leaders may have ended."""
-    stats = {int(path.name): _stat(int(path.name)) for path in Path("/proc").glob("[0-9]*")}
-    return [pid for pid, stat in stats.items()
-            if stat and int(stat[3]) in sessions and stat[0] != "Z"]
-
-
-def _began(pid: int) -> str:
-    stat = _stat(pid)
-    return stat[19] if stat else ""
-
-
-def _stat(pid: int) -> list[str]:
-    """Return the fields of /proc/PID/stat from the state on; none where there is no process."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return []

@@ -152,12 +152,8 @@ def federate(shared: Shared, parties: list[Party], on_progress: Callable[[int], 
              ) -> list[Weights]:
     """Make the means in this process, and return them.
 
-    Every party trains in every round, so that the mean is that of `FedQMIX`.
-
-    Args:
-        shared: settings.
-        parties: each gets a folder `run-in-process` in its own.
-        on_progress: called with the number of rounds since the last call.
+    Every party trains in every round, so that the mean is that of `FedQMIX`. Each gets a folder
+    `run-in-process` in its own; progress is the number of rounds since the last call.
     """
     clients = [Client(shared.run, shared.learner,
                       replace(party, folder=party.folder / "run-in-process"),

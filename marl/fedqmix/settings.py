@@ -124,11 +124,9 @@ class Shared:
 
 
 def write_app(shared: Shared, folder: Path) -> None:
-    """Write a Flower App: settings only, no code; every party runs what it has installed.
+    """Write a Flower App, a `pyproject.toml` with settings only.
 
-    Args:
-        shared: its settings.
-        folder: to be made, with a `pyproject.toml`.
+    No code is in it: every party runs what it has installed.
     """
     app = {"publisher": "radiotwin", "config": shared.config(),
            "components": {"serverapp": "marl.fedqmix.flower_app:server_app",

@@ -144,11 +144,7 @@ class Format:
         return set(map(_plain, self.signature)) <= set(map(_plain, header))
 
     def mapping(self, header: Iterable[str]) -> dict[str, str]:
-        """Return the entries of `columns` for a header, without what it does not have.
-
-        Args:
-            header: names of the file's columns.
-        """
+        """Return the entries of `columns` for a header, without what it does not have."""
         actual = {_plain(name): name for name in reversed(list(header))}  # the first one counts
         result = {}
         for quantity, entries in self.columns.items():
@@ -368,12 +364,7 @@ FORMATS: tuple[Format, ...] = (*PHONE, *DRIVE_TEST, *LORA, *SCANNER)
 
 
 def expected(formats: Iterable[Format], columns: Collection[str] = ()) -> Expected:
-    """Return what a file may have.
-
-    Args:
-        formats: that it may be of.
-        columns: of a declared mapping, in lower case.
-    """
+    """Return what a file of some formats, or of a declared mapping (lower case), may have."""
     formats = list(formats)
     signatures = [frozenset(name.lower() for name in each.signature) for each in formats]
     return Expected((frozenset(columns), *signatures),
@@ -388,11 +379,7 @@ def find_format(header: Iterable[str]) -> Format | None:
 
 
 def format_named(name: str) -> Format:
-    """Return a format by its name.
-
-    Raises:
-        BadInput: unknown.
-    """
+    """Return a format by its name; BadInput if it is unknown."""
     for each in FORMATS:
         if each.name == name:
             return each

@@ -63,9 +63,6 @@ class LogFile:
     def read_text(self, budget: Budget) -> str:
         """Read a text in UTF-8.
 
-        Args:
-            budget: of its bytes.
-
         Raises:
             BadInput: it cannot be read, is too large, or no UTF-8.
         """
@@ -81,15 +78,14 @@ class LogFile:
 
 def list_files(paths: Iterable[Path | str],
                without: Iterable[Path | str]) -> tuple[list[LogFile], int]:
-    """List the files to import.
+    """List the files to import: in the order of `paths`, and by name in each.
 
     Args:
         paths: files, folders (with all in them), and zip files.
         without: files and folders that are no logs, such as tables of positions, or the output.
 
     Returns:
-        the files, in the order of `paths` and by name in each, and how many of folders and zip
-        files have another format and are left out.
+        the files, and how many of folders and zip files have another format and are left out.
 
     Raises:
         BadInput: a path cannot be read, or there are none or too many files.
@@ -127,9 +123,6 @@ def flight_names(files: list[LogFile]) -> list[str]:
 def open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open a zip file whose list of files is small, and whose files are so in all.
 
-    Args:
-        path: of the zip file.
-
     Raises:
         BadInput: no zip file, encrypted, of an unusual compression, or too large.
     """
@@ -155,15 +148,7 @@ def open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
 
 @contextmanager
 def open_member(archive: zipfile.ZipFile, name: str, source: object) -> Iterator[IO[bytes]]:
-    """Open a file in a zip file.
-
-    Args:
-        archive: from `open_archive`.
-        name: of the file in it.
-        source: for messages.
-
-    Yields:
-        binary file of at most as many bytes as the list of files declares.
+    """Open a file in a zip file, of at most as many bytes as the list of files declares.
 
     Raises:
         BadInput: it is damaged.

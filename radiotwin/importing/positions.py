@@ -32,14 +32,9 @@ MOVING_M = 1.0  # a device whose positions differ by more than this is not at re
 
 
 def local_m(positions: pd.DataFrame, origin: Origin | None) -> np.ndarray:
-    """Convert positions to the local frame about an origin (see `radiotwin.geo`).
+    """Convert positions, columns of `POSITION` [degrees, m], to x, y, z [m] about an origin.
 
-    Args:
-        positions: any columns of `POSITION` [degrees, m], n rows.
-        origin: None where all positions are local already.
-
-    Returns:
-        x, y, z [m], (n, 3); NaN where unknown.
+    NaN in the (n, 3) stands for unknown; without an origin all positions are local already.
     """
     places_m = np.full((len(positions), 3), np.nan)
     for axis, name in enumerate("xy"):
@@ -62,10 +57,7 @@ def find_origin(declared: Origin | None, receivers: pd.DataFrame,
                 devices: pd.DataFrame) -> Origin | None:
     """Return the declared origin, or the median of the receivers; None where all are local.
 
-    Args:
-        declared: origin from the settings.
-        receivers: positions with any columns of `POSITION`.
-        devices: the same; their median is the origin where no receiver has a latitude.
+    Where no receiver has a latitude, that of the devices.
 
     Raises:
         BadInput: some positions are local and some geographic, and no origin relates them.
@@ -90,15 +82,9 @@ def find_origin(declared: Origin | None, receivers: pd.DataFrame,
 
 
 def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
-    """Convert projected x, y to latitude and longitude.
+    """Convert projected x, y, in the unit of a reference system, to latitude and longitude.
 
-    Args:
-        positions: any columns of `POSITION`; x, y in the unit of `crs`.
-        crs: name of a projected reference system, see `reference_system`; None leaves x, y as
-            they are.
-
-    Returns:
-        latitude and longitude instead of x and y, and the other columns as they are.
+    Other columns stay; without a system x and y do, too.
 
     Raises:
         BadInput: unknown or not projected system, or x, y far outside its area of use.
@@ -314,21 +300,9 @@ class PositionedLinks:
     device_m: np.ndarray
     origin: Origin | None
 
-    def select(self, keep: np.ndarray, source: Source | None = None, tally: Tally | None = None,
-               reason: str = "") -> "PositionedLinks":
-        """Return some links with their devices.
-
-        Args:
-            keep: (n,) bool.
-            source: the file, for the place of the first link that is left out.
-            tally: counts the others, if there is one.
-            reason: why they are left out.
-        """
-        links = self.links
-        if tally is not None and source is not None:
-            links = tally.drop(links, ~keep, reason, "", source.where)
-        else:
-            links = links[keep]
+    def select(self, keep: np.ndarray) -> "PositionedLinks":
+        """Return the links of a mask (n,) with their devices."""
+        links = self.links[keep]
         devices = self.devices[self.devices["device"].isin(links["device"])]
         return PositionedLinks(links, devices.reset_index(drop=True), self.device_m[keep],
                                self.origin)
@@ -338,11 +312,7 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
                   tally: Tally) -> PositionedLinks:
     """Find the positions of receivers and devices in one local frame.
 
-    Args:
-        source: the file, for messages.
-        links: as of `build_links`.
-        settings: tables, crs and origin.
-        tally: counts the links whose receiver has no position.
+    Links whose receiver has none are counted and left out.
 
     Raises:
         BadInput: a table that cannot be used, a position far from the origin, or a moving device.

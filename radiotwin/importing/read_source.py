@@ -219,12 +219,9 @@ class Expected:
 
 def read_source(file: LogFile | Path | str, settings: Settings | None = None,
                 expected: Expected = Expected()) -> Source:
-    """Open a file of measurements.
+    """Open a file of measurements of one of the formats of `log_files`.
 
-    Args:
-        file: of one of the formats of `log_files`.
-        settings: with what is declared about a text; the rest is found.
-        expected: what it may have.
+    What the settings do not declare of a text, and what is expected to be in it, is found.
 
     Raises:
         BadInput: another format, unreadable, or without rows.

@@ -59,12 +59,7 @@ def average(links: pd.DataFrame, length_m: float,
 
 
 def in_wavelengths(length_m: float, frequency_hz: float) -> float:
-    """Convert a length [m] to wavelengths.
-
-    Args:
-        length_m: [m].
-        frequency_hz: [Hz].
-    """
+    """Convert a length [m] to wavelengths."""
     return length_m * frequency_hz / speed_of_light
 
 
@@ -129,17 +124,10 @@ def _level(level_db: np.ndarray, bin_index: np.ndarray, count: np.ndarray,
 
 
 def stay_representatives(links: pd.DataFrame, distance_m: float) -> np.ndarray:
-    """Choose one reading of each stay: the one with the (lower) median level.
+    """Return which readings (n,) represent a stay: of each the one with the (lower) median level.
 
     A stay is a run of readings of one receiver, device and flight, in the order of time, that are
     within a distance of the first of them. A reading that was not detected is below all others.
-
-    Args:
-        links: n rows with receiver positions.
-        distance_m: [m].
-
-    Returns:
-        (n,) bool, the readings that represent a stay.
     """
     track = links.groupby(["receiver", "device", "flight"], sort=False).ngroup().to_numpy()
     rows = pd.DataFrame({"row": np.arange(len(links)), "level_db": links["level_db"].to_numpy()})
@@ -169,14 +157,7 @@ def _stays(position_m: np.ndarray, track: np.ndarray, distance_m: float) -> np.n
 
 
 def without_repetition(source: Source) -> tuple[Source, list[int]]:
-    """Remove the rows that equal an earlier one in every column.
-
-    Args:
-        source: the file.
-
-    Returns:
-        the file without them, and their indices.
-    """
+    """Remove the rows that equal an earlier one in every column; return their indices, too."""
     table = source.table
     rows = np.arange(len(table))  # that repeat, or are repeated, in the columns so far
     key = np.zeros(len(table), dtype=np.uint64)

@@ -62,7 +62,8 @@ def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Ta
         if len(time_s) else None,
         "origin": None if origin is None else origin.model_dump(),
         "ranges": _ranges(table, positioned.links),
-        "warnings": [*notes, *_file_warnings(others),
+        "warnings": [*notes, *["1 file of another format is left out"] * (others == 1),
+                     *[f"{others} files of other formats are left out"] * (others > 1),
                      *_position_warnings(measurements),
                      *_level_warnings(positioned, measurements, tally, logs.readings),
                      *_time_and_angle_warnings(table),
@@ -85,12 +86,6 @@ def _ranges(table: pd.DataFrame, links: pd.DataFrame) -> dict[str, dict[str, Any
         result[name] = {"min": low, "median": middle, "max": high, "unit": unit,
                         "empty": int(values.isna().sum())}
     return result
-
-
-def _file_warnings(others: int) -> Iterator[str]:
-    if others:
-        yield (f"{others} files of other formats are left out" if others > 1
-               else "1 file of another format is left out")
 
 
 def _position_warnings(measurements: Measurements) -> Iterator[str]:
@@ -196,8 +191,10 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
     notes += clock_notes(positioned.links)
     if settings.thin_m:
         on_progress("thinning")
-        positioned = positioned.select(stay_representatives(positioned.links, settings.thin_m),
-                                       logs.source, tally, f"stay within {settings.thin_m:g} m")
+        keep = stay_representatives(positioned.links, settings.thin_m)
+        tally.drop(positioned.links, ~keep, f"stay within {settings.thin_m:g} m", "",
+                   logs.source.where)
+        positioned = positioned.select(keep)
     if positioned.links.empty:
         reasons = "; ".join(f"{number} {reason}" for (reason, _), number in tally.left_out.items())
         raise BadInput(f"{logs.source.path}: nothing is left of {logs.readings} readings: "

@@ -28,11 +28,7 @@ QUANTITIES = (*POSITION, ABOVE_GROUND)
 
 
 def check_position(given: set[str], prefix: str) -> None:
-    """Check that the quantities of a position are consistent.
-
-    Args:
-        given: those of `QUANTITIES` that have a column.
-        prefix: of their names in the message, `""` or `device_`.
+    """Check that some of `QUANTITIES` are a position; the prefix is that of names in the message.
 
     Raises:
         ValueError: not latitude, longitude or x, y with at most one of `HEIGHTS`.
@@ -214,12 +210,8 @@ class Settings(Table):
     def require_columns(self, source: str, header: Iterable[str]) -> None:
         """Check that there are columns of levels and of devices.
 
-        Args:
-            source: the file, for the message.
-            header: its columns.
-
         Raises:
-            BadInput: names all that is missing.
+            BadInput: names all that is missing, and the columns that the file has.
         """
         missing = []
         if not self.wide and not self.columns.level:
@@ -234,10 +226,7 @@ class Settings(Table):
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Parse pairs of the command line.
-
-    Args:
-        text: such as `latitude=lat,longitude=lon`.
+    """Parse pairs of the command line, such as `latitude=lat,longitude=lon`.
 
     Raises:
         BadInput: not pairs, or a name that is repeated.
@@ -288,9 +277,7 @@ def read_settings(path: Path | str | None, given: Mapping[str, Any],
 def merged(settings: Settings, defaults: Mapping[str, Any]) -> Settings:
     """Return settings with defaults for what they do not declare.
 
-    Args:
-        settings: of the import.
-        defaults: fields of `Settings`; a position counts only where none is declared.
+    Of the defaults a position counts only where none is declared.
 
     Raises:
         BadInput: both together are not allowed.
@@ -356,12 +343,9 @@ def _message(problem: Mapping[str, Any], source: str | None) -> str:
 
 
 def write_settings(settings: Settings, path: Path, folder: Path) -> None:
-    """Write settings as TOML.
+    """Write settings that differ from the defaults as TOML.
 
-    Args:
-        settings: those that differ from the defaults are written.
-        path: of the file.
-        folder: where the file will be in the end; the paths of tables become relative to it.
+    Paths of tables become relative to the folder where the file will be in the end.
     """
     data = settings.model_dump(exclude_none=True, exclude_defaults=True)
     for table in ("devices", "receivers"):

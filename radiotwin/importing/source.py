@@ -52,7 +52,7 @@ class Source:
         Args:
             spec: name of a column, `always VALUE`, or a text with names in braces, such as
                 `{Date} {Time}`, which is empty where one of these cells is.
-            purpose: what they are needed for, for the message.
+            purpose: what they are needed for, for the message; as in the other methods.
 
         Raises:
             BadInput: no such column.
@@ -72,10 +72,7 @@ class Source:
         return text
 
     def require(self, specs: Mapping[str, str]) -> None:
-        """Check that the file has all columns of a mapping.
-
-        Args:
-            specs: what they are needed for -> as in `cells`.
+        """Check that the file has all columns of a mapping: purpose -> as in `cells`.
 
         Raises:
             BadInput: names all that are missing.
@@ -90,10 +87,6 @@ class Source:
 
     def names(self, spec: str, purpose: str) -> np.ndarray:
         """Return the cells as names, (n,) texts, `""` where empty; equal ones are one object.
-
-        Args:
-            spec: name of a column, or `always VALUE`.
-            purpose: what they are needed for, for the message.
 
         Raises:
             BadInput: no such column, or a text that cannot be a name.
@@ -110,10 +103,6 @@ class Source:
 
     def numbers(self, spec: str, purpose: str) -> np.ndarray:
         """Return the cells as numbers, (n,); NaN where empty.
-
-        Args:
-            spec: name of a column, or `always VALUE`.
-            purpose: what they are needed for, for the message.
 
         Raises:
             BadInput: no such column, a text, or a number that is not finite.
@@ -135,28 +124,17 @@ class Source:
         return numbers
 
     def refuse(self, spec: str, cells: pd.Series, bad: ArrayLike, reason: str) -> None:
-        """Raise BadInput about the first bad cell of a column, if there is one.
+        """Raise BadInput about the first bad cell (n,) of a column, if there is one.
 
-        Args:
-            spec: the column.
-            cells: (n,) with the index of the table.
-            bad: (n,) bool.
-            reason: end of the message, after the cell's text.
-
-        Raises:
-            BadInput: names file, row and column.
+        The message names file, row and column, and ends with the reason.
         """
         refuse(self.path, spec, cells, bad, reason, lambda row: self.where(cells.index[row]))
 
 
 def as_text(cells: pd.Series) -> pd.Series:
-    """Convert cells to stripped texts.
+    """Convert cells (n,) of any type to stripped texts.
 
-    Args:
-        cells: (n,) of any type.
-
-    Returns:
-        texts, (n,): `""` for every spelling of an empty cell, whole numbers without a point.
+    `""` stands for every spelling of an empty cell; whole numbers have no point.
     """
     if cells.dtype.kind == "f":
         whole = (cells == cells.round()) & (cells.abs() < 2.0**53)  # exact in double precision
@@ -167,11 +145,9 @@ def as_text(cells: pd.Series) -> pd.Series:
 
 
 def columns_of(spec: str, header: Iterable[object]) -> list[str]:
-    """Return the names of columns in an entry of a mapping.
+    """Return the names of columns in an entry of a mapping, as of `Source.cells`.
 
-    Args:
-        spec: as in `Source.cells`.
-        header: names of the file's columns; a name may have braces itself.
+    A name of the header may have braces itself.
     """
     if spec.startswith(ALWAYS) and spec not in header:
         return []
@@ -197,11 +173,7 @@ class Problems:
                 self._messages.append(str(error))
 
     def check(self) -> None:
-        """Raise all messages as one.
-
-        Raises:
-            BadInput: there are some.
-        """
+        """Raise all messages as one BadInput, if there are any."""
         if not self._messages:
             return
         if len(self._messages) == 1:
@@ -225,7 +197,7 @@ class Tally:
     first: dict[tuple[str, str], str] = field(default_factory=dict)
 
     def count(self, reason: str, column: str, number: int, where: str) -> None:
-        """Add readings; zero of them leave no entry.
+        """Add readings left out for a reason; of none there is no entry.
 
         Args:
             reason: why they are left out.
@@ -239,18 +211,7 @@ class Tally:
 
     def drop(self, links: pd.DataFrame, bad: ArrayLike, reason: str, column: str,
              where: Callable[[int], str]) -> pd.DataFrame:
-        """Remove links and count them.
-
-        Args:
-            links: n rows.
-            bad: (n,) bool, those to remove.
-            reason: why they are left out.
-            column: of the file.
-            where: index -> `row 7`.
-
-        Returns:
-            the other links.
-        """
+        """Return links without the bad ones (n,), which are counted; `where` as of `Source`."""
         bad = np.asarray(bad, dtype=bool)
         if not bad.any():
             return links

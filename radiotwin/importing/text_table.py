@@ -251,11 +251,7 @@ def _trailer(lines: list[str], delimiter: str, header: list[str]) -> int:
 
 
 def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.ndarray]:
-    """Read all cells as texts.
-
-    Args:
-        file: of text.
-        dialect: of the text.
+    """Read all cells of a text as texts.
 
     Returns:
         cells, `""` where empty, decimal commas as points; and the line of each row, from 1.

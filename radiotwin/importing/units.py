@@ -41,7 +41,7 @@ POSSIBLE_DB = (-250.0, 0.0)
 
 
 def seconds(source: Source, spec: str, time_format: str | None, zone: str | None) -> np.ndarray:
-    """Read the times of a column.
+    """Read the times of a column as seconds since the epoch, UTC, (n,); NaN where a cell is empty.
 
     Args:
         source: the file.
@@ -49,9 +49,6 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
         time_format: one of `EPOCH_S`, `ISO`, or a strftime format; not needed where the file has
             typed times.
         zone: IANA time zone of times without an offset from UTC.
-
-    Returns:
-        seconds since the epoch, UTC, (n,); NaN where the cell is empty.
 
     Raises:
         BadInput: format or zone not declared, a cell that cannot be read, or a local time that the
@@ -83,14 +80,9 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
 
 
 def calendar_days(time_s: np.ndarray, zone: str | None) -> np.ndarray:
-    """Convert times to dates.
+    """Convert times (n,) [s] to dates in a time zone, such as `2022-04-25`; `""` where unknown.
 
-    Args:
-        time_s: seconds since the epoch, (n,).
-        zone: IANA time zone of the calendar; None for UTC.
-
-    Returns:
-        dates such as `2022-04-25`, (n,); `""` where the time is unknown.
+    The zone is one of the IANA; None for UTC.
     """
     days = np.empty(len(time_s), dtype=object)
     for start in range(0, len(time_s), _ROWS_AT_ONCE):
@@ -161,11 +153,7 @@ def _localize(source: Source, spec: str, text: pd.Series, parsed: pd.Series,
 
 
 def clock_notes(links: pd.DataFrame) -> list[str]:
-    """Return notes on receivers whose times put them at two places at once.
-
-    Args:
-        links: with receiver positions, and `time_s` or not.
-    """
+    """Return notes on receivers whose times put them at two places at once."""
     if "time_s" not in links:
         return []
     notes = []
@@ -197,15 +185,7 @@ def clock_notes(links: pd.DataFrame) -> list[str]:
 
 
 def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
-    """Convert lengths to metres.
-
-    Args:
-        numbers: (n,) in `unit`.
-        unit: of `METRES`; None if it is not declared.
-        column: file and column, for the message.
-
-    Returns:
-        lengths [m], (n,).
+    """Convert lengths (n,) in a unit of `METRES` to metres; `column` is for the message.
 
     Raises:
         BadInput: the unit is not declared.
@@ -235,13 +215,7 @@ class Levels:
 
 def read_levels(source: Source, spec: str, settings: Settings,
                 offset_db: float | np.ndarray = 0.0) -> Levels:
-    """Read the levels of one column.
-
-    Args:
-        source: the file.
-        spec: the column.
-        settings: unit, and the values that mean not detected or not measured.
-        offset_db: added to each level, or (n,) to each its own.
+    """Read the levels of one column; the offset is added to each, or (n,) to each its own.
 
     Raises:
         BadInput: the unit is not declared, a cell is not a number, or empty cells have no declared

@@ -49,28 +49,16 @@ class Budget:
         return int(digits)
 
     def check(self, amount: float, subject: object) -> None:
-        """Check an amount.
-
-        Args:
-            amount: as large as it is, or would get.
-            subject: has it, such as the path of a file; the message begins with it.
+        """Check an amount, as large as it is, or would get.
 
         Raises:
-            BadInput: the amount is above the limit.
+            BadInput: it is above the limit; the message begins with the subject, such as a path.
         """
         if amount > self.limit:
             self.refuse(subject, f"{amount:,.0f} {self.unit}")
 
     def refuse(self, subject: object, amount: str) -> NoReturn:
-        """Raise the message of an amount above the limit.
-
-        Args:
-            subject: the message begins with it.
-            amount: with its unit, as far as it is known, such as `more than 3 rows`.
-
-        Raises:
-            BadInput: always.
-        """
+        """Raise the message, BadInput, of a subject's amount, such as `more than 3 rows`."""
         raise BadInput(f"{subject}: {amount}; at most {self.limit:,} are read; if it is meant to "
                        f"be so large, set {self.variable} to a larger number")
 

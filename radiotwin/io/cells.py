@@ -45,9 +45,6 @@ PLANNING = {"method": "text", "trained_in": "text", "real_episodes": "number",
 class CsvLayout:
     """Checks that every row of a CSV file has as many fields as its header.
 
-    Args:
-        path: of the file, for messages.
-
     Attributes:
         header: names of the columns.
         rows: with the header, without blank lines.
@@ -61,10 +58,7 @@ class CsvLayout:
         self.has_apostrophes = False
 
     def check(self, file: IO[bytes]) -> None:
-        """Check all rows; counts separators as long as there are no quotation marks.
-
-        Args:
-            file: decompressed.
+        """Check all rows of a file; count separators as long as there are no quotation marks.
 
         Raises:
             BadInput: names the row.
@@ -212,28 +206,14 @@ def write_csv(table: pd.DataFrame, target: Path | IO[bytes], float_format: str |
 
 
 def check_suffix(path: Path) -> None:
-    """Check that a table has one of the formats that are read and written.
-
-    Args:
-        path: of the table; its suffix counts in any case.
-
-    Raises:
-        BadInput: another suffix.
-    """
+    """Raise BadInput unless a table has a suffix of a format that is read and written."""
     name = PurePath(path.name.lower())  # some loggers write A.CSV
     if name.suffix not in (".csv", ".parquet") and name.suffixes[-2:] != [".csv", ".gz"]:
         raise BadInput(f"{path}: unknown format; allowed are .csv, .csv.gz and .parquet")
 
 
 def require_pyarrow(path: Path) -> None:
-    """Check that pyarrow is installed.
-
-    Args:
-        path: of the Parquet file, for the message.
-
-    Raises:
-        BadInput: it is not.
-    """
+    """Raise BadInput about a Parquet file unless pyarrow is installed."""
     optional_package("pyarrow", f"{path}: Parquet needs the package pyarrow; `pip install "
                                 "radiotwin[parquet]`, or use .csv.gz")
 
@@ -261,11 +241,7 @@ def refuse(path: Path | str, name: str, column: pd.Series, bad: ArrayLike, reaso
 
 
 def as_numbers(text: pd.Series) -> np.ndarray:
-    """Convert texts to numbers, (n,); NaN where one is not a number, or empty.
-
-    Args:
-        text: (n,) without spaces around.
-    """
+    """Convert texts (n,) without spaces around to numbers; NaN where one is none, or empty."""
     numbers = np.empty(len(text))
     for start in range(0, len(text), _NUMBERS_AT_ONCE):
         rows = slice(start, start + _NUMBERS_AT_ONCE)

@@ -24,11 +24,10 @@ _hashed: WeakKeyDictionary[Any, bytes] = WeakKeyDictionary()
 def content_hash(value: Any) -> str:
     """Return a hash of a value.
 
-    Args:
-        value: numbers, texts, bytes, None, arrays, tuples, lists, sets, dictionaries, and objects
-            of classes of this package: pydantic models, dataclasses by their fields, others by
-            their `state()`, or else by their attributes. The hash of an object that cannot change
-            (a frozen dataclass, or a class with `never_changes`) is remembered.
+    It may consist of numbers, texts, bytes, None, arrays, tuples, lists, sets, dictionaries, and
+    objects of classes of this package: pydantic models, dataclasses by their fields, others by
+    their `state()`, or else by their attributes. The hash of an object that cannot change (a frozen
+    dataclass, or a class with `never_changes`) is remembered.
 
     Raises:
         Unhashable: something else.

@@ -27,11 +27,7 @@ MAX_NUMBER = 1e15  # no quantity of a run is larger, in any unit
 
 
 def name_fault(name: str) -> str | None:
-    """Return why a text cannot be a name of a device, a receiver or a flight; None if it can.
-
-    Args:
-        name: without spaces around it.
-    """
+    """Return why a text cannot name a device, a receiver or a flight; None if it can."""
     if not name:
         return "is empty; give a name"
     if len(name) > MAX_NAME:
@@ -62,11 +58,9 @@ class Origin(Table):
 
 
 def as_origin(value: Origin | Sequence[float] | None) -> Origin | None:
-    """Return the origin of a frame from numbers.
+    """Return the origin of a frame from (latitude, longitude) [degrees] and maybe its altitude [m].
 
-    Args:
-        value: (latitude, longitude) [degrees] and optionally the altitude of the ground [m]; an
-            origin and None are returned as they are.
+    An origin, and None, are returned as they are.
 
     Raises:
         BadInput: not two or three numbers, or a place that is not on the earth.
@@ -111,10 +105,6 @@ Whole = Annotated[int, PlainValidator(_whole)]
 def read_record(path: Path | str, what: str) -> dict[str, Any]:
     """Read a JSON object within the limits of size, entries and nesting.
 
-    Args:
-        path: of the file.
-        what: it should be, for the message.
-
     Raises:
         BadInput: it cannot be read, it is not JSON or no object, or it is too large.
     """
@@ -126,14 +116,10 @@ def read_record(path: Path | str, what: str) -> dict[str, Any]:
 
 
 def check_size(record: object, source: object) -> None:
-    """Check the number of entries of each list and object, and how deep they are nested.
-
-    Args:
-        record: as JSON has it.
-        source: it is from; the message begins with it.
+    """Check the number of entries of each list and object of JSON, and how deep they are nested.
 
     Raises:
-        BadInput: too many, or too deep.
+        BadInput: too many, or too deep; the message begins with `source`.
     """
     depth, level = 0, [record]
     while level:
@@ -151,14 +137,9 @@ def validated(schema: type[BaseModel], record: object, source: object,
               remedy: str) -> dict[str, Any]:
     """Return the fields of a record that a schema names, and that were given.
 
-    Args:
-        schema: of the record.
-        record: as JSON has it.
-        source: it is from; the message begins with it.
-        remedy: end of the message, such as "run `radiotwin close-loop` again".
-
     Raises:
-        BadInput: a field is missing or has another type; the message names the first one.
+        BadInput: a field is missing or has another type; the message names `source` and the first
+            one, and ends with the remedy, such as "run `radiotwin close-loop` again".
     """
     try:
         return schema.model_validate(record).model_dump(by_alias=True, exclude_unset=True)

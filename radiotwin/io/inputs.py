@@ -45,7 +45,7 @@ def is_within(path: Path, *folders: Path) -> bool:
 
 
 def require_within(folder: Path, path: Path, source: str) -> Path:
-    """Return the path if it lies in the folder once links are followed.
+    """Return a path if it lies in a folder once links are followed.
 
     Args:
         folder: that the reader may read.
@@ -64,12 +64,8 @@ def require_within(folder: Path, path: Path, source: str) -> Path:
 def keep_inputs(out: Path, *read: Path | None) -> None:
     """Check that an output replaces nothing that the command reads; call it before long work.
 
-    Args:
-        out: file or folder that will be replaced.
-        read: files and folders; None where an option is not given.
-
     Raises:
-        BadInput: one of them is `out`, or lies in it, once links are followed.
+        BadInput: one of the files and folders `read` is `out`, or lies in it.
     """
     for path in read:
         if path is not None and is_within(path, out):
@@ -93,17 +89,10 @@ def require_plain(folder: Path) -> None:
 
 
 def check_input(path: Path | str, what: str = "file") -> int:
-    """Check that a library may open a file: it exists, is regular, and is not too large.
-
-    Args:
-        path: of the file.
-        what: it should be, for the message, such as `radio map (.nc)`.
-
-    Returns:
-        its size [bytes].
+    """Return the size of a file [bytes] that a library may open: regular, and not too large.
 
     Raises:
-        BadInput: it cannot be read.
+        BadInput: as `open_input`.
     """
     with open_input(path, what) as file:
         return os.fstat(file.fileno()).st_size
@@ -116,11 +105,8 @@ def open_input(path: Path | str, what: str = "file",
 
     Args:
         path: of the file.
-        what: it should be, for the message.
+        what: it should be, for the message, such as `radio map (.nc)`; in all functions here.
         budget: of its bytes, checked before the first is read.
-
-    Yields:
-        binary file.
 
     Raises:
         BadInput: no such file, a folder, a pipe, a device, no permission, or too large.
@@ -148,11 +134,6 @@ def open_input(path: Path | str, what: str = "file",
 def read_bytes(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES) -> bytes:
     """Read a file.
 
-    Args:
-        path: of the file.
-        what: it should be, for the message.
-        budget: of its bytes.
-
     Raises:
         BadInput: as `open_input`.
     """
@@ -169,11 +150,6 @@ def read_text(path: Path | str, what: str = "text file",
               budget: Budget = DOCUMENT_BYTES) -> str:
     """Read a text in UTF-8, with or without a byte-order mark.
 
-    Args:
-        path: of the file.
-        what: it should be, for the message.
-        budget: of its bytes.
-
     Raises:
         BadInput: as `open_input`, or it is not UTF-8.
     """
@@ -182,10 +158,6 @@ def read_text(path: Path | str, what: str = "text file",
 
 def decode_text(data: bytes, path: Path | str) -> str:
     """Decode a text in UTF-8, with or without a byte-order mark.
-
-    Args:
-        data: of the file.
-        path: of the file, for the message.
 
     Raises:
         BadInput: it is not UTF-8.
@@ -199,10 +171,6 @@ def decode_text(data: bytes, path: Path | str) -> str:
 
 def read_json(path: Path | str, what: str = "JSON file") -> Any:
     """Read a JSON document by the standard: NaN and infinity are refused.
-
-    Args:
-        path: of the file.
-        what: it should be, for the message.
 
     Raises:
         BadInput: as `read_text`, not JSON, nested too deep, or a number of too many digits.
@@ -236,10 +204,6 @@ def parse_json(text: str, source: object, allow_nan: bool = False) -> Any:
 def read_toml(path: Path | str, what: str = "TOML file") -> dict[str, Any]:
     """Read a TOML document.
 
-    Args:
-        path: of the file.
-        what: it should be, for the message.
-
     Raises:
         BadInput: as `read_text`, not TOML, nested too deep, or a number of too many digits.
     """
@@ -261,13 +225,8 @@ def open_gzip(path: Path | str, what: str = "file",
               budget: Budget = FILE_BYTES) -> Iterator[IO[bytes]]:
     """Open a file for reading; decompress it while it is read if its name ends in `.gz`, or `.GZ`.
 
-    Args:
-        path: of the file.
-        what: it should be, for the message.
-        budget: of its bytes, before and after decompression.
-
     Yields:
-        buffered binary file; reading beyond the budget, or a damaged file, raises BadInput.
+        buffered binary file of at most `budget` bytes; reading more, or a damaged one, is BadInput.
 
     Raises:
         BadInput: as `open_input`.
@@ -283,16 +242,10 @@ def open_gzip(path: Path | str, what: str = "file",
 @contextmanager
 def bounded(file: IO[bytes], source: object, is_gzip: bool,
             budget: Budget = FILE_BYTES) -> Iterator[IO[bytes]]:
-    """Read from packed bytes up to a budget.
-
-    Args:
-        file: open, such as a file in a zip file.
-        source: of it, for messages.
-        is_gzip: whether it is compressed by gzip, too.
-        budget: of its bytes after decompression.
+    """Read at most `budget` bytes of an open file, such as one in a zip file, after decompression.
 
     Yields:
-        buffered binary file; reading beyond the budget, or a damaged file, raises BadInput.
+        buffered binary file; reading more, or a damaged file, raises BadInput about `source`.
     """
     content = gzip.GzipFile(fileobj=file) if is_gzip else file
     with io.BufferedReader(_Bounded(content, source, budget), _BLOCK_BYTES) as buffered:
@@ -330,7 +283,7 @@ def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None]
                    end: Callable[[str], None] = lambda tag: None,
                    budget: Budget = FILE_BYTES,
                    text: Callable[[str], None] | None = None) -> int:
-    """Call back for every element of a file, in the file's order.
+    """Call back for every element of an XML file, in the file's order; return the bytes read.
 
     Args:
         path: XML file.
@@ -338,9 +291,6 @@ def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None]
         end: Called as `end(tag)` where it ends.
         budget: Of the file's bytes.
         text: Called with each piece of text between tags; None: texts are not read.
-
-    Returns:
-        Bytes read.
 
     Raises:
         BadInput: No such file, malformed XML (with line and column), declared entities, or a file

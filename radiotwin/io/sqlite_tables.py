@@ -21,13 +21,6 @@ _ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_PRAGMA)
 def open_tables(path: Path, what: str) -> Iterator[sqlite3.Connection]:
     """Open a database so that it can do nothing but read this one file.
 
-    Args:
-        path: of the file.
-        what: it should be, for messages.
-
-    Yields:
-        database.
-
     Raises:
         BadInput: no such file, no SQLite, or one that another program has open.
         sqlite3.Error: a damaged database.
@@ -68,13 +61,7 @@ def require_table(database: sqlite3.Connection, name: str) -> None:
 
 def scan(database: sqlite3.Connection, table: str, columns: list[str],
          budget: Budget = FEATURES) -> Iterator[tuple]:
-    """Yield the given columns of every row.
-
-    Args:
-        database: as of `open_tables`.
-        table: that `require_table` let pass.
-        columns: names.
-        budget: of the rows.
+    """Yield columns of every row of a table that `require_table` let pass.
 
     Raises:
         BadInput: too many rows.

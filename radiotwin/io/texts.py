@@ -21,12 +21,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 def shown(text: str, max_length: int = MAX_TEXT) -> str:
-    r"""Return a text with its hidden characters as `\x1b` or `\u202e`, cut where it is too long.
-
-    Args:
-        text: may hold anything.
-        max_length: longest that is left as it is, in characters.
-    """
+    r"""Return a text with its hidden characters as `\x1b` or `\u202e`, cut where it is too long."""
     cut = text if len(text) <= max_length else text[:max_length - 1] + "…"
     return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1], cut)
 
@@ -60,32 +55,20 @@ def shown_data(value: Any) -> Any:
 
 
 def quoted(text: Any) -> Any:
-    """Return a text as it is written to CSV, the same object where nothing changes.
-
-    Args:
-        text: cell or name of a column; what is not a text stays.
-    """
+    """Return a cell or a name as it is written to CSV, the same object where nothing changes."""
     if isinstance(text, str) and _FORMULA.match(text) and not _NUMBER.fullmatch(text):
         return f"'{text}"
     return text
 
 
 def unquoted(text: Any) -> Any:
-    """Return what `quoted` was given.
-
-    Args:
-        text: cell or name of a column; what is not a text stays.
-    """
+    """Return what `quoted` was given."""
     is_quoted = isinstance(text, str) and text.startswith("'") and _FORMULA.match(text)
     return text[1:] if is_quoted else text
 
 
 def with_quotes(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with `quoted` texts and names of columns.
-
-    Args:
-        table: any columns; it is not changed.
-    """
+    """Return a table with `quoted` texts and names of columns."""
     table = table.rename(columns=quoted)
     for name in table.columns:
         if table[name].dtype.kind not in "biufmM":
@@ -97,11 +80,7 @@ def with_quotes(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def without_quotes(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table whose cells are `unquoted`; names of columns stay.
-
-    Args:
-        table: columns of texts or others; it is not changed.
-    """
+    """Return a table whose cells are `unquoted`; names of columns stay."""
     table = table.copy(deep=False)
     for name in table.columns:
         if table[name].dtype.kind in "OU" or isinstance(table[name].dtype, pd.StringDtype):

@@ -64,10 +64,7 @@ def in_scene_frame(measurements: Measurements, scene: Scene,
 def in_known_frame(measurements: Measurements, there: Origin | None, what: str) -> Measurements:
     """Return measurements in the frame about an origin; as they are where either is unknown.
 
-    Args:
-        measurements: with or without an origin.
-        there: origin of what they are used with.
-        what: that is, for the message.
+    `what` they are used with is for the message.
 
     Warns:
         Positions were converted, with how far they moved.

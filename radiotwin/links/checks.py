@@ -42,9 +42,7 @@ INDOORS = "it was indoors (see building_entry), or its position or the wall is o
 def height_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
     """Return a note where heights look as if they counted from another zero than the scene's.
 
-    Args:
-        receiver_m: (n, 3), z above the datum of the scene [m]; NaN where unknown.
-        scene: the 3D map.
+    Receivers (n, 3) have z above the datum of the scene [m], NaN where unknown.
     """
     known = np.isfinite(receiver_m).all(axis=1)
     if not known.any():
@@ -74,15 +72,10 @@ def height_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
 
 def chance_inside(city: CityMap, position_m: np.ndarray,
                   sd_m: float = POSITION_SD_M) -> np.ndarray:
-    """Return the probability that ends of links are inside buildings.
+    """Return the probability (n,) that ends of links are inside buildings.
 
-    Args:
-        city: 3D map.
-        position_m: (n, 3) where they are said to be [m].
-        sd_m: standard deviation of that in x and in y, normal and independent [m].
-
-    Returns:
-        (n,) share of equally probable places that are inside: rings of a normal distribution.
+    It is the share that is inside of equally probable places around where they are said to be (n,
+    3) [m]: rings of a normal distribution, with the same standard deviation [m] in x and in y.
     """
     places_m, own = np.unique(position_m, axis=0, return_inverse=True)
     share = (np.arange(RINGS) + 0.5) / RINGS
@@ -203,18 +196,10 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
 
 
 def unmapped_ends(receiver_m: np.ndarray, device_m: np.ndarray, scene: Scene) -> np.ndarray:
-    """Return which links end off the 3D map and below its roofs, where nobody knows what is built.
+    """Return which links (n,) end off the 3D map and below its roofs.
 
     Whether such a link has line of sight is not known. What ends above the roofs has a free way
-    there, wherever it is.
-
-    Args:
-        receiver_m: (n, 3) [m].
-        device_m: (n, 3) [m]; NaN where unknown.
-        scene: the 3D map.
-
-    Returns:
-        (n,) bool.
+    there, wherever it is. Both ends are (n, 3) [m]; NaN where unknown.
     """
     low_m, high_m = map_corners_m(scene)
     roof_m = _roof_m(scene)
@@ -283,15 +268,12 @@ def refuse_misplaced_anchors(links: Links, scene: Scene) -> None:
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,
                       keep: np.ndarray) -> list[tuple[np.ndarray, str]]:
-    """Return links of receivers that say nothing, and why.
+    """Return links of receivers that say nothing, and why: masks (n,), each with its reason.
 
     Args:
         table: n measurements.
         level_db: (n,) [dB]; NaN = not detected.
         keep: (n,) bool, links that count.
-
-    Returns:
-        masks (n,), each with its reason.
     """
     end, names = pd.factorize(table["receiver"], sort=True)
     links = np.bincount(end[keep], minlength=len(names))
@@ -317,15 +299,8 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
     """Return links of devices that nobody detected although many tried, and a note on them.
 
     A device that is off would pass for one with a huge loss. One with few links may be a position
-    of a device that moves, and then its blanks are as good as any.
-
-    Args:
-        table: n measurements.
-        level_db: (n,) [dB]; NaN = not detected.
-        keep: (n,) bool, links that count.
-
-    Returns:
-        mask (n,), and its reason.
+    of a device that moves, and then its blanks are as good as any. Arguments as of
+    `useless_receivers`.
     """
     end, names = pd.factorize(table["device"], sort=True)
     links, heard = (np.bincount(end[rows], minlength=len(names))

@@ -46,8 +46,7 @@ REMEMBERED = 8  # sets of links: of a model and its folds
 def pairs_of_links(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (p,) and rows (p,) of pairs of links of one series: neighbours, and along tracks.
 
-    Args:
-        place: (n, d) of both ends; the last column separates series.
+    A place is (n, d) of both ends; its last column separates series.
     """
     n = len(place)
     every = np.arange(n) if n <= MAX_LINKS else np.sort(
@@ -154,15 +153,7 @@ class Variogram:
     @classmethod
     def of(cls, position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
            lengths_m: np.ndarray) -> Variogram:
-        """Return that of n links.
-
-        Args:
-            position_m: (n, d) of both ends [m].
-            trends: as of the class.
-            first: as of the class.
-            second: as of the class.
-            lengths_m: as of the class.
-        """
+        """Return that of n links with both ends at (n, d) [m]; other arguments as of the class."""
         distance_m, least_m = _apart_m(position_m, first, second), float(lengths_m[0])
         edges = np.geomspace(least_m, max(float(distance_m.max(initial=0)), 2 * least_m), BINS)
         index = np.searchsorted(edges, distance_m)
@@ -172,11 +163,8 @@ class Variogram:
     def length_m(self, z: np.ndarray) -> float:
         """Return the correlation length whose field, with a nugget, is nearest to a residual's.
 
-        Args:
-            z: (n,) residuals over their scale.
-
-        Returns:
-            one of `lengths_m`; the first where the residual is not correlated, or says too little.
+        The residuals (n,) are over their scale. The first of `lengths_m` stands for a residual that
+        is not correlated, or says too little.
         """
         rest = np.empty(len(z))
         for trend in self.trends:
@@ -193,12 +181,9 @@ class Variogram:
 
 def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
             index: np.ndarray, lengths_m: np.ndarray) -> np.ndarray:
-    """Return the mean semivariance of detrended fields in each bin; NaN without a sampled pair.
+    """Return the mean semivariance (1 + k, bins) of detrended fields; NaN in a bin without a pair.
 
     Arguments as of `Variogram`, and the positions (n, d) of both ends [m].
-
-    Returns:
-        (1 + k, bins)
     """
     owner = np.empty(len(position_m), dtype=int)
     for number, trend in enumerate(trends):
@@ -222,13 +207,9 @@ def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, seco
 
 def _nearest(gamma: np.ndarray, pairs: np.ndarray, fields: np.ndarray,
              lengths_m: np.ndarray) -> float:
-    """Return the length [m] whose field and nugget are nearest to a variogram (b,).
+    """Return the length [m] whose field and nugget are nearest to a variogram (b,) of pairs (b,).
 
-    Args:
-        gamma: (b,) semivariances.
-        pairs: (b,) of links.
-        fields: (1 + k, b) semivariances of white noise, and of a field of each length.
-        lengths_m: (k,)
+    Fields (1 + k, b) are semivariances of white noise, and of a field of each length (k,).
     """
     # Bins are dependent: beyond some hundreds, more pairs do not make one more certain.
     weight = np.sqrt(np.minimum(pairs, 500)) / np.maximum(gamma, 0.05 * gamma.max(initial=1e-9))
@@ -289,11 +270,8 @@ def correlation_length_m(links: Links, z: np.ndarray) -> float:
     """Return the distance over which the correlation of a residual falls to 1/e [m].
 
     At least the usual step between places, which is also what a residual without any correlation
-    gives; at most a quarter of the extent of the campaign.
-
-    Args:
-        links: n links.
-        z: (n,) residuals over their scale; those of blank links do not count.
+    gives; at most a quarter of the extent of the campaign. The residuals (n,) are over their scale;
+    those of blank links do not count.
     """
     seen = np.isfinite(links.level_db) & np.isfinite(z)
     least_m, rows, variogram = _variogram(links, seen.tobytes())

@@ -21,32 +21,20 @@ LITTLE = 30  # places: fewer say little
 
 
 def evidence_blocks(links: Links) -> np.ndarray:
-    """Return the piece of evidence that each link belongs to.
+    """Return the piece of evidence (n,) that each link belongs to, an integer.
 
     Links of one device and receiver that are close to each other on the ground and in one flight
     have nearly the same shadowing, and count as one. How close, `with_evidence` has found out; on
     links that it has not seen, the pieces are `UNKNOWN_M` wide.
-
-    Args:
-        links: n links.
-
-    Returns:
-        (n,) int label.
     """
     return _evidence(links)[:, 0]
 
 
 def places(links: Links) -> np.ndarray:
-    """Return the place that each link belongs to: squares of ground that both its ends are in.
+    """Return the place (n,) of each link, an integer: squares of ground that both its ends are in.
 
     What stands beside a way shadows every flight that comes along it again, whatever the receiver,
     so that more flights over the same ground tell no more of what belongs to a device.
-
-    Args:
-        links: n links.
-
-    Returns:
-        (n,) int label.
     """
     return _evidence(links)[:, 1]
 
@@ -59,13 +47,9 @@ def _evidence(links: Links) -> np.ndarray:
 
 
 def with_evidence(links: Links, z: np.ndarray) -> Links:
-    """Return links whose pieces of evidence fit a residual, with notes on them.
+    """Return links whose pieces of evidence fit a residual (n,) over its scale, with notes on them.
 
     Done once, by the residual of the base: then all that is scored later counts the same pieces.
-
-    Args:
-        links: n links.
-        z: (n,) residuals of the base over their scale.
     """
     length_m = correlation_length_m(links, z)
     width_m = fitting_width_m(links, LENGTHS * length_m)
@@ -109,12 +93,8 @@ def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
 def design_effect(block: np.ndarray, z: np.ndarray, max_z: float = 4.0) -> float:
     """Return how many links count as one (Kish 1965, 'Survey sampling', Sec. 5.4).
 
-    The variance of the blocks' means over what it would be for independent links, at least 1.
-
-    Args:
-        block: (n,) label of the piece of evidence.
-        z: (n,) residuals over their scale.
-        max_z: outliers count as this many scales.
+    The variance of the means of blocks (n,) over what it would be for independent links, at least
+    1. Residuals (n,) are over their scale, and outliers count as `max_z`.
     """
     z = np.clip(z, -max_z, max_z)
     size = np.bincount(block)

@@ -140,7 +140,7 @@ class LimitEstimate:
 
 def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray, as_one: float,
                    declared_db: float = -np.inf) -> LimitEstimate | None:
-    """Estimate the limit of detection of one receiver.
+    """Estimate the limit of detection of one receiver; None of too few readings or blanks.
 
     Args:
         level_db: (n,) readings [dB]; NaN: not detected.
@@ -148,9 +148,6 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarr
         scale_db: (n,) scale of their errors, Student-t with `DOF` degrees of freedom [dB].
         as_one: number of links that count as one, as of `design_effect`.
         declared_db: to be compared with [dB]; -inf: none.
-
-    Returns:
-        the estimate; None where there are too few readings or blanks.
     """
     blank = np.isnan(level_db)
     read_db = np.sort(level_db[~blank])
@@ -397,9 +394,6 @@ def limits_to_explain(links: Links) -> Links:
 
     A receiver that is clearly less sensitive than most has the usual limit, and one whose links are
     blank at any level has at most the usual one, or the lowest reading of all.
-
-    Args:
-        links: n links with the limits of `estimate_limits`.
     """
     usual_db = links.usual_limit_db
     known = np.isfinite(links.limit_db)

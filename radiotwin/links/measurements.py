@@ -83,13 +83,7 @@ _DEVICE_MAY_BE_EMPTY = {"x_m", "y_m", "z_m", *DEVICE_OPTIONAL}
 
 def read_columns(path: Path, required: list[str], optional: list[str],
                  may_be_empty: set[str]) -> pd.DataFrame:
-    """Read the columns of a table, names as texts and all others as numbers.
-
-    Args:
-        path: `.csv`, `.csv.gz` or `.parquet`.
-        required: columns that it must have.
-        optional: columns that it may have.
-        may_be_empty: columns whose cells may be empty: NaN.
+    """Read the columns of a table, names as texts and all others as numbers, NaN where empty.
 
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.
@@ -458,13 +452,7 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
 
 
 def read_devices(path: Path | str) -> pd.DataFrame:
-    """Read a table of devices.
-
-    Args:
-        path: `.csv`, `.csv.gz` or `.parquet` with the columns of `DEVICE_REQUIRED`.
-
-    Returns:
-        one row per device, columns as in `devices.csv`.
+    """Read a table of devices with the columns of `DEVICE_REQUIRED`, one row each.
 
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.

@@ -34,12 +34,7 @@ QUANTILE = 0.95  # upper end of a 90 % interval
 
 
 def site_of(links: Links, device: int) -> list[int]:
-    """Return the device and the anchors that share its mast, in order.
-
-    Args:
-        links: with the devices' positions.
-        device: index of a device.
-    """
+    """Return the device and the anchors that share its mast, in order."""
     apart_m = np.linalg.norm(links.device_m - links.device_m[device], axis=1)
     return [int(other) for other in np.flatnonzero(apart_m <= SAME_SITE_M)
             if other == device or other in links.anchors]
@@ -48,8 +43,7 @@ def site_of(links: Links, device: int) -> list[int]:
 def antenna_of(links: Links, device: int) -> list[int]:
     """Return the device and those of its mast whose declared azimuth is the same, in order.
 
-    They are carriers through one antenna, or through antennas side by side. Arguments as of
-    `site_of`.
+    They are carriers through one antenna, or through antennas side by side.
     """
     found, mast = {device}, np.array(site_of(links, device))
     for _ in mast:  # what is near a member is one, too, so that the groups of a mast are disjoint
@@ -62,15 +56,8 @@ def antenna_of(links: Links, device: int) -> list[int]:
 def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
     """Return whose signals reach a receiver on nearly the same ways as those of a device.
 
-    The others of its antenna that were heard, or where there are none of its mast.
-
-    Args:
-        links: with the devices' positions.
-        device: index of a device.
-        heard: devices with a reading.
-
-    Returns:
-        at most `MAX_RELATIVES` devices.
+    The others of its antenna that were heard, or where there are none of its mast; at most
+    `MAX_RELATIVES`.
     """
     others = ([other for other in group if other != device and other in heard]
               for group in (antenna_of(links, device), site_of(links, device)))
@@ -100,9 +87,6 @@ class ReceiverDifference:
 
 def receiver_differences(links: Links) -> list[ReceiverDifference]:
     """Compare every two receivers that read the same devices at the same places.
-
-    Args:
-        links: n links.
 
     Returns:
         the differences that at least `MIN_PAIRS` pairs at `MIN_PLACES` places tell; none where

@@ -19,9 +19,6 @@ def thin_piles(links: Links) -> Links:
 
     A receiver that hovers reads one and the same error many times. What a place (of one pair of
     ends, on one flight) has beyond `PILE` times the usual number is left out, evenly in time.
-
-    Args:
-        links: n links.
     """
     cell = np.floor(moving_end_m(links)[:, :2] / PLACE_M).astype(np.int64)
     keys = np.column_stack([cell, pair_of_ends(links), links.flight])
@@ -46,10 +43,6 @@ def thin_links(links: Links, seed: int) -> Links:
     The links of each flight, device and receiver are taken in the order of their times, and of as
     many as go into the sample once, one is drawn. So all flights, devices, receivers, times and
     blanks have the share that they have of all links, and means over the sample are not biased.
-
-    Args:
-        links: n links.
-        seed: of the draw.
     """
     links = thin_piles(links)
     n = len(links)

@@ -15,14 +15,9 @@ NO_EDGE = -10.0  # stands for a diffraction parameter without a map: far from an
 
 
 def residual_variables(links: Links, mean_db: np.ndarray) -> dict[str, np.ndarray]:
-    """Return every variable that a residual may depend on, by name.
+    """Return every variable (n,) that a residual may depend on, by name.
 
-    Args:
-        links: n links.
-        mean_db: (n,) predicted level [dB].
-
-    Returns:
-        (n,) arrays; integers are labels without an order, NaN is unknown.
+    Integers are labels without an order, NaN is unknown. Predicted levels are (n,) [dB].
     """
     return {name: variable(links, mean_db) for name, variable in VARIABLES.items()}
 
@@ -64,11 +59,9 @@ VARIABLES: dict[str, Callable[[Links, np.ndarray], np.ndarray]] = {
 
 
 def feature_count(devices: int, declared: bool) -> int:
-    """Return the number of columns of `link_features` without receivers.
+    """Return the number of columns of `link_features` without receivers, for so many devices.
 
-    Args:
-        devices: how many there are.
-        declared: whether the azimuth of any is.
+    It depends on whether the azimuth of any is declared.
     """
     labels = devices if 1 < devices <= MAX_LABELS else 0
     return OF_GEOMETRY + OF_BORESIGHT * declared + labels

@@ -39,11 +39,7 @@ def moving_end(table: pd.DataFrame) -> str:
 
 
 def of_device(table: pd.DataFrame, device: str | None) -> pd.DataFrame:
-    """Return the links of a device; of all where it is None.
-
-    Raises:
-        BadInput: no link is to such a device.
-    """
+    """Return the links of a device; of all where it is None. BadInput: none is to such a device."""
     if device is None:
         return table
     part = table[table["device"] == device]

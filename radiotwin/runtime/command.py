@@ -65,15 +65,12 @@ def with_output_options(command: Callable[..., Any], prints_tables: bool) -> Cal
 
 def with_options(command: Callable[..., Any], signature: inspect.Signature,
                  added: dict[str, tuple[Any, Any]]) -> Callable[..., Any]:
-    """Declare the options of a command; Typer reads them from its signature and annotations.
+    """Declare more options of a command; Typer reads them from its signature and annotations.
 
     Args:
-        command: function to be called; it takes all options as keywords.
+        command: takes all options as keywords; it is changed.
         signature: its parameters so far.
         added: name -> annotation and default of the options to add.
-
-    Returns:
-        `command`, changed.
     """
     parameters = [*signature.parameters.values()] + [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
@@ -88,9 +85,7 @@ def with_options(command: Callable[..., Any], signature: inspect.Signature,
 def output(quiet: bool, as_json: bool) -> Iterator[None]:
     """Print text as usual, or nothing, or all of it as one JSON document at the end.
 
-    Args:
-        quiet: print no text and show no progress.
-        as_json: print no text; on success, write `console.collected` to standard output.
+    Quiet also shows no progress. The document is `console.collected`, on success.
     """
     before = console.quiet, progress.silent
     console.quiet, progress.silent = quiet or as_json, quiet or progress.silent

@@ -37,8 +37,7 @@ _displays: list[Progress] = []  # at most one: a terminal has room for one displ
 def printable(text: str) -> str:
     """Return a text with escapes in place of what a terminal would obey or could not show.
 
-    Args:
-        text: any; tabs and line feeds are kept.
+    Tabs and line feeds are kept.
     """
     return _OBEYED.sub(lambda match: repr(match[0])[1:-1], text)
 
@@ -48,12 +47,7 @@ class PrintableConsole(Console):
 
     def render(self, renderable: RenderableType,
                options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Yield segments of printable text; see `rich.console.Console.render`.
-
-        Args:
-            renderable: anything that rich can print.
-            options: of the console.
-        """
+        """Yield segments of printable text; see `rich.console.Console.render`."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(printable(segment.text), segment.style)
 
@@ -139,14 +133,10 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
 
 
 def print_table(table: Table, to: Console) -> None:
-    """Print a table with all of its text.
+    """Print a table, whose columns overflow by `fold`, with all of its text.
 
     A file or a pipe has no width: there lines are as long as they need to be. On a terminal, what
     is wider than it goes on in the next line of its cell.
-
-    Args:
-        table: whose columns overflow by `fold`.
-        to: where to print it.
     """
     if to.is_terminal:
         to.print(table)

@@ -58,10 +58,7 @@ class TrialFailed(Exception):
 
 
 def trace_trial_link(device: str) -> float:
-    """Return the gain of a link of 100 m in free space at 2.4 GHz [dB].
-
-    Args:
-        device: `cpu` or `cuda`.
+    """Return the gain of a link of 100 m in free space at 2.4 GHz [dB], on `cpu` or `cuda`.
 
     Raises:
         TrialFailed: It cannot be traced, or a ray went through a wall.
@@ -153,10 +150,7 @@ def torch_refusal() -> str | None:
 
 
 def tracing_device(wanted: str) -> Device:
-    """Return where rays are traced.
-
-    Args:
-        wanted: `cpu`, `cuda`, or `auto`: on a GPU where that works.
+    """Return where rays are traced: `cpu`, `cuda`, or of `auto` a GPU where that works.
 
     Raises:
         BadInput: Another word, or `cuda` where it does not work.
@@ -187,11 +181,8 @@ def _device(wanted: str, work: Literal["tracing", "training"]) -> Device:
 def share_of_gpu(memory_bytes: int) -> float:
     """Return the part of a GPU that a worker gets: as many share one as its memory holds.
 
-    Args:
-        memory_bytes: That a worker takes; 0: not known, then it gets all of it.
-
-    Returns:
-        Above 0, at most 1, with four decimals: Ray counts in these.
+    It is above 0 and at most 1, with four decimals, in which Ray counts. A worker whose memory is
+    not known (0) gets all of it.
     """
     memories = [gpu.memory_bytes for gpu in gpus()]
     if not memories or not memory_bytes:

@@ -9,20 +9,20 @@ a process of its own.
 none, with exit status 1.
 """
 
-import json
 import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from radiotwin.errors import BadInput, RunFailed
-from radiotwin.io.files import atomic_path
+from radiotwin.errors import RunFailed
+from radiotwin.io.content_hash import content_hash
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MIN_VERSION = 17  # of Dr.Jit 1.5
@@ -143,14 +143,7 @@ def find() -> list[Candidate]:
 
 
 def probe(path: Path) -> str | None:
-    """Compile and run a kernel in a process of its own.
-
-    Args:
-        path: of the library.
-
-    Returns:
-        None if it works, or else the reason.
-    """
+    """Compile and run a kernel in a process of its own; return why it fails, None if it works."""
     try:
         done = _run_python(_PROBE, path)
     except subprocess.TimeoutExpired:
@@ -164,34 +157,13 @@ def probe(path: Path) -> str | None:
     return complaint.removeprefix("OSError: ")
 
 
-def _memory_file() -> Path:
+def _passed(path: Path) -> Path:
+    """Return the file that exists once a library has passed, with this Dr.Jit and Python."""
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return caches / "radiotwin" / "llvm.json"
-
-
-def _probe_key(path: Path) -> list:
-    """Return the file, Dr.Jit and Python that the result of a probe is valid for."""
     status = path.stat()
-    return [str(path), status.st_mtime_ns, status.st_size, version("drjit"), sys.executable]
-
-
-def _remembered() -> list:
-    """Return the keys of the probes that passed; none if the file is missing or damaged."""
-    try:
-        content = json.loads(_memory_file().read_text(encoding="utf-8"))
-    except (OSError, ValueError, RuntimeError):
-        return []
-    return content if isinstance(content, list) else []
-
-
-def _remember(key: list) -> None:
-    """Save the key of a probe that passed; without a writable cache the next run probes again."""
-    try:
-        passed = [old for old in _remembered() if isinstance(old, list) and old[:1] != key[:1]]
-        with atomic_path(_memory_file()) as temporary:
-            temporary.write_text(json.dumps([*passed, key]), encoding="utf-8")
-    except (OSError, RuntimeError, BadInput):
-        pass
+    key = content_hash((str(path), status.st_mtime_ns, status.st_size, version("drjit"),
+                        sys.executable))
+    return caches / "radiotwin" / f"llvm-{key}"
 
 
 @cache
@@ -199,21 +171,20 @@ def rejection(candidate: Candidate) -> str | None:
     """Return the reason why a library cannot be used, or None if it can.
 
     Successful probes are remembered between runs, failures are not.
-
-    Args:
-        candidate: as `find` returns it.
     """
     if candidate.version and candidate.version[0] < MIN_VERSION:
         return f"too old: Dr.Jit needs version {MIN_VERSION} or newer"
     try:
-        key = _probe_key(candidate.path)
-    except (OSError, PackageNotFoundError):  # a name that only the loader resolves, or no Dr.Jit
+        passed = _passed(candidate.path)
+    except (OSError, RuntimeError, PackageNotFoundError):  # no such file, home, or Dr.Jit
         return probe(candidate.path)
-    if key in _remembered():
+    if passed.exists():
         return None
     reason = probe(candidate.path)
     if reason is None:
-        _remember(key)
+        with suppress(OSError):  # without a writable cache the next run probes again
+            passed.parent.mkdir(parents=True, exist_ok=True)
+            passed.touch()
     return reason
 
 

@@ -7,12 +7,12 @@ from typing import Any
 
 
 def load_plugins(group: str, register: Callable[[Any], Any], what: str) -> None:
-    """Register every class that a package adds to a group.
+    """Register every class that a package adds to a group, such as `radiotwin.effects`.
 
     Warns where one cannot be loaded or registered, and goes on without it.
 
     Args:
-        group: such as `radiotwin.effects`.
+        group: of entry points.
         register: is called with each class; may refuse it with an exception.
         what: they are, for the warning, such as `effect`.
     """

@@ -20,13 +20,10 @@ MOST = 4  # more wait for each other: the parts between run one at a time
 
 
 def die_with_parent(parent: int) -> None:
-    """Have this process end when the one that started it is killed.
+    """Have this process end when the one that started it is killed, or has died already.
 
     On Linux the kernel sees to it, even in a long computation; elsewhere a thread looks once a
     second (on Windows nothing does).
-
-    Args:
-        parent: its number; it may have died already.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))  # PR_SET_PDEATHSIG of sys/prctl.h
@@ -113,12 +110,10 @@ def thread_count() -> int:
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Return a function's results in the order of its arguments.
+    """Return a function's results in the order of its arguments, one a call.
 
-    Args:
-        function: changes nothing that other calls read. A progress bar of its own needs one that is
-            open around all.
-        items: arguments, one a call.
+    It changes nothing that other calls read. A progress bar of its own needs one that is open
+    around all.
     """
     listed = list(items)
     count = min(thread_count(), len(listed))

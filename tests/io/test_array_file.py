@@ -1,23 +1,16 @@
-"""Files of arrays: the format is that of safetensors, and what a header claims is checked before it is believed."""
+"""Files of arrays: the format is that of safetensors, and a file that lies is one message."""
 
-import io
 import json
 
 import numpy as np
 import pytest
-from safetensors.numpy import load, save
+from safetensors.numpy import load
 
 from radiotwin.errors import BadInput
-from radiotwin.io.array_file import parse_arrays, write_arrays
+from radiotwin.io.array_file import pack_arrays, parse_arrays
 
 ARRAYS = {"a": np.arange(6, dtype=np.int16).reshape(2, 3), "b": np.array([True, False]), "c": np.zeros((0, 4)),
           "d": np.array(2.5, np.float32)}
-
-
-def written(arrays=ARRAYS, text="hello"):
-    file = io.BytesIO()
-    write_arrays(file, arrays, "text", text)
-    return file.getvalue()
 
 
 def with_header(header, content=b"\0" * 8):
@@ -26,8 +19,8 @@ def with_header(header, content=b"\0" * 8):
 
 
 def test_arrays_come_back_as_the_library_of_the_format_reads_them():
-    found, text = parse_arrays(written(), "text", "it")
-    other = load(written())
+    data = pack_arrays(ARRAYS, "text", "hello")
+    (found, text), other = parse_arrays(data, "text", "it"), load(data)
     assert text == "hello" and found.keys() == other.keys() == ARRAYS.keys()
     for name, array in ARRAYS.items():
         assert found[name].dtype == array.dtype and found[name].shape == array.shape
@@ -35,15 +28,8 @@ def test_arrays_come_back_as_the_library_of_the_format_reads_them():
         np.testing.assert_array_equal(other[name], array)
 
 
-def test_a_file_of_the_library_is_read():
-    found, text = parse_arrays(save(ARRAYS, {"text": "hello"}), "text", "it")
-    assert text == "hello"
-    for name, array in ARRAYS.items():
-        np.testing.assert_array_equal(found[name], array)
-
-
-def one(dtype="F64", shape=(1,), offsets=(0, 8), **more):
-    return {"__metadata__": {"text": ""}, "x": {"dtype": dtype, "shape": shape, "data_offsets": offsets} | more}
+def one(dtype="F64", shape=(1,), offsets=(0, 8)):
+    return {"__metadata__": {"text": ""}, "x": {"dtype": dtype, "shape": shape, "data_offsets": offsets}}
 
 
 HOSTILE = {
@@ -55,7 +41,7 @@ HOSTILE = {
     "huge product": with_header(one("U8", [2**31, 2**31, 0], [0, 0])), "negative": with_header(one(shape=[-1])),
     "a side that is true": with_header(one(shape=[True])), "dimensions": with_header(one(shape=[1] * 100)),
     "before": with_header(one(offsets=[-8, 0])), "beyond": with_header(one(offsets=[8, 16])),
-    "bytes left": with_header(one(), b"\0" * 9), "more keys": with_header(one(more=1)),
+    "bytes left": with_header(one(), b"\0" * 9),
     "overlapping": with_header(one() | {"y": one()["x"]}), "no boolean": with_header(one("BOOL", [8]), b"\2" * 8),
     "many digits": with_header(b'{"x": {"shape": [' + b"9" * 5000 + b"]}}")}
 

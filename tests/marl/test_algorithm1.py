@@ -9,7 +9,6 @@ import marl.algorithm1
 import marl.qmix
 from marl.algorithm1 import (
     Reality,
-    learn_twin,
     location_errors_m,
     measuring_policy,
     run_algorithm,
@@ -21,7 +20,6 @@ from marl.mission import Known, make_mission
 from marl.planner import PlanPolicy
 from marl.settings import PRESETS, RunSettings
 from marl.training import Trainer
-from radiotwin.errors import BadInput
 from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 
@@ -88,16 +86,11 @@ def test_below_sensitivity_is_blank(small_scene):
 
 
 def test_positions_of_unknown_devices_come_from_measurements_only(small_scene, reality):
-    known = Known.of(learn_twin(reality, "nn", 0, None).devices)
+    known = Known.of(fit_twin(reality.measurements(), small_scene, model="segmented_nn", seed=0).devices)
     errors_m = location_errors_m(small_scene, known)
     assert len(errors_m) == sum(d.role == "unknown" for d in small_scene.config.devices)
     assert (errors_m > 0).all() and np.median(errors_m) < 25
     assert np.isnan(location_errors_m(small_scene, Known.anchors(small_scene))).all()
-
-
-def test_an_unknown_kind_of_twin_is_refused(reality):
-    with pytest.raises(BadInput, match="allowed are nn, log-distance, kriging"):
-        learn_twin(reality, "oracle", 0, None)
 
 
 @pytest.mark.parametrize("algorithm, guide", [("qmix", "planner"), ("iql", "none"), ("planner", "none"),

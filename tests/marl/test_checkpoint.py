@@ -9,7 +9,7 @@ import torch
 
 from marl.checkpoint import load_checkpoint, save_checkpoint
 from radiotwin.errors import BadInput
-from radiotwin.io.array_file import write_arrays
+from radiotwin.io.array_file import pack_arrays
 
 
 def test_every_type_of_value_comes_back(tmp_path):
@@ -49,8 +49,7 @@ def test_a_damaged_checkpoint_is_bad_input(tmp_path):
     '{"format": 4, "state": {"a": {"$texts": 3, "codes": 1}}}', '{"format": 4, "state": {}}',
     '{"format": 4, "state": {"a": ' + "[" * 5000 + "]" * 5000 + "}}", '{"format": 4, "state": {"a": ' + "9" * 5000 + "}}"])
 def test_a_document_that_makes_no_sense_is_one_message(text, tmp_path):
-    with (tmp_path / "state").open("wb") as file:
-        write_arrays(file, {"0": np.zeros(3)}, "checkpoint", text)
+    (tmp_path / "state").write_bytes(pack_arrays({"0": np.zeros(3)}, "checkpoint", text))
     with pytest.raises(BadInput, match="state"):
         load_checkpoint(tmp_path / "state")
 
@@ -66,7 +65,6 @@ def test_a_pickle_is_not_run(tmp_path):
 
 
 def test_a_checkpoint_of_another_version_is_refused(tmp_path):
-    with (tmp_path / "state").open("wb") as file:
-        write_arrays(file, {}, "checkpoint", json.dumps({"format": 99, "state": {}}))
+    (tmp_path / "state").write_bytes(pack_arrays({}, "checkpoint", json.dumps({"format": 99, "state": {}})))
     with pytest.raises(BadInput, match="another version.*start again"):
         load_checkpoint(tmp_path / "state")

@@ -5,13 +5,7 @@ import pytest
 from matplotlib.collections import LineCollection
 
 from marl.environment import Environment
-from marl.figures import (
-    choose_flight,
-    curve_figure,
-    draw_curve,
-    draw_trajectories,
-    trajectories_figure,
-)
+from marl.figures import choose_flight, curve_figure, draw_curve, save, trajectories_figure
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy
 from marl.mission import Known
@@ -44,7 +38,7 @@ def test_trajectories_have_a_panel_a_uav_and_a_segment_a_slot(small_scene, city_
         assert len(segments) == (flights.frames.battery[1, :, u] > 0).sum() - 1
         start = small_scene.config.uavs[u]
         assert np.hypot(*(segments[0][0] - [start.start_x_m, start.start_y_m])) < city_mission.step_m / 2
-    draw_trajectories(small_scene, city_mission, flights, 1, known, tmp_path / "trajectories.png")
+    save(figure, tmp_path / "trajectories.png")
     assert is_png(tmp_path / "trajectories.png")
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import marl.session
+from marl.fedqmix.__main__ import app
 from marl.learner import make_learner
 from marl.mission import Known, make_mission
 from marl.session import Session, _world
@@ -14,6 +15,7 @@ from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import segmented_truth
+from radiotwin.runtime.command import exit_status
 from radiotwin.twin import Twin
 
 WORLD = {"city": "a", "scene.toml": "b", "truth": "c", "truth besides gain_db": "e"}
@@ -38,6 +40,26 @@ def test_a_run_is_resumed_in_its_own_folder_only(begun, session):
         session(False)._claim_folder(WORLD)
     with pytest.raises(BadInput, match="truth has changed"):
         begun._claim_folder(WORLD | {"truth": "d"})
+
+
+def test_a_run_of_an_earlier_version_is_not_begun_anew_without_a_word(small_scene, tmp_path, monkeypatch, capsys):
+    """Its checkpoint is of a form that is not read."""
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "checkpoint.pt").write_bytes(b"of torch")
+    monkeypatch.setattr("sys.argv", ["fedqmix", "--scene", str(small_scene.folder), "--truth", "segmented", "--out", str(out),
+                                     "--resume"])
+    assert exit_status(app, "") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"{out / 'checkpoint.pt'} is of an earlier version" in said and "cannot be resumed" in said
+    assert "without --resume and with another --out" in said
+    assert [path.name for path in out.iterdir()] == ["checkpoint.pt"]
+
+
+def test_an_old_checkpoint_beside_a_new_one_does_no_harm(begun, tmp_path):
+    for name in ("checkpoint.pt", "checkpoint.safetensors"):
+        (tmp_path / "run" / name).touch()
+    begun._claim_folder(WORLD)
 
 
 @pytest.mark.parametrize("change", [lambda truth: truth.assign(sigma_db=3 * truth["sigma_db"]), lambda truth: truth.assign(los=~truth["los"]),

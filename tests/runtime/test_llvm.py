@@ -118,18 +118,6 @@ def test_failure_is_not_remembered(tree, probed):
     assert len(probed) == 2
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b'{"a": 1}', b"[1, null]"])
-def test_corrupt_memory_is_ignored(tree, probed, tmp_path, content):
-    write(tree, "libLLVM-19.so")
-    memory = tmp_path / "cache" / "radiotwin" / "llvm.json"
-    memory.parent.mkdir(parents=True)
-    memory.write_bytes(content)
-    assert llvm.available()
-    llvm.rejection.cache_clear()
-    assert llvm.available()
-    assert len(probed) == 1  # and it was put right
-
-
 def test_memory_that_cannot_be_written_does_no_harm(tree, probed, tmp_path):
     write(tree, "libLLVM-19.so")
     (tmp_path / "cache").write_text("a file where the folder should be")

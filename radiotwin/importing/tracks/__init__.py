@@ -22,13 +22,7 @@ _READERS = {".gpx": read_gpx, ".nmea": read_nmea, ".nma": read_nmea, ".ulg": rea
 
 def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
                tally: Tally) -> tuple[pd.DataFrame, list[str]]:
-    """Fill in the positions that a log does not have from tracks.
-
-    Args:
-        source: the log, for messages.
-        links: as of `build_links`.
-        settings: tracks, and between which positions is interpolated.
-        tally: counts the links at whose time a track has no position.
+    """Fill in the positions that a log does not have from tracks; count the links that none has.
 
     Returns:
         links with `latitude, longitude, altitude` and, where a track has them, angles; and notes.

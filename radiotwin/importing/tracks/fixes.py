@@ -25,14 +25,10 @@ class Fixes:
     notes: tuple[str, ...] = ()
 
     def at(self, time_s: np.ndarray, max_gap_s: float) -> dict[str, np.ndarray]:
-        """Interpolate between neighbouring positions.
-
-        Args:
-            time_s: seconds since 1970 UTC, (m,).
-            max_gap_s: largest time between two positions, between which is interpolated.
+        """Interpolate between neighbouring positions, at times (m,) [s since 1970 UTC].
 
         Returns:
-            column -> (m,); NaN where there are no two neighbours so close in time.
+            column -> (m,); NaN where no two neighbours are so close in time.
         """
         after = np.searchsorted(self.time_s, time_s).clip(1, max(len(self.time_s) - 1, 1))
         before = after - 1
@@ -60,13 +56,7 @@ class Fixes:
 
 def make_fixes(source: object, time_s: np.ndarray, values: dict[str, np.ndarray],
                notes: tuple[str, ...] = ()) -> Fixes:
-    """Sort positions by time; of several at one time the last one counts.
-
-    Args:
-        source: the file, for messages.
-        time_s: seconds since 1970 UTC, (n,); NaN where unknown.
-        values: column -> (n,).
-        notes: on how they were read.
+    """Sort positions by time (n,) [s since 1970 UTC]; of several at one time the last one counts.
 
     Raises:
         BadInput: fewer than two have a time and a position, or one is off the Earth.

@@ -29,9 +29,6 @@ def read_nmea(path: Path) -> Fixes:
 
     Sentences whose check sum is wrong are left out.
 
-    Args:
-        path: of the file.
-
     Raises:
         BadInput: no date, or fewer than two positions.
     """
@@ -50,7 +47,9 @@ def read_nmea(path: Path) -> Fixes:
                     if rows and fields[1] and rows[-1][0] == _seconds(fields[1]):
                         rows[-1][1] = day
                 elif kind == "RMC" and fields[2] == "A":
-                    day = _day(_year(int(fields[9][4:6])), int(fields[9][2:4]), int(fields[9][:2]))
+                    year = int(fields[9][4:6])
+                    year += 2000 if year < _CENTURY else 1900
+                    day = _day(year, int(fields[9][2:4]), int(fields[9][:2]))
                     _add(rows, _seconds(fields[1]), day, fields[3:7], np.nan)
                 elif kind == "GGA" and fields[6] not in ("", "0"):
                     height_m = float(fields[9]) if fields[9] else np.nan
@@ -117,10 +116,6 @@ def _degrees(text: str, side: str) -> float:
     return -value if side in ("S", "W") else value
 
 
-def _year(two_digits: int) -> int:
-    return two_digits + (2000 if two_digits < _CENTURY else 1900)
-
-
 def _day(year: int, month: int, day: int) -> float:
     return (datetime(year, month, day, tzinfo=UTC)
             - datetime(1970, 1, 1, tzinfo=UTC)) / timedelta(days=1)
@@ -179,9 +174,6 @@ class _Points:
 
 def read_gpx(path: Path) -> Fixes:
     """Read the track points of a GPX file; times without an offset are UTC, as GPX prescribes.
-
-    Args:
-        path: of the file.
 
     Raises:
         BadInput: no GPX, or fewer than two track points have a time.

@@ -47,21 +47,13 @@ _COLUMNS = 4  # time [s], latitude, longitude [degrees], altitude [m]
 
 
 class Chunks:
-    """Decompresses the chunks of one recording.
-
-    Args:
-        path: of the recording, for messages.
-    """
+    """Decompresses the chunks of one recording."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._total = path, 0
 
     def open(self, compression: str, data: bytes) -> bytes:
-        """Decompress a chunk.
-
-        Args:
-            compression: `none` or nothing, `bz2`, `lz4`, `zstd`.
-            data: of the chunk.
+        """Decompress a chunk by `none` or nothing, `bz2`, `lz4` or `zstd`.
 
         Raises:
             BadInput: unknown compression, damaged, or more than the budget of a chunk or a file.

@@ -82,9 +82,6 @@ def read_ulog(path: Path) -> Fixes:
 
     Times count from the start of the autopilot; the GNSS receiver's UTC places them.
 
-    Args:
-        path: of the file.
-
     Raises:
         BadInput: pyulog is not installed, the log is damaged, or has no position or no UTC.
     """

@@ -9,11 +9,10 @@ from __future__ import annotations
 import json
 
 import numpy as np
-from safetensors.numpy import save
 
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import Limit
-from radiotwin.io.array_file import parse_arrays
+from radiotwin.io.array_file import pack_arrays, parse_arrays
 from radiotwin.io.inputs import parse_json
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.aerial import (
@@ -121,9 +120,9 @@ def encode_channel(model: ChannelModel, beside: dict[str, np.ndarray] | None = N
     """
     arrays, settings = model.state()
     arrays = arrays | {f"{BESIDE}{name}": array for name, array in (beside or {}).items()}
-    # One key, because safetensors writes several in an order that changes from run to run.
-    header = {"channel": json.dumps({"model": model.name, "settings": settings}, sort_keys=True)}
-    return save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, header)
+    header = json.dumps({"model": model.name, "settings": settings}, sort_keys=True)
+    return pack_arrays({name: np.atleast_1d(array) for name, array in arrays.items()}, "channel",
+                       header)
 
 
 def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np.ndarray]]:

@@ -70,12 +70,7 @@ class Executor:
 
         Without other processes, or where they are not worth it, nothing is done. A piece that
         cannot be run there is left to this process, where its error shows; that it could not is
-        said.
-
-        Args:
-            job: As of `run`.
-            pieces: As of `run`.
-            cache: As of `run`.
+        said. Arguments are those of `run`.
         """
         if self.is_worth_it:
             missing = deque(_Todo(piece, lambda result: None) for piece in pieces

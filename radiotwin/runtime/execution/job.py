@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Generic, Protocol, TypeVar
 
-from radiotwin.errors import BadInput
 from radiotwin.runtime.processes import die_with_parent
 
 P = TypeVar("P")
@@ -47,11 +46,6 @@ class Resources:
     is_bound: bool = True
     cores: int = 1
     gpu_share: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.memory_bytes < 0 or self.cores < 1 or not 0 <= self.gpu_share <= 1:
-            raise BadInput(f"{self}: allowed are at least 0 bytes, at least 1 core and a share of "
-                           "a GPU from 0 to 1")
 
 
 class Cache(Protocol[P_contra, R]):
@@ -124,12 +118,7 @@ class PieceRunner:
         self._function: Callable[[Any], Any] | None = None
 
     def run(self, piece: Any, function: bytes | None = None) -> Outcome:
-        """Run a piece.
-
-        Args:
-            piece: argument of the function.
-            function: pickled, where it is another one than that of the piece before.
-        """
+        """Run a piece; with a function, pickled, where it is another one than before."""
         if function is not None:
             self._function = None  # its memory is free before that of the next one is taken
             self._function = pickle.loads(function)  # of the process that started this one
@@ -154,11 +143,7 @@ def run_piece(piece: Any, function: bytes | None = None) -> Outcome:
 
 
 def begin(parent: int) -> int:
-    """Prepare a worker's process; return its number.
-
-    Args:
-        parent: process that started it, with which it ends.
-    """
+    """Prepare a worker's process, which ends with its parent; return its number."""
     if hasattr(signal, "SIGINT"):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the driver ends
     die_with_parent(parent)

@@ -199,12 +199,6 @@ def test_a_wrong_number_of_workers(workers):
         pass
 
 
-@pytest.mark.parametrize("values", [{"cores": 0}, {"memory_bytes": -1}, {"gpu_share": 1.5}])
-def test_wrong_resources(values):
-    with pytest.raises(BadInput, match="allowed are at least"):
-        Resources(**values)
-
-
 DRIVER = """
 import sys
 from radiotwin.runtime.execution import Job, open_executor
