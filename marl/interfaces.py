@@ -76,9 +76,7 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
               ) -> tuple[dict[str, Arrays], dict[str, dict[str, Any]]]:
         """Take off; see `pettingzoo.ParallelEnv`.
 
-        Args:
-            seed: of the shadowing; None goes on with the random numbers of the flights before.
-            options: not used.
+        Without a seed the random numbers of the flights before go on; options are not used.
         """
         if seed is not None or self._rng is None:
             self._rng = np.random.default_rng(seed)
@@ -90,11 +88,7 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
     def step(self, actions: dict[str, int]) -> tuple[
             dict[str, Arrays], dict[str, float], dict[str, bool], dict[str, bool],
             dict[str, dict[str, Any]]]:
-        """Fly one slot; see `pettingzoo.ParallelEnv`.
-
-        Args:
-            actions: one for each agent that still flies.
-        """
+        """Fly one slot with an action of each agent that flies; see `pettingzoo.ParallelEnv`."""
         flying = self.agents
         wanted = np.array([[actions[agent] if agent in flying else NO_OP
                             for agent in self.possible_agents]])
@@ -162,10 +156,7 @@ class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
               ) -> tuple[Arrays, dict[str, Any]]:
         """Take off with all flights; see `gymnasium.vector.VectorEnv`.
 
-        Args:
-            seed: of the shadowing of all flights; None goes on with the random numbers of those
-                before.
-            options: not used.
+        Without a seed the random numbers of the flights before go on; options are not used.
         """
         if seed is not None or self._np_random is None:
             self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
@@ -197,11 +188,7 @@ class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
 
 
 class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
-    """One flight; as `CentralVectorEnv`, but a flight that is over waits for `reset`.
-
-    Args:
-        mission: of `make_mission`.
-    """
+    """One flight; as `CentralVectorEnv`, but a flight that is over waits for `reset`."""
 
     metadata = {"render_modes": []}
 

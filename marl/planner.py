@@ -42,7 +42,7 @@ class Plan(NamedTuple):
 
 
 class TourFlight(NamedTuple):
-    """State of UAVs that follow tours, and scratch arrays.
+    """State of U UAVs that follow tours, and scratch arrays.
 
     Attributes:
         cell: (U, 2) int64 row and column.
@@ -50,9 +50,7 @@ class TourFlight(NamedTuple):
         left: (K,) data units that are expected to be left.
         reached: (U,) int64 waypoints that each UAV has passed.
         hovered: (U,) int64 hovers flown at the next waypoint.
-        strength: (U, K) scratch.
-        assigned: (U,) scratch.
-        mask: (6,) scratch.
+        strength, assigned, mask: (U, K), (U,) and (6,) scratch.
     """
 
     cell: np.ndarray

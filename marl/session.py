@@ -39,14 +39,7 @@ BASELINES = ("planner", "greedy", "random")  # in every table
 
 @dataclass(frozen=True)
 class Session:
-    """A run and its folder.
-
-    Args:
-        run: settings of the run.
-        learner: settings of learning.
-        out: folder of the results.
-        resume: go on with the run in it.
-    """
+    """A run, or one that is to be resumed, and the folder of its results."""
 
     run: RunSettings
     learner: LearnerSettings

@@ -35,12 +35,7 @@ from radiotwin.scene import Scene
 class FederatedSession:
     """A federation and the folder of its results.
 
-    Args:
-        run: settings that all parties share, and the scene of all that have none of their own.
-        learner: settings of learning.
-        federation: how means are made.
-        engine: what makes them, and what parties have.
-        out: folder of the results.
+    The run's scene is that of all parties that have none of their own.
     """
 
     run: RunSettings

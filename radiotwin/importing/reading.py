@@ -36,13 +36,7 @@ NAMES = ("device", "receiver", "flight")
 
 @dataclass(frozen=True)
 class LevelColumn:
-    """One column of levels.
-
-    Attributes:
-        spec: name of the column.
-        own: quantity -> column or name, for those that belong to this column of levels only.
-        offset_db: added to its levels.
-    """
+    """One column of levels; what belongs to it only, by quantity; and what is added to it."""
 
     spec: str
     own: dict[str, str]
@@ -302,13 +296,9 @@ class Logs:
 
 def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
               on_progress: Callable[[str], None]) -> Logs:
-    """Read files.
+    """Read files; what the settings do not say is from each file's format.
 
-    Args:
-        files: at least one.
-        settings: of the import; what they do not say is from each file's format.
-        tally: counts the readings that are left out.
-        on_progress: called with the name of each step.
+    Readings that are left out are counted, and progress is the name of each step.
 
     Raises:
         BadInput: all that is wrong, with file, row and column.

@@ -200,12 +200,9 @@ def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Levels:
-    """Levels of one column.
+    """Levels (n,) of one column, and which of them were not measured, or are outside `POSSIBLE_DB`.
 
-    Attributes:
-        db: level [dBm, or dB for gains], (n,); NaN = not detected, or not usable.
-        not_measured: (n,) bool, the receiver did not listen.
-        impossible: (n,) bool, outside `POSSIBLE_DB`.
+    A level [dBm, or dB for gains] that is NaN was not detected, or cannot be used.
     """
 
     db: np.ndarray

@@ -77,13 +77,7 @@ def trace_trial_link(device: str) -> float:
 
 @dataclass(frozen=True)
 class Gpu:
-    """A GPU that the driver knows.
-
-    Attributes:
-        name: Of the model.
-        memory_bytes: Its memory.
-        driver: Version of the driver.
-    """
+    """A GPU that the driver knows."""
 
     name: str
     memory_bytes: int

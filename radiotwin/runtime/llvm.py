@@ -64,12 +64,7 @@ with tempfile.TemporaryDirectory() as home:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A libLLVM on this machine.
-
-    Attributes:
-        path: of the library.
-        version: None where neither the name nor the library itself gives it.
-    """
+    """A libLLVM on this machine; its version is None where neither its name nor itself gives it."""
 
     path: Path
     version: tuple[int, ...] | None

@@ -12,12 +12,9 @@ COLUMNS = ("latitude", "longitude", "altitude", *ANGLES)
 
 @dataclass(frozen=True)
 class Fixes:
-    """Positions of one receiver.
+    """Positions of one receiver at times (n,) [s since 1970 UTC], ascending.
 
-    Attributes:
-        time_s: seconds since 1970 UTC, (n,), ascending.
-        values: column of `COLUMNS` -> (n,) [degrees, m]; NaN where unknown.
-        notes: on how they were read.
+    Each column of `COLUMNS` is (n,) [degrees, m]; NaN where unknown.
     """
 
     time_s: np.ndarray

@@ -96,14 +96,7 @@ _MAKERS: dict[str, Callable[[], Any]] = {"bz2": bz2.BZ2Decompressor, "lz4": _lz4
 
 
 class BagMessage(NamedTuple):
-    """A message that is not decoded yet.
-
-    Attributes:
-        topic: that it was sent to.
-        time_ns: when it was recorded, since 1970.
-        data: serialised.
-        is_ros1: whether as ROS 1 does, else CDR as ROS 2.
-    """
+    """A message that is not decoded yet: serialised as ROS 1 does, else CDR as ROS 2."""
 
     topic: str
     time_ns: int
@@ -290,11 +283,7 @@ def read_rosbag(path: Path, topic: str | None = None) -> Fixes:
     """Read the positions of a ROS 1 bag (.bag) or a ROS 2 bag (.mcap, .db3, or the folder of it).
 
     Times are those of the messages' headers, else those of the recording. Messages without a fix
-    are left out.
-
-    Args:
-        path: of the file or folder.
-        topic: with the positions; None: the only one.
+    are left out. Without a topic there is to be only one with positions.
 
     Raises:
         BadInput: rosbags is not installed, the bag is damaged or has no such topic, or several.

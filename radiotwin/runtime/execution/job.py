@@ -96,13 +96,9 @@ class Job(Generic[P, R]):
 
 @dataclass
 class Outcome:
-    """Result of a piece.
+    """Result of a piece, with the texts of its warnings, what it logged, and how long it took.
 
-    Attributes:
-        result: of the function.
-        messages: texts of the warnings that it gave.
-        records: (logger, level, text) that it logged, from warnings upwards.
-        seconds: that it took.
+    Records are (logger, level, text), from warnings upwards.
     """
 
     result: Any
@@ -191,12 +187,7 @@ class _Noting(logging.Handler):
 
 @dataclass(frozen=True)
 class Death:
-    """Why a worker has ended while it ran a piece.
-
-    Attributes:
-        reason: for messages.
-        memory: whether it took too much memory for certain.
-    """
+    """Why a worker has ended while it ran a piece, and whether for certain of too much memory."""
 
     reason: str
     memory: bool = False
@@ -237,15 +228,10 @@ class Pool(ABC):
 
     @abstractmethod
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
-        """Return workers for a job.
+        """Return workers for a job of so many pieces, and no more of them.
 
-        Args:
-            function: pickled.
-            resources: of each worker.
-            count: number of pieces; there are no more workers.
-
-        Returns:
-            the workers; none where other processes would not be faster than this one.
+        The function is pickled. There are none where other processes would not be faster than this
+        one.
 
         Raises:
             RunFailed: so many workers of this size cannot be had.
