@@ -5,30 +5,24 @@ With them: the threads and the memory of a process that trains, checked before a
 
 import ctypes
 import math
-import multiprocessing
-import os
-import pickle
-import signal
 import sys
-import traceback
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from multiprocessing.connection import Connection
+from concurrent.futures import Future
 from typing import Any
 
 import scipy.linalg  # noqa: F401  compiled code uses its BLAS, limited only once it is loaded
 import threadpoolctl
 import torch
 
-from marl.checkpoint import Damaged
 from marl.environment import observation_size, state_size
 from marl.mission import Mission
 from marl.settings import LearnerSettings, RunSettings, learner_class
 from marl.training import Trainer
 from radiotwin.errors import RunFailed
 from radiotwin.io.budgets import TRAINING_BYTES
-from radiotwin.io.signals import kept_from_children
-from radiotwin.runtime.processes import die_with_parent, usable_cores
+from radiotwin.io.signals import deferred
+from radiotwin.runtime.execution.local import start_process
+from radiotwin.runtime.processes import usable_cores
 
 _COPIES = 4  # of the weights: target network, and two moments of the optimiser
 
@@ -92,14 +86,17 @@ class Replicas:
     """
 
     def __init__(self, arguments: Sequence[tuple]) -> None:
-        here = len(arguments) == 1 or usable_cores() == 1
-        self._replicas: list[Any] = []
-        self._pool: ThreadPoolExecutor | None = None
+        self._here: list[Trainer] = []
+        self._pools: list[Any] = []
+        self._begun: list[Future[None]] = []
+        if len(arguments) == 1 or usable_cores() == 1:
+            self._here = [Trainer(*each) for each in arguments]
+            return
         try:
             for each in arguments:
-                self._replicas.append(_Local(*each) if here else _Remote(*each))
-            if not here:  # the threads only wait for the processes
-                self._pool = ThreadPoolExecutor(len(arguments))
+                pool, _ = start_process({})
+                self._pools.append(pool)
+                self._begun.append(pool.submit(_begin, each))
         except BaseException:  # interrupted, too
             self.close()
             raise
@@ -118,99 +115,41 @@ class Replicas:
         Raises:
             RunFailed: a process has ended.
         """
-        own = [()] * len(self._replicas) if each is None else [(one,) for one in each]
-        if self._pool is None:
-            return [replica.call(method, *arguments, *mine)
-                    for replica, mine in zip(self._replicas, own)]
-        calls = [self._pool.submit(replica.call, method, *arguments, *mine)
-                 for replica, mine in zip(self._replicas, own)]
-        return [call.result() for call in calls]
+        own = [()] * len(self._here or self._pools) if each is None else [(one,) for one in each]
+        if self._here:
+            return [getattr(trainer, method)(*arguments, *mine)
+                    for trainer, mine in zip(self._here, own)]
+        from loky.process_executor import TerminatedWorkerError
 
-    def close(self) -> None:
-        """End the processes, whatever they do."""
-        for replica in self._replicas:
-            replica.kill()
-        if self._pool is not None:
-            self._pool.shutdown()
-        for replica in self._replicas:
-            replica.close()
-
-
-class _Local:
-    def __init__(self, *arguments: Any) -> None:
-        self._trainer = Trainer(*arguments)
-
-    def call(self, method: str, *arguments: Any) -> Any:
-        return getattr(self._trainer, method)(*arguments)
-
-    def kill(self) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
-
-
-class _Remote:
-    def __init__(self, *arguments: Any) -> None:
-        # A forked process would inherit the locks of threads that it does not have.
-        context = multiprocessing.get_context("spawn")
-        self._pipe, other = context.Pipe()
-        self._process = context.Process(target=_serve, args=(other, os.getpid(), arguments),
-                                        daemon=True)
-        with kept_from_children():
-            self._process.start()
-        other.close()
-
-    def call(self, method: str, *arguments: Any) -> Any:
         try:
-            _send(self._pipe, (method, arguments))
-            done, result = _receive(self._pipe)
-        except (EOFError, OSError):
-            self._process.join(timeout=1)
-            if self._process.exitcode == -signal.SIGTERM:  # sent to all, and to this one as well
-                raise SystemExit(128 + signal.SIGTERM) from None
+            for begun in self._begun:
+                begun.result()
+            calls = [pool.submit(_call, method, (*arguments, *mine))
+                     for pool, mine in zip(self._pools, own)]
+            return [call.result() for call in calls]
+        except TerminatedWorkerError as error:
+            if "SIGTERM" in str(error):  # sent to all, and to this one as well
+                raise SystemExit(143) from None
             raise RunFailed("a process that trains a replica has ended, perhaps for lack of "
                             "memory; start the same command with --resume to go on from the last "
                             "checkpoint") from None
-        if isinstance(result, Damaged):
-            raise result
-        if not done:
-            raise RuntimeError(f"in a replica's process:\n{result}")
-        return result
-
-    def kill(self) -> None:
-        if self._process.pid is not None:
-            self._process.kill()
-            self._process.join()
 
     def close(self) -> None:
-        self._pipe.close()
+        """End the processes, whatever they do."""
+        with deferred():
+            for pool in self._pools:
+                pool.shutdown(wait=True, kill_workers=True)
 
 
-def _serve(pipe: Connection, parent: int, arguments: tuple) -> None:
-    """Answer calls until the other end of the pipe closes, or the parent dies."""
-    die_with_parent(parent)
+_trainer: Trainer  # of a process that is nothing but a replica's
+
+
+def _begin(arguments: tuple) -> None:
+    global _trainer
     limit_threads(1)
     keep_memory()
-    trainer = Trainer(*arguments)
-    try:
-        while True:
-            method, call = _receive(pipe)
-            try:
-                answer = True, getattr(trainer, method)(*call)
-            except Damaged as error:
-                answer = False, error
-            except Exception:
-                answer = False, traceback.format_exc()
-            _send(pipe, answer)
-    except (EOFError, OSError, KeyboardInterrupt):  # closed, or interrupted
-        return
+    _trainer = Trainer(*arguments)
 
 
-def _send(pipe: Connection, message: tuple) -> None:
-    """Send plain bytes: `pipe.send` would hand over tensors as shared memory, one file each."""
-    pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
-
-
-def _receive(pipe: Connection) -> tuple:
-    return pickle.loads(pipe.recv_bytes())
+def _call(method: str, arguments: tuple) -> Any:
+    return getattr(_trainer, method)(*arguments)

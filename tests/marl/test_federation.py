@@ -1,5 +1,8 @@
 """Averaging, and replicas that share no memory."""
 
+import os
+import signal
+
 import numpy as np
 import pytest
 
@@ -94,10 +97,10 @@ def test_processes_learn_the_same_as_this_one(mission, monkeypatch):
         replicas.call("set_weights", each=[there[1], there[0]])
         swapped = replicas.call("weights")
         np.testing.assert_array_equal(swapped[0]["agent.head.bias"], there[1]["agent.head.bias"])
-        with pytest.raises(RuntimeError, match="AttributeError"):
+        with pytest.raises(AttributeError, match="no_such_method"):
             replicas.call("no_such_method")
-        replicas._replicas[0]._process.kill()
-        replicas._replicas[0]._process.join()
+        [number] = replicas._pools[0]._processes
+        os.kill(number, signal.SIGKILL)
         with pytest.raises(RunFailed, match="--resume"):
             replicas.call("train", 4)
     finally:
@@ -110,6 +113,6 @@ def test_on_one_core_replicas_learn_in_this_process(mission, monkeypatch):
     replicas = Replicas(arguments(mission))
     try:
         assert replicas.call("train", 8) == [trainer.train(8) for trainer in here]
-        assert not any(hasattr(replica, "_process") for replica in replicas._replicas)
+        assert not replicas._pools
     finally:
         replicas.close()

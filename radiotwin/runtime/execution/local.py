@@ -97,6 +97,17 @@ def _cores() -> int:
     return loky.cpu_count()  # of the control group, too
 
 
+def start_process(environment: dict[str, str]) -> tuple[Any, "Future[int]"]:
+    """Return loky's pool of one new process, which gets no Ctrl-C; and its number, once begun."""
+    import loky
+    from loky.backend import resource_tracker
+
+    with kept_from_children():
+        resource_tracker.ensure_running()
+        pool = loky.ProcessPoolExecutor(1, env=environment | _NO_LEAK_CHECK)
+        return pool, pool.submit(begin, os.getpid())
+
+
 class _LocalWorker(Worker):
     def __init__(self) -> None:
         self.function, self.resources = b"", Resources()
@@ -120,15 +131,8 @@ class _LocalWorker(Worker):
         return self._pool.submit(run_piece, piece, self.function)
 
     def _start(self) -> None:
-        import loky
-        from loky.backend import resource_tracker
-
-        with kept_from_children():
-            resource_tracker.ensure_running()
-            self._pool = loky.ProcessPoolExecutor(
-                1, env={**thread_variables(self.resources.cores), **_NO_LEAK_CHECK})
-            self._over_memory, self._sent = False, b""
-            self._begun = self._pool.submit(begin, os.getpid())
+        self._over_memory, self._sent = False, b""
+        self._pool, self._begun = start_process(thread_variables(self.resources.cores))
 
     def death(self, error: BaseException) -> Death | None:
         import loky
