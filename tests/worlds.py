@@ -1,6 +1,7 @@
 """Worlds that tests of several packages share: open ground, by plain formulas of their own, and a traced city."""
 
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -107,14 +108,17 @@ def quick_report():
         yield
 
 
+def leave_effects(patch, *names):
+    """Leave some effects in the catalogue of a loop: to look for all of them takes seconds."""
+    few = [each for each in catalogue() if each.name in names]
+    assert {each.name for each in few} == set(names)
+    patch.setattr("radiotwin.closeloop.run.catalogue", lambda: few)
+
+
 @pytest.fixture
 def only_effects(monkeypatch):
-    """Function that leaves some effects in the catalogue of a loop, by their names: to look for all of them takes seconds."""
-    def leave(*names):
-        few = [each for each in catalogue() if each.name in names]
-        assert {each.name for each in few} == set(names)
-        monkeypatch.setattr("radiotwin.closeloop.run.catalogue", lambda: few)
-    return leave
+    """Function that leaves some effects in the catalogue of a loop, by their names."""
+    return partial(leave_effects, monkeypatch)
 
 
 @pytest.fixture(scope="session")

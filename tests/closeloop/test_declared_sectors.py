@@ -177,6 +177,7 @@ def test_declared_tilts_that_differ_predict_better_than_one_for_all(seed):
     assert flat.parameters.keys() - tilted.parameters.keys() == {"tilt_deg"}
 
 
+@pytest.mark.slow
 def test_a_sector_without_a_declared_tilt_has_that_of_the_others():
     measurements = network(3, tilts_deg=(-3.0, -20.0))
     told = measurements.devices.assign(tilt_deg=[-3.0, -3.0, np.nan, -20.0, np.nan, -3.0])

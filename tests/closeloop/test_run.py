@@ -141,6 +141,7 @@ def test_a_sector_antenna_is_named_and_its_direction_found(open_ground):
     assert abs((found - 70 + 180) % 360 - 180) < 20
 
 
+@pytest.mark.slow
 def test_an_anchor_that_is_elsewhere_is_found(open_ground):
     world = open_ground.fly(6)
     measurements = open_ground.measured(world)

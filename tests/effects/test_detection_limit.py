@@ -54,7 +54,7 @@ def test_a_receiver_that_reads_far_weaker_levels_has_no_such_limit(seen, monkeyp
     assert DetectionLimit().propose(given)  # that is what forbids it
 
 
-@pytest.mark.seconds
+@pytest.mark.slow
 def test_close_loop_finds_it(open_ground, loop):
     """Receiver r1 is less sensitive than r0, and the file declares neither's limit."""
     world = open_ground.fly(3, limit_db=-500.0)

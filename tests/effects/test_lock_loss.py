@@ -72,7 +72,7 @@ def test_without_a_limit_a_blank_has_no_meaning(seen):
     assert LockLoss().propose(given) == []
 
 
-@pytest.mark.seconds
+@pytest.mark.slow
 def test_links_lost_at_random_are_named_and_counted(open_ground, loop):
     world, rng = open_ground.fly(23), np.random.default_rng(23)
     measurements = open_ground.measured(world)
