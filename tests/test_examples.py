@@ -37,6 +37,7 @@ def test_find_devices(run, tmp_path):
     assert (tmp_path / "find_devices" / "twin" / "twin.json").is_file()
 
 
+@pytest.mark.slow
 def test_close_the_loop(run):
     with quickened():
         out = run("close_the_loop")

@@ -88,6 +88,7 @@ def test_an_earlier_twin_can_start_the_search(chain, run):
         assert np.hypot(before["x_m"] - after["x_m"], before["y_m"] - after["y_m"]) < 5
 
 
+@pytest.mark.slow
 def test_a_twin_by_paths_is_made_and_used_as_any_other(chain, run):
     """Of two devices only: to follow paths takes long."""
     survey = pd.read_csv(chain / "survey" / "measurements.csv.gz")

@@ -285,7 +285,7 @@ IN_THE_CITY = {
 
 
 @pytest.mark.parametrize(("edit", "parts"), [
-    pytest.param(*given, id=name, marks=[pytest.mark.slow] * (name in ("nothing implausible", "receivers in degrees")))
+    pytest.param(*given, id=name, marks=[pytest.mark.slow] * (name != "all links with line of sight"))
     for name, given in IN_THE_CITY.items()])
 def test_thin_data_with_a_map_gives_a_result_that_says_so(close_loop, small_scene, tmp_path, edit, parts):
     links, devices = edit(*in_the_city(small_scene))

@@ -66,6 +66,7 @@ def found():
         return rt.close_loop(campaign(0), base="log-distance", hold_out="flight")
 
 
+@pytest.mark.slow
 def test_an_episode_is_as_well_known_as_the_flight_it_was_on_tells(found):
     [episode] = [each for each in rt.make_report(found)["effects"] if each["name"] == "episode"]
     loss, start, end = (episode["parameters"][f"{name}[all]"] for name in ("loss_db", "start_s", "end_s"))
@@ -75,6 +76,7 @@ def test_an_episode_is_as_well_known_as_the_flight_it_was_on_tells(found):
     assert loss["determined"] and start["determined"] and end["determined"]
 
 
+@pytest.mark.slow
 def test_nobody_knew_the_episode_before_its_flight_and_nothing_else_is_judged_by_it(found):
     model = found.after
     during = (model.links.time_s >= BEGIN_S) & (model.links.time_s <= END_S)

@@ -41,6 +41,7 @@ def test_two_anchors_of_which_none_is_probable_alone_are_named_together(selected
     assert all(trial.probability >= needed for trial in kept)
 
 
+@pytest.mark.slow
 def test_one_anchor_has_no_second_beside_it(selected):
     needed = best_alone(selected({1: 45.0}, 1.0)) + 0.005
     assert selected({1: 45.0}, needed).model.whole.effects == ()

@@ -54,7 +54,7 @@ def test_an_emitter_is_found_at_its_position(open_ground, loop):
     assert found.error["after"]["nll"] < found.error["before"]["nll"] - 0.1
 
 
-@pytest.mark.seconds
+@pytest.mark.slow
 def test_a_floor_that_is_the_same_everywhere_is_no_emitter(open_ground, loop):
     world = open_ground.fly(22)
     world.gain_db = 10 * np.log10(watts(world.gain_db) + watts(-97.0))

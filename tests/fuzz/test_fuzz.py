@@ -16,6 +16,7 @@ from tests.fuzz.honest import make_honest
 from tests.fuzz.mutations import Mutation, names
 from tests.fuzz.sandbox import CANARY, prepare_case, run_watched
 from tests.fuzz.targets import TARGETS
+from tests.worlds import quickened
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork") or not os.path.isdir("/proc/self"),
                                 reason="cases run in forked children that are watched through /proc")
@@ -27,7 +28,8 @@ KNOWN = [loads(line) for line in CORPUS.read_text().splitlines()]
 def run(tmp_path_factory):
     """Run a case on a copy of the honest files."""
     folder = tmp_path_factory.mktemp("fuzz")
-    make_honest(folder / "honest")
+    with quickened():
+        make_honest(folder / "honest")
     with listen() as listener:
         yield partial(run_case, honest=folder / "honest", folder=folder / "case", listener=listener)
 

@@ -70,6 +70,7 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(unbroken):
     assert all(0 < ratio <= 1 for ratio in ratios.values()) and ratios["planner", "NN twin"] > ratios["random", ""]
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(unbroken, scene_option, tmp_path):
     words = scene_option + SMALL + "--compare false "  # the comparison comes after it
     process = start(words + "--out killed", tmp_path)

@@ -51,6 +51,7 @@ def test_algorithm_1_has_a_row_for_each_round_and_the_seed_decides(small_scene):
     assert set(rows["flight"][0]) == {"cell", "battery", "assigned", "collected"}
 
 
+@pytest.mark.slow
 def test_a_twin_is_judged_by_the_truth(small_scene):
     settings = {f"small-{model}": {"model": model, "survey_flights": [1, 3], "noise_db": 1.0}
                 for model in ("segmented_nn", "log_distance", "regression_kriging")}
@@ -111,6 +112,7 @@ def test_displaced_devices_are_on_free_ground_as_far_off_as_said(small_scene):
     assert world.believed.uav_link_db[0] < world.believed.threshold_db
 
 
+@pytest.mark.slow
 def test_channel_models_are_scored(small_scene):
     rows = rows_of(models.score_models, small_scene, {"small-segmented": models.models_cases(0)["rbm-segmented"]
                                                       | {"flights": 2}})

@@ -92,6 +92,7 @@ def test_a_batch_in_halves_differs_little_from_the_whole(small_scene):
     assert same.mean() > 0.9 and np.isfinite(whole).sum() > 20
 
 
+@pytest.mark.slow
 def test_the_map_of_cells_by_workers(own_scene, tmp_path):
     cells = SolverSettings(solver="map", samples_per_src=100_000)
     alone = trace_map(own_scene, cells, tmp_path / "alone.nc", ["d0"])

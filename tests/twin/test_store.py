@@ -57,6 +57,7 @@ def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, only_e
     assert_equal(twin.predict(faultless[0]), again.predict(faultless[1]))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick_report")
 def test_a_curve_that_only_describes_is_drawn_on_the_maps_of_a_stored_twin(open_ground, only_effects, tmp_path):
     only_effects("antenna_pattern", "device_gain_offset")

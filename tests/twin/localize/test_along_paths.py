@@ -23,6 +23,7 @@ def found(twin, name):
     return np.array([device.x_m, device.y_m]), device.credible_radius_m
 
 
+@pytest.mark.slow
 def test_paths_find_a_device_in_a_narrow_street_that_a_law_puts_where_it_would_see_more(narrow_street, monkeypatch):
     true_m, scene, name = narrow_street.position_m, narrow_street.scene, narrow_street.name
     links = prepare_links(narrow_street.measured, scene)
