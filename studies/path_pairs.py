@@ -7,7 +7,6 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.propagation.paths.candidates import candidate_search
-from radiotwin.propagation.paths.fields import VERTICAL
 from radiotwin.propagation.paths.images import PathBuffer
 from radiotwin.propagation.paths.interactions import slabs_of
 from radiotwin.propagation.paths.powers import PATH_CHUNK, WEDGES, clear_paths_gains
@@ -46,7 +45,7 @@ def engine_paths(
     out: list[list[FoundPath]] = [[] for _ in receiver_m]
     for clear, gain in clear_paths_gains(
             city, search, candidates, device_m, receiver_m, buffer,
-            2 * np.pi * frequency_hz / speed_of_light, slabs, VERTICAL, WEDGES[wedge]):
+            2 * np.pi * frequency_hz / speed_of_light, slabs, WEDGES[wedge]):
         for path, power in zip(clear, gain):
             row, count = buffer.candidate[path], buffer.count[path]
             before, after = ((facets[row] >= 0).sum() for facets in (candidates.before,

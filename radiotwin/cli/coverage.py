@@ -11,7 +11,7 @@ from radiotwin.cli.options import (
     OnlyDevices,
     OptionalScene,
     open_model,
-    parse_bounds,
+    parse_extent,
     parse_numbers,
     split_names,
 )
@@ -86,9 +86,8 @@ def coverage(
     from radiotwin.report import write_coverage_pictures
     from radiotwin.scene.build import check_target
 
-    bounds = None if extent is None else parse_bounds("--extent", extent)
     settings = CoverageSettings(
-        height_m=height, step_m=step, extent_m=bounds, tx_power_dbm=tx_power_dbm,
+        height_m=height, step_m=step, extent_m=parse_extent(extent), tx_power_dbm=tx_power_dbm,
         bandwidth_hz=bandwidth_hz, noise_figure_db=noise_figure_db, load=load,
         threshold_dbm=threshold_dbm, reliability=reliability, indoor_loss_db=indoor_loss_db,
         classes_dbm=tuple(parse_numbers("--classes", classes)),

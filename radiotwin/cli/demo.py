@@ -5,8 +5,7 @@ from pathlib import Path
 
 from radiotwin.errors import BadInput
 from radiotwin.maps.survey import fly_survey
-from radiotwin.report import read_run, write_comparison_figures, write_picture, write_report
-from radiotwin.report.comparison import write_comparison
+from radiotwin.report import read_run, write_comparison_folder, write_picture, write_report
 from radiotwin.runtime.cuda import Device
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions, build_scene
@@ -54,8 +53,7 @@ def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed:
     comparison = compare_models(train, test, scene, truth, seed=seed)
     comparison.twins["segmented_nn"].save(folder / "twin")
     on_progress("5 drawing")
-    write_comparison(comparison, scene, folder / "comparison")
-    write_comparison_figures(comparison, scene, truth, folder / "comparison")
+    write_comparison_folder(comparison, scene, folder / "comparison", truth)
     write_report(read_run(folder), folder / "report.html")
     return comparison
 

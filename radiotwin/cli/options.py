@@ -167,22 +167,17 @@ def parse_numbers(option: str, text: str, count: int | None = None) -> list[floa
     return values
 
 
-def parse_bounds(option: str, text: str) -> tuple[float, float, float, float]:
-    """Parse the borders of an area in the scene's frame.
-
-    Args:
-        option: that has them, for the message.
-        text: `XMIN,YMIN,XMAX,YMAX` [m].
-
-    Returns:
-        x_min, x_max, y_min, y_max [m]
+def parse_extent(text: str | None) -> tuple[float, float, float, float] | None:
+    """Return x_min, x_max, y_min, y_max [m] of `XMIN,YMIN,XMAX,YMAX`; None for none.
 
     Raises:
         BadInput: they are not four numbers, or a minimum is not below its maximum.
     """
+    if text is None:
+        return None
     values = _numbers(text)
     if len(values) != 4 or not (values[0] < values[2] and values[1] < values[3]):
-        raise BadInput(f"{option} {text!r} is not an area; give XMIN,YMIN,XMAX,YMAX in metres, "
+        raise BadInput(f"--extent {text!r} is not an area; give XMIN,YMIN,XMAX,YMAX in metres, "
                        "the minimum below the maximum")
     x_min, y_min, x_max, y_max = values
     return x_min, x_max, y_min, y_max

@@ -21,7 +21,7 @@ from radiotwin.cli.options import (
     TargetDb,
     Workers,
     open_model,
-    parse_bounds,
+    parse_extent,
     parse_numbers,
     parse_origin,
     split_names,
@@ -115,8 +115,7 @@ def build_scene(
                    terrain=terrain, crs=crs, overpass=overpass, step_m=step,
                    altitudes_m=None if altitudes is None else
                    parse_numbers("--altitudes", altitudes),
-                   extent_m=None if extent is None else parse_bounds("--extent", extent),
-                   check_only=check)
+                   extent_m=parse_extent(extent), check_only=check)
     if overpass:
         say(f"wrote {source} (© OpenStreetMap contributors, ODbL)")
     print_report(report, console)

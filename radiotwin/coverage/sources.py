@@ -104,9 +104,8 @@ def _source_of_paths(scene: Scene, transmitters: Sequence[Transmitter]) -> GainS
         parts = [np.empty(0)]
         for start in range(0, len(receiver_m), PATH_RECEIVERS):
             ends_m = receiver_m[start:start + PATH_RECEIVERS]
-            found = path_powers(scene.city, each.position_m[None], ends_m,
-                                np.zeros(len(ends_m), int), float(each.frequency_hz or np.nan),
-                                "vertical")
+            found = path_powers(scene.city, each.position_m, ends_m,
+                                float(each.frequency_hz or np.nan))
             parts.append(found.total if each.antenna is None else
                          _through_antenna(found.departures, found.total, each.antenna))
         with np.errstate(divide="ignore"):

@@ -58,19 +58,12 @@ def gaussian_nll(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
 
 def mean_if_detected(mean_db: np.ndarray, sd_db: np.ndarray,
                      limit_db: np.ndarray | float) -> np.ndarray:
-    """Return the mean of a level given that it lies above the limit.
+    """Return the mean of a level given that it lies above the limit [dB]; the arguments broadcast.
 
     Compare measured levels with this: near the limit only the strong ones were detected, whose mean
     lies above the mean of all. mean + sd * phi(a) / Phi(-a), a = (limit - mean) / sd, of the
-    truncated normal distribution (Johnson, Kotz and Balakrishnan 1994, section 13.10.1).
-
-    Args:
-        mean_db: expected [dB]; all arguments broadcast.
-        sd_db: standard deviation [dB].
-        limit_db: limit of detection [dB]; -inf: everything is detected.
-
-    Returns:
-        [dB], of the broadcast shape.
+    truncated normal distribution (Johnson, Kotz and Balakrishnan 1994, section 13.10.1). At a limit
+    of -inf everything is detected.
     """
     below = (limit_db - mean_db) / sd_db
     return mean_db + sd_db * np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(-below))
@@ -80,17 +73,8 @@ def standardised(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
                  limit_db: Limit) -> np.ndarray:
     """Return the standardised residual (level - mean) / sd of each link.
 
-    A link that was not detected gets its conditional mean below the limit, -phi(a) / Phi(a),
-    a = (limit - mean) / sd, as in `mean_if_detected`.
-
-    Args:
-        level_db: (n,) measured [dB]; NaN: not detected.
-        mean_db: (n,) expected [dB].
-        sd_db: (n,) standard deviation [dB].
-        limit_db: limit of detection [dB]; unknown only for links that were detected.
-
-    Returns:
-        (n,) residual in standard deviations.
+    A link that was not detected, and whose limit is known, gets its conditional mean below the
+    limit, -phi(a) / Phi(a), a = (limit - mean) / sd, as in `mean_if_detected`. All are (n,) [dB].
     """
     residual = (level_db - mean_db) / sd_db
     missing = np.isnan(residual)
@@ -125,16 +109,7 @@ def gaussian_nll_torch(level: torch.Tensor, mean: torch.Tensor, log_sd: torch.Te
 
 def detection_probability(mean_db: np.ndarray, sd_db: np.ndarray,
                           limit_db: np.ndarray | float) -> np.ndarray:
-    """Return the probability that a level lies above the limit; the arguments broadcast.
-
-    Args:
-        mean_db: expected [dB].
-        sd_db: standard deviation [dB].
-        limit_db: limit of detection [dB]; -inf: everything is detected.
-
-    Returns:
-        in 0..1, of the broadcast shape.
-    """
+    """Return the probability that a level lies above the limit [dB]; the arguments broadcast."""
     return ndtr((mean_db - limit_db) / sd_db)
 
 
@@ -169,9 +144,6 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
         log_distance: (n,) log10(d / 1 m).
         level_db: (n,) [dB], at least two of them detected; NaN: below the limit.
         limit_db: limit of detection [dB]; unknown only for levels that were detected.
-
-    Returns:
-        line
     """
     detected = ~np.isnan(level_db)
     x, y = log_distance[detected], level_db[detected]
@@ -236,15 +208,10 @@ def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.nda
 
 
 def fit_sd_db(level_db: np.ndarray, mean_db: np.ndarray, limit_db: Limit) -> float:
-    """Return the standard deviation of highest likelihood around given means.
+    """Return the standard deviation of highest likelihood around given means (n,) [dB].
 
-    Args:
-        level_db: (n,) [dB]; NaN: below the limit.
-        mean_db: (n,) expected [dB].
-        limit_db: limit of detection [dB]; None: links that were not detected count nothing.
-
-    Returns:
-        [dB], between MIN_SD_DB and MAX_SD_DB.
+    It is between MIN_SD_DB and MAX_SD_DB. Levels are as of `fit_line`; without a limit those that
+    were not detected count nothing.
     """
 
     def objective(log_sd: float) -> float:

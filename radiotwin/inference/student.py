@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln, stdtr
 
+DOF = 4.0  # degrees of freedom of errors with outliers, where they are not estimated
 MIN_CURVATURE = 1e-6  # of a blank that says nothing, so that every Newton step is defined
 MIN_PROBABILITY = 1e-300  # of which a logarithm is taken
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr, logsumexp, ndtr, stdtr
 
+from radiotwin.inference.student import DOF
 from radiotwin.io.texts import percent
 from radiotwin.links.evidence import design_effect, evidence_blocks
 from radiotwin.links.links import Links
@@ -34,7 +35,6 @@ ODD = 1e-3  # probability of a reading that should not be there
 ODD_SHARE = 2e-3  # of the readings: the lowest ones, which need not be right
 STEP_DB, MAX_STEPS = 0.25, 160  # of the limits that are tried
 BELOW_DB, HIGHEST = 8.0, 0.3  # they begin below the lowest reading, and end at that quantile
-DOF = 4.0  # of the errors of the crude prediction: heavy tails
 SD_SHARE = np.sqrt((DOF - 2) / DOF)  # of the scale of a t distribution in its standard deviation
 MIN_NATS = 5.0  # that speak for a limit, or against a declared one: 150 to 1
 RISE_DB, FALL_DB = 2.0, 1.0  # above and below a declared limit: as good as there

@@ -69,13 +69,12 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
     """Collect the variables of the template `closeloop_sections.html`.
 
     Args:
-        report: content of `closeloop.json`.
+        report: content of `closeloop.json`, checked.
         folder: of the figures.
 
     Raises:
-        BadInput: a damaged report or figure.
+        BadInput: a damaged figure.
     """
-    report = check_report(report, folder / "closeloop.json")
     candidates = report["candidates"]
     verdict = words.BADGES[report["verdict"]]
     if report["verdict"] == "effect":

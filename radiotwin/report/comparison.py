@@ -110,32 +110,22 @@ def compare_held_out(measurements: Measurements, scene: Scene, truth: RadioMap |
         executor: where the models are fitted; None: in this process.
 
     Raises:
-        BadInput: too few flights, or what `judge_also` and `compare_models` refuse.
+        BadInput: too few flights, neither a twin's folder nor a radio map, a map without a truth,
+            or what `compare_models` refuses.
     """
     train, test = split_flights(measurements, held_out)
-    twins, maps = judge_also([Path(path) for path in also], truth, test.flights)
+    twins, maps = _judge_also([Path(path) for path in also], truth, test.flights)
     models = (*DEFAULT_MODELS, *published_models(scene.config.radio.frequency_hz),
               *["raytrace"] * raytrace)
     return compare_models(train, test, scene, truth, seed=seed, models=models, twins=twins,
                           maps=maps, executor=executor)
 
 
-def judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
+def _judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
                ) -> tuple[dict[str, Twin], dict[str, RadioMap]]:
-    """Read twins and radio maps that are to be compared with the models.
+    """Read twins and radio maps that are to be compared with the models, by their paths.
 
     Warns where a twin was fitted to one of the held-out flights.
-
-    Args:
-        paths: folders of twins, and files of radio maps.
-        truth: map of reference gains; None: there is none.
-        held_out: names of the held-out flights.
-
-    Returns:
-        twins and maps, by their paths
-
-    Raises:
-        BadInput: neither a twin's folder nor a radio map, or a map without a truth.
     """
     twins, maps = {}, {}
     for path in paths:
@@ -219,17 +209,17 @@ def write_comparison_figures(comparison: Comparison, scene: Scene, truth: RadioM
             `maps.png`.
     """
     folder = Path(folder)
-    save(scatter_figure(comparison, list(comparison.twins)), folder / "scatter.png")
+    save(_scatter_figure(comparison, list(comparison.twins)), folder / "scatter.png")
     shown = [name for name in SHOWN if name in comparison.twins] or list(comparison.twins)[:2]
     if len(comparison.locations) and comparison.locations["error_m"].notna().all():
-        save(estimates_figure(comparison, shown, scene), folder / "estimates.png")
+        save(_estimates_figure(comparison, shown, scene), folder / "estimates.png")
     if truth is not None:
         maps = {name: comparison.twins[name].radio_map(scene) for name in reversed(shown)}
-        figure = model_maps_figure(truth, maps, scene, typical_device(truth, maps))
+        figure = model_maps_figure(truth, maps, scene, _typical_device(truth, maps))
         save(figure, folder / "maps.png")
 
 
-def typical_device(truth: RadioMap, maps: dict[str, RadioMap]) -> str:
+def _typical_device(truth: RadioMap, maps: dict[str, RadioMap]) -> str:
     """Return the device in all maps whose share of line of sight is nearest to the mean."""
     devices = [name for name in truth.devices
                if all(name in radio_map.devices for radio_map in maps.values())]
@@ -237,13 +227,8 @@ def typical_device(truth: RadioMap, maps: dict[str, RadioMap]) -> str:
     return devices[int(np.abs(los - los.mean()).argmin())]
 
 
-def scatter_figure(comparison: Comparison, models: list[str]) -> Figure:
-    """Draw predicted over measured levels of the held-out links, LoS and NLoS apart.
-
-    Args:
-        comparison: with its held-out predictions.
-        models: names of the models, a panel for each.
-    """
+def _scatter_figure(comparison: Comparison, models: list[str]) -> Figure:
+    """Draw predicted over measured levels of the held-out links, a panel for each model."""
     columns = min(len(models), MAX_COLUMNS)
     figure, axes = panels(-(-len(models) // columns), columns, 4.2, 4.6)
     for unused in axes.flat[len(models):]:
@@ -267,14 +252,8 @@ def scatter_figure(comparison: Comparison, models: list[str]) -> Figure:
     return figure
 
 
-def estimates_figure(comparison: Comparison, models: list[str], scene: Scene) -> Figure:
-    """Draw the estimated positions of the unknown devices; circles contain 90 % of the posterior.
-
-    Args:
-        comparison: with its located devices.
-        models: names of the models, a panel for each.
-        scene: whose buildings and true positions are drawn.
-    """
+def _estimates_figure(comparison: Comparison, models: list[str], scene: Scene) -> Figure:
+    """Draw where each model locates the devices; circles contain 90 % of the posterior."""
     extent = scene.config.extent
     ratio = (extent.x_max_m - extent.x_min_m) / (extent.y_max_m - extent.y_min_m)
     figure, axes = panels(1, len(models), 6.4 * min(max(ratio, 0.7), 1.4), 6.4)

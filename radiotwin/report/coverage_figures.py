@@ -11,6 +11,7 @@ from matplotlib.patches import Patch, Rectangle
 from radiotwin.coverage import Coverage
 from radiotwin.coverage.legends import Legend, drawn_rasters, file_stem, legend_of
 from radiotwin.report.labels import new_figure, plain, save
+from radiotwin.report.map_figures import HeightGrid
 from radiotwin.scene import Scene
 from radiotwin.scene.plot import height_grid
 
@@ -36,20 +37,11 @@ def write_coverage_pictures(coverage: Coverage, scene: Scene, folder: Path) -> N
     """
     heights = height_grid(scene, OUTLINE_CELLS)
     for name in drawn_rasters(coverage):
-        save(coverage_figure(coverage, scene, name, heights), folder / f"{file_stem(name)}.png")
+        save(_coverage_figure(coverage, scene, name, heights), folder / f"{file_stem(name)}.png")
 
 
-def coverage_figure(coverage: Coverage, scene: Scene, name: str,
-                    heights: tuple[np.ndarray, tuple[float, float, float, float]] | None = None,
-                    ) -> Figure:
-    """Draw a raster in classes.
-
-    Args:
-        coverage: of the network.
-        scene: whose buildings are drawn.
-        name: of the raster, as in `Coverage.dataset`.
-        heights: as of `height_grid`; None: sampled here.
-    """
+def _coverage_figure(coverage: Coverage, scene: Scene, name: str, heights: HeightGrid) -> Figure:
+    """Draw a raster of `Coverage.dataset` in classes."""
     legend, bounds_m = legend_of(name, coverage), coverage.grid.bounds_m
     x_min, x_max, y_min, y_max = bounds_m
     width, height = x_max - x_min, y_max - y_min
@@ -61,7 +53,7 @@ def coverage_figure(coverage: Coverage, scene: Scene, name: str,
     ax.imshow(np.ma.masked_less(classes, 0), origin="lower", extent=bounds_m,
               cmap=ListedColormap(legend.colours), vmin=-0.5, vmax=len(legend.colours) - 0.5,
               interpolation="nearest")
-    height_m, over = height_grid(scene, OUTLINE_CELLS) if heights is None else heights
+    height_m, over = heights
     building = height_m > BUILDING_M
     indoors = coverage.settings.indoor_loss_db is not None
     if not indoors:
@@ -160,15 +152,11 @@ def _caption(coverage: Coverage, scene: Scene) -> str:
              f"{facts['step_m']:g} m",
              f"bandwidth {facts['bandwidth_hz'] / 1e6:g} MHz, noise {facts['noise_dbm']:.1f} dBm "
              f"(noise figure {facts['noise_figure_db']:.1f} dB)"]
-    credit = attribution(scene)
+    credit = _attribution(scene)
     return "\n".join([lines[0], lines[1] + (f"; buildings {credit}" if credit else "")])
 
 
-def attribution(scene: Scene) -> str:
-    """Return the credit that a scene's map asks for; empty where none is known.
-
-    Args:
-        scene: whose provenance names the file that it was built from.
-    """
+def _attribution(scene: Scene) -> str:
+    """Return the credit that the map a scene was built from asks for; empty if none is known."""
     source = scene.config.provenance.get("source", "").lower()
     return "© OpenStreetMap contributors (ODbL)" if source.endswith(OSM_SUFFIXES) else ""

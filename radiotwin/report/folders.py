@@ -248,8 +248,9 @@ def read_run(folder: Path | str, scene: Path | None = None, truth: str | None = 
 
 
 def _first(folder: Path, *names: str) -> Path | None:
-    """Return the first file of the folder, none of which a link may lead elsewhere."""
-    found = next((folder / name for name in names if os.path.isfile(folder / name)), None)
+    """Return the first file of the folder (or .zarr), none of which a link may lead elsewhere."""
+    found = next((folder / name for name in names if os.path.isfile(folder / name)
+                  or (name.endswith(ZARR) and os.path.isdir(folder / name))), None)
     return None if found is None else require_within(folder, found, str(folder))
 
 
@@ -298,7 +299,7 @@ def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, Radio
         maps[TRUTH] = given
     elif truth == "segmented" and run.scene is not None:
         maps[TRUTH] = segmented_truth(run.scene)
-    elif run.scene is not None and (path := _first_map(run.scene.folder)):
+    elif run.scene is not None and (path := _first(run.scene.folder, *TRUTH_MAPS)):
         found = stack.enter_context(RadioMap.open(path))
         try:
             found.require_of(run.scene)
@@ -323,12 +324,6 @@ def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, Radio
         else:
             maps[path.stem] = found
     return maps
-
-
-def _first_map(folder: Path) -> Path | None:
-    """Return the traced map of a scene's folder, which no link may lead elsewhere."""
-    found = next((folder / name for name in TRUTH_MAPS if os.path.exists(folder / name)), None)
-    return None if found is None else require_within(folder, found, str(folder))
 
 
 def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:

@@ -70,16 +70,11 @@ def write_picture(radio_map: RadioMap, scene: Scene, path: Path | str) -> None:
         scene: whose buildings are outlined.
         path: PNG file.
     """
-    save(radio_map_figure(radio_map, scene), path)
+    save(_radio_map_figure(radio_map, scene), path)
 
 
-def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
-    """Draw the gain of each of `MAX_PANELS` devices at the lowest altitude, a panel for each.
-
-    Args:
-        radio_map: map to draw.
-        scene: whose buildings are outlined.
-    """
+def _radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
+    """Draw the gain of each of `MAX_PANELS` devices at the lowest altitude, a panel for each."""
     names = radio_map.devices[:MAX_PANELS]
     radio_map = radio_map.thinned(max(-(-max(radio_map.lattice.shape[1:]) // MAX_CELLS), 1))
     gain_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values

@@ -70,12 +70,9 @@ def pack_m(values: ArrayLike) -> dict:
 
 
 def map_layers(run: Run) -> list[dict]:
-    """Return gain, standard deviation, line of sight and error of each map.
+    """Return gain, standard deviation, line of sight and error of each map of a run.
 
     Large maps are thinned to every n-th position; a note is added to the run.
-
-    Args:
-        run: with its maps; the one named `TRUTH` is the reference of the errors.
     """
     step = _thinning(run)
     truth = run.maps.get(TRUTH)
@@ -105,8 +102,7 @@ def map_layers(run: Run) -> list[dict]:
 def link_layer(run: Run) -> dict | None:
     """Return held-out residuals of a close-loop at the moving end; None without residuals.
 
-    Args:
-        run: with its residuals; a note is added where links are left out.
+    A note is added to the run where links are left out.
     """
     links = run.residuals
     if links is None or links.empty:
@@ -129,11 +125,7 @@ def link_layer(run: Run) -> dict | None:
 
 
 def device_layer(run: Run) -> list[dict]:
-    """Return name, role, true position where it is known, and the twin's estimate of each device.
-
-    Args:
-        run: with its scene and twin.
-    """
+    """Return name, role, true position if known, and the twin's estimate of each device."""
     devices: dict[str, dict] = {}
     for known in run.scene.config.devices if run.scene else []:
         devices[known.device] = {"name": known.device, "role": known.role, "estimate": None,
@@ -158,8 +150,7 @@ def device_layer(run: Run) -> list[dict]:
 def flight_layer(run: Run) -> list[dict]:
     """Return the start of each flight, and the position of each UAV from then on.
 
-    Args:
-        run: with its tracks; a note is added where positions are left out.
+    A note is added to the run where positions are left out.
     """
     tracks = run.tracks
     if tracks is None or tracks.empty:
@@ -251,24 +242,17 @@ def _thinning(run: Run) -> int:
 
 
 def city_mesh(scene: Scene) -> tuple[dict, str]:
-    """Return the buildings of a scene for the viewer.
+    """Return the buildings of a scene for the viewer, and a note on what was simplified.
 
     Flat ground is left out. A city of more than `MAX_FACES` triangles is drawn as blocks, each as
     high as the highest surface in its cell.
-
-    Args:
-        scene: with its 3D map.
-
-    Returns:
-        packed coordinates and faces, and a note on what was simplified (empty for nothing)
     """
     city = scene.city
     keep = city.vertices[city.faces][:, :, 2].max(axis=1) > FLAT_M
     if keep.sum() <= MAX_FACES:
         used, index = np.unique(city.faces[keep], return_inverse=True)
         return _packed(city.vertices[used], index.reshape(-1, 3)), ""
-    height_m, (x_min, x_max, y_min, y_max) = height_grid(scene, BLOCK_CELLS,
-                                                              above_datum=True)
+    height_m, (x_min, x_max, y_min, y_max) = height_grid(scene, BLOCK_CELLS, above_datum=True)
     cell_m = max(x_max - x_min, y_max - y_min) / BLOCK_CELLS
     return _packed(*blocks(height_m, x_min, y_min, cell_m)), (
         f"The city has {keep.sum():,} triangles and is drawn as blocks of {cell_m:.1f} m.")

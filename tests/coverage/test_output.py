@@ -21,7 +21,7 @@ from radiotwin.coverage.output import FILES, available_formats, write_formats, w
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_geographic
 from radiotwin.report import write_coverage_pictures
-from radiotwin.report.coverage_figures import attribution
+from radiotwin.report.coverage_figures import _attribution
 from radiotwin.scene import Scene
 
 
@@ -161,6 +161,6 @@ def test_a_missing_package_is_told(scene, package, monkeypatch):
 
 
 def test_maps_of_openstreetmap_are_credited(scene):
-    assert attribution(scene) == ""
+    assert _attribution(scene) == ""
     of_osm = scene.config.model_copy(update={"provenance": {"source": "data/town.osm.pbf"}})
-    assert attribution(Scene(scene.folder, of_osm)) == "© OpenStreetMap contributors (ODbL)"
+    assert _attribution(Scene(scene.folder, of_osm)) == "© OpenStreetMap contributors (ODbL)"

@@ -9,7 +9,7 @@ from radiotwin.errors import BadInput
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.report import write_comparison_folder
-from radiotwin.report.comparison import judge_also
+from radiotwin.report.comparison import _judge_also
 from radiotwin.scene import Scene
 from radiotwin.twin import fit_twin
 from radiotwin.twin.compare import compare_models, predict, score_map, split_flights
@@ -104,9 +104,9 @@ def test_a_map_of_other_devices_is_refused(truth):
 def test_a_twin_that_has_seen_the_held_out_flight_is_named(comparison, tmp_path, flown):
     comparison.twins["log_distance"].save(tmp_path / "twin")
     with pytest.warns(UserWarning, match="too good"):
-        judge_also([tmp_path / "twin"], None, ["f1"])
+        _judge_also([tmp_path / "twin"], None, ["f1"])
     with pytest.raises(BadInput, match="--truth"):
-        judge_also([tmp_path / "map.nc"], None, ["f2"])
+        _judge_also([tmp_path / "map.nc"], None, ["f2"])
 
 
 def test_twins_are_matched_by_the_names_of_their_devices(comparison, small_scene, truth, flown):

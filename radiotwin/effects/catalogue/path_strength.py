@@ -16,7 +16,7 @@ from radiotwin.effects.arrays import NEPERS, add_power, city_of
 from radiotwin.effects.base import PathEffect, ResidualView
 from radiotwin.effects.params import Allowed, Decibels, EffectParams, Estimate, Parameter, Variation
 from radiotwin.links import Links
-from radiotwin.propagation.laws.followed_paths import paths_of
+from radiotwin.propagation.laws.followed_paths import path_gains
 
 STRENGTHS_DB = (0.0, -4.0, -8.0)  # to begin with, relative to theory
 MAX_LINKS = 60_000  # bounds the time of following paths
@@ -64,7 +64,7 @@ class _Paths(PathEffect):
     @override
     def inputs(self, links: Links) -> np.ndarray:
         city_of(links, self.name)
-        return paths_of(links, self.kinds)
+        return path_gains(links.geometry, self.kinds)
 
     @override
     def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -197,16 +197,7 @@ def drop_uninformative(links: LinkGeometry, level_db: np.ndarray, limit_db: Limi
 
 
 def require_names(what: str, given: Collection[str], expected: Collection[str]) -> None:
-    """Refuse names that are missing, and those that nobody asked for.
-
-    Args:
-        what: has the names, for the message.
-        given: names that are there.
-        expected: names that must be there.
-
-    Raises:
-        ValueError: they differ.
-    """
+    """Raise ValueError where names that are given differ from those that are expected."""
     wrong = sorted(set(given) ^ set(expected))
     if wrong:
         state = "missing" if wrong[0] in expected else "unknown"
@@ -215,18 +206,11 @@ def require_names(what: str, given: Collection[str], expected: Collection[str]) 
 
 def require_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...],
                   low: float, high: float) -> np.ndarray:
-    """Return an array of numbers after a check.
-
-    Args:
-        arrays: by name.
-        name: of the array.
-        shape: None for any length but zero.
-        low: least number.
-        high: greatest number.
+    """Return the array of a name after a check of its shape (None: any length) and its bounds.
 
     Raises:
         KeyError: there is none of that name.
-        ValueError: it has another shape, or a number outside the bounds.
+        ValueError: it has another shape, is empty, or has a number outside the bounds.
     """
     array = arrays[name]
     if array.ndim != len(shape) or 0 in array.shape or any(

@@ -38,9 +38,7 @@ def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> 
         geometry: n links over a map.
         kinds: names of `radiotwin.propagation.paths.PathPowers`' components; None: all.
     """
-    from radiotwin.propagation.paths.powers import (
-        COMPONENTS,  # late, as everywhere here: numba is large
-    )
+    from radiotwin.propagation.paths.powers import COMPONENTS  # late: numba is large
 
     columns = [COMPONENTS.index(kind) for kind in (COMPONENTS if kinds is None else kinds)]
     power = np.zeros(len(geometry))
@@ -67,11 +65,6 @@ def interaction_gains(geometry: LinkGeometry) -> np.ndarray:
         power[rows] = np.column_stack([by_kind[:, which].sum(axis=1) for which in
                                        (direct, ~direct & ~diffracted, diffracted)])
     return power
-
-
-def paths_of(links: Links, kinds: tuple[str, ...]) -> np.ndarray:
-    """Return `path_gains` (n,) of measured links."""
-    return path_gains(links.geometry, kinds)
 
 
 def rays_of(links: Links, end: str) -> np.ndarray:
@@ -211,13 +204,12 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
 
     def follow(number: int) -> _NewPaths:
         position_m, ends_m = asked[number]
-        found = path_powers(city, np.array([position_m]), ends_m, np.zeros(len(ends_m), int),
-                            frequency_hz, "vertical")
+        found = path_powers(city, np.array(position_m), ends_m, frequency_hz)
         powers = np.column_stack([getattr(found, name) for name in COMPONENTS])
         return powers, found.departures.astype(np.float32), found.arrivals.astype(np.float32)
 
     def write(found: _NewPaths) -> Piece:
-        return dict(zip(("powers", "departures", "arrivals"), found, strict=True)), None
+        return dict(zip(_Followed._fields[1:], found, strict=True)), None
 
     def read(arrays: dict[str, np.ndarray], _: Any) -> _NewPaths:
         values = arrays["powers"], arrays["departures"], arrays["arrivals"]
@@ -228,10 +220,9 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
 
     parts: KeptParts[int, _NewPaths] = KeptParts(
         "paths", lambda number: (city, *asked[number], frequency_hz), write, read)
-    names = [parts.name(number) for number in range(len(asked))]
     found = {}
-    for number, (name, (_, ends_m)) in enumerate(zip(names, asked, strict=True)):
-        earlier = parts.find(name) if name else None
+    for number, (_, ends_m) in enumerate(asked):
+        earlier = parts.get(number)
         if earlier is not None and len(earlier[0][0]) == len(ends_m):
             found[number] = earlier[0]
     new = [number for number in range(len(asked)) if number not in found]
@@ -244,8 +235,7 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
 
         # Threads follow, and one keeps: what is kept notes warnings, of which there is one place.
         for number, (value, seconds) in zip(new, in_threads(timed, new), strict=True):
-            if names[number]:
-                parts.keep(names[number], value, [], seconds)
+            parts.put(number, value, [], seconds)
             found[number] = value
     return [found[number] for number in range(len(asked))]
 

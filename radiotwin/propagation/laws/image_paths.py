@@ -6,7 +6,7 @@ the level and error scale of links with, and without, line of sight over such a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -15,6 +15,7 @@ from typing_extensions import override
 
 from radiotwin.inference import student
 from radiotwin.inference.gaussian import Limit, limits_of
+from radiotwin.inference.student import DOF
 from radiotwin.links import LinkGeometry, design_effect
 from radiotwin.propagation.laws.base import (
     ANY_LEVEL_SD_DB,
@@ -26,7 +27,6 @@ from radiotwin.propagation.laws.followed_paths import free_space, interaction_ga
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.published import free_space_db
 
-DOF = 4.0  # of the errors
 BLOCK_M = 100.0  # side of the ground within which the links of a device err alike
 MIN_NLOS = 30  # links without line of sight that the diffuse power is fitted to
 DIFFUSE_DEFAULT = (-150.0, 3.0)  # nearly nothing; the exponent then does not matter
@@ -42,33 +42,13 @@ Offsets = tuple[float, float]
 """Levels of reflected and of diffracted paths above those of the map [dB]."""
 
 
-@dataclass(frozen=True, eq=False)
-class ClassFit:
-    """Level and error scale of links of one class.
-
-    Attributes:
-        numbers: level [dB], and logarithm of the scale where the map's errors do nothing.
-    """
-
-    numbers: np.ndarray
-
-    @property
-    def level_db(self) -> float:
-        """Offset of measured levels from those of the paths [dB]."""
-        return float(self.numbers[0])
-
-    def scale_db(self, square_db: np.ndarray) -> np.ndarray:
-        """Return the scale (n,) [dB] of links that errors of the map change so much (n,) [dB²]."""
-        return scale_db(float(np.exp(self.numbers[1])), square_db)
-
-
 def scale_db(own_db: float | np.ndarray, square_db: np.ndarray) -> np.ndarray:
     """Return the Student-t scale (n,) [dB] of a class's own scale and the map's errors (n,)."""
     return np.sqrt(own_db**2 + square_db * (DOF - 2) / DOF)
 
 
 def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
-              square_db: np.ndarray, start: np.ndarray | None = None) -> ClassFit:
+              square_db: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
     """Fit level and scale to links of one class.
 
     Args:
@@ -77,6 +57,10 @@ def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
         paths: (n,) levels of the followed paths [dB].
         square_db: (n,) mean square of what the map's errors do [dB²].
         start: of an earlier fit.
+
+    Returns:
+        (2,) offset of measured levels from those of the paths [dB], and logarithm of the scale
+        where the map's errors do nothing.
     """
     if start is None:
         seen = np.isfinite(level_db)
@@ -88,7 +72,7 @@ def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
                                           scale_db(own_db, square_db), DOF).sum())
 
     found = minimize(nll, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02})
-    return ClassFit(np.array([found.x[0], np.clip(found.x[1], -3, 4)]))
+    return np.array([found.x[0], np.clip(found.x[1], -3, 4)])
 
 
 class LinkFit:
@@ -123,10 +107,11 @@ class LinkFit:
             mine = los == state
             if not np.isfinite(self.level_db[mine]).any():
                 continue
-            fit = fit_class(self.level_db[mine], self.limits_db[mine], paths_db[mine],
-                            square_db[mine], self._start.get(state))
-            self._start[state] = fit.numbers
-            mean_db, sd_db = paths_db[mine] + fit.level_db, fit.scale_db(square_db[mine])
+            offset_db, log_own = self._start[state] = fit_class(
+                self.level_db[mine], self.limits_db[mine], paths_db[mine], square_db[mine],
+                self._start.get(state))
+            mean_db = paths_db[mine] + offset_db
+            sd_db = scale_db(float(np.exp(log_own)), square_db[mine])
             nll[mine] = student.censored_nll(self.level_db[mine], self.limits_db[mine], mean_db,
                                              sd_db, DOF)
             z[mine] = np.nan_to_num((self.level_db[mine] - mean_db) / sd_db)
@@ -198,7 +183,7 @@ class ImagePaths(ChannelModel):
 
         def loss(numbers: np.ndarray) -> float:
             inside = _within_bounds(numbers, near_m, links.frequency_hz)
-            error_db = level_db - with_diffuse_db(power, nlos.distance_m, *inside)
+            error_db = level_db - _with_diffuse_db(power, nlos.distance_m, *inside)
             error_db = error_db - np.median(error_db[known & ~blank])
             error_db = np.where(blank, np.minimum(error_db, 0.0), error_db)[known]
             misfit = np.log1p((error_db / ERROR_SCALE_DB) ** 2).sum()
@@ -217,17 +202,12 @@ class ImagePaths(ChannelModel):
 
     def level_db(self, power: np.ndarray, links: LinkGeometry) -> np.ndarray:
         """Return the mean level (n,) [dB] of links whose paths carry these powers (n,)."""
-        return with_diffuse_db(power, links.distance_m, *self.diffuse)
+        return _with_diffuse_db(power, links.distance_m, *self.diffuse)
 
     @property
     @override
     def quick(self) -> ChannelModel:
         return self.law
-
-    @property
-    @override
-    def trend(self) -> ChannelModel:
-        return self
 
     @override
     def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
@@ -236,14 +216,6 @@ class ImagePaths(ChannelModel):
         columns = np.column_stack([los, ~los, los * slope, ~los * slope])
         return columns.astype(float), np.array([ANY_LEVEL_SD_DB] * 2 + [LOS_SLOPE_SD_DB,
                                                                          NLOS_SLOPE_SD_DB])
-
-    @override
-    def error_group(self, links: LinkGeometry) -> np.ndarray:
-        return links.los.astype(int)
-
-    @override
-    def error_groups(self, links: LinkGeometry) -> int:
-        return 2
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -287,16 +259,11 @@ def stored_diffuse(value: Any) -> tuple[float, float]:
 
 
 def _within_bounds(numbers: np.ndarray, near_m: float, frequency_hz: float) -> np.ndarray:
-    """Return the diffuse power (2,) that is nearest and weaker than a way in free space.
+    """Return the nearest diffuse power (2,) that is weaker than free space from a distance on [m].
 
     A level of links without line of sight is fitted beside it. Where paths bring nothing that
     readings show, diffuse power above that of free space would take their place, and then that of
     the links with line of sight.
-
-    Args:
-        numbers: (2,) gain at 100 m [dB] and exponent.
-        near_m: distance from which on it is to be weaker [m], 100 m or less.
-        frequency_hz: of the radio [Hz].
     """
     gain_db, exponent = np.clip(numbers, *DIFFUSE_BOUNDS)
     most_db = -free_space_db(np.array(100.0), frequency_hz) - MIN_LOSS_DB \
@@ -304,16 +271,9 @@ def _within_bounds(numbers: np.ndarray, near_m: float, frequency_hz: float) -> n
     return np.array([np.clip(gain_db, None, most_db), exponent])
 
 
-def with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,
+def _with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,
                     exponent: float) -> np.ndarray:
-    """Return the level (n,) [dB] of followed and diffuse power together.
-
-    Args:
-        power: (n,) of the followed paths, linear.
-        distance_m: (n,) [m].
-        gain_db: of the diffuse power at 100 m [dB].
-        exponent: of its fall with distance.
-    """
+    """Return the level (n,) [dB] of followed power (n,), linear, and of diffuse power."""
     return 10 * np.log10(power + 10 ** (gain_db / 10) * (distance_m / 100.0) ** -exponent)
 
 
@@ -372,4 +332,4 @@ def _level_db(gains: np.ndarray, distance_m: np.ndarray, diffuse: tuple[float, f
               offsets_db: Offsets | np.ndarray) -> np.ndarray:
     """Return the level (n,) [dB] of `interaction_gains` (n, 3) and diffuse power."""
     factor = 10 ** (np.array([0.0, *offsets_db]) / 10)
-    return with_diffuse_db(gains @ factor, distance_m, *diffuse)
+    return _with_diffuse_db(gains @ factor, distance_m, *diffuse)

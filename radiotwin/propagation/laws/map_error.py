@@ -11,6 +11,7 @@ it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Self
 
 import numpy as np
@@ -60,7 +61,7 @@ WARN_OFFSET_DB = 3.0
 
 
 @dataclass(frozen=True)
-class Sizes:
+class _Sizes:
     """Errors of walls and roofs.
 
     Attributes:
@@ -75,116 +76,68 @@ class Sizes:
     as_one: float
 
 
-def estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
-                   diffuse: tuple[float, float], offsets_db: Offsets, seed: int) -> Sizes:
-    """Estimate the errors of walls and roofs.
+def _estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+                    diffuse: tuple[float, float], offsets_db: Offsets, seed: int) -> _Sizes:
+    """Estimate the errors of walls and roofs from links to devices of known position."""
+    power, fit = (diffuse, offsets_db), LinkFit(level_db, limit_db)
+    base_db = paths_db(links, *power)
 
-    Args:
-        links: n links over a map, to devices whose positions are known.
-        level_db: (n,) [dB]; NaN: not detected.
-        limit_db: below which levels are not detected [dB], one for all or (n,); None: unknown.
-        diffuse: power beside the paths, see `ImagePaths`.
-        offsets_db: see `Offsets`.
-        seed: of the maps' errors.
-    """
-    spread = _Spread(links, diffuse, offsets_db, seed)
-    fit = LinkFit(level_db, limit_db)
-    reached = [1, 1]
-    while True:  # larger errors are followed only where they may be
-        profile = _profile(spread, reached, fit)
-        at_end = [places[-1] == STEPS * last and last < len(WALL_SIZES_M) - 1
-                  for places, last in zip(profile.likely(links), reached, strict=True)]
-        if not any(at_end):
-            return profile.sizes(links)
-        reached = [last + wider for last, wider in zip(reached, at_end, strict=True)]
+    @cache
+    def square_db(wall_m: float, height_m: float) -> np.ndarray:
+        return _mean_square_db(links, base_db, power, (wall_m, height_m), seed)
 
-
-class _Spread:
-    """Mean square of what errors of a map do to links, by the size of the errors."""
-
-    def __init__(self, links: LinkGeometry, diffuse: tuple[float, float], offsets_db: Offsets,
-                 seed: int) -> None:
-        self.links, self._seed = links, seed
-        self._power = diffuse, offsets_db
-        self.base_db = paths_db(links, *self._power)
-        nothing = np.zeros(len(links))
-        self._known: dict[tuple[float, float], np.ndarray] = {(0.0, 0.0): nothing}
-
-    def square_db(self, wall: float, height: float) -> np.ndarray:
-        """Return the mean square (n,) [dB²] at places on the scales of sizes, such as 1.5."""
-        walls, heights = ([(size, 0.0) for size in WALL_SIZES_M],
-                          [(0.0, size) for size in HEIGHT_SIZES_M])
-        return self._between(walls, wall) + self._between(heights, height)
-
-    def _between(self, sizes: list[tuple[float, float]], at: float) -> np.ndarray:
+    def between(sizes: list[tuple[float, float]], at: float) -> np.ndarray:
         low = min(int(at), len(sizes) - 2)
         share = at - low
         if not share:
-            return self._at(sizes[low])
-        return (1 - share) * self._at(sizes[low]) + share * self._at(sizes[low + 1])
+            return square_db(*sizes[low])
+        return (1 - share) * square_db(*sizes[low]) + share * square_db(*sizes[low + 1])
 
-    def _at(self, size: tuple[float, float]) -> np.ndarray:
-        if size not in self._known:
-            city = self.links.city
-            assert city is not None
-            changes = []
-            with progress("following paths over wrong maps", total=MEMBERS) as advance:
-                for member in range(MEMBERS):
-                    wrong = perturbed_map(city, *size, self._seed + member)
-                    there = replace(self.links, city=wrong)  # line of sight stays the map's
-                    changes.append(paths_db(there, *self._power) - self.base_db)
-                    advance(1)
-            self._known[size] = np.mean(np.square(changes), axis=0)
-        return self._known[size]
-
-
-@dataclass(frozen=True, eq=False)
-class _Profile:
-    """Likelihood of sizes of errors.
-
-    Attributes:
-        nll: (walls, heights) on the scales of sizes, `STEPS` to a followed one [nats].
-        best: row and column of the least.
-        z: (n,) residuals over their scale at the best.
-    """
-
-    nll: np.ndarray
-    best: tuple[int, int]
-    z: np.ndarray
-
-    def likely(self, links: LinkGeometry) -> list[np.ndarray]:
-        """Return the places within the 90 % interval on both scales."""
-        enough = INTERVAL_NATS * links_as_one(links, self.z)
-        return [np.flatnonzero(self.nll.min(axis=1 - axis) - self.nll.min() <= enough)
-                for axis in range(2)]
-
-    def sizes(self, links: LinkGeometry) -> Sizes:
-        """Return the most likely sizes with their intervals."""
-        wall_m, height_m = (self._size(*each) for each in zip(
-            self.best, self.likely(links), (WALL_SIZES_M, HEIGHT_SIZES_M), strict=True))
-        return Sizes(wall_m, height_m, float(self.nll.min()), links_as_one(links, self.z))
-
-    @staticmethod
-    def _size(best: int, places: np.ndarray, scale_m: tuple[float, ...]) -> Size:
-        """Return estimate and interval [m]; the ends are within a step of the last likely place."""
-        three = np.array([best, places[0] - 1, places[-1] + 1]) / STEPS
-        size, low, high = np.interp(three, np.arange(len(scale_m)), scale_m).tolist()
-        return size, low, high
-
-
-def _profile(spread: _Spread, reached: list[int], fit: LinkFit) -> _Profile:
-    """Try all sizes up to the places `reached` on both scales."""
-    walls, heights = (range(STEPS * last + 1) for last in reached)
-    nll, best, best_z = np.full((len(walls), len(heights)), np.inf), np.inf, fit.level_db
-    for wall in walls:
-        for height in heights:
-            square_db = spread.square_db(wall / STEPS, height / STEPS)
-            each, z = fit.fit(spread.links.los, spread.base_db, square_db)
+    reached = [1, 1]  # places on both scales
+    while True:
+        nll, z = np.full([STEPS * last + 1 for last in reached], np.inf), level_db
+        for wall, height in np.ndindex(*nll.shape):
+            of_walls = between([(size, 0.0) for size in WALL_SIZES_M], wall / STEPS)
+            of_heights = between([(0.0, size) for size in HEIGHT_SIZES_M], height / STEPS)
+            each, its_z = fit.fit(links.los, base_db, of_walls + of_heights)
+            if each.sum() < nll.min():
+                z = its_z
             nll[wall, height] = each.sum()
-            if nll[wall, height] < best:
-                best, best_z = nll[wall, height], z
-    row, column = np.unravel_index(nll.argmin(), nll.shape)
-    return _Profile(nll, (int(row), int(column)), best_z)
+        as_one = links_as_one(links, z)
+        likely = [np.flatnonzero(nll.min(axis=1 - axis) - nll.min() <= INTERVAL_NATS * as_one)
+                  for axis in range(2)]
+        # Larger errors are followed only where they may be.
+        at_end = [places[-1] == STEPS * last and last < len(WALL_SIZES_M) - 1
+                  for places, last in zip(likely, reached, strict=True)]
+        if not any(at_end):
+            best = np.unravel_index(nll.argmin(), nll.shape)
+            wall_m, height_m = (_size(*each) for each in zip(
+                best, likely, (WALL_SIZES_M, HEIGHT_SIZES_M), strict=True))
+            return _Sizes(wall_m, height_m, float(nll.min()), as_one)
+        reached = [last + wider for last, wider in zip(reached, at_end, strict=True)]
+
+
+def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
+                    power: tuple[tuple[float, float], Offsets], size_m: tuple[float, float],
+                    seed: int) -> np.ndarray:
+    """Return the mean square (n,) [dB²] of what errors of walls and heights do to levels (n,)."""
+    city = links.city
+    if city is None or not any(size_m):
+        return np.zeros(len(links))
+    changes = []
+    with progress("following paths over wrong maps", total=MEMBERS) as advance:
+        for member in range(MEMBERS):
+            there = replace(links, city=perturbed_map(city, *size_m, seed + member))
+            changes.append(paths_db(there, *power) - base_db)  # line of sight stays the map's
+            advance(1)
+    return np.mean(np.square(changes), axis=0)
+
+
+def _size(best: np.intp, places: np.ndarray, scale_m: tuple[float, ...]) -> Size:
+    """Return estimate and interval [m]; the ends are within a step of the last likely place."""
+    three = np.array([best, places[0] - 1, places[-1] + 1]) / STEPS
+    size, low, high = np.interp(three, np.arange(len(scale_m)), scale_m).tolist()
+    return size, low, high
 
 
 def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, seed: int
@@ -215,11 +168,11 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
     device = np.unique(links.device, return_inverse=True)[1]
     if device.max() + 1 < MIN_DEVICES:
         return NO_SHIFT
-    search = _Search(links, level_db, limits_db)
+    diffuse = ImagePaths().fit_diffuse(links, level_db, limits_db).diffuse
     with progress("looking for a shift of the map", total=None):
-        best = search.best()
-    shifts = np.array(list(search.nll))
-    by_device = np.array([np.bincount(device, nll) for nll in search.nll.values()])
+        tried = _try_shifts(links, LinkFit(level_db, limits_db), diffuse)
+    best, shifts = _likeliest(tried), np.array(list(tried))
+    by_device = np.array([np.bincount(device, nll) for nll in tried.values()])
     # Of each device: the best shift for the others, and what it gains by that.
     without = (by_device.sum(axis=1)[:, None] - by_device).argmin(axis=0)
     gains = by_device[0] - by_device[without, np.arange(len(without))]
@@ -228,8 +181,7 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
     chance = ttest_1samp(roots, 0, alternative="greater").pvalue
     if np.hypot(*best) < SEEN_SHIFT_M or not chance < SURE:
         return NO_SHIFT
-    diffuse, offsets_db = search.diffuse, (0.0, 0.0)
-    here, there = (estimate_sizes(each, level_db, limits_db, diffuse, offsets_db, seed)
+    here, there = (_estimate_sizes(each, level_db, limits_db, diffuse, (0.0, 0.0), seed)
                    for each in (links, moved(links, *best)))
     if here.nll - there.nll < SURE_NATS * there.as_one:  # walls that are off explain as much
         return NO_SHIFT
@@ -239,45 +191,35 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
     return best[0], best[1], max(radius_m, STEPS_M[-1])
 
 
-class _Search:
-    """Shifts that were tried.
+def _try_shifts(links: LinkGeometry, fit: LinkFit, diffuse: tuple[float, float]
+                ) -> dict[tuple[float, float], np.ndarray]:
+    """Return shifts, no shift first, and the negative log-likelihood of each link (n,) [nats].
 
-    Attributes:
-        diffuse: power beside the paths.
-        nll: shift -> negative log-likelihood of each link (n,) [nats]; the first is no shift.
+    Those on rings, and from the best one in steps to what is better.
     """
+    tried: dict[tuple[float, float], np.ndarray] = {}
 
-    def __init__(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit) -> None:
-        self._links, self._fit = links, LinkFit(level_db, limit_db)
-        self.diffuse = ImagePaths().fit_diffuse(links, level_db, limit_db).diffuse
-        self.nll: dict[tuple[float, float], np.ndarray] = {}
-
-    def best(self) -> tuple[float, float]:
-        """Return the best of the rings, or what is better in steps from there."""
-        self._try(0.0, 0.0)
-        for radius_m in RINGS_M:
-            for angle_rad in np.arange(8) * np.pi / 4:
-                self._try(radius_m * np.cos(angle_rad), radius_m * np.sin(angle_rad))
-        best = self._least()
-        for step_m in STEPS_M:
-            while True:
-                for east, north in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-                    self._try(best[0] + step_m * east, best[1] + step_m * north)
-                better = self._least()
-                if better == best:
-                    break
-                best = better
-        return best
-
-    def _least(self) -> tuple[float, float]:
-        return min(self.nll, key=lambda shift: self.nll[shift].sum())
-
-    def _try(self, east_m: float, north_m: float) -> None:
+    def look(east_m: float, north_m: float) -> None:
         shift = round(float(east_m), 3), round(float(north_m), 3)
-        if shift in self.nll or np.hypot(*shift) > MAX_SHIFT_M:
-            return
-        over = moved(self._links, *shift)
-        self.nll[shift], _ = self._fit.fit(over.los, paths_db(over, self.diffuse))
+        if shift not in tried and np.hypot(*shift) <= MAX_SHIFT_M:
+            over = moved(links, *shift)
+            tried[shift], _ = fit.fit(over.los, paths_db(over, diffuse))
+
+    look(0.0, 0.0)
+    for radius_m in RINGS_M:
+        for angle_rad in np.arange(8) * np.pi / 4:
+            look(radius_m * np.cos(angle_rad), radius_m * np.sin(angle_rad))
+    for step_m in STEPS_M:
+        best = None
+        while best != (better := _likeliest(tried)):
+            best = better
+            for east, north in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+                look(best[0] + step_m * east, best[1] + step_m * north)
+    return tried
+
+
+def _likeliest(tried: dict[tuple[float, float], np.ndarray]) -> tuple[float, float]:
+    return min(tried, key=lambda shift: tried[shift].sum())
 
 
 @dataclass(frozen=True)
@@ -390,5 +332,5 @@ def estimate_other_errors(links: LinkGeometry, level_db: np.ndarray, limit_db: L
     rows = np.sort(rng.choice(known, min(LINKS, len(known)), replace=False))
     links, level_db, limits_db = links.select(rows), level_db[rows], limits_db[rows]
     offsets_db = fit_offsets(links, level_db, limits_db, diffuse)
-    sizes = estimate_sizes(links, level_db, limits_db, diffuse, offsets_db, seed)
+    sizes = _estimate_sizes(links, level_db, limits_db, diffuse, offsets_db, seed)
     return MapError(sizes.wall_m, sizes.height_m, offsets_db=offsets_db), diffuse

@@ -9,6 +9,7 @@ import numpy as np
 from typing_extensions import override
 
 from radiotwin.inference.gaussian import Limit, standardised
+from radiotwin.inference.student import DOF
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.base import (
     MAX_DB,
@@ -21,7 +22,6 @@ from radiotwin.propagation.laws.base import (
 )
 from radiotwin.propagation.laws.image_paths import (
     DIFFUSE_DEFAULT,
-    DOF,
     fit_class,
     paths_db,
     scale_db,
@@ -92,7 +92,8 @@ class PathKriging(ChannelModel):
         links, level_db, limit_db = links.select(sure), level_db[sure], limit_db[sure]
         paths = self._over_maps(links)
         self._fit_classes(links, level_db, limit_db, *paths)
-        self._fit_field(links, level_db, limit_db, *paths)
+        residual = standardised(level_db, *self._at_paths(links, *paths), limit_db)
+        self.field.fit(links.device, links.receiver_m, residual, seed)
         self.weight = self._held_out_weight(links, level_db, limit_db, *paths)
         return self
 
@@ -102,7 +103,9 @@ class PathKriging(ChannelModel):
         mean_db, sd_db = self.kriging.predict(links)
         sure = np.flatnonzero(~np.isin(links.device, self.lost))
         followed = links.select(sure)
-        by_paths = self._with_field(self.field, followed, *self._over_maps(followed))
+        by_map_db, by_map_sd_db = self._at_paths(followed, *self._over_maps(followed))
+        shift, left = self.field.predict(followed.device, followed.receiver_m)
+        by_paths = by_map_db + by_map_sd_db * shift, by_map_sd_db * left
         share = self.weight[followed.los.astype(int)]
         mean_db[sure], sd_db[sure] = _mixture(share, by_paths, (mean_db[sure], sd_db[sure]))
         return mean_db, sd_db
@@ -136,8 +139,9 @@ class PathKriging(ChannelModel):
         for los in (False, True):
             mine = links.los == los
             if heard[los]:
-                fit = fit_class(level_db[mine], limit_db[mine], mean_db[mine], square_db[mine])
-                self.classes[int(los)] = fit.level_db, np.exp(fit.numbers[1])
+                offset_db, log_own = fit_class(level_db[mine], limit_db[mine], mean_db[mine],
+                                               square_db[mine])
+                self.classes[int(los)] = offset_db, np.exp(log_own)
         for los in (False, True):
             if not heard[los]:  # nothing is known of it but what the other shows
                 self.classes[int(los)] = self.classes[1 - int(los)]
@@ -147,18 +151,6 @@ class PathKriging(ChannelModel):
         """Return mean and standard deviation (n,) [dB] without what is interpolated."""
         level_db, own_db = self.classes[links.los.astype(int)].T
         return mean_db + level_db, SPREAD_FACTOR * scale_db(own_db, square_db)
-
-    def _fit_field(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
-                   mean_db: np.ndarray, square_db: np.ndarray) -> None:
-        mean_db, sd_db = self._at_paths(links, mean_db, square_db)
-        residual = standardised(level_db, mean_db, sd_db, limit_db)
-        self.field.fit(links.device, links.receiver_m, residual, self.seed)
-
-    def _with_field(self, field: ResidualField, links: LinkGeometry, mean_db: np.ndarray,
-                    square_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        mean_db, sd_db = self._at_paths(links, mean_db, square_db)
-        mean, sd = field.predict(links.device, links.receiver_m)
-        return mean_db + sd_db * mean, sd_db * sd
 
     def _held_out_weight(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                          mean_db: np.ndarray, square_db: np.ndarray) -> np.ndarray:

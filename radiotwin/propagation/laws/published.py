@@ -151,7 +151,7 @@ class PublishedLaw(ChannelModel):
             odd = (value < least) | (value > most)
             if not odd.any():
                 continue
-            ends = sorted({shortly(value[odd].min()), shortly(value[odd].max())}, key=_value)
+            ends = dict.fromkeys((shortly(value[odd].min()), shortly(value[odd].max())))
             share = "" if (value == value[0]).all() and odd.all() else f" in {percent(odd.mean())}"
             ranges = sorted(set(zip(least[odd].tolist(), most[odd].tolist(), strict=True)))
             published = " or ".join(_range(*each) for each in ranges)
@@ -247,10 +247,6 @@ def _range(least: float, most: float) -> str:
     if np.isinf(most):
         return f"{least:g} and more"
     return f"{least:g} to {most:g}"
-
-
-def _value(text: str) -> float:
-    return float(text.replace(",", ""))
 
 
 class WalfischIkegami(PublishedLaw):

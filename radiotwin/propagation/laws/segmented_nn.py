@@ -16,6 +16,7 @@ import torch
 from typing_extensions import override
 
 from radiotwin.inference.gaussian import Limit, fit_sd_db, gaussian_nll_torch
+from radiotwin.inference.held_out import deal_groups
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.adam import Adam
 from radiotwin.propagation.laws.base import (
@@ -109,6 +110,7 @@ def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
     return weights
 
 
+@one_thread()
 def train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Train all members and keep the weights of each that were best on its held-out links.
 
@@ -123,12 +125,7 @@ def train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.ndar
         weights by name, (MEMBERS, ...) each, and for every link the output (n,) of the member that
         it was held out from.
     """
-    with one_thread():
-        return _train(data, torch.Generator().manual_seed(seed))
-
-
-def _train(data: TrainingData,
-           generator: torch.Generator) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    generator = torch.Generator().manual_seed(seed)
     inputs = torch.as_tensor(data.inputs, dtype=torch.float32)
     target = torch.as_tensor(data.target, dtype=torch.float32)
     censored, fold = torch.as_tensor(data.censored), torch.as_tensor(data.fold)
@@ -338,17 +335,11 @@ def _coordinates(links: LinkGeometry) -> np.ndarray:
 
 
 def _folds(links: LinkGeometry, rng: np.random.Generator) -> np.ndarray:
-    """Return the member (n,) that each link is held out from, of about equal numbers of links.
+    """Return the member (n,) that each link is held out from.
 
     Whole blocks of one device and BLOCK_M of ground go together: neighbouring links share their
     obstacles, so that a member would be validated on what it has learned already.
     """
     cell = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
-    blocks, block, count = np.unique(np.column_stack([links.device, cell]), axis=0,
-                                     return_inverse=True, return_counts=True)
-    fold = np.empty(len(blocks), np.int64)
-    load = np.zeros(MEMBERS)
-    for b in sorted(rng.permutation(len(blocks)), key=lambda b: -count[b]):
-        fold[b] = load.argmin()
-        load[fold[b]] += count[b]
-    return fold[block.ravel()]
+    block = np.unique(np.column_stack([links.device, cell]), axis=0, return_inverse=True)[1]
+    return deal_groups(block.ravel(), MEMBERS, rng)

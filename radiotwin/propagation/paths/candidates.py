@@ -24,14 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from radiotwin.propagation.paths.facets import (
-    Edges,
-    Facets,
-    build_topology,
-    expand,
-    extract_edges,
-    extract_facets,
-)
+from radiotwin.propagation.paths.facets import Edges, Facets, expand, facets_and_edges
 from radiotwin.propagation.paths.images import (
     MAX_INTERACTIONS,
     Candidates,
@@ -82,21 +75,10 @@ class Ways(NamedTuple):
     source_m: np.ndarray
 
 
-def open_ways(
+def _open_ways(
     city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
 ) -> Ways:
-    """Keep the ways on which nothing blocks every point of the edge.
-
-    Args:
-        city: 3D map.
-        surfaces: of the map.
-        before: (w, a) facets before the edge; then -1.
-        edge: (w,) rows of the edges.
-        device_m: (3,) position of the device [m].
-
-    Returns:
-        Those of the ways that the device sees the edge by.
-    """
+    """Return those of ways (w,) to edges by which the device, at (3,) [m], sees a point of one."""
     lit_m, source_m, samples = _lit_parts(surfaces, before, edge, device_m)
     points = PathBuffer.allocate(SAMPLE_CHUNK + int(samples.max(initial=0)))
     one_by_one = Candidates(before, np.full(len(edge), -1), before[:, :0])
@@ -177,22 +159,14 @@ def _sample(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def with_facets_after(
+def _with_facets_after(
     surfaces: Surfaces, ways: Ways, first: np.ndarray, end: np.ndarray, after: np.ndarray,
     depth: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Combine each way to an edge with the sequences of facets after it that rays can reach.
 
-    Args:
-        surfaces: of the map.
-        ways: to edges.
-        first: (e,) first row in `after` of each edge.
-        end: (e,) the row after its last one.
-        after: (m, b) facets after the edge; then -1.
-        depth: maximum number of interactions.
-
-    Returns:
-        (c,) row of the way, and (c,) row of `after`.
+    Those of edge e are the rows `first[e]` to `end[e]` of `after` (m, b). Returns the row of the
+    way (c,), and that of `after` (c,).
     """
     total = 0
     for way in range(len(ways.edge)):
@@ -230,7 +204,7 @@ class FacetSequences:
 
 
 @lru_cache(maxsize=4)
-def sphere(count: int) -> np.ndarray:
+def _sphere(count: int) -> np.ndarray:
     """Return (count, 3) unit vectors of a Fibonacci lattice (Gonzalez, Math. Geosci. 42, 2010)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
@@ -240,47 +214,13 @@ def sphere(count: int) -> np.ndarray:
     return vectors
 
 
-def device_sequences(
-    city: CityMap, facets: Facets, normal: np.ndarray, device_m: np.ndarray, depth: int,
-    rays: int = DEVICE_RAYS,
-) -> FacetSequences:
-    """Find the sequences of facets that rays from a device visit.
-
-    Args:
-        city: 3D map.
-        facets: of the city.
-        normal: (f + 1, 3) of `Surfaces`.
-        device_m: (3,) position [m].
-        depth: maximum number of facets of a sequence.
-        rays: that are shot.
-
-    Returns:
-        The sequences of up to `depth` facets.
-    """
-    direction = sphere(rays)
-    start_m = np.broadcast_to(device_m, direction.shape)
-    return _shoot(city, facets, normal, start_m, direction, np.zeros(len(direction), dtype=int), 1,
-                  depth)
-
-
-def edge_sequences(
+def _edge_sequences(
     city: CityMap, facets: Facets, normal: np.ndarray, edges: Edges, rows: np.ndarray, depth: int
 ) -> FacetSequences:
-    """Find the sequences of facets that rays from edges visit.
+    """Find the sequences of up to `depth` facets that rays from some edges (n,) visit.
 
     Rays start at most 20 m apart along an edge. The surroundings of an edge are seen from many
     starts, so fewer rays do than from a device.
-
-    Args:
-        city: 3D map.
-        facets: of the city.
-        normal: (f + 1, 3) of `Surfaces`.
-        edges: of the city.
-        rows: (n,) rows of `edges`: the sources.
-        depth: maximum number of facets of a sequence.
-
-    Returns:
-        The sequences of up to `depth` facets.
     """
     offset_m = (edges.end_m - edges.start_m)[rows]
     starts = np.maximum(np.ceil(np.linalg.norm(offset_m, axis=1) / 20.0).astype(int), 1)
@@ -290,7 +230,7 @@ def edge_sequences(
     share = (within + 0.5) / starts[source]
     start_m = edges.start_m[rows[source]] + share[:, None] * offset_m[source] \
         + SKIN_M * outward[source]
-    direction = sphere(EDGE_RAYS)
+    direction = _sphere(EDGE_RAYS)
     is_open = np.maximum(edges.normal_0[rows] @ direction.T, edges.normal_n[rows] @ direction.T) > 0
     at, ray = np.nonzero(is_open[source])
     return _shoot(city, facets, normal, start_m[at], direction[ray], source[at], len(rows), depth)
@@ -372,9 +312,7 @@ class CandidateSearch:
     """
 
     def __init__(self, city: CityMap, depth: int) -> None:
-        topology = build_topology(city)
-        self.facets = extract_facets(city, topology)
-        self.edges = extract_edges(city, self.facets, topology)
+        self.facets, self.edges = facets_and_edges(city)
         self.surfaces = pack(self.facets, self.edges, city.terrain is None)
         self.is_ground = np.zeros(len(self.facets) + 1, dtype=bool)
         self.is_ground[-1] = True
@@ -417,18 +355,20 @@ class CandidateSearch:
 
     def _find(self, device_m: np.ndarray, rays: int) -> Candidates:
         normal, offset_m = self.surfaces.planes[:, :3], self.surfaces.planes[:, OFFSET]
-        sequences = device_sequences(self._city, self.facets, normal, device_m, self._depth,
-                                     rays)
+        direction = _sphere(rays)
+        sequences = _shoot(self._city, self.facets, normal,
+                           np.broadcast_to(device_m, direction.shape), direction,
+                           np.zeros(rays, dtype=int), 1, self._depth)
         facing = np.flatnonzero(normal @ device_m > offset_m)
         single = np.full((len(facing), self._depth), -1)
         single[:, 0] = facing
         reflections = np.unique(np.concatenate([sequences.facets[sequences.order > 0], single]),
                                 axis=0)
-        ways = open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
+        ways = _open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
         with self._one_at_a_time:
             self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
             after = self._after  # others replace it, its rows stay
-        way, row = with_facets_after(self.surfaces, ways, self._first_after, self._end_after,
+        way, row = _with_facets_after(self.surfaces, ways, self._first_after, self._end_after,
                                      after, self._depth)
         none = np.full((len(reflections), self._depth), -1)
         return Candidates(np.concatenate([reflections, ways.before[way]]),
@@ -453,8 +393,8 @@ class CandidateSearch:
         """Find the sequences of facets after edges (n,)."""
         for start in range(0, len(edges), EDGE_CHUNK):
             part = edges[start:start + EDGE_CHUNK]
-            found = edge_sequences(self._city, self.facets, self.surfaces.planes[:, :3],
-                                   self.edges, part, self._depth - 1)
+            found = _edge_sequences(self._city, self.facets, self.surfaces.planes[:, :3],
+                                    self.edges, part, self._depth - 1)
             order = np.argsort(found.source, kind="stable")
             bounds = np.searchsorted(found.source[order], np.arange(len(part) + 1))
             self._first_after[part] = len(self._after) + bounds[:-1]

@@ -24,7 +24,6 @@ from scipy.spatial import cKDTree
 
 from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.vectors import cross, dot
-from radiotwin.propagation.paths.vectors import cross as cross_product
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import CityMap
 
@@ -60,17 +59,10 @@ class Topology:
     group: np.ndarray
 
 
-def build_topology(city: CityMap) -> Topology:
+def _topology(city: CityMap) -> Topology:
     """Weld the corners of a city, split its triangles' sides and sort the segments.
 
-    Args:
-        city: 3D map.
-
-    Returns:
-        The topology of all faces but those of a flat ground, within 5 cm of z = 0.
-
-    Raises:
-        BadInput: a corner is not finite.
+    Of all faces but those of a flat ground, within 5 cm of z = 0.
     """
     if not np.isfinite(city.vertices).all():
         raise BadInput("the city has corners that are not finite numbers [m]; repair its meshes")
@@ -105,11 +97,11 @@ def _weld(vertices_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _normals_and_heights(triangle_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return unit normals (n, 3) and smallest heights (n,) [m] of triangles (n, 3, 3)."""
-    cross = np.cross(triangle_m[:, 1] - triangle_m[:, 0], triangle_m[:, 2] - triangle_m[:, 0])
-    twice_area = np.linalg.norm(cross, axis=1)
+    outward = np.cross(triangle_m[:, 1] - triangle_m[:, 0], triangle_m[:, 2] - triangle_m[:, 0])
+    twice_area = np.linalg.norm(outward, axis=1)
     sides_m = np.linalg.norm(triangle_m - np.roll(triangle_m, 1, axis=1), axis=2)
     longest_m = np.maximum(sides_m.max(axis=1), 1e-12)
-    return cross / np.maximum(twice_area, 1e-12)[:, None], twice_area / longest_m
+    return outward / np.maximum(twice_area, 1e-12)[:, None], twice_area / longest_m
 
 
 def _split(vertices_m: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -193,29 +185,17 @@ class Facets:
         return len(self.normal)
 
 
-def extract_facets(city: CityMap, topology: Topology | None = None) -> Facets:
-    """Merge the triangles of a city to facets; faces on flat ground, z = 0, are left out.
-
-    Args:
-        city: 3D map.
-        topology: of this city; None: built here.
-
-    Returns:
-        The facets, in the order of their first triangle.
-
-    Raises:
-        BadInput: a corner is not finite.
-    """
-    topology = topology or build_topology(city)
+def _facets(city: CityMap, topology: Topology) -> Facets:
+    """Merge triangles to facets, in the order of their first triangle."""
     material = city.material[topology.source]
     label = _coplanar_groups(topology, material)
     count = int(label.max()) + 1 if len(label) else 0
     order = np.argsort(label, kind="stable")
     first = np.searchsorted(label[order], np.arange(count + 1))
     corners_m = topology.vertices_m[topology.triangles[order]]
-    cross = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    outward = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
     normal, origin_m, axis_u, axis_v, size_m, full = np.split(
-        _frames(corners_m, cross, first), [3, 6, 9, 12, 14], axis=1)
+        _frames(corners_m, outward, first), [3, 6, 9, 12, 14], axis=1)
     of_row = label[order]
     offset_m = corners_m - origin_m[of_row, None]
     uv_m = np.stack([np.einsum("ikj,ij->ik", offset_m, axis[of_row]) for axis in (axis_u, axis_v)],
@@ -248,14 +228,14 @@ def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _frames(corners_m: np.ndarray, cross: np.ndarray, first: np.ndarray) -> np.ndarray:
+def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np.ndarray:
     """Return the planes of facets and their smallest bounding rectangles.
 
     A rectangle is tried along the `TRIED_SIDES` longest sides of a facet's triangles.
 
     Args:
         corners_m: (t, 3, 3) triangles, facet after facet [m].
-        cross: (t, 3) outward normals of the triangles, twice as long as their areas [m²].
+        outward: (t, 3) outward normals of the triangles, twice as long as their areas [m²].
         first: (f + 1,) first triangle of each facet.
 
     Returns:
@@ -264,7 +244,7 @@ def _frames(corners_m: np.ndarray, cross: np.ndarray, first: np.ndarray) -> np.n
     out = np.empty((len(first) - 1, 15))
     for facet in range(len(first) - 1):
         points_m = corners_m[first[facet]:first[facet + 1]].copy().reshape(-1, 3)
-        weight = cross[first[facet]:first[facet + 1]]
+        weight = outward[first[facet]:first[facet + 1]]
         normal = weight.sum(axis=0)
         area_m2 = np.sqrt(dot(normal, normal)) / 2.0
         normal = normal / (2.0 * area_m2)
@@ -280,7 +260,7 @@ def _frames(corners_m: np.ndarray, cross: np.ndarray, first: np.ndarray) -> np.n
         for k in longest:
             along = sides[k] - dot(sides[k], normal) * normal
             along = along / np.sqrt(dot(along, along))
-            across = cross_product(normal, along)
+            across = cross(normal, along)
             low_u = low_v = np.inf
             high_u = high_v = -np.inf
             for point_m in points_m:
@@ -330,24 +310,24 @@ class Edges:
         return len(self.start_m)
 
 
-def extract_edges(
-    city: CityMap, facets: Facets | None = None, topology: Topology | None = None
-) -> Edges:
-    """Find the convex edges of a city: roof edges and corners, without those on the ground.
+def facets_and_edges(city: CityMap) -> tuple[Facets, Edges]:
+    """Merge the triangles of a city to facets, and find the convex edges between them.
+
+    Faces on flat ground, z = 0, are left out, and so are edges on it.
 
     Args:
         city: 3D map.
-        facets: of this city; None: extracted here.
-        topology: of this city; None: built here.
-
-    Returns:
-        The edges, sorted by their facets.
 
     Raises:
         BadInput: a corner is not finite.
     """
-    topology = topology or build_topology(city)
-    facets = facets or extract_facets(city, topology)
+    topology = _topology(city)
+    facets = _facets(city, topology)
+    return facets, _edges(facets, topology)
+
+
+def _edges(facets: Facets, topology: Topology) -> Edges:
+    """Find roof edges and corners, sorted by their facets."""
     if not len(facets):
         none = np.empty((0, 3))
         no_facets = np.empty((0, 2), dtype=int)

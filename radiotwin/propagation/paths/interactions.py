@@ -193,16 +193,8 @@ def wedge_coefficients(
 ) -> tuple[complex, complex]:
     """Return the diffraction coefficients of a wedge [2, eq. 25-28, 3].
 
-    Args:
-        phi: angle of the diffracted ray from face 0, across the edge [rad], 0 to n π.
-        phi_in: the same angle of the incident ray.
-        sine_edge: sine of the angle between ray and edge.
-        distance_m: s s' sin² / (s + s') of the distances s' before and s after the edge [m].
-        wave_number: 2 π / wavelength [1/m].
-        n: exterior angle of the wedge divided by π.
-        face_0: reflection coefficients (TE and TM) of face 0 at the first of `face_sines`; -1 and 1
-            stand for a perfect conductor.
-        face_n: those of face n at the second.
+    Its arguments are as of `wedge_terms`, and the reflection coefficients (TE and TM) of faces 0
+    and n at their `face_sines`; -1 and 1 stand for a perfect conductor.
 
     Returns:
         The coefficients for the field along (soft) and across (hard) the edge [√m].
@@ -222,11 +214,7 @@ def wedge_coefficients(
 def face_sines(phi: float, phi_in: float, sine_edge: float, n: float) -> tuple[float, float]:
     """Return the sines of the angles at which faces 0 and n reflect, see the head of this module.
 
-    Args:
-        phi: as of `wedge_coefficients`, like the others.
-        phi_in: angle of the incident ray [rad].
-        sine_edge: sine of the angle between ray and edge.
-        n: exterior angle of the wedge divided by π.
+    Its arguments are as of `wedge_terms`.
     """
     return (sine_edge * abs(np.sin(min(phi, phi_in))),
             sine_edge * abs(np.sin(n * np.pi - max(phi, phi_in))))
@@ -283,12 +271,7 @@ def around_edge(
 ) -> tuple[bool, float, float]:
     """Return whether a point is in an edge's open space, and its cylindrical coordinates.
 
-    Args:
-        edges: of `Surfaces`.
-        edge: row of `edges`.
-        x: position of the point, east [m].
-        y: north [m].
-        z: up [m].
+    The edge is a row of `Surfaces.edges`, the point has x, y and z [m].
 
     Returns:
         Whether it is in the open space, its distance along the edge from the start [m], and its
@@ -321,7 +304,7 @@ def diffract(
         after_m: length of the path after the edge [m].
         wave_number: 2 π / wavelength [1/m].
         slabs: materials of the city.
-        wedge: LUEBBERS or SIONNA, see `radiotwin.propagation.paths.interactions`.
+        wedge: LUEBBERS or SIONNA.
         field: (3,) complex, changed in place.
     """
     row = edges[edge]

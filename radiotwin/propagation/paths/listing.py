@@ -7,11 +7,11 @@ factor and the impulse response of its paths.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -80,6 +80,11 @@ class Rays:
         return self.length_m / speed_of_light
 
 
+NO_RAYS = Rays(np.zeros(0, dtype=int), np.zeros(0, dtype=complex), np.zeros(0),
+               np.zeros((0, MAX_INTERACTIONS), dtype=np.int8),
+               np.zeros((0, MAX_INTERACTIONS, 3)), *np.zeros((2, 0, 3)))
+
+
 def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float,
                 depth: int = 4) -> Iterator[tuple[Rays, int]]:
     """Follow the paths from a device to receivers, some receivers at a time.
@@ -105,11 +110,13 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
         ends_m = np.ascontiguousarray(receiver_m[first:first + RECEIVER_CHUNK], dtype=float)
         parts = [_direct(city, device_m, ends_m, wave_number)]
         for rows in found_clear(city, search.surfaces, candidates, device_m, ends_m, buffer):
-            amplitude, length_m = np.empty(len(rows), dtype=complex), np.empty(len(rows))
-            path_amplitudes(search.surfaces, candidates, wave_number, slabs, LUEBBERS, buffer,
-                            rows, amplitude, length_m)
-            parts.append(_rays(buffer, rows, kinds[buffer.candidate[rows]], amplitude, length_m))
-        yield _joined(parts, first), len(ends_m)
+            found = path_amplitudes(search.surfaces, candidates, wave_number, slabs, LUEBBERS,
+                                    buffer, rows)
+            parts.append(_rays(buffer, rows, kinds[buffer.candidate[rows]], *found))
+        joined = _joined(parts)
+        order = np.lexsort((joined.length_m, joined.receiver))
+        rays = Rays(*(getattr(joined, each.name)[order] for each in fields(Rays)))
+        yield replace(rays, receiver=rays.receiver + first), len(ends_m)
 
 
 def _direct(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, wave_number: float) -> Rays:
@@ -144,21 +151,9 @@ def _kinds(candidates: Candidates) -> np.ndarray:
                     NO_INTERACTION).astype(np.int8)
 
 
-def _joined(parts: list[Rays], first: int) -> Rays:
-    """Return the paths of several parts, sorted, with receivers counted from `first`."""
-    joined = [np.concatenate([getattr(part, name) for part in parts])
-              for name in Rays.__dataclass_fields__]
-    order = np.lexsort((joined[2], joined[0]))
-    receiver, *others = (each[order] for each in joined)
-    return Rays(receiver + first, *others)
-
-
-class _Paths(NamedTuple):
-    """Paths of one device; arrays (p, …) as in `Rays`, with antennas."""
-
-    link: np.ndarray
-    rays: Rays
-    amplitude: np.ndarray
+def _joined(parts: list[Rays]) -> Rays:
+    return Rays(*(np.concatenate([getattr(part, each.name) for part in parts])
+                  for each in fields(Rays)))
 
 
 def list_paths(scene: Scene, points_m: np.ndarray, out_path: Path | str | None = None,
@@ -193,10 +188,11 @@ def list_paths(scene: Scene, points_m: np.ndarray, out_path: Path | str | None =
     index = device_indices(scene, devices)
     ROWS.check(len(index) * len(points_m), "points times devices")
     reason = np.concatenate([_reasons(scene, row, points_m) for row in index])
-    parts = list(_follow(scene, index, points_m, reason.reshape(len(index), -1) == ""))
+    usable = reason.reshape(len(index), -1) == ""
+    rays = _joined([NO_RAYS, *_follow(scene, index, points_m, usable)])
     dataset = _links(scene, index, points_m)
     dataset["reason"] = "link", reason
-    _describe(dataset, parts, scene.config.radio.frequency_hz, velocity, bandwidth_hz)
+    _describe(dataset, rays, scene.config.radio.frequency_hz, velocity, bandwidth_hz)
     missing = (dataset["path_count"].to_numpy() == 0) & (reason == "")
     dataset["reason"] = "link", np.where(missing, "no path", reason).astype(object)
     dataset.attrs |= {
@@ -241,8 +237,8 @@ def _reasons(scene: Scene, device: int, points_m: np.ndarray) -> np.ndarray:
 
 
 def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.ndarray
-            ) -> Iterator[_Paths]:
-    """Yield the paths of some links at a time, in the order of the links."""
+            ) -> Iterator[Rays]:
+    """Yield the paths of some links at a time, in their order, with antennas and rows of links."""
     count = 0
     with progress("following paths", total=int(usable.sum())) as advance:
         for row, device in enumerate(index):
@@ -257,8 +253,8 @@ def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.nda
                         gain_dbi += antenna.gain_dbi(way)
                 count += len(gain_dbi)
                 PATHS.check(count, f"paths of {len(index)} devices to {len(points_m)} points")
-                yield _Paths(row * len(points_m) + points[rays.receiver], rays,
-                             rays.amplitude * 10 ** (gain_dbi / 20))
+                yield replace(rays, receiver=row * len(points_m) + points[rays.receiver],
+                              amplitude=rays.amplitude * 10 ** (gain_dbi / 20))
                 advance(receivers)
 
 
@@ -272,17 +268,14 @@ def _links(scene: Scene, index: list[int], points_m: np.ndarray) -> xr.Dataset:
     return xr.Dataset({name: ("link", values) for name, values in ends.items()})
 
 
-def _describe(dataset: xr.Dataset, parts: list[_Paths], frequency_hz: float,
-              velocity: np.ndarray | None, bandwidth_hz: float | None) -> None:
+def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np.ndarray | None,
+              bandwidth_hz: float | None) -> None:
     """Add the paths, and the figures of each link, to a dataset of links."""
-    links = dataset.sizes["link"]
-    link = np.concatenate([part.link for part in parts] or [np.zeros(0, dtype=int)])
-    amplitude = np.concatenate([part.amplitude for part in parts] or [np.zeros(0, dtype=complex)])
-    delay_s = _column(parts, "delay_s", ())
+    links, link = dataset.sizes["link"], rays.receiver
+    amplitude, delay_s, kinds = rays.amplitude, rays.delay_s, rays.kinds
     power = np.abs(amplitude) ** 2
     first_s = np.full(links, np.inf)
     np.minimum.at(first_s, link, delay_s)
-    kinds = _column(parts, "kinds", (MAX_INTERACTIONS,)).astype(np.int8)
     with np.errstate(divide="ignore"):
         path_gain_db = 10 * np.log10(np.maximum(power, 1e-300))
     count = np.bincount(link, minlength=links)
@@ -297,15 +290,13 @@ def _describe(dataset: xr.Dataset, parts: list[_Paths], frequency_hz: float,
         "link_of_path": link.astype(np.int32), "path_gain_db": path_gain_db,
         "phase_rad": np.angle(amplitude), "delay_s": delay_s}
     for end in ("departure", "arrival"):
-        way = _column(parts, end, (3,))
+        way = getattr(rays, end)
         azimuth = np.arctan2(way[:, 0], way[:, 1])
         elevation = np.arcsin(np.clip(way[:, 2], -1, 1))
         of_paths[f"{end}_azimuth_deg"] = np.degrees(azimuth) % 360
         of_paths[f"{end}_elevation_deg"] = np.degrees(elevation)
-        values[f"{end}_azimuth_spread_deg"] = angular_spread_deg(
-            azimuth, power, link, links)
-        values[f"{end}_zenith_spread_deg"] = angular_spread_deg(
-            elevation, power, link, links)
+        values[f"{end}_azimuth_spread_deg"] = angular_spread_deg(azimuth, power, link, links)
+        values[f"{end}_zenith_spread_deg"] = angular_spread_deg(elevation, power, link, links)
         if end == "arrival" and velocity is not None:
             shift_hz = doppler_hz(way, velocity, speed_of_light / frequency_hz)
             of_paths["doppler_hz"] = shift_hz
@@ -319,23 +310,17 @@ def _describe(dataset: xr.Dataset, parts: list[_Paths], frequency_hz: float,
         "flag_values": np.array([NO_INTERACTION, REFLECTION, DIFFRACTION], dtype=np.int8),
         "flag_meanings": "none reflection diffraction"}
     dataset["interaction_m"] = (
-        ("path", "interaction", "axis"),
-        _column(parts, "points_m", (MAX_INTERACTIONS, 3))[:, :used].astype(np.float32))
+        ("path", "interaction", "axis"), rays.points_m[:, :used].astype(np.float32))
     dataset["axis"] = "axis", np.array(list("xyz"), dtype=object)
     if bandwidth_hz is not None:
         excess_s = delay_s - first_s[link]
-        taps = tap_count(excess_s, bandwidth_hz)
+        taps = 2 * EDGE_TAPS + 1 + int(np.ceil(float(excess_s.max(initial=0.0)) * bandwidth_hz))
         RESPONSE_VALUES.check(links * taps, f"impulse responses of {links} links, {taps} taps each")
         response = impulse_response(amplitude, excess_s, link, links, bandwidth_hz, taps)
         dataset["tap_delay_s"] = "tap", (np.arange(taps) - EDGE_TAPS) / bandwidth_hz
         for name, part in (("real", response.real), ("imaginary", response.imag)):
             dataset[f"response_{name}"] = ("link", "tap"), part, {
                 "long_name": f"{name} part of the band-limited impulse response"}
-
-
-def _column(parts: list[_Paths], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return (p, *shape) of all paths."""
-    return np.concatenate([getattr(part.rays, name) for part in parts] or [np.zeros((0, *shape))])
 
 
 def _db(power: np.ndarray) -> np.ndarray:
@@ -393,14 +378,7 @@ def angular_spread_deg(angle_rad: np.ndarray, power: np.ndarray, link: np.ndarra
                        ) -> np.ndarray:
     """Return the circular angular spread of each link (3GPP TR 38.901, Annex A.1).
 
-    Args:
-        angle_rad: (p,) azimuths or zeniths [rad].
-        power: (p,) linear.
-        link: (p,) row of each path's link.
-        links: number of links.
-
-    Returns:
-        (links,) [degrees]; NaN where there is no path.
+    Of azimuths or zeniths [rad], with the arguments of `rms_spread`; NaN where there is no path.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         resultant = np.abs(sums(power * np.exp(1j * angle_rad), link, links)) \
@@ -409,16 +387,10 @@ def angular_spread_deg(angle_rad: np.ndarray, power: np.ndarray, link: np.ndarra
 
 
 def k_factor_db(power: np.ndarray, direct: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
-    """Return the power of the direct path over that of all others [dB].
+    """Return the power of the direct path over that of all others (links,) [dB].
 
-    Args:
-        power: (p,) linear.
-        direct: (p,) bool: the path has no interaction.
-        link: (p,) row of each path's link.
-        links: number of links.
-
-    Returns:
-        (links,); NaN where there is no direct path, or no other.
+    A path (p,) is direct if it has no interaction; others as of `rms_spread`. NaN where there is no
+    direct path, or no other.
     """
     first, rest = sums(power * direct, link, links), sums(power * ~direct, link, links)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -436,11 +408,6 @@ def doppler_hz(arrival: np.ndarray, velocity_m_s: np.ndarray, wavelength_m: floa
     return arrival @ velocity_m_s / wavelength_m
 
 
-def tap_count(excess_s: np.ndarray, bandwidth_hz: float) -> int:
-    """Return the number of taps that hold paths of these excess delays, (p,) [s]."""
-    return 2 * EDGE_TAPS + 1 + int(np.ceil(float(excess_s.max(initial=0.0)) * bandwidth_hz))
-
-
 def impulse_response(amplitude: np.ndarray, excess_s: np.ndarray, link: np.ndarray, links: int,
                      bandwidth_hz: float, taps: int) -> np.ndarray:
     """Return the band-limited impulse response of each link, sampled at the bandwidth.
@@ -455,7 +422,7 @@ def impulse_response(amplitude: np.ndarray, excess_s: np.ndarray, link: np.ndarr
         link: (p,) row of each path's link, ascending.
         links: number of links.
         bandwidth_hz: B [Hz].
-        taps: number of taps, see `tap_count`.
+        taps: number of taps.
 
     Returns:
         (links, taps) complex.

@@ -9,14 +9,12 @@ from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.candidates import DEVICE_RAYS, CandidateSearch, candidate_search
-from radiotwin.propagation.paths.fields import AVERAGE, VERTICAL, path_gains
+from radiotwin.propagation.paths.fields import path_gains
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
 from radiotwin.propagation.paths.interactions import LUEBBERS, SIONNA, Slabs, slabs_of
 from radiotwin.propagation.paths.two_edges import paths_over_two_edges, two_edge_gains
-from radiotwin.runtime.console import progress
 from radiotwin.scene.citymap import CityMap
 
-POLARISATIONS = {"average": AVERAGE, "vertical": VERTICAL}
 WEDGES = {"luebbers": LUEBBERS, "sionna": SIONNA}
 PATH_CHUNK = 50_000  # paths at once: about 30 MB
 DARK_CHUNK = 100  # receivers at once that only two edges may reach
@@ -42,7 +40,7 @@ class PathsWithPoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PathPowers:
-    """Linear power gains (n,) of links between isotropic antennas, by the kind of path; 0: none.
+    """Linear power gains (n,) between vertically polarised isotropic antennas, by kind of path.
 
     A reflection by the ground counts as a reflection where there are other interactions; alone it
     is `ground`. Powers are added, not fields: where direct and reflected or diffracted rays nearly
@@ -84,11 +82,10 @@ COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 
 
 def path_powers(
-    city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray,
-    frequency_hz: float, polarisation: str = "average", depth: int = DEPTH,
-    wedge: str = "sionna", rays: int = DEVICE_RAYS,
+    city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float, *,
+    depth: int = DEPTH, wedge: str = "sionna", rays: int = DEVICE_RAYS,
 ) -> PathPowers:
-    """Follow the paths from devices to receivers and add up their powers.
+    """Follow the paths from a device to receivers and add up their powers.
 
     Surfaces are slabs of the map's materials, and flat ground is one of `city.ground_material`.
     Ends inside buildings are accepted, but their results mean little. At the depth of 4 the RMS
@@ -97,71 +94,62 @@ def path_powers(
 
     Args:
         city: 3D map.
-        device_m: (k, 3) positions of the devices [m].
+        device_m: (3,) position [m].
         receiver_m: (n, 3) positions of the receivers [m].
-        device: (n,) row of `device_m` of each receiver.
         frequency_hz: carrier frequency [Hz].
-        polarisation: `vertical` of both antennas, or `average` over all.
         depth: maximum number of interactions of a path, 1 to 6.
         wedge: coefficient of diffraction: `luebbers`, reciprocal and exact for conductors; or
             `sionna`, that of Sionna RT. See `radiotwin.propagation.paths.interactions`.
-        rays: shot from each device to find what paths of several interactions visit.
-
-    Returns:
-        The powers of the n links.
+        rays: shot from the device to find what paths of several interactions visit.
 
     Raises:
-        BadInput: an array has another shape, a value is not finite, a row does not exist, or an
-            argument is out of its range.
+        BadInput: a position or the frequency is no number, or the depth is out of its range.
     """
     device_m = np.asarray(device_m, dtype=float)
     receiver_m = np.ascontiguousarray(receiver_m, dtype=float)
-    device = np.asarray(device)
-    _check(device_m, receiver_m, device, frequency_hz, polarisation, depth, wedge, rays)
+    if not (np.isfinite(device_m).all() and np.isfinite(receiver_m).all()):
+        raise BadInput("device_m and receiver_m must hold finite positions [m]")
+    if not 0 < frequency_hz < np.inf:
+        raise BadInput(f"frequency_hz is {frequency_hz}; it must be positive")
+    if not 1 <= depth <= MAX_INTERACTIONS:
+        raise BadInput(f"depth is {depth}; allowed are 1 to {MAX_INTERACTIONS}")
     wave_number = 2 * np.pi * frequency_hz / speed_of_light
     powers = np.zeros((len(COMPONENTS), len(receiver_m)))
-    powers[0] = _direct(city, device_m[device], receiver_m, wave_number)
+    powers[0] = _direct(city, device_m, receiver_m, wave_number)
     departures, arrivals = np.zeros((2, len(receiver_m), SECTORS, 3))
-    straight_m = receiver_m - device_m[device]
+    straight_m = receiver_m - device_m
     _add_rays(departures, np.arange(len(receiver_m)), straight_m, powers[0])
     _add_rays(arrivals, np.arange(len(receiver_m)), -straight_m, powers[0])
     search = candidate_search(city, depth)
     buffer = PathBuffer.allocate(PATH_CHUNK)
     slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
-    rows = np.unique(device)
-    with progress("following paths", total=len(rows)) as advance:
-        for row in rows:
-            links = np.flatnonzero(device == row)
-            candidates = search.candidates(device_m[row], rays)
-            kind = _kinds(candidates, search.is_ground)
-            for clear, gain in clear_paths_gains(
-                    city, search, candidates, device_m[row], receiver_m[links], buffer,
-                    wave_number, slabs, POLARISATIONS[polarisation], WEDGES[wedge]):
-                link, points_m = links[buffer.receiver[clear]], buffer.points_m[clear]
-                last, path = buffer.count[clear] - 1, np.arange(len(clear))
-                np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
-                _add_rays(departures, link, points_m[:, 1] - points_m[:, 0], gain)
-                _add_rays(arrivals, link, points_m[path, last - 1] - points_m[path, last], gain)
-            dark = links[powers[:, links].sum(axis=0) == 0]
-            seen = np.unique(candidates.edge[(candidates.before[:, 0] < 0)])
-            for first in range(0, len(dark) if depth > 1 else 0, DARK_CHUNK):
-                part = dark[first:first + DARK_CHUNK]
-                pairs = paths_over_two_edges(city, search.surfaces, search.facet_edges, seen,
-                                             device_m[row], receiver_m[part])
-                gain = two_edge_gains(search.surfaces, wave_number, slabs,
-                                      POLARISATIONS[polarisation], WEDGES[wedge], pairs.edge,
-                                      pairs.points_m)
-                link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)
-                np.add.at(powers, (COMPONENTS.index("diffracted_2"), link), gain)
-                _add_rays(departures, link, legs_m[:, 0], gain)
-                _add_rays(arrivals, link, -legs_m[:, 2], gain)
-            advance(1)
+    candidates = search.candidates(device_m, rays)
+    kind = _kinds(candidates, search.is_ground)
+    for clear, gain in clear_paths_gains(city, search, candidates, device_m, receiver_m, buffer,
+                                         wave_number, slabs, WEDGES[wedge]):
+        link, points_m = buffer.receiver[clear], buffer.points_m[clear]
+        last, path = buffer.count[clear] - 1, np.arange(len(clear))
+        np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
+        _add_rays(departures, link, points_m[:, 1] - points_m[:, 0], gain)
+        _add_rays(arrivals, link, points_m[path, last - 1] - points_m[path, last], gain)
+    dark = np.flatnonzero(powers.sum(axis=0) == 0)
+    seen = np.unique(candidates.edge[(candidates.before[:, 0] < 0)])
+    for first in range(0, len(dark) if depth > 1 else 0, DARK_CHUNK):
+        part = dark[first:first + DARK_CHUNK]
+        pairs = paths_over_two_edges(city, search.surfaces, search.facet_edges, seen, device_m,
+                                     receiver_m[part])
+        gain = two_edge_gains(search.surfaces, wave_number, slabs, WEDGES[wedge], pairs.edge,
+                              pairs.points_m)
+        link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)
+        np.add.at(powers, (COMPONENTS.index("diffracted_2"), link), gain)
+        _add_rays(departures, link, legs_m[:, 0], gain)
+        _add_rays(arrivals, link, -legs_m[:, 2], gain)
     return PathPowers(*powers, departures, arrivals)  # type: ignore[call-arg]  # a row a kind
 
 
 def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
                       frequency_hz: float) -> PathsWithPoints:
-    """Follow the paths of vertical antennas as `path_powers` does, and return each by itself.
+    """Follow the paths as `path_powers` does, and return each by itself.
 
     Without the direct ones, and those over two edges.
 
@@ -180,7 +168,7 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
     for clear, gain in clear_paths_gains(
             city, search, search.candidates(device_m), device_m,
             np.ascontiguousarray(receiver_m, dtype=float), buffer,
-            2 * np.pi * frequency_hz / speed_of_light, slabs, VERTICAL, WEDGES["sionna"]):
+            2 * np.pi * frequency_hz / speed_of_light, slabs, SIONNA):
         parts.append(PathsWithPoints(buffer.receiver[clear], gain,
                                      buffer.points_m[clear].astype(np.float32),
                                      buffer.count[clear]))
@@ -189,15 +177,12 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
 
 def clear_paths_gains(
     city: CityMap, search: CandidateSearch, candidates: Candidates, device_m: np.ndarray,
-    receiver_m: np.ndarray, buffer: PathBuffer, wave_number: float, slabs: Slabs,
-    polarisation: int, wedge: int,
+    receiver_m: np.ndarray, buffer: PathBuffer, wave_number: float, slabs: Slabs, wedge: int,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield rows (p,) of a buffer that hold paths which nothing blocks, and their gains (p,)."""
     for clear in found_clear(city, search.surfaces, candidates, device_m, receiver_m, buffer):
-        gain = np.empty(len(clear))
-        path_gains(search.surfaces, candidates, wave_number, slabs, polarisation, wedge, buffer,
-                   clear, gain)
-        yield clear, gain
+        yield clear, path_gains(search.surfaces, candidates, wave_number, slabs, wedge, buffer,
+                                clear)
 
 
 def _add_rays(sums: np.ndarray, link: np.ndarray, ray_m: np.ndarray, power: np.ndarray) -> None:
@@ -225,29 +210,3 @@ def _kinds(candidates: Candidates, is_ground: np.ndarray) -> np.ndarray:
                          COMPONENTS.index("diffracted"))
     reflected = np.where(only_ground, COMPONENTS.index("ground"), np.minimum(reflections, 3))
     return np.where(candidates.edge >= 0, over_edge, reflected)
-
-
-def _check(
-    device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray, frequency_hz: float,
-    polarisation: str, depth: int, wedge: str, rays: int,
-) -> None:
-    for name, points_m in (("device_m", device_m), ("receiver_m", receiver_m)):
-        if points_m.ndim != 2 or points_m.shape[1] != 3 or not np.isfinite(points_m).all():
-            raise BadInput(f"{name} must hold finite positions [m] of shape (n, 3), it has the "
-                           f"shape {points_m.shape}")
-    if device.shape != (len(receiver_m),) or device.dtype.kind not in "iu":
-        raise BadInput(f"device must hold one row of device_m for each of {len(receiver_m)} "
-                       f"receivers; it has the shape {device.shape} and holds {device.dtype}")
-    if len(device) and not (0 <= device.min() and device.max() < len(device_m)):
-        raise BadInput(f"device holds rows from {device.min()} to {device.max()}, device_m has "
-                       f"{len(device_m)}")
-    if not 0 < frequency_hz < np.inf:
-        raise BadInput(f"frequency_hz is {frequency_hz}; it must be positive")
-    if polarisation not in POLARISATIONS:
-        raise BadInput(f"polarisation is {polarisation!r}; allowed are {', '.join(POLARISATIONS)}")
-    if wedge not in WEDGES:
-        raise BadInput(f"wedge is {wedge!r}; allowed are {', '.join(WEDGES)}")
-    if not 1 <= depth <= MAX_INTERACTIONS:
-        raise BadInput(f"depth is {depth}; allowed are 1 to {MAX_INTERACTIONS}")
-    if rays < 1:
-        raise BadInput(f"rays is {rays}; it must be 1 or more")

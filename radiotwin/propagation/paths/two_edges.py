@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.propagation.paths.facets import expand
-from radiotwin.propagation.paths.fields import VERTICAL, send, vertical
+from radiotwin.propagation.paths.fields import vertical
 from radiotwin.propagation.paths.interactions import Slabs, around_edge, diffract
 from radiotwin.propagation.paths.surfaces import ALONG, LENGTH, NORMAL_0, NORMAL_N, START, Surfaces
 from radiotwin.propagation.paths.vectors import cross, dot
@@ -221,17 +221,16 @@ def wave_at_edge(
 
 @njit(cache=True, error_model="numpy")
 def two_edge_gains(
-    surfaces: Surfaces, wave_number: float, slabs: Slabs, polarisation: int, wedge: int,
-    edge: np.ndarray, points_m: np.ndarray,
+    surfaces: Surfaces, wave_number: float, slabs: Slabs, wedge: int, edge: np.ndarray,
+    points_m: np.ndarray,
 ) -> np.ndarray:
-    """Compute the power gains of paths over two edges between isotropic antennas.
+    """Compute the power gains of paths over two edges between vertical isotropic antennas.
 
     Args:
         surfaces: of the map.
         wave_number: 2 π / wavelength [1/m].
         slabs: materials of the map.
-        polarisation: as of `radiotwin.propagation.paths.fields.path_gains`.
-        wedge: as there.
+        wedge: as of `radiotwin.propagation.paths.fields.path_gains`.
         edge: (p, 2) as in `EdgePairs`.
         points_m: (p, 4, 3) as there.
 
@@ -247,17 +246,12 @@ def two_edge_gains(
             direction[k] = legs[k] / length_m
         sine2 = _twist(surfaces.edges[edge[i, 0], ALONG:ALONG + 3],
                        surfaces.edges[edge[i, 1], ALONG:ALONG + 3], direction[1])
-        power = 0.0
-        for sent in range(1 + polarisation):
-            send(direction[0], sent, field)
-            diffract(surfaces.edges, edge[i, 0], direction[0], direction[1], a,
-                     wave_at_edge(a, b, c, sine2)[1], wave_number, slabs, wedge, field)
-            diffract(surfaces.edges, edge[i, 1], direction[1], direction[2],
-                     wave_at_edge(c, b, a, sine2)[1], c, wave_number, slabs, wedge, field)
-            if polarisation == VERTICAL:
-                power += abs(dot(field, vertical(direction[2]))) ** 2
-            else:
-                power += 0.5 * (abs(field[0]) ** 2 + abs(field[1]) ** 2 + abs(field[2]) ** 2)
+        field[:] = vertical(direction[0])
+        diffract(surfaces.edges, edge[i, 0], direction[0], direction[1], a,
+                 wave_at_edge(a, b, c, sine2)[1], wave_number, slabs, wedge, field)
+        diffract(surfaces.edges, edge[i, 1], direction[1], direction[2],
+                 wave_at_edge(c, b, a, sine2)[1], c, wave_number, slabs, wedge, field)
+        power = abs(dot(field, vertical(direction[2]))) ** 2
         spread = 1.0 / (a * c * (b * (a + b + c) + a * c * sine2))
         gain[i] = spread * power / (2.0 * wave_number) ** 2
     return gain

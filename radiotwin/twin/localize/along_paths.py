@@ -20,6 +20,7 @@ from scipy.special import stdtrit
 
 from radiotwin.effects.base import ResidualView
 from radiotwin.inference.censored_regression import CensoredRegression
+from radiotwin.inference.student import DOF
 from radiotwin.links import Links
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.runtime.console import progress
@@ -43,7 +44,6 @@ DESCENTS, DESCENTS_APART_M = 2, 15.0
 STEPS_M = (4.0, 2.0, 1.0, 0.5)
 AROUND_M = (14.0, 7.0)  # rings about where a descent has ended, in case it was a local minimum
 RAYS = 10_000  # from each position, 2 degrees apart: ten times as many find the same places
-DOF = 4.0
 MAX_MISFIT = 4.0  # square of how many times the errors of other devices
 CREDIBLE = 0.9
 WORKER_BYTES = 2 * 2**30  # of a process that searches
@@ -194,8 +194,7 @@ class Relocation:
         missing = {key: row for row, key in enumerate(hashes) if key not in known}
         if missing:
             new_m = ends_m[list(missing.values())]
-            followed = path_powers(city, np.array([position_m]), new_m,
-                                   np.zeros(len(new_m), int), frequency_hz, "vertical", rays=RAYS)
+            followed = path_powers(city, np.array(position_m), new_m, frequency_hz, rays=RAYS)
             known.update(zip(missing, followed.total.tolist(), strict=True))
         return np.array([known[key] for key in hashes])
 

@@ -12,6 +12,7 @@ from radiotwin.propagation.laws.image_paths import fit_offsets, moved, paths_db
 from radiotwin.propagation.laws.map_error import NO_SHIFT, MapError, estimate_shift
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import itu_material
+from tests.propagation.links import powers_of_links
 
 DEVICES_M = np.array([[45.0, 42.0, 1.5], [100.0, 155.0, 1.5], [160.0, 60.0, 1.5]])
 DIFFUSE = (-140.0, 3.0)  # gain at 100 m [dB], and exponent
@@ -42,9 +43,7 @@ def links_over(city, receiver_m, device):
 
 def levels(city, receiver_m, device, seed, factors=(1.0, 1.0)):
     """Levels of a world whose reflections and diffractions carry so many times their power."""
-    from radiotwin.propagation.paths import path_powers
-
-    powers = path_powers(city, DEVICES_M, receiver_m, device, 2.4e9, "vertical")
+    powers = powers_of_links(city, DEVICES_M, receiver_m, device)
     diffracted = powers.diffracted + powers.reflected_diffracted + powers.diffracted_2
     power = powers.direct + factors[1] * diffracted + factors[0] * (powers.total - powers.direct - diffracted)
     distance_m = np.linalg.norm(receiver_m - DEVICES_M[device], axis=1)

@@ -13,6 +13,7 @@ from radiotwin.propagation.laws.map_error import MapError, estimate_map_error
 from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.propagation.laws.registry import decode_both, encode_channel
 from radiotwin.scene.citymap import CityMap
+from tests.propagation.links import powers_of_links
 
 DEVICES_M = np.array([[45.0, 42.0, 1.5], [100.0, 155.0, 1.5], [160.0, 60.0, 1.5]])
 
@@ -44,9 +45,7 @@ def flight(count, seed):
 
 def levels(city, receiver_m, device, seed, noise_db=1.0):
     """Levels of a world whose paths the engine follows over the true map."""
-    from radiotwin.propagation.paths import path_powers
-
-    powers = path_powers(city, DEVICES_M, receiver_m, device, 2.4e9, "vertical").total
+    powers = powers_of_links(city, DEVICES_M, receiver_m, device).total
     distance_m = np.linalg.norm(receiver_m - DEVICES_M[device], axis=1)
     powers = powers + 1e-13 * (distance_m / 100) ** -3.0
     return 10 * np.log10(powers) + np.random.default_rng(seed).normal(0, noise_db, len(device))

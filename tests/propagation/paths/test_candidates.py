@@ -33,8 +33,8 @@ def test_threads_find_what_one_alone_finds(town, device_m, monkeypatch):
             meeting.reset()
         return look_around(*args)
 
-    look_around = module.edge_sequences
-    monkeypatch.setattr(module, "edge_sequences", watched)
+    look_around = module._edge_sequences
+    monkeypatch.setattr(module, "_edge_sequences", watched)
     shared = CandidateSearch(town(0.2), 2)
     with ThreadPoolExecutor(3) as pool:
         found = list(pool.map(shared.candidates, device_m))

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from radiotwin.errors import BadInput
-from radiotwin.propagation.paths import extract_edges, extract_facets
+from radiotwin.propagation.paths.facets import facets_and_edges
 from radiotwin.propagation.paths.surfaces import pack, within
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import itu_material
@@ -27,7 +27,7 @@ def sliced_wall(height_m=10.0):
 
 @pytest.mark.parametrize("angle_rad", [0.0, 0.4])
 def test_a_box_has_four_walls_and_a_roof(city_of, angle_rad):
-    facets = extract_facets(city_of((0, 0, 10, 20, 30), angle_rad=angle_rad))
+    facets = facets_and_edges(city_of((0, 0, 10, 20, 30), angle_rad=angle_rad))[0]
     assert len(facets) == 5 and (np.abs(facets.normal[:, 2]) < 0.1).sum() == 4 and facets.full.all()
     assert sorted(np.round(facets.size_m.prod(axis=1))) == [200, 300, 300, 600, 600]
     assert np.allclose(np.cross(facets.axis_u, facets.axis_v), facets.normal)
@@ -38,7 +38,7 @@ def test_a_box_has_four_walls_and_a_roof(city_of, angle_rad):
 
 
 def test_slices_are_merged_across_t_junctions():
-    facets = extract_facets(sliced_wall())
+    facets = facets_and_edges(sliced_wall())[0]
     assert len(facets) == 5 and facets.full.all()
 
 
@@ -47,7 +47,7 @@ def test_surfaces_of_two_materials_are_two_facets(box_mesh):
     metal_halves = np.zeros(len(mesh.faces), dtype=int)
     metal_halves[::2] = 1
     city = CityMap(mesh.vertices, mesh.faces, [itu_material("brick"), itu_material("metal")], metal_halves)
-    facets = extract_facets(city)
+    facets = facets_and_edges(city)[0]
     assert len(facets) > 5
     assert (facets.material[facets.of_face[facets.of_face >= 0]] == city.material[facets.of_face >= 0]).all()
 
@@ -56,16 +56,16 @@ def test_faces_of_the_ground_belong_to_no_facet(city_of):
     ground = trimesh.Trimesh([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], [[0, 1, 2], [0, 2, 3]],
                              process=False)
     city = city_of((0, 0, 10, 10, 10), ground)
-    facets = extract_facets(city)
+    facets = facets_and_edges(city)[0]
     assert len(facets) == 5 and (facets.of_face[-2:] == -1).all()
 
 
 def test_an_angled_facet_ends_at_its_outline(prism):
     mesh = prism([(0, 0), (30, 0), (30, 10), (10, 10), (10, 30), (0, 30)], 12.0)
     city = CityMap(mesh.vertices, mesh.faces)
-    facets = extract_facets(city)
+    facets, edges = facets_and_edges(city)
     roof = int(np.flatnonzero(facets.normal[:, 2] > 0.9)[0])
-    surfaces = pack(facets, extract_edges(city, facets))
+    surfaces = pack(facets, edges)
     on = [within(surfaces.planes, surfaces.triangle_uv_m, roof, x, y, 12.0)
           for x, y in ((5.0, 25.0), (25.0, 5.0), (25.0, 25.0), (-1.0, 5.0))]
     assert len(facets) == 7 and not facets.full[roof] and on == [True, True, False, False]
@@ -75,4 +75,4 @@ def test_corners_must_be_finite(city_of):
     city = city_of((0, 0, 10, 10, 10))
     city.vertices[0, 0] = np.nan
     with pytest.raises(BadInput, match="finite"):
-        extract_facets(city)
+        facets_and_edges(city)

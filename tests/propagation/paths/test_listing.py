@@ -8,9 +8,9 @@ import xarray as xr
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
-from radiotwin.propagation.paths import path_powers
 from radiotwin.propagation.paths.listing import list_paths
 from radiotwin.scene.antennas import Antenna, Pattern
+from tests.propagation.links import powers_of_links
 
 POINTS_M = np.array([[40.0, 40, 55], [10, 30, 30], [80, 20, 55]])
 
@@ -64,8 +64,8 @@ def test_figures_are_those_of_the_paths_of_each_link(listed, small_scene):
 def test_gains_are_those_of_the_powers(listed, small_scene):
     made, _ = listed
     device = np.repeat(np.arange(len(small_scene.device_m)), len(POINTS_M))
-    total = path_powers(small_scene.city, small_scene.device_m, np.tile(POINTS_M, (len(small_scene.device_m), 1)),
-                        device, small_scene.config.radio.frequency_hz, "vertical", wedge="luebbers").total
+    total = powers_of_links(small_scene.city, small_scene.device_m, np.tile(POINTS_M, (len(small_scene.device_m), 1)),
+                            device, small_scene.config.radio.frequency_hz, wedge="luebbers").total
     found = made["reason"].to_numpy() == ""
     assert np.allclose(made["gain_db"].to_numpy()[found], 10 * np.log10(total[found]))
 

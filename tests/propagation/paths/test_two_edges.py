@@ -28,7 +28,7 @@ def two_roofs(*heights_m):
 
 def over_free(city, from_m, to_m, kind, wedge="luebbers"):
     """Power of paths over one or two edges, over that of free space."""
-    powers = path_powers(city, from_m[None], to_m[None], np.array([0]), FREQUENCY_HZ, "vertical", 2, wedge)
+    powers = path_powers(city, from_m, to_m[None], FREQUENCY_HZ, depth=2, wedge=wedge)
     return getattr(powers, kind)[0] / (WAVELENGTH_M / (4 * np.pi * np.linalg.norm(to_m - from_m))) ** 2
 
 
@@ -126,6 +126,6 @@ def test_at_the_second_shadow_boundary_half_the_field_is_left():
 
 def test_only_where_nothing_else_arrives():
     receiver_m = np.array([RECEIVER_M, [230.0, 0, 60]])
-    powers = path_powers(two_roofs(30, 34), DEVICE_M[None], receiver_m, np.array([0, 0]), FREQUENCY_HZ)
+    powers = path_powers(two_roofs(30, 34), DEVICE_M, receiver_m, FREQUENCY_HZ)
     assert (powers.diffracted_2 > 0).tolist() == [True, False] and powers.total[1] > powers.total[0] > 0
     assert np.linalg.norm(powers.departures[0].sum(axis=0)) == pytest.approx(powers.total[0])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from radiotwin.propagation.paths.candidates import CandidateSearch, open_ways
+from radiotwin.propagation.paths.candidates import CandidateSearch, _open_ways
 from radiotwin.propagation.paths.pruning import cone_misses
 
 
@@ -42,7 +42,7 @@ def test_only_edges_that_the_device_sees_are_tried(city_of):
     city = city_of((0, -20, 5, 20, 30), (30, -10, 40, 10, 10), (30, 100, 40, 120, 10))
     search = CandidateSearch(city, 1)
     everything = np.arange(len(search.edges))
-    ways = open_ways(city, search.surfaces, np.full((len(everything), 1), -1), everything, np.array([-20.0, 0, 1.5]))
+    ways = _open_ways(city, search.surfaces, np.full((len(everything), 1), -1), everything, np.array([-20.0, 0, 1.5]))
     middle_m = (search.edges.start_m + search.edges.end_m)[ways.edge] / 2
     assert set(np.unique(ways.edge)) < set(everything) and len(np.unique(ways.edge)) == len(ways.edge)
     hidden = (middle_m[:, 0] > 25) & (np.abs(middle_m[:, 1]) < 50)
