@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from radiotwin.propagation.paths.facets import Edges, Facets, expand, facets_and_edges
+from radiotwin.propagation.paths.facets import CityFacets, expand, extract_facets
 from radiotwin.propagation.paths.images import (
     MAX_INTERACTIONS,
     Candidates,
@@ -39,12 +39,12 @@ from radiotwin.propagation.paths.pruning import cone_misses, lit_part
 from radiotwin.propagation.paths.surfaces import (
     ALONG,
     LENGTH,
+    NORMAL,
     NORMAL_0,
     NORMAL_N,
     OFFSET,
     START,
     Surfaces,
-    pack,
 )
 from radiotwin.propagation.paths.two_edges import FacetEdges
 from radiotwin.runtime.compiled import njit
@@ -215,32 +215,34 @@ def _sphere(count: int) -> np.ndarray:
 
 
 def _edge_sequences(
-    city: CityMap, facets: Facets, normal: np.ndarray, edges: Edges, rows: np.ndarray, depth: int
+    city: CityMap, facets: CityFacets, rows: np.ndarray, depth: int
 ) -> FacetSequences:
     """Find the sequences of up to `depth` facets that rays from some edges (n,) visit.
 
     Rays start at most 20 m apart along an edge. The surroundings of an edge are seen from many
     starts, so fewer rays do than from a device.
     """
-    offset_m = (edges.end_m - edges.start_m)[rows]
+    edges, ends_m = facets.surfaces.edges[rows], facets.edge_ends_m[rows]
+    normal_0, normal_n = edges[:, NORMAL_0:NORMAL_0 + 3], edges[:, NORMAL_N:NORMAL_N + 3]
+    offset_m = ends_m[:, 1] - ends_m[:, 0]
     starts = np.maximum(np.ceil(np.linalg.norm(offset_m, axis=1) / 20.0).astype(int), 1)
     source, within = expand(starts)
-    outward = (edges.normal_0 + edges.normal_n)[rows]
+    outward = normal_0 + normal_n
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     share = (within + 0.5) / starts[source]
-    start_m = edges.start_m[rows[source]] + share[:, None] * offset_m[source] \
-        + SKIN_M * outward[source]
+    start_m = ends_m[source, 0] + share[:, None] * offset_m[source] + SKIN_M * outward[source]
     direction = _sphere(EDGE_RAYS)
-    is_open = np.maximum(edges.normal_0[rows] @ direction.T, edges.normal_n[rows] @ direction.T) > 0
+    is_open = np.maximum(normal_0 @ direction.T, normal_n @ direction.T) > 0
     at, ray = np.nonzero(is_open[source])
-    return _shoot(city, facets, normal, start_m[at], direction[ray], source[at], len(rows), depth)
+    return _shoot(city, facets, start_m[at], direction[ray], source[at], len(rows), depth)
 
 
 def _shoot(
-    city: CityMap, facets: Facets, normal: np.ndarray, start_m: np.ndarray, direction: np.ndarray,
+    city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray,
     source: np.ndarray, sources: int, depth: int,
 ) -> FacetSequences:
     """Follow rays (n, 3) of sources (n,) through `depth` reflections, and to the facet after."""
+    normal = facets.surfaces.planes[:, NORMAL:NORMAL + 3]
     row = source  # of each ray: the sequence that it has visited
     sequences, of_source = [np.empty((sources, 0), dtype=int)], [np.arange(sources)]
     first = [0]
@@ -274,7 +276,7 @@ def _shoot(
 
 
 def _first_facets(
-    city: CityMap, facets: Facets, start_m: np.ndarray, direction: np.ndarray
+    city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray
 ) -> np.ndarray:
     """Return (2, n) distance [m] and facet that rays hit first; -1: none, or a face's back."""
     distance_m, face, cosine = city.first_hits_towards(start_m, direction)
@@ -287,7 +289,7 @@ def _first_facets(
         fall_m = np.where(direction[:, 2] < 0, -start_m[:, 2] / direction[:, 2], np.inf)
     on_ground = (fall_m > 0) & (fall_m < np.inf) & (distance_m > fall_m - 0.1)
     return np.stack([np.where(on_ground, np.maximum(fall_m, 0), distance_m),
-                     np.where(on_ground, len(facets), facet)])
+                     np.where(on_ground, len(facets.surfaces.planes) - 1, facet)])
 
 
 @lru_cache(maxsize=12)  # a map and those with errors that stand beside it
@@ -304,30 +306,29 @@ class CandidateSearch:
         depth: maximum number of interactions of a path, at least 1.
 
     Attributes:
-        facets: of the city.
-        edges: of the city.
-        surfaces: both, for compiled code.
+        facets: of the city, and its edges.
+        surfaces: of `facets`.
         is_ground: (f + 1,) bool, rows of the ground in `surfaces.planes`.
         facet_edges: edges at each facet.
     """
 
     def __init__(self, city: CityMap, depth: int) -> None:
-        self.facets, self.edges = facets_and_edges(city)
-        self.surfaces = pack(self.facets, self.edges, city.terrain is None)
-        self.is_ground = np.zeros(len(self.facets) + 1, dtype=bool)
+        self.facets = extract_facets(city)
+        self.surfaces = self.facets.surfaces
+        self.is_ground = np.zeros(len(self.surfaces.planes), dtype=bool)
         self.is_ground[-1] = True
         if city.terrain is not None:
             self.is_ground[self.facets.of_face[city.terrain]] = True
         self._city, self._depth = city, depth
         self._after = np.empty((0, depth - 1), dtype=int)
-        self._first_after, self._end_after = np.full((2, len(self.edges)), -1)
+        edges = len(self.surfaces.edges)
+        self._first_after, self._end_after = np.full((2, edges), -1)
         self._remembered: OrderedDict[tuple[bytes, int], Candidates] = OrderedDict()
         self._one_at_a_time = Lock()
-        facet = self.edges.facet.ravel()
-        edge = np.repeat(np.arange(len(self.edges)), 2)
+        facet, edge = self.facets.edge_facets.ravel(), np.repeat(np.arange(edges), 2)
         order = np.lexsort((edge, facet))
         self.facet_edges = FacetEdges(self.facets.of_face, edge[order], np.searchsorted(
-            facet[order], np.arange(len(self.facets) + 2)))
+            facet[order], np.arange(len(self.is_ground) + 1)))
 
     def candidates(self, device_m: np.ndarray, rays: int = DEVICE_RAYS) -> Candidates:
         """Find the sequences from a device, those without an edge first, and remember them.
@@ -354,12 +355,11 @@ class CandidateSearch:
         return found
 
     def _find(self, device_m: np.ndarray, rays: int) -> Candidates:
-        normal, offset_m = self.surfaces.planes[:, :3], self.surfaces.planes[:, OFFSET]
+        planes = self.surfaces.planes
         direction = _sphere(rays)
-        sequences = _shoot(self._city, self.facets, normal,
-                           np.broadcast_to(device_m, direction.shape), direction,
-                           np.zeros(rays, dtype=int), 1, self._depth)
-        facing = np.flatnonzero(normal @ device_m > offset_m)
+        sequences = _shoot(self._city, self.facets, np.broadcast_to(device_m, direction.shape),
+                           direction, np.zeros(rays, dtype=int), 1, self._depth)
+        facing = np.flatnonzero(planes[:, NORMAL:NORMAL + 3] @ device_m > planes[:, OFFSET])
         single = np.full((len(facing), self._depth), -1)
         single[:, 0] = facing
         reflections = np.unique(np.concatenate([sequences.facets[sequences.order > 0], single]),
@@ -393,8 +393,7 @@ class CandidateSearch:
         """Find the sequences of facets after edges (n,)."""
         for start in range(0, len(edges), EDGE_CHUNK):
             part = edges[start:start + EDGE_CHUNK]
-            found = _edge_sequences(self._city, self.facets, self.surfaces.planes[:, :3],
-                                    self.edges, part, self._depth - 1)
+            found = _edge_sequences(self._city, self.facets, part, self._depth - 1)
             order = np.argsort(found.source, kind="stable")
             bounds = np.searchsorted(found.source[order], np.arange(len(part) + 1))
             self._first_after[part] = len(self._after) + bounds[:-1]

@@ -16,6 +16,7 @@ building one material where its roof is to diffract.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -23,6 +24,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from radiotwin.errors import BadInput
+from radiotwin.propagation.paths.surfaces import GROUND_MATERIAL, MATERIAL, NORMAL, Surfaces
 from radiotwin.propagation.paths.vectors import cross, dot
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import CityMap
@@ -151,42 +153,44 @@ def expand(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
 
 
-@dataclass(frozen=True, eq=False)
-class Facets:
-    """Planar facets; the plane of each is normal · p = offset_m.
+class CityFacets(NamedTuple):
+    """Facets and edges of a city.
 
     Attributes:
-        normal: (f, 3) outward unit normals.
-        offset_m: (f,) distances of the planes from the origin [m].
-        origin_m: (f, 3) a corner of the bounding rectangle [m].
-        axis_u: (f, 3) unit vectors along one side of it.
-        axis_v: (f, 3) unit vectors along the other; u × v = normal.
-        size_m: (f, 2) lengths of the sides [m].
-        full: (f,) bool: the facet fills its bounding rectangle.
-        first: (f + 1,) first row in `triangle_uv_m` of each facet.
-        triangle_uv_m: (t, 6) corners u, v, u, v, u, v of the triangles in the plane [m].
+        surfaces: both, for compiled code.
         of_face: (city faces,) facet of each face of the city; -1: a sliver, or on flat ground.
-        material: (f,) row of the city's materials.
+        edge_ends_m: (e, 2, 3) starts and ends of the edges [m].
+        edge_facets: (e, 2) face 0 and face n of the edges.
     """
 
-    normal: np.ndarray
-    offset_m: np.ndarray
-    origin_m: np.ndarray
-    axis_u: np.ndarray
-    axis_v: np.ndarray
-    size_m: np.ndarray
-    full: np.ndarray
-    first: np.ndarray
-    triangle_uv_m: np.ndarray
+    surfaces: Surfaces
     of_face: np.ndarray
-    material: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.normal)
+    edge_ends_m: np.ndarray
+    edge_facets: np.ndarray
 
 
-def _facets(city: CityMap, topology: Topology) -> Facets:
-    """Merge triangles to facets, in the order of their first triangle."""
+def extract_facets(city: CityMap) -> CityFacets:
+    """Merge the triangles of a city to facets, and find the convex edges between them.
+
+    Faces on flat ground, z = 0, are left out, and so are edges on it.
+
+    Args:
+        city: 3D map.
+
+    Raises:
+        BadInput: a corner is not finite.
+    """
+    topology = _topology(city)
+    planes, triangle_uv_m, of_face = _facets(city, topology)
+    edges, ends_m, facet = _edges(planes, of_face, topology)
+    ground = [0, 0, 1, 0.0 if city.terrain is None else np.inf, 0, 0, 0, 1, 0, 0, 0, 1, 0, np.inf,
+              np.inf, 1, 0, 0, GROUND_MATERIAL]
+    surfaces = Surfaces(np.concatenate([planes, [ground]]), triangle_uv_m, edges)
+    return CityFacets(surfaces, of_face, ends_m, facet)
+
+
+def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return planes (f, 19), triangles (t, 6) and facets of faces, in order of first triangles."""
     material = city.material[topology.source]
     label = _coplanar_groups(topology, material)
     count = int(label.max()) + 1 if len(label) else 0
@@ -194,17 +198,17 @@ def _facets(city: CityMap, topology: Topology) -> Facets:
     first = np.searchsorted(label[order], np.arange(count + 1))
     corners_m = topology.vertices_m[topology.triangles[order]]
     outward = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    normal, origin_m, axis_u, axis_v, size_m, full = np.split(
-        _frames(corners_m, outward, first), [3, 6, 9, 12, 14], axis=1)
+    frames = _frames(corners_m, outward, first)
+    normal, origin_m, axis_u, axis_v = np.split(frames[:, :12], 4, axis=1)
     of_row = label[order]
     offset_m = corners_m - origin_m[of_row, None]
     uv_m = np.stack([np.einsum("ikj,ij->ik", offset_m, axis[of_row]) for axis in (axis_u, axis_v)],
                     axis=2)
     of_face = np.full(len(city.faces), -1)
     of_face[topology.source] = label
-    return Facets(normal, np.einsum("ij,ij->i", normal, origin_m), origin_m, axis_u, axis_v,
-                  size_m, full[:, 0] > 0, first, uv_m.reshape(-1, 6), of_face,
-                  material[order][first[:-1]])
+    planes = np.column_stack([normal, np.einsum("ij,ij->i", normal, origin_m), frames[:, 3:],
+                              first[:-1], first[1:], material[order][first[:-1]]])
+    return planes, np.ascontiguousarray(uv_m.reshape(-1, 6)), of_face
 
 
 def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
@@ -278,78 +282,32 @@ def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class Edges:
-    """Convex edges between two facets.
-
-    Where a building leans on a higher one without sharing its corners, the edge of its roof in
-    that wall is listed, too; it lies inside the other building, so no ray reaches it. A half plane
-    sweeps the open space when it is turned from face 0 by `exterior_rad` towards `normal_0`.
-
-    Attributes:
-        start_m: (e, 3) starts [m].
-        end_m: (e, 3) ends [m].
-        direction: (e, 3) unit vectors from start to end.
-        facet: (e, 2) face 0 and face n, rows of `Facets`.
-        tangent_0: (e, 3) unit vectors in face 0, at right angles to the edge, into the face.
-        normal_0: (e, 3) outward unit normals of face 0.
-        normal_n: (e, 3) outward unit normals of face n.
-        exterior_rad: (e,) angle of the open space [rad], π to 2 π.
-    """
-
-    start_m: np.ndarray
-    end_m: np.ndarray
-    direction: np.ndarray
-    facet: np.ndarray
-    tangent_0: np.ndarray
-    normal_0: np.ndarray
-    normal_n: np.ndarray
-    exterior_rad: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.start_m)
-
-
-def facets_and_edges(city: CityMap) -> tuple[Facets, Edges]:
-    """Merge the triangles of a city to facets, and find the convex edges between them.
-
-    Faces on flat ground, z = 0, are left out, and so are edges on it.
-
-    Args:
-        city: 3D map.
-
-    Raises:
-        BadInput: a corner is not finite.
-    """
-    topology = _topology(city)
-    facets = _facets(city, topology)
-    return facets, _edges(facets, topology)
-
-
-def _edges(facets: Facets, topology: Topology) -> Edges:
-    """Find roof edges and corners, sorted by their facets."""
-    if not len(facets):
-        none = np.empty((0, 3))
-        no_facets = np.empty((0, 2), dtype=int)
-        return Edges(none, none, none, no_facets, none, none, none, np.empty(0))
+def _edges(planes: np.ndarray, of_face: np.ndarray, topology: Topology
+           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return edges (e, 19), their ends (e, 2, 3) [m] and facets (e, 2), sorted by these."""
+    if not len(planes):
+        return np.empty((0, 19)), np.empty((0, 2, 3)), np.empty((0, 2), dtype=int)
+    normal, material = planes[:, NORMAL:NORMAL + 3], planes[:, MATERIAL]
     # Folds flatter than 0.1 rad approximate curved surfaces and diffract too little to count
     found = _wedges(topology.vertices_m, topology.triangles, topology.normal, topology.segments,
                     topology.owner, topology.group, np.pi + 0.1)
     segment = topology.segments[found[:, 0]]
-    pair = np.sort(facets.of_face[topology.source[found[:, 1:]]], axis=1)
-    keep = (pair[:, 0] != pair[:, 1]) \
-        & (facets.material[pair[:, 0]] == facets.material[pair[:, 1]])
-    start_m, end_m, pair = _join(topology.vertices_m[segment[keep]], pair[keep])
-    direction = end_m - start_m
-    direction /= np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
-    normal_0, normal_n = facets.normal[pair[:, 0]], facets.normal[pair[:, 1]]
+    pair = np.sort(of_face[topology.source[found[:, 1:]]], axis=1)
+    keep = (pair[:, 0] != pair[:, 1]) & (material[pair[:, 0]] == material[pair[:, 1]])
+    ends_m, pair = _join(topology.vertices_m[segment[keep]], pair[keep])
+    direction = ends_m[:, 1] - ends_m[:, 0]
+    length_m = np.linalg.norm(direction, axis=1)
+    direction /= np.maximum(length_m, 1e-12)[:, None]
+    normal_0, normal_n = normal[pair[:, 0]], normal[pair[:, 1]]
     # At a convex edge each face runs against the normal of the other
     tangent_0 = _tangent(direction, normal_0, normal_n)
     tangent_n = _tangent(direction, normal_n, normal_0)
     sine = np.einsum("ij,ij->i", tangent_n, normal_0)
     cosine = np.einsum("ij,ij->i", tangent_n, tangent_0)
     exterior_rad = np.mod(np.arctan2(sine, cosine), 2 * np.pi)
-    return Edges(start_m, end_m, direction, pair, tangent_0, normal_0, normal_n, exterior_rad)
+    edges = np.column_stack([ends_m[:, 0], direction, length_m, tangent_0, normal_0, normal_n,
+                             exterior_rad, material[pair]])
+    return edges, ends_m, pair
 
 
 def _tangent(direction: np.ndarray, normal: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -358,14 +316,14 @@ def _tangent(direction: np.ndarray, normal: np.ndarray, other: np.ndarray) -> np
     return tangent * np.where(sign == 0, 1.0, sign)[:, None]
 
 
-def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Join consecutive pieces between the same two facets; return starts, ends and facets."""
+def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Join consecutive pieces between the same two facets; return ends and facets."""
     order = np.lexsort((pair[:, 1], pair[:, 0]))
     ends_m, pair = ends_m[order], pair[order]
     is_new = np.append(True, (pair[1:] != pair[:-1]).any(axis=1))[:len(pair)]
     first = np.append(np.flatnonzero(is_new), len(pair))
     joined_m, row = _joined(ends_m, first)
-    return joined_m[:, 0], joined_m[:, 1], pair[row]
+    return joined_m, pair[row]
 
 
 @njit(cache=True)

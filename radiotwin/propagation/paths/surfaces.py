@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from radiotwin.propagation.paths.facets import Edges, Facets
 from radiotwin.runtime.compiled import njit
 
 ON_PLANE_M = 1e-4  # [m], a point this close to a plane is on neither side of it
 GROUND_MATERIAL = -1  # last row of `Slabs`
 
-# First columns of the fields of `Surfaces.planes` and `Surfaces.edges`. Numba counts references to
+# First columns of what is in `Surfaces.planes` and `Surfaces.edges`. Numba counts references to
 # each array that a function is given; with an array for each field, that would take longer than
 # the geometry.
 NORMAL, OFFSET, ORIGIN, AXIS_U, AXIS_V, SIZE, FULL, FIRST, END, MATERIAL = (
@@ -23,41 +22,27 @@ START, ALONG, LENGTH, TANGENT, NORMAL_0, NORMAL_N, EXTERIOR, MATERIAL_0, MATERIA
 
 
 class Surfaces(NamedTuple):
-    """Facets, with the ground after the last one, and edges.
+    """Facets, with the ground after the last one, and the convex edges between two of them.
+
+    Where a building leans on a higher one without sharing its corners, the edge of its roof in
+    that wall is listed, too; it lies inside the other building, so no ray reaches it. A half plane
+    sweeps the open space of an edge when it is turned from face 0 by the exterior angle, π to 2 π,
+    towards the normal of face 0.
 
     Attributes:
-        planes: (f + 1, 19) of `Facets`: unit normal, offset, origin, axes u and v, sizes, whether
-            it is full, its first triangle and the one after its last, material.
-        triangle_uv_m: (t, 6) as in `Facets`.
-        edges: (e, 19) of `Edges`: start, direction, length, tangent in face 0, normals of face 0
-            and face n, exterior angle, materials of face 0 and face n.
+        planes: (f + 1, 19) outward unit normal, distance of the plane from the origin [m], a corner
+            of the bounding rectangle [m], unit vectors u and v along its sides, u × v = normal,
+            their lengths [m], whether the facet fills it, its first triangle and the one after its
+            last, row of the city's materials.
+        triangle_uv_m: (t, 6) corners u, v, u, v, u, v of the triangles in the plane [m].
+        edges: (e, 19) start [m], unit vector to the end, length [m], unit vector in face 0, at
+            right angles to the edge, into the face, outward normals of face 0 and face n, exterior
+            angle [rad], materials of face 0 and face n.
     """
 
     planes: np.ndarray
     triangle_uv_m: np.ndarray
     edges: np.ndarray
-
-
-def pack(facets: Facets, edges: Edges, flat_ground: bool = True) -> Surfaces:
-    """Put facets, the ground and edges into arrays for compiled code.
-
-    Args:
-        facets: of a city.
-        edges: of the city.
-        flat_ground: whether its ground is all of z = 0; else no path meets that plane.
-    """
-    planes = np.column_stack([
-        facets.normal, facets.offset_m, facets.origin_m, facets.axis_u, facets.axis_v,
-        facets.size_m, facets.full, facets.first[:-1], facets.first[1:], facets.material])
-    ground = [0, 0, 1, 0.0 if flat_ground else np.inf, 0, 0, 0, 1, 0, 0, 0, 1, 0, np.inf, np.inf,
-              1, 0, 0, GROUND_MATERIAL]
-    length_m = np.linalg.norm(edges.end_m - edges.start_m, axis=1)
-    return Surfaces(
-        np.concatenate([planes, [ground]]).astype(float),
-        np.ascontiguousarray(facets.triangle_uv_m, dtype=float),
-        np.column_stack([edges.start_m, edges.direction, length_m, edges.tangent_0, edges.normal_0,
-                         edges.normal_n, edges.exterior_rad,
-                         facets.material[edges.facet]]).astype(float))
 
 
 @njit(cache=True, error_model="numpy")

@@ -5,10 +5,28 @@ import pytest
 import trimesh
 
 from radiotwin.errors import BadInput
-from radiotwin.propagation.paths.facets import facets_and_edges
-from radiotwin.propagation.paths.surfaces import pack, within
+from radiotwin.propagation.paths.facets import extract_facets
+from radiotwin.propagation.paths.surfaces import (
+    AXIS_U,
+    AXIS_V,
+    FULL,
+    MATERIAL,
+    NORMAL,
+    ORIGIN,
+    SIZE,
+    within,
+)
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import itu_material
+
+
+def planes_of(city):
+    """Without the ground, the last one."""
+    return extract_facets(city).surfaces.planes[:-1]
+
+
+def three(planes, first):
+    return planes[:, first:first + 3]
 
 
 def sliced_wall(height_m=10.0):
@@ -27,19 +45,20 @@ def sliced_wall(height_m=10.0):
 
 @pytest.mark.parametrize("angle_rad", [0.0, 0.4])
 def test_a_box_has_four_walls_and_a_roof(city_of, angle_rad):
-    facets = facets_and_edges(city_of((0, 0, 10, 20, 30), angle_rad=angle_rad))[0]
-    assert len(facets) == 5 and (np.abs(facets.normal[:, 2]) < 0.1).sum() == 4 and facets.full.all()
-    assert sorted(np.round(facets.size_m.prod(axis=1))) == [200, 300, 300, 600, 600]
-    assert np.allclose(np.cross(facets.axis_u, facets.axis_v), facets.normal)
-    centre_m = facets.origin_m + 0.5 * (facets.size_m[:, :1] * facets.axis_u + facets.size_m[:, 1:] * facets.axis_v)
+    planes = planes_of(city_of((0, 0, 10, 20, 30), angle_rad=angle_rad))
+    normal, size_m, axis_u, axis_v = three(planes, NORMAL), planes[:, SIZE:SIZE + 2], three(planes, AXIS_U), three(planes, AXIS_V)
+    assert len(planes) == 5 and (np.abs(normal[:, 2]) < 0.1).sum() == 4 and planes[:, FULL].all()
+    assert sorted(np.round(size_m.prod(axis=1))) == [200, 300, 300, 600, 600]
+    assert np.allclose(np.cross(axis_u, axis_v), normal)
+    centre_m = three(planes, ORIGIN) + 0.5 * (size_m[:, :1] * axis_u + size_m[:, 1:] * axis_v)
     middle_m = np.array([5, 10, 15]) @ np.array([[np.cos(angle_rad), np.sin(angle_rad), 0],
                                                  [-np.sin(angle_rad), np.cos(angle_rad), 0], [0, 0, 1]])
-    assert (np.einsum("ij,ij->i", facets.normal, centre_m - middle_m) > 0).all()
+    assert (np.einsum("ij,ij->i", normal, centre_m - middle_m) > 0).all()
 
 
 def test_slices_are_merged_across_t_junctions():
-    facets = facets_and_edges(sliced_wall())[0]
-    assert len(facets) == 5 and facets.full.all()
+    planes = planes_of(sliced_wall())
+    assert len(planes) == 5 and planes[:, FULL].all()
 
 
 def test_surfaces_of_two_materials_are_two_facets(box_mesh):
@@ -47,32 +66,30 @@ def test_surfaces_of_two_materials_are_two_facets(box_mesh):
     metal_halves = np.zeros(len(mesh.faces), dtype=int)
     metal_halves[::2] = 1
     city = CityMap(mesh.vertices, mesh.faces, [itu_material("brick"), itu_material("metal")], metal_halves)
-    facets = facets_and_edges(city)[0]
-    assert len(facets) > 5
-    assert (facets.material[facets.of_face[facets.of_face >= 0]] == city.material[facets.of_face >= 0]).all()
+    surfaces, of_face, *_ = extract_facets(city)
+    assert len(surfaces.planes) > 6
+    assert (surfaces.planes[of_face[of_face >= 0], MATERIAL] == city.material[of_face >= 0]).all()
 
 
 def test_faces_of_the_ground_belong_to_no_facet(city_of):
     ground = trimesh.Trimesh([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], [[0, 1, 2], [0, 2, 3]],
                              process=False)
     city = city_of((0, 0, 10, 10, 10), ground)
-    facets = facets_and_edges(city)[0]
-    assert len(facets) == 5 and (facets.of_face[-2:] == -1).all()
+    assert len(planes_of(city)) == 5 and (extract_facets(city).of_face[-2:] == -1).all()
 
 
 def test_an_angled_facet_ends_at_its_outline(prism):
     mesh = prism([(0, 0), (30, 0), (30, 10), (10, 10), (10, 30), (0, 30)], 12.0)
     city = CityMap(mesh.vertices, mesh.faces)
-    facets, edges = facets_and_edges(city)
-    roof = int(np.flatnonzero(facets.normal[:, 2] > 0.9)[0])
-    surfaces = pack(facets, edges)
+    surfaces = extract_facets(city).surfaces
+    roof = int(np.flatnonzero(surfaces.planes[:, NORMAL + 2] > 0.9)[0])
     on = [within(surfaces.planes, surfaces.triangle_uv_m, roof, x, y, 12.0)
           for x, y in ((5.0, 25.0), (25.0, 5.0), (25.0, 25.0), (-1.0, 5.0))]
-    assert len(facets) == 7 and not facets.full[roof] and on == [True, True, False, False]
+    assert len(surfaces.planes) == 8 and not surfaces.planes[roof, FULL] and on == [True, True, False, False]
 
 
 def test_corners_must_be_finite(city_of):
     city = city_of((0, 0, 10, 10, 10))
     city.vertices[0, 0] = np.nan
     with pytest.raises(BadInput, match="finite"):
-        facets_and_edges(city)
+        extract_facets(city)

@@ -7,6 +7,7 @@ from radiotwin.propagation.paths.candidates import CandidateSearch
 from radiotwin.propagation.paths.fields import path_gains
 from radiotwin.propagation.paths.images import Candidates, PathBuffer, find_paths
 from radiotwin.propagation.paths.interactions import LUEBBERS, slabs_of
+from radiotwin.propagation.paths.surfaces import ALONG, NORMAL, OFFSET, ORIGIN, START
 from radiotwin.scene.citymap import CONCRETE
 
 WAVE_NUMBER = 2 * np.pi * 2.4e9 / 299_792_458.0
@@ -17,9 +18,8 @@ SLABS = slabs_of([CONCRETE, CONCRETE], 2.4e9)
 def inner_corner(city_of):
     """Walls x = 0 and y = 0 that face the quarter x, y > 0, and their rows."""
     search = CandidateSearch(city_of((-5, -5, 0, 60, 20), (0, -5, 60, 0, 20)), depth=2)
-    normal = search.facets.normal
-    return search, int(np.argmax((normal[:, 0] > 0.9) & np.isclose(search.facets.offset_m, 0))), \
-        int(np.argmax((normal[:, 1] > 0.9) & np.isclose(search.facets.offset_m, 0)))
+    planes = search.surfaces.planes
+    return search, *(int(np.argmax((planes[:, NORMAL + axis] > 0.9) & np.isclose(planes[:, OFFSET], 0))) for axis in (0, 1))
 
 
 def solve(search, before, edge, after, device_m, receiver_m):
@@ -61,10 +61,10 @@ def test_beside_the_wall_is_no_reflection(inner_corner):
 def test_diffraction_and_reflection_after_the_edge(city_of):
     """Over a roof edge to a higher wall and back: angles to the edge are equal, and so are those to the wall."""
     search = CandidateSearch(city_of((0, -50, 5, 50, 10), (60, -50, 70, 50, 40)), depth=3)
-    edges, facets = search.edges, search.facets
-    roof = int(np.flatnonzero(np.isclose(edges.start_m[:, [0, 2]], [0, 10]).all(axis=1)
-                              & (np.abs(edges.direction[:, 1]) > 0.9))[0])
-    wall = int(np.flatnonzero((facets.normal[:, 0] < -0.9) & (facets.origin_m[:, 0] > 50))[0])
+    planes, _, edges = search.surfaces
+    roof = int(np.flatnonzero(np.isclose(edges[:, [START, START + 2]], [0, 10]).all(axis=1)
+                              & (np.abs(edges[:, ALONG + 1]) > 0.9))[0])
+    wall = int(np.flatnonzero((planes[:, NORMAL] < -0.9) & (planes[:, ORIGIN] > 50))[0])
     paths, gain = solve(search, [-1], roof, [wall], [-10.0, -5.0, 2.0], [20.0, 12.0, 45.0])
     assert len(paths) == 1 and gain[0] > 0
     legs = np.diff(paths[0], axis=0)
