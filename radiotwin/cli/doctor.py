@@ -61,12 +61,7 @@ def diagnose() -> Diagnosis:
 
 
 def print_diagnosis(diagnosis: Diagnosis, console: Console) -> None:
-    """Print findings about this machine, and remedies.
-
-    Args:
-        diagnosis: to print.
-        console: to print on.
-    """
+    """Print findings about this machine, and remedies."""
     def say(text: str, style: str | None = None) -> None:  # neither wraps paths nor reads markup
         console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from radiotwin.twin.compare import Comparison
 
 
-
-
 def fit(
     measurements: MeasurementFile,
     scene: SceneOption,
@@ -186,11 +184,7 @@ def compare(
 
 
 def print_comparison(comparison: "Comparison") -> None:
-    """Print the tables of a comparison.
-
-    Args:
-        comparison: of models.
-    """
+    """Print the tables of a comparison of models."""
     result("scores", comparison.scores.to_dict("records"))
     result("locations", comparison.locations.to_dict("records"))
     for title, columns, rows in comparison.tables():

@@ -64,10 +64,7 @@ Cluster = Annotated[str | None, typer.Option(
 
 @contextmanager
 def open_model(path: Path) -> "Iterator[RadioMap | Twin]":
-    """Open a radio map, whose values stay in its file, or load a twin.
-
-    Args:
-        path: of a radio map (.nc, .zarr), or of a twin's folder.
+    """Open a radio map (.nc, .zarr), whose values stay in its file, or load a twin's folder.
 
     Raises:
         BadInput: it is neither.
@@ -84,19 +81,12 @@ def open_model(path: Path) -> "Iterator[RadioMap | Twin]":
 
 
 def split_names(text: str | None) -> list[str] | None:
-    """Split a list of names.
-
-    Args:
-        text: `A,B`; None or empty for all.
-    """
+    """Return the names of `A,B`; None for all."""
     return text.split(",") if text else None
 
 
 def parse_origin(text: str | None) -> "Origin | None":
-    """Parse the origin of a frame.
-
-    Args:
-        text: `LATITUDE,LONGITUDE` or `LATITUDE,LONGITUDE,ALTITUDE`; None for none.
+    """Return the origin of `LATITUDE,LONGITUDE` or `LATITUDE,LONGITUDE,ALTITUDE`; None for none.
 
     Raises:
         BadInput: anything else, or a place that is not on the earth.
@@ -117,15 +107,10 @@ def parse_origin(text: str | None) -> "Origin | None":
 
 def in_frame_of(scene: "Scene | None", measurements: "Measurements",
                 shift: str | None) -> "Measurements":
-    """Return measurements in the frame of a scene; as they are where there is none.
-
-    Args:
-        scene: the 3D map.
-        measurements: as they were read.
-        shift: `DX,DY` [m]; None for none.
+    """Return measurements in the frame of a scene, if there is one, after a shift `DX,DY` [m].
 
     Raises:
-        BadInput: not two numbers, no scene, or frames that cannot be related.
+        BadInput: not two numbers, no scene to shift to, or frames that cannot be related.
     """
     from radiotwin.links.alignment import in_scene_frame
 
@@ -150,12 +135,7 @@ def keep_scene_apart(out: Path, scene: "Scene | None") -> None:
 
 
 def parse_numbers(option: str, text: str, count: int | None = None) -> list[float]:
-    """Parse a list of numbers.
-
-    Args:
-        option: that has it, for the message.
-        text: `A,B,…`.
-        count: of them; None: at least one.
+    """Return the numbers of an option's `A,B,…`, of which there are `count`, or at least one.
 
     Raises:
         BadInput: they are not so many finite numbers.

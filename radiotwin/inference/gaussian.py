@@ -184,16 +184,8 @@ def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.nda
                limit_db: Limit, prior_db: float, prior_sd_db: float) -> LogDistanceLine:
     """Return the line, moved up or down to few or no levels: a maximum a posteriori shift.
 
-    Args:
-        line: to move.
-        log_distance: (n,) log10(d / 1 m); n may be 0, then the shift is the prior's mean.
-        level_db: (n,) [dB]; NaN: below the limit.
-        limit_db: limit of detection [dB]; None: links that were not detected count nothing.
-        prior_db: mean of the shift's normal prior [dB].
-        prior_sd_db: its standard deviation [dB].
-
-    Returns:
-        line of the same exponent and standard deviation.
+    Levels are as of `fit_line`; without a limit those that were not detected count nothing. The
+    shift's prior is normal, of mean `prior_db` and standard deviation `prior_sd_db`.
     """
 
     def objective(shift_db: float) -> float:

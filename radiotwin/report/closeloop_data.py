@@ -48,13 +48,9 @@ class DrawnLinks(Links):
         return np.stack([self.device_m[self.device], self.receiver_m], axis=1)
 
     def on_axis(self, name: str, value: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return a variable as it is drawn, and the label of its axis.
+        """Return a variable (n,) as it is drawn, and the label of its axis.
 
         Times count from the first measurement, in days, hours or seconds.
-
-        Args:
-            name: name of the variable.
-            value: (n,) its values.
         """
         label, unit = variable_label(name)
         if name == "time_s":
@@ -168,11 +164,7 @@ class LoopData:
 
 
 def collect(loop: Loop) -> LoopData:
-    """Copy what the figures need out of a close-loop.
-
-    Args:
-        loop: result of `radiotwin.closeloop`.
-    """
+    """Copy what the figures need out of a close-loop."""
     model = loop.after
     links = _links(model.whole, loop.before.held_out_mean_db)
     before = loop.dependences_before
@@ -231,14 +223,9 @@ class BinMeans:
 
 
 def bin_index(value: np.ndarray, count: int) -> np.ndarray:
-    """Assign values to bins that hold about as many values each.
+    """Return the bin (n,) of each finite value (n,); bins hold about as many values each.
 
-    Args:
-        value: (n,) finite values.
-        count: number of bins; where there are at most as many distinct values, each has its own.
-
-    Returns:
-        (n,) index of the bin of each value
+    Where there are at most as many distinct values as bins, each has its own.
     """
     values = np.unique(value)
     if len(values) <= count:

@@ -63,12 +63,7 @@ ON_MAP = ("place_of_ray", "place_of_receiver")  # variables that the residual ma
 
 
 def effect_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw an effect in the figure that suits it.
-
-    Args:
-        effect: the effect and its contribution.
-        background: map of the same links.
-    """
+    """Draw an effect in the figure that suits it."""
     kind = effect.figure or FIGURE_OF_STAGE.get(effect.stage, "")
     return FIGURES.get(kind, variable_figure)(effect, background)
 
@@ -190,19 +185,9 @@ FIGURE_OF_STAGE = {"paths": "histogram", "detection": "intervals", "limit": "int
 
 def _draw_means(ax: Axes, effect: EffectData, rows: np.ndarray, value: np.ndarray,
                 measured_db: np.ndarray, fitted_db: np.ndarray, label: str) -> BinMeans:
-    """Draw links as dots, their means over a variable, and the mean of what is fitted.
+    """Draw links (r,) as dots, their means over a variable, and the means of what is fitted.
 
-    Args:
-        ax: axes to draw into.
-        effect: the effect.
-        rows: (r,) indices of the links.
-        value: (n,) variable.
-        measured_db: (n,) level or residual [dB].
-        fitted_db: (n,) the same as fitted [dB].
-        label: of the means in the legend.
-
-    Returns:
-        the means of what is fitted
+    Variable, measured and fitted levels or residuals are of all links (n,). Returns the last means.
     """
     rows = rows[np.isfinite(value[rows])]
     index = bin_index(value[rows], EFFECT_BINS)
@@ -308,9 +293,7 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
 def waterfall_figure(report: dict) -> Figure:
     """Draw the held-out RMSE of the base, the change by each kept effect, and the final RMSE.
 
-    Args:
-        report: content of `closeloop.json`; its other models are horizontal lines, up to
-            `MAX_LINE` times the highest bar.
+    Other models of `closeloop.json` are horizontal lines, up to `MAX_LINE` times the highest bar.
     """
     before, after = (report["error"][when]["rmse_db"] or 0.0 for when in ("before", "after"))
     kept = [(candidate["name"], candidate["heldout_rmse_db"]) for candidate in report["candidates"]

@@ -53,9 +53,6 @@ CONTENT = ("scene.toml, twin.json, closeloop.json, compare.json, config.json of 
 def check_closeloop_folder(folder: Path | str) -> None:
     """Check that the result of a close-loop can be written to a folder, before it is made.
 
-    Args:
-        folder: to write.
-
     Raises:
         BadInput: it cannot be written, or its `twin` is not a twin's folder.
     """
@@ -111,10 +108,6 @@ def write_comparison_folder(comparison: Comparison, scene: Scene, folder: Path |
 
 def check_map_target(path: Path | str, scene: Scene) -> None:
     """Check that a map of a scene can be written under a file name, before it is made.
-
-    Args:
-        path: file to write; its suffix chooses the format.
-        scene: of the map.
 
     Raises:
         BadInput: an unknown format, one that needs an origin where the scene has none, or a file

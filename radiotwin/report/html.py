@@ -64,16 +64,7 @@ class Picture:
 
 
 def read_picture(folder: Path, name: str, title: str, text: str = "") -> Picture | None:
-    """Read a PNG file of a folder to be put into a page.
-
-    Args:
-        folder: that holds it.
-        name: of the file.
-        title: heading.
-        text: description.
-
-    Returns:
-        the figure; None where the folder does not hold it.
+    """Read a PNG file to be put into a page; None where the folder does not hold it.
 
     Raises:
         BadInput: it leads out of the folder, is not PNG, or is too large.

@@ -216,13 +216,9 @@ class MapBackground:
         return width_in * min(max((y_max - y_min) / max(x_max - x_min, 1.0), 0.4), 1.3)
 
     def frame(self, positions_m: np.ndarray) -> tuple[float, float, float, float]:
-        """Enlarge a part of the map, in the map's proportions.
+        """Return x_min, x_max, y_min, y_max [m] of a part, in the map's proportions.
 
-        Args:
-            positions_m: (n, 2) positions that are to be seen [m].
-
-        Returns:
-            x_min, x_max, y_min, y_max [m]
+        It shows positions (n, 2) [m].
         """
         x_min, x_max, y_min, y_max = self.bounds
         if not len(positions_m):
@@ -234,12 +230,7 @@ class MapBackground:
         return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
 
     def draw(self, ax: Axes, labelled: bool = True) -> None:
-        """Draw buildings, the ends that do not move, and axes in metres.
-
-        Args:
-            ax: axes to draw into.
-            labelled: whether the y axis has labels.
-        """
+        """Draw buildings, the ends that do not move, and axes in metres."""
         x_min, x_max, y_min, y_max = self.bounds
         if self._scene is not None:
             draw_vegetation(ax, self._scene)
@@ -258,10 +249,7 @@ class MapBackground:
                            edgecolors="black", linewidths=0.8, zorder=4, label=label)
 
     def cell_means(self, value_db: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Average a value over the links whose moving end is in a cell.
-
-        Args:
-            value_db: (n,) value of each link [dB]; NaN is left out.
+        """Average values of links (n,) [dB], NaN left out, by the cell of their moving end.
 
         Returns:
             edges of the cells in x and in y [m], and (ny, nx) means [dB]; NaN where a cell has
@@ -373,12 +361,7 @@ def level_map_figure(data: LoopData, background: MapBackground) -> Figure | None
 
 
 def contribution_map_figure(contribution_db: np.ndarray, background: MapBackground) -> Figure:
-    """Draw the mean contribution of an effect over the positions of the moving end.
-
-    Args:
-        contribution_db: (n,) change of the predicted level of each link [dB].
-        background: of the same links.
-    """
+    """Draw what an effect changes links by, (n,) [dB], over the positions of the moving end."""
     figure = new_figure(6.6, background.panel_height(4.9) + 0.9)
     ax = figure.add_subplot()
     background.draw(ax)

@@ -32,11 +32,9 @@ MIN_STEP_M = 1e-9  # a shorter leg along an axis is none along it
 
 
 def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> np.ndarray:
-    """Return the power gain (n,) of some kinds of paths between isotropic antennas.
+    """Return the power gain (n,) of paths between isotropic antennas.
 
-    Args:
-        geometry: n links over a map.
-        kinds: names of `radiotwin.propagation.paths.PathPowers`' components; None: all.
+    Kinds are components of `radiotwin.propagation.paths.PathPowers`; None: all.
     """
     from radiotwin.propagation.paths.powers import COMPONENTS  # late: numba is large
 
@@ -51,9 +49,6 @@ def interaction_gains(geometry: LinkGeometry) -> np.ndarray:
     """Return the power gain (n, 3) of the direct, the reflected and the diffracted paths.
 
     A path with an edge is diffracted, whatever else it has.
-
-    Args:
-        geometry: n links over a map.
     """
     from radiotwin.propagation.paths.powers import COMPONENTS
 
@@ -68,14 +63,9 @@ def interaction_gains(geometry: LinkGeometry) -> np.ndarray:
 
 
 def rays_of(links: Links, end: str) -> np.ndarray:
-    """Return power times direction of the paths at one end of links.
+    """Return power times direction of the paths at one end of links, (n, sectors, 3).
 
-    Args:
-        links: n links over a map.
-        end: `departures` or `arrivals`, see `radiotwin.propagation.paths.PathPowers`.
-
-    Returns:
-        (n, sectors, 3)
+    `departures` or `arrivals`, see `radiotwin.propagation.paths.PathPowers`.
     """
     from radiotwin.propagation.paths.powers import SECTORS
 

@@ -49,14 +49,10 @@ def scale_db(own_db: float | np.ndarray, square_db: np.ndarray) -> np.ndarray:
 
 def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
               square_db: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Fit level and scale to links of one class.
+    """Fit level and scale to links of one class, perhaps from an earlier fit on.
 
-    Args:
-        level_db: (n,) [dB]; NaN: not detected.
-        limits_db: (n,) below which levels are not detected [dB].
-        paths: (n,) levels of the followed paths [dB].
-        square_db: (n,) mean square of what the map's errors do [dB²].
-        start: of an earlier fit.
+    Levels of links (n,), their limits, and those of the followed paths are in dB, the mean square
+    of what the map's errors do in dB².
 
     Returns:
         (2,) offset of measured levels from those of the paths [dB], and logarithm of the scale
@@ -119,12 +115,7 @@ class LinkFit:
 
 
 def links_as_one(links: LinkGeometry, z: np.ndarray) -> float:
-    """Return how many links count as one.
-
-    Args:
-        links: n links.
-        z: (n,) residuals over their scale.
-    """
+    """Return how many links count as one, by their residuals over the scale (n,)."""
     block = np.column_stack([links.device, np.floor(links.receiver_m[:, :2] / BLOCK_M)])
     label = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)
     return design_effect(label, z)
@@ -160,14 +151,7 @@ class ImagePaths(ChannelModel):
 
     def fit_diffuse(self, links: LinkGeometry, level_db: np.ndarray,
                     limit_db: Limit) -> Self:
-        """Fit the diffuse power to links without line of sight, beside a level of their own.
-
-        Args:
-            links: n links over a map.
-            level_db: (n,) [dB]; NaN = not detected.
-            limit_db: below which levels are not detected [dB], one for all or (n,); None or -inf:
-                unknown.
-        """
+        """Fit the diffuse power to links without line of sight, as of `fit`, beside their level."""
         nlos = links.select(~links.los)
         level_db = level_db[~links.los]
         blank = np.isnan(level_db)
@@ -279,13 +263,7 @@ def _with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,
 
 def paths_db(links: LinkGeometry, diffuse: tuple[float, float], offsets_db: Offsets = (0.0, 0.0)
              ) -> np.ndarray:
-    """Return the level (n,) [dB] of followed paths and diffuse power.
-
-    Args:
-        links: n links over a map.
-        diffuse: power beside the paths, see `ImagePaths`.
-        offsets_db: see `Offsets`.
-    """
+    """Return the level (n,) [dB] of followed paths and diffuse power, as of `ImagePaths`."""
     return _level_db(interaction_gains(links), links.distance_m, diffuse, offsets_db)
 
 
@@ -302,13 +280,8 @@ def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
     """Return what reflections and diffractions carry beside those over the map [dB].
 
     The most likely ones under a normal prior of `OFFSET_SD_DB`, which keeps them at 0 where levels
-    do not tell the two apart: each class of line of sight has a level of its own.
-
-    Args:
-        links: n links over a map.
-        level_db: (n,) [dB]; NaN: not detected.
-        limit_db: below which levels are not detected [dB], one for all or (n,); None: unknown.
-        diffuse: power beside the paths, see `ImagePaths`.
+    do not tell the two apart: each class of line of sight has a level of its own. Levels and limits
+    are as of `ImagePaths.fit`, the diffuse power is as of `ImagePaths`.
     """
     fit, gains = LinkFit(level_db, limit_db), interaction_gains(links)
     distance_m = links.distance_m

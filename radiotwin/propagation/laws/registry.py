@@ -77,10 +77,7 @@ def channel_models() -> dict[str, type[ChannelModel]]:
 
 
 def channel_named(name: str) -> type[ChannelModel]:
-    """Return a channel model's class.
-
-    Args:
-        name: of the model, or an alias of it.
+    """Return the class of a channel model by its name, or an alias of it.
 
     Raises:
         BadInput: no such model is installed.
@@ -95,29 +92,16 @@ def channel_named(name: str) -> type[ChannelModel]:
 
 def fit_once(kind: type[ChannelModel], links: LinkGeometry, level_db: np.ndarray,
              limit_db: Limit, seed: int) -> ChannelModel:
-    """Fit a new model, or take it from an earlier run that was to fit the same.
+    """Fit a new model of a kind, or take it from an earlier run that was to fit the same.
 
-    Args:
-        kind: of model.
-        links: n links.
-        level_db: (n,) [dB]; NaN: not detected.
-        limit_db: level below which the receiver does not detect [dB]; None: unknown.
-        seed: as of `ChannelModel.fit`.
-
-    Raises:
-        BadInput: as of `ChannelModel.fit`.
+    Arguments and errors are those of `ChannelModel.fit`.
     """
     return kept("channel", (kind, links, level_db, limit_db, seed),
                 lambda: kind().fit(links, level_db, limit_db, seed), kind.state, kind.from_state)
 
 
 def encode_channel(model: ChannelModel, beside: dict[str, np.ndarray] | None = None) -> bytes:
-    """Return a fitted model as the content of a safetensors file.
-
-    Args:
-        model: fitted.
-        beside: arrays of something else that the file is to hold, by name.
-    """
+    """Return a fitted model as a safetensors file, beside which it may hold other arrays."""
     arrays, settings = model.state()
     arrays = arrays | {f"{BESIDE}{name}": array for name, array in (beside or {}).items()}
     header = json.dumps({"model": model.name, "settings": settings}, sort_keys=True)

@@ -82,14 +82,9 @@ def one_thread() -> Iterator[None]:
 
 
 def forward(weights: dict[str, torch.Tensor], inputs: torch.Tensor) -> torch.Tensor:
-    """Return the output of every member: two tanh layers and a linear one.
+    """Return every member's residual in standard deviations of the class, (MEMBERS, n).
 
-    Args:
-        weights: tensors by the names in WEIGHTS, each with the members as first dimension.
-        inputs: (n, INPUTS).
-
-    Returns:
-        (MEMBERS, n) residual in standard deviations of its class.
+    Two tanh layers and a linear one. Weights are by the names in WEIGHTS, inputs (n, INPUTS).
     """
     hidden = torch.tanh(torch.baddbmm(weights["b1"], inputs.expand(MEMBERS, -1, -1), weights["w1"]))
     hidden = torch.tanh(torch.baddbmm(weights["b2"], hidden, weights["w2"]))
@@ -111,15 +106,11 @@ def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
 
 
 @one_thread()
-def train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Train all members and keep the weights of each that were best on its held-out links.
 
     The loss is the censored Gaussian likelihood, with one standard deviation for each class and
-    member that is learned with the weights.
-
-    Args:
-        data: n links.
-        seed: of the first weights and the batches; equal data and seed give equal bits.
+    member that is learned with the weights. Equal data and seed give equal bits.
 
     Returns:
         weights by name, (MEMBERS, ...) each, and for every link the output (n,) of the member that
@@ -229,7 +220,7 @@ class SegmentedNN(ChannelModel):
             los=links.los[use],
             fold=_folds(links, np.random.default_rng(seed))[use],
         )
-        self.weights, heldout = train(data, seed)
+        self.weights, heldout = _train(data, seed)
         mean_db = law_db.copy()
         mean_db[use] += heldout * law_sd_db[use]
         for s, line in enumerate((self.law.nlos, self.law.los)):

@@ -331,14 +331,9 @@ class CandidateSearch:
             facet[order], np.arange(len(self.is_ground) + 1)))
 
     def candidates(self, device_m: np.ndarray, rays: int = DEVICE_RAYS) -> Candidates:
-        """Find the sequences from a device, those without an edge first, and remember them.
+        """Return the sequences of up to `depth` interactions that are worth trying.
 
-        Args:
-            device_m: (3,) position [m].
-            rays: that are shot from it.
-
-        Returns:
-            All sequences of up to `depth` interactions that are worth trying.
+        Those from a device at (3,) [m] that rays shot from it find; without an edge first.
         """
         key = np.asarray(device_m, dtype=float).tobytes(), rays
         with self._one_at_a_time:

@@ -83,15 +83,9 @@ def find_paths(
     surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray, receiver_m: np.ndarray,
     cursor: int, buffer: PathBuffer,
 ) -> tuple[int, int]:
-    """Try candidates × receivers in order from `cursor` until the buffer is full.
+    """Try candidates × receivers (n, 3) in order from a cursor on until the buffer is full.
 
-    Args:
-        surfaces: of the map.
-        candidates: sequences to try.
-        device_m: (3,) position of the device [m].
-        receiver_m: (n, 3) positions of the receivers [m].
-        cursor: candidate · n + receiver to begin with.
-        buffer: output, filled from its first row on.
+    The cursor is candidate · n + receiver; the buffer is filled from its first row on.
 
     Returns:
         The number of paths found, and the cursor to go on with.
@@ -236,15 +230,9 @@ def found_clear(
     city: CityMap, surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
     receiver_m: np.ndarray, buffer: PathBuffer,
 ) -> Iterator[np.ndarray]:
-    """Find the paths from a device that nothing blocks, as many at a time as a buffer holds.
+    """Find the paths from a device (3,) to receivers (n, 3) [m] that nothing blocks.
 
-    Args:
-        city: 3D map.
-        surfaces: of the map.
-        candidates: that are tried.
-        device_m: (3,) position [m].
-        receiver_m: (n, 3) positions [m].
-        buffer: takes the paths.
+    As many at a time as a buffer holds.
 
     Yields:
         (m,) rows of the buffer, ascending; the next paths take their places.
@@ -258,17 +246,10 @@ def found_clear(
 def clear_paths(
     city: CityMap, surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer, found: int
 ) -> np.ndarray:
-    """Return the rows of the paths in a buffer that nothing blocks.
+    """Return the rows of the first `found` paths in a buffer that nothing blocks.
 
     Points of interaction are moved off their surface by `SKIN_M`, so that no surface blocks the
     path that it reflects or diffracts.
-
-    Args:
-        city: 3D map.
-        surfaces: of the map.
-        candidates: that the paths were found with.
-        buffer: the paths.
-        found: number of paths in the buffer.
 
     Returns:
         (m,) rows of the buffer, ascending.

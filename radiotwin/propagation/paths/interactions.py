@@ -238,14 +238,9 @@ def _cotangent_term(beta: float, x: float, n: float, sign: int) -> complex:
 def reflect(
     normal: np.ndarray, material: int, direction_in: np.ndarray, slabs: Slabs, field: np.ndarray
 ) -> np.ndarray:
-    """Reflect the field of a ray, in place, and return the direction of the reflected ray.
+    """Reflect the complex field (3,) of a ray, in place, and return the reflected ray's direction.
 
-    Args:
-        normal: (3,) unit normal of the surface, on either side.
-        material: row of `slabs`.
-        direction_in: (3,) unit vector of the ray.
-        slabs: materials of the city.
-        field: (3,) complex, changed in place.
+    The surface has a unit normal (3,), on either side, and a material, a row of the slabs.
     """
     cosine = dot(direction_in, normal)
     direction = direction_in - 2.0 * cosine * normal

@@ -87,14 +87,7 @@ NO_RAYS = Rays(np.zeros(0, dtype=int), np.zeros(0, dtype=complex), np.zeros(0),
 
 def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float,
                 depth: int = 4) -> Iterator[tuple[Rays, int]]:
-    """Follow the paths from a device to receivers, some receivers at a time.
-
-    Args:
-        city: 3D map.
-        device_m: (3,) position [m].
-        receiver_m: (n, 3) positions [m].
-        frequency_hz: carrier frequency [Hz].
-        depth: maximum number of interactions of a path, 1 to 6.
+    """Follow paths of up to `depth` interactions from a device (3,) to receivers (n, 3) [m].
 
     Yields:
         The paths to the next receivers, whose rows are among all, and the number of these.
@@ -341,13 +334,7 @@ def _write(dataset: xr.Dataset, path: Path | str) -> None:
 
 
 def sums(values: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
-    """Return the sum (links,) of real or complex values (p,) over the paths of each link.
-
-    Args:
-        values: (p,) of the paths.
-        link: (p,) row of each path's link.
-        links: number of links.
-    """
+    """Return the sum (links,) of real or complex values (p,) over the paths of each link (p,)."""
     if np.iscomplexobj(values):
         return sums(values.real, link, links) + 1j * sums(values.imag, link, links)
     return np.bincount(link, weights=values, minlength=links)
@@ -400,10 +387,7 @@ def k_factor_db(power: np.ndarray, direct: np.ndarray, link: np.ndarray, links: 
 def doppler_hz(arrival: np.ndarray, velocity_m_s: np.ndarray, wavelength_m: float) -> np.ndarray:
     """Return the Doppler shifts (p,) of paths to a moving receiver, positive where it approaches.
 
-    Args:
-        arrival: (p, 3) unit vectors from the receiver along the paths.
-        velocity_m_s: (3,) of the receiver [m/s].
-        wavelength_m: of the carrier [m].
+    Arrivals are unit vectors (p, 3) from the receiver along the paths.
     """
     return arrival @ velocity_m_s / wavelength_m
 
@@ -414,15 +398,8 @@ def impulse_response(amplitude: np.ndarray, excess_s: np.ndarray, link: np.ndarr
 
     Tap l of an ideal low-pass is the sum of a sinc(l - B τ) over the paths (Tse and Viswanath,
     "Fundamentals of Wireless Communication", 2005, eq. 2.34). Tap `EDGE_TAPS` is at the excess
-    delay 0; those before and after hold the ringing of the low-pass.
-
-    Args:
-        amplitude: (p,) complex, with the phase of the carrier over the whole delay.
-        excess_s: (p,) delays after the link's first path [s].
-        link: (p,) row of each path's link, ascending.
-        links: number of links.
-        bandwidth_hz: B [Hz].
-        taps: number of taps.
+    delay 0; those before and after hold the ringing of the low-pass. Amplitudes (p,) have the phase
+    of the carrier over the whole delay; rows of links (p,) ascend.
 
     Returns:
         (links, taps) complex.

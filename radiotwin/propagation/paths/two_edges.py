@@ -61,15 +61,9 @@ def paths_over_two_edges(
     city: CityMap, surfaces: Surfaces, facet_edges: FacetEdges, seen: np.ndarray,
     device_m: np.ndarray, receiver_m: np.ndarray,
 ) -> EdgePairs:
-    """Find the paths from a device to receivers over two edges.
+    """Find the paths from a device (3,) to receivers (n, 3) [m] over two edges.
 
-    Args:
-        city: 3D map.
-        surfaces: of the map.
-        facet_edges: of the map.
-        seen: (s,) edges that the device sees.
-        device_m: (3,) position [m].
-        receiver_m: (n, 3) positions [m].
+    The first one is of those that the device sees, (s,).
     """
     bend_m = _bends(surfaces.edges, seen, device_m, receiver_m).reshape(-1, 3)
     receiver, first = np.repeat(np.arange(len(receiver_m)), len(seen)), np.tile(
@@ -150,13 +144,8 @@ def shortest(
     """Return where the shortest way over two edges' lines crosses them (Fermat's principle).
 
     The length is convex in both positions; Newton's method with halved steps finds its minimum,
-    where the angles of the ray to each edge are equal before and after it (Keller's law).
-
-    Args:
-        one: row of `Surfaces.edges`: the first edge.
-        other: the second.
-        from_m: (3,) start of the way [m].
-        to_m: (3,) its end [m].
+    where the angles of the ray to each edge are equal before and after it (Keller's law). Edges are
+    rows of `Surfaces.edges`, the way's ends (3,) [m].
 
     Returns:
         Positions along the edges from their starts [m]; -1 where the way goes through the point in
@@ -224,18 +213,9 @@ def two_edge_gains(
     surfaces: Surfaces, wave_number: float, slabs: Slabs, wedge: int, edge: np.ndarray,
     points_m: np.ndarray,
 ) -> np.ndarray:
-    """Compute the power gains of paths over two edges between vertical isotropic antennas.
+    """Return the power gains (p,), linear, of paths over two edges, (p, 2) as in `EdgePairs`.
 
-    Args:
-        surfaces: of the map.
-        wave_number: 2 π / wavelength [1/m].
-        slabs: materials of the map.
-        wedge: as of `radiotwin.propagation.paths.fields.path_gains`.
-        edge: (p, 2) as in `EdgePairs`.
-        points_m: (p, 4, 3) as there.
-
-    Returns:
-        (p,) linear.
+    Others as of `radiotwin.propagation.paths.fields.path_gains`.
     """
     gain = np.empty(len(edge))
     direction, field = np.empty((3, 3)), np.empty(3, dtype=np.complex128)
