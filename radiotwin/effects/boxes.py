@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 
 from radiotwin.effects.arrays import ends_above
 from radiotwin.effects.params import Length, Metres
+from radiotwin.inference.student import DOF
 from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
 
@@ -19,7 +20,6 @@ HEIGHTS_M = (6.0, 9.0, 12.0, 16.0, 22.0, 30.0, 40.0, 52.0, 66.0, 85.0, 110.0)  #
 MIN_APART_M = 25.0  # between the best cells
 CHUNK, MAX_POINTS = 2000, 4_000_000  # links, and points on them, at a time: bounds memory
 P_MISS = 0.4  # probability that a link through a cell misses the box there, which is smaller
-DOF = 4.0  # degrees of freedom of the errors
 MIN_SHARE = 0.1  # of the links through a box, to be more than a few
 GRAZING_DB = 6.0  # loss of a way that touches an edge
 SAME_PLACE_M = 10.0  # devices of one mast

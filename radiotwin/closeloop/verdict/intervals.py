@@ -25,13 +25,13 @@ from radiotwin.closeloop.crossfit import CrossFit, same_effects
 from radiotwin.closeloop.verdict.criteria import LEVELS_DB, MAX_SHARE, MIN_CLUSTERS, MIN_FOLDS
 from radiotwin.effects.params import Estimate, Parameter
 from radiotwin.inference.sandwich import MAX_WIDTH
+from radiotwin.inference.student import DOF
 from radiotwin.links import evidence_blocks
 from radiotwin.twin.model.model import Fit
 from radiotwin.twin.model.uncertainty import Linearised, Secant, estimates, linearise
 
 QUANTILE = 0.95  # upper end of a 90 % interval
 MIN_CHANGE_DB = 1e-6  # of a reading that an effect acts on
-DOF = 4.0  # degrees of freedom of the errors, by which outliers count less
 
 
 def effect_parameters(model: CrossFit) -> list[dict[str, Parameter]]:

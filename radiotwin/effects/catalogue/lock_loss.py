@@ -31,10 +31,9 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Variation,
 )
-from radiotwin.inference.student import Losses, log_density
+from radiotwin.inference.student import DOF, Losses, log_density
 from radiotwin.links import Links
 
-DOF = 4.0  # of the errors within a state
 TAILS = (1.2, 1.6, 2.2, 3.0, 4.0, 8.0)  # degrees of freedom of the single t, tried
 FIRST_DROPS_DB = (10.0, 15.0, 22.0, 32.0, 42.0)
 STEPS = 40  # of EM
