@@ -66,11 +66,7 @@ def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
 
 
 def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
-    """Collect the variables of the template `closeloop_sections.html`.
-
-    Args:
-        report: content of `closeloop.json`, checked.
-        folder: of the figures.
+    """Collect the variables of `closeloop_sections.html` from a report that has been checked.
 
     Raises:
         BadInput: a damaged figure.

@@ -146,13 +146,10 @@ def _judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
 
 
 def write_comparison(comparison: Comparison, scene: Scene, folder: Path | str) -> None:
-    """Write the tables of a comparison.
+    """Write the tables of a comparison, and the name of its scene.
 
-    Args:
-        comparison: result of `compare_models`.
-        scene: whose name is recorded.
-        folder: for `compare.json`, `scores.csv`, `locations.csv` and `predictions.csv.gz`; made if
-            needed, files of these names are replaced.
+    `compare.json`, `scores.csv`, `locations.csv` and `predictions.csv.gz`; the folder is made if
+    needed, files of these names are replaced.
     """
     folder = Path(folder)
     record = {"schema": SCHEMA, "scene": scene.config.name, "scores": _rows(comparison.scores),
@@ -167,13 +164,7 @@ def write_comparison(comparison: Comparison, scene: Scene, folder: Path | str) -
 
 
 def read_comparison(path: Path) -> Comparison:
-    """Read the tables of a comparison.
-
-    Args:
-        path: of a `compare.json`.
-
-    Returns:
-        scores and locations; twins and predictions are empty.
+    """Read the scores and locations of a `compare.json`; twins and predictions are empty.
 
     Raises:
         BadInput: it cannot be read, it is of another version, or it is damaged.
@@ -287,12 +278,7 @@ def _estimates_figure(comparison: Comparison, models: list[str], scene: Scene) -
 
 
 def comparison_context(comparison: Comparison, folder: Path) -> dict[str, Any]:
-    """Collect the variables of the template `comparison_sections.html`.
-
-    Args:
-        comparison: scores and located devices.
-        folder: of the figures.
-    """
+    """Collect the variables of `comparison_sections.html`, with the figures of a folder."""
     pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
     return {"lead": _summary(comparison),
             "tables": [Table(list(columns), rows, title)

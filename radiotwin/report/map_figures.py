@@ -111,11 +111,7 @@ def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene
                       device: str) -> Figure:
     """Draw the truth beside models, and their errors, for one device at the lowest altitude.
 
-    Args:
-        truth: map of reference gains.
-        models: name -> map over the same lattice with that device.
-        scene: whose buildings are outlined.
-        device: name of the device.
+    The models' maps, by name, are over the same lattice.
     """
     figure, axes = panels(2, 1 + len(models), 4.0, 4.3)
     heights = height_grid(scene, OUTLINE_CELLS)

@@ -84,12 +84,7 @@ class ChannelModel(ABC):
         return self
 
     def level_at(self, links: Links, exact: bool = False) -> np.ndarray:
-        """Return the mean level (n,) [dB] of measured links, such as with moved devices.
-
-        Args:
-            links: n links.
-            exact: whether `quick` does not do.
-        """
+        """Return the mean level (n,) [dB] of measured links, of `quick` unless it must be exact."""
         channel = self if exact else self.quick
         return channel.predict(links.geometry)[0]
 
@@ -133,13 +128,10 @@ class ChannelModel(ABC):
 
 
 def check_fit_data(links: LinkGeometry, level_db: np.ndarray, *, needs_los: bool) -> None:
-    """Refuse links that no channel can be learnt from.
+    """Refuse links that no channel can be learnt from; levels (n,) [dB] are NaN if not detected.
 
-    Args:
-        links: n links.
-        level_db: (n,) [dB]; NaN: not detected.
-        needs_los: whether one detected link must have line of sight; for a model with `uses_map`
-            and a map. No such link nearly always means that map and positions disagree.
+    A model with `uses_map` and a map needs a detected link with line of sight: if there is none,
+    map and positions nearly always disagree.
 
     Raises:
         BadInput: fewer than MIN_DETECTED detected links, or none with the line of sight needed.

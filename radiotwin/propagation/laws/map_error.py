@@ -144,11 +144,7 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
                    ) -> Shift:
     """Estimate the shift of a map from links between declared positions (maximum likelihood).
 
-    Args:
-        links: n links over a map; those to devices of estimated position are not looked at.
-        level_db: (n,) [dB]; NaN: not detected.
-        limit_db: below which levels are not detected [dB], one for all or (n,); None: unknown.
-        seed: of the choice of links, and of the maps' errors.
+    Arguments are those of `estimate_map_error`.
 
     Returns:
         zeros where there are too few links, or no shift. Walls that are off each in their own way
