@@ -77,13 +77,9 @@ class CensoredRegression:
     random_effect_sd_db: np.ndarray | float = 0.0
 
     def arriving(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the mean level before the receiver.
+        """Return the mean level before the receiver (n,) [dB] by coefficients (p0 + p1,).
 
-        Args:
-            coefficients: (p0 + p1,).
-
-        Returns:
-            (n,) [dB], and its slope in the law (n,); None where that is one.
+        And its slope in the law (n,); None where that is one.
         """
         split, slope = self.law_columns.shape[1], None
         level_db = self.law_db + self.law_columns @ coefficients[:split]
@@ -94,9 +90,7 @@ class CensoredRegression:
     def linearise(self, coefficients: np.ndarray, scale_db: np.ndarray) -> "Linearisation":
         """Return mean and scale of the readings with their derivatives.
 
-        Args:
-            coefficients: (p0 + p1,).
-            scale_db: (groups,) error scales [dB].
+        By coefficients (p0 + p1,) and error scales (groups,) [dB].
         """
         arriving_db, law_slope = self.arriving(coefficients)
         scale = np.hypot(scale_db[self.group], self.random_effect_sd_db)

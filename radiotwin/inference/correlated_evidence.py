@@ -70,12 +70,8 @@ class CorrelatedEvidence:
             seed: int) -> Self:
         """Choose the length of the correlation at which residuals are likeliest.
 
-        Args:
-            series: (n,) label of the field that each row belongs to.
-            position_m: (n, 3) where [m].
-            z: (n,) residuals; NaN = of no use.
-            nuisance: what is fitted beside it.
-            seed: of the draw of rows, where there are many.
+        Rows (n,) have the label of the field that they belong to, a position [m], and a residual,
+        NaN if it is of no use. Where there are many, some are drawn.
         """
         rng = np.random.default_rng(seed)
         chosen = []
@@ -112,12 +108,7 @@ class CorrelatedEvidence:
                                zip(self.parts, self.bases, strict=True)]) if self.parts else mine
 
     def log_evidence(self, z: np.ndarray, columns: Columns) -> float:
-        """Return the log marginal likelihood [nats], at the likeliest variances.
-
-        Args:
-            z: (n,) residuals.
-            columns: of n rows.
-        """
+        """Return the log marginal likelihood of residuals (n,) at the best variances [nats]."""
         return self.of_rotated(self.rotated(z), self.rotated(columns.values), columns.prior_sd)[0]
 
     def of_rotated(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
@@ -166,13 +157,8 @@ class CorrelatedEvidence:
                     theta: np.ndarray) -> float:
         """Return how sharply the data would show a pattern of unit size [1/size²].
 
-        Twice the expected log-likelihood ratio of the pattern beside columns that are fitted, too.
-
-        Args:
-            pattern: (m,) rotated.
-            columns: (m, q) rotated.
-            prior_sd: (q,) of their coefficients.
-            theta: the two variances' logarithms.
+        Twice the expected log-likelihood ratio of the pattern beside columns that are fitted, too;
+        both are rotated. Others as of `at`.
         """
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
         weighted = columns.T / variance

@@ -49,17 +49,11 @@ def levels_of(values: np.ndarray) -> np.ndarray | None:
 
 def permutation_p_value(level: np.ndarray, z: np.ndarray, series: Series,
                         rng: np.random.Generator) -> float:
-    """Return the p-value of the values' squares between bins.
+    """Return the p-value of the values' squares between bins (n,).
 
     Where the bin changes within most series, each is rotated by a random number of places, so that
     neighbours stay neighbours; else whole series swap their means. (`scipy.stats.permutation_test`
     knows neither.) Sequential (Besag and Clifford 1991, 'Sequential Monte Carlo p-values').
-
-    Args:
-        level: (n,) bin.
-        z: (n,) values.
-        series: of the n values.
-        rng: of the permutations.
     """
     observed = _between(level, z)
     permuted = _rotated if _changes_within(level[series.order], series.starts) else _swapped

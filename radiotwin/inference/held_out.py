@@ -82,10 +82,7 @@ def cross_fit_p_value(gains: np.ndarray) -> float:
     without the effect is known, and so is its mean over the folds; by Markov's inequality
     (Wasserman, Ramdas and Balakrishnan 2020, 'Universal inference', PNAS 117(29), the cross-fit
     test). Here that model is fitted elsewhere, too, so that the average is above 1 where links are
-    few.
-
-    Args:
-        gains: (folds,) gain in log-likelihood of each fold [nats].
+    few. Gains (folds,) are in log-likelihood [nats].
     """
     return float(np.exp(-max(logsumexp(gains) - np.log(len(gains)), 0.0)))
 
@@ -93,9 +90,7 @@ def cross_fit_p_value(gains: np.ndarray) -> float:
 def sign_flip_p_value(gains: np.ndarray, seed: int) -> float:
     """Return the one-sided sign-flip permutation p-value of the sum of gains.
 
-    Args:
-        gains: (pieces,) gain of each independent piece of evidence; zeros do not count.
-        seed: of the flips.
+    Each is of an independent piece of evidence; zeros do not count.
     """
     rng = np.random.default_rng(seed)
     gains = gains[gains != 0]

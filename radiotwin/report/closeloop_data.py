@@ -236,14 +236,9 @@ def bin_index(value: np.ndarray, count: int) -> np.ndarray:
 
 def bin_means(index: np.ndarray, value: np.ndarray, residual_db: np.ndarray,
               block: np.ndarray) -> BinMeans:
-    """Average residuals over bins; bins of fewer than `MIN_LINKS` links are left out.
+    """Average residuals of links (n,) over bins of a variable, without those of few links.
 
-    Args:
-        index: (n,) bin of each link.
-        value: (n,) variable.
-        residual_db: (n,) values to average [dB].
-        block: (n,) index of the block of links with a common error, which counts as one
-            observation in the standard error.
+    A block of links with a common error counts as one observation in the standard error.
     """
     count = np.bincount(index)
     mean = np.bincount(index, weights=residual_db) / np.maximum(count, 1)

@@ -89,11 +89,8 @@ def through_antenna_db(power: np.ndarray, gain: np.ndarray, scattered: np.ndarra
                        mean_gain: float) -> np.ndarray:
     """Return what an antenna adds to links (n,) [dB].
 
-    Args:
-        power: (n, sectors) of the rays.
-        gain: (n, sectors) of the antenna in their directions, linear.
-        scattered: (n,) power from everywhere.
-        mean_gain: of the antenna over all directions, linear.
+    Rays have a power, and the antenna a linear gain in their directions, (n, sectors); scattered
+    power (n,) comes from everywhere, so that the mean gain over all directions applies to it.
     """
     received = (power * gain).sum(axis=1) + scattered * mean_gain
     return 10 * np.log10(received / (power.sum(axis=1) + scattered))

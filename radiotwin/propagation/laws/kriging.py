@@ -79,7 +79,7 @@ class ResidualField:
 
     def fit(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray, seed: int,
             kind: np.ndarray | None = None) -> Self:
-        """Fit the correlation and store the points.
+        """Fit the correlation, store the points, and return the field itself.
 
         Args:
             series: (n,) index of the series that a point belongs to.
@@ -87,9 +87,6 @@ class ResidualField:
             residual: (n,) of unit variance.
             seed: of the selection of points that the correlation is fitted to.
             kind: (n,) index of what has an error of its own in each series; None: nothing has.
-
-        Returns:
-            the field itself
         """
         rng = np.random.default_rng(seed)
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
@@ -131,15 +128,10 @@ class ResidualField:
 
     def predict(self, series: np.ndarray, position_m: np.ndarray,
                 kind: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the conditional distribution of the residual; memory does not grow with n.
+        """Return mean and standard deviation (n,) of the residual at points, as of `fit`.
 
-        Args:
-            series: (n,) index of each point's series.
-            position_m: (n, 3) [m].
-            kind: (n,) as for `fit`.
-
-        Returns:
-            (n,) mean and (n,) standard deviation: 0 and 1 far from points and in unknown series.
+        Far from points that are stored, and in unknown series, they are 0 and 1. Memory does not
+        grow with n.
         """
         mean, sd = np.zeros(len(series)), np.ones(len(series))
         for number, rows, cross in self._crossing(series, position_m, kind):

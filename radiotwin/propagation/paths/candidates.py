@@ -78,7 +78,7 @@ class Ways(NamedTuple):
 def _open_ways(
     city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
 ) -> Ways:
-    """Return those of ways (w,) to edges by which the device, at (3,) [m], sees a point of one."""
+    """Return those of ways (w,) by which the device, at (3,) [m], sees a point of the edge."""
     lit_m, source_m, samples = _lit_parts(surfaces, before, edge, device_m)
     points = PathBuffer.allocate(SAMPLE_CHUNK + int(samples.max(initial=0)))
     one_by_one = Candidates(before, np.full(len(edge), -1), before[:, :0])
