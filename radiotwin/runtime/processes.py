@@ -112,8 +112,8 @@ def thread_count() -> int:
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """Return a function's results in the order of its arguments, one a call.
 
-    It changes nothing that other calls read. A progress bar of its own needs one that is open
-    around all.
+    The function changes nothing that other calls read. A progress bar of its own needs one that is
+    open around all.
     """
     listed = list(items)
     count = min(thread_count(), len(listed))
