@@ -119,6 +119,7 @@ OTHERS = {
 }
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("other", OTHERS)
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_no_fault_of_a_flight_is_not_called_one(flown, other, seed):

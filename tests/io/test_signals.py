@@ -41,6 +41,7 @@ def run(program, folder, *arguments):
                           env=os.environ | {"PYTHONPATH": str(ROOT)}, timeout=60)
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("numbers, status, word", [("[signal.SIGINT]", 130, "interrupted"),
                                                    ("[signal.SIGTERM] * 2", 143, "terminated"),
                                                    ("[signal.SIGINT, signal.SIGTERM]", 130, "interrupted")])

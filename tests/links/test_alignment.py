@@ -47,6 +47,7 @@ def placed(scene, origin):
     return Scene(scene.folder, config)
 
 
+@pytest.mark.seconds
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("wrong_m", [(60.0, -40.0), (-130.0, 20.0), (8.0, 210.0)])
 def test_the_translation_is_found(rbm, seed, wrong_m):

@@ -52,6 +52,7 @@ def wheel(tmp_path_factory):
     return folder / done.stdout.split()[-1]
 
 
+@pytest.mark.seconds
 def test_the_wheel_holds_all_data(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     packages = (path for package in ("radiotwin", "marl") for path in (ROOT / package).rglob("*"))
@@ -63,6 +64,7 @@ def test_the_wheel_holds_all_data(wheel):
                 assert f"radiotwin/{path.relative_to(ROOT).as_posix()}" in names
 
 
+@pytest.mark.seconds
 def test_in_a_wheel(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")
     (tmp_path / "empty").mkdir()

@@ -32,6 +32,7 @@ def test_scene_name(source, name):
     assert scene_name(source) == name
 
 
+@pytest.mark.seconds
 def test_building_needs_no_ray_tracer():
     """Rationale: everything but tracing must work where there is no LLVM; importing drjit there can abort."""
     code = (

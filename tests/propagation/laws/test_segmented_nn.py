@@ -8,6 +8,8 @@ from radiotwin.links.links import LinkGeometry
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.segmented_nn import SegmentedNN, forward
 
+pytestmark = pytest.mark.seconds
+
 LIMIT_DB = -120.0
 
 
@@ -16,7 +18,6 @@ def rmse(model, data, mask):
     return np.sqrt(np.mean((model.predict(data.links)[0][mask] - data.level_db[mask]) ** 2))
 
 
-@pytest.mark.seconds
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 10))])
 def test_held_out_error_is_within_8_percent_of_the_noise(world, laws, seed):
     """Rationale: on the published law nothing is left to learn, so whatever lies above the noise is overfitting.
@@ -32,7 +33,6 @@ def test_held_out_error_is_within_8_percent_of_the_noise(world, laws, seed):
         assert rmse(model, test, test.links.los == los) == pytest.approx(laws["parameters"][los][2], rel=0.08)
 
 
-@pytest.mark.seconds
 def test_learns_a_break_point_that_no_line_has(world, laws):
     """Error against the noiseless truth: at most half of the segmented law's in both classes."""
     train = world(20, 2000, limit_db=LIMIT_DB, law=laws["break point"])
@@ -57,7 +57,6 @@ def test_nine_in_ten_fall_within_their_interval(fitted_nn, world):
         assert np.mean(np.abs(z[fresh.links.los == los]) < 1.645) == pytest.approx(0.9, abs=0.03)
 
 
-@pytest.mark.seconds
 def test_equal_seeds_give_equal_bits_whatever_the_threads(world):
     data = world(40, 80)
     before, models = torch.get_num_threads(), []

@@ -12,6 +12,8 @@ from radiotwin.propagation.paths.listing import list_paths
 from radiotwin.scene.antennas import Antenna, Pattern
 from tests.propagation.links import powers_of_links
 
+pytestmark = pytest.mark.seconds
+
 POINTS_M = np.array([[40.0, 40, 55], [10, 30, 30], [80, 20, 55]])
 
 
