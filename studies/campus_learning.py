@@ -13,7 +13,14 @@ from matplotlib.figure import Figure
 
 from radiotwin import Measurements, Scene, close_loop, make_report
 from radiotwin.closeloop.output.corrected_twin import corrected_twin
-from radiotwin.closeloop.predict.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
+from radiotwin.closeloop.predict.baselines import (
+    BOOSTING,
+    EXTRA_TREES,
+    Part,
+    fitted_law,
+    law_db,
+    trees_db,
+)
 from radiotwin.links import Links, prepare_links
 from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
@@ -50,7 +57,7 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
     predicted = {TWIN: by_twin.mean_db, NAMED: named.predict(others).mean_db}
     unlimited = links.with_columns(limit_db=np.full(len(links), -np.inf))
     for kind in (LogDistance, SegmentedLogDistance, RegressionKriging):
-        predicted[kind.name] = law_db(kind, unlimited, rows, test)
+        predicted[kind.name] = law_db(fitted_law(kind, unlimited, rows), unlimited, test)
     for name in (EXTRA_TREES, BOOSTING):
         predicted[name] = trees_db(name, Part(unlimited), rows, test, seed)
     report = make_report(loop)

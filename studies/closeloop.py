@@ -18,7 +18,7 @@ import trimesh
 from radiotwin import Measurements, Scene, close_loop, make_report
 from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
 from radiotwin.closeloop.search.declared import add_declared
-from radiotwin.closeloop.search.stages import SearchInputs, search
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.effects.registry import catalogue
 from radiotwin.links import prepare_links
 from radiotwin.scene.citymap import CityMap
@@ -100,7 +100,7 @@ def base_rmse_db(measurements: Measurements, scene: Scene, base: str, hold_out: 
     kind = make_bases(scene, 0)[base]
     model = cross_validate(links, kind, folds, training_parts(links, folds))
     inputs = SearchInputs(links, kind, folds, tuple(effect() for effect in catalogue()))
-    return search(model, [add_declared], inputs).model.rmse_db()
+    return search(SearchState(model), [add_declared], inputs).model.rmse_db()
 
 
 def with_true_city(scene: Scene, effect: dict) -> Scene:

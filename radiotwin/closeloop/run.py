@@ -193,7 +193,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
                     if not (effect.in_paths and models[best].whole.channel.follows_paths))
     inputs = SearchInputs(links, bases[best], folds, effects, criteria, seed,
                           executor or Executor(), on_progress)
-    declared = search(models[best], [add_declared], inputs)
+    declared = search(SearchState(models[best]), [add_declared], inputs)
     on_progress("looking at the residual")
     before = after = dependences(declared.model, seed)
     found = search(declared, [add_faults, add_changes, add_causes, drop_idle_faults], inputs)

@@ -8,16 +8,16 @@ too, has the mean of the pattern. Where the paths over the map explain less than
 to the receiver, as over a map with guessed heights, the gain is that of the straight line.
 """
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 from typing_extensions import override
 
 from radiotwin.effects.arrays import LinkCache, frequent_labels, one_hot
-from radiotwin.effects.base import GainEffect, LevelAt, Term
+from radiotwin.effects.base import Effect, GainEffect, LevelAt, Term
 from radiotwin.effects.params import (
     Allowed,
     DeviceIndex,
@@ -60,17 +60,14 @@ class AntennaParams(EffectParams):
         return given
 
 
-Pattern = TypeVar("Pattern", bound=EffectParams)
-
-
-def vary_patterns(patterns: dict[int, Pattern],
-                  effect: Callable[[dict[int, Pattern]], Any]) -> Variation:
+def vary_patterns(effect: Effect, end: str) -> Variation:
     """Return how the patterns of several antennas, or bodies, may be refined, each by itself.
 
     Args:
-        patterns: pattern of each device or receiver.
-        effect: patterns -> the effect with them.
+        effect: whose parameters have them.
+        end: "devices" or "receivers": the parameter that has them by index.
     """
+    patterns = getattr(effect.params, end)
     members, fields = len(patterns), quantities(next(iter(patterns.values())))
     values = np.array([[getattr(pattern, name) for name in fields]
                        for pattern in patterns.values()])
@@ -79,8 +76,9 @@ def vary_patterns(patterns: dict[int, Pattern],
 
     def changed(numbers: np.ndarray) -> Any:
         rows = np.reshape(numbers, (members, -1)).tolist()
-        return effect({member: pattern.model_copy(update=dict(zip(fields, row, strict=True)))
-                       for (member, pattern), row in zip(patterns.items(), rows, strict=True)})
+        return effect.changed(**{end: {
+            member: pattern.model_copy(update=dict(zip(fields, row, strict=True)))
+            for (member, pattern), row in zip(patterns.items(), rows, strict=True)}})
 
     return Variation(values.ravel(), steps, low, high, changed,
                      list(np.arange(values.size).reshape(members, -1)))
@@ -93,24 +91,28 @@ def allowed_of(name: str, field: dict[str, Any]) -> Allowed:
     return Allowed(field["low"], field["high"])
 
 
-def report_pattern(pattern: AntennaParams, sd: np.ndarray, name: str,
-                   with_map: bool) -> dict[str, Parameter]:
-    """Return a pattern's parameters, by name; without a map, the last is not reported.
+def report_patterns(patterns: Mapping[int, EffectParams], params_sd: np.ndarray,
+                    names: Sequence[str], prefix: str = "",
+                    with_scattered: bool = True) -> dict[str, Parameter]:
+    """Return the parameters of patterns, by name.
 
     Args:
-        pattern: fitted.
-        sd: (r,) standard deviation of each parameter.
-        name: of the device or receiver.
-        with_map: whether paths were followed.
+        patterns: k patterns as fitted, by index of their device or receiver.
+        params_sd: (k r,) standard deviation of each of their r parameters.
+        names: of the devices or receivers.
+        prefix: of the parameters' names.
+        with_scattered: whether the last one counts: the power on paths that are not followed.
     """
     reported = {}
-    for (field, each), field_sd in zip(quantities(pattern).items(), sd, strict=True):
-        value = getattr(pattern, field)
-        value = value % 360 if field.endswith("azimuth_deg") else value
-        reported[f"{field}[{name}]"] = Parameter.normal(value, field_sd, each["unit"],
-                                                        allowed_of(field, each))
-    if not with_map:
-        reported.popitem()
+    for (member, pattern), sd in zip(patterns.items(), np.reshape(params_sd, (len(patterns), -1)),
+                                     strict=True):
+        for (field, each), field_sd in zip(quantities(pattern).items(), sd, strict=True):
+            value = getattr(pattern, field)
+            value = value % 360 if field.endswith("azimuth_deg") else value
+            reported[f"{prefix}{field}[{names[member]}]"] = Parameter.normal(
+                value, field_sd, each["unit"], allowed_of(field, each))
+        if not with_scattered:
+            reported.popitem()
     return reported
 
 

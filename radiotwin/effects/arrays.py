@@ -105,6 +105,11 @@ def robust_sd(values: np.ndarray) -> float:
     return MAD_SD * float(np.median(np.abs(values - np.median(values))))
 
 
+def squares_about_mean(values: np.ndarray, weight: np.ndarray) -> float:
+    """Return the weighted squares of values (n,) about their weighted mean."""
+    return weight @ (values - weight @ values / weight.sum()) ** 2
+
+
 def add_power(level_db: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the level of the sum of two powers, and its slope in the first level.
 

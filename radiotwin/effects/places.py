@@ -11,24 +11,32 @@ from typing import NamedTuple
 import numpy as np
 
 from radiotwin.effects.boxes import Box
+from radiotwin.effects.params import Length, Metres
 
 
-class RaisedRoof(NamedTuple):
-    """A roof of the map that is higher, or lower, than the map says.
+class Roof(NamedTuple):
+    """A roof of the map, and how much higher it is than the map says.
 
     Attributes:
         building: index, as `radiotwin.effects.boxes.buildings` numbers them.
         x_m, y_m, height_m: centre and height on the map [m].
-        by_m: how much higher it is [m].
-        sd_m: standard deviation of `by_m` [m].
+        offset_m: how much higher the one is that predicts links best [m].
+        offset_sd_m: standard deviation of `true_offset_m` [m].
+        common_m: what the other roofs have in common of it, which is the model's [m].
     """
 
     building: int
-    x_m: float
-    y_m: float
-    height_m: float
-    by_m: float
-    sd_m: float
+    x_m: Metres
+    y_m: Metres
+    height_m: Metres
+    offset_m: Metres
+    offset_sd_m: Length
+    common_m: Metres = 0.0
+
+    @property
+    def true_offset_m(self) -> float:
+        """Estimate of true minus mapped height [m]."""
+        return self.offset_m - self.common_m
 
 
 class FoundAntenna(NamedTuple):
@@ -62,7 +70,7 @@ class Correction:
 
     boxes: tuple[Box, ...] = ()
     gone: tuple[int, ...] = ()
-    roofs: tuple[RaisedRoof, ...] = ()
+    roofs: tuple[Roof, ...] = ()
     moves_m: Mapping[int, tuple[float, float]] = field(default_factory=dict)
     antennas: Mapping[int, FoundAntenna] = field(default_factory=dict)
 

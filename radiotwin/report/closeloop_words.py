@@ -144,7 +144,7 @@ def probability(value: float | None) -> str:
 
 def _criteria(report: dict) -> dict[str, float]:
     """Return the report's criteria, and today's in place of those that it lacks."""
-    return SelectionCriteria().to_json() | report.get("criteria", {})
+    return vars(SelectionCriteria()) | report.get("criteria", {})
 
 
 def _counts(dependence: dict, report: dict) -> bool:

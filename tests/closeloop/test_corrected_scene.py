@@ -20,8 +20,9 @@ from radiotwin.effects.catalogue.gain_drift import ReceiverDrift
 from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
-from radiotwin.effects.catalogue.roof_heights import Roof, RoofHeights
+from radiotwin.effects.catalogue.roof_heights import RoofHeights
 from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
+from radiotwin.effects.places import Roof
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions

@@ -26,7 +26,6 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.links.variables import link_features
 from radiotwin.report.closeloop_figures import waterfall_figure
 from radiotwin.twin.model.blend import Blend
-from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
 from radiotwin.twin.model.uncertainty import estimates, linearise
 
 MASTS_M = np.array([[150.0, 200.0, 25.0], [420.0, 330.0, 25.0]])
@@ -272,7 +271,7 @@ def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
     kind = make_bases(None, 0)["log-distance"]
     base = cross_validate(links, kind, folds, training_parts(links, folds))
     result = search(base, [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
-    fields = [CorrelatedShadowing.fit(each, 0) for each in result.model.each]
+    fields = [each.rest(0) for each in result.model.each]
     model = result.model.with_shadowing(fields)
     mean_db, scale_db = model.held_out_reading
     spread_db, unheard_db = model.held_out_scales

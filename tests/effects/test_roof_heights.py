@@ -5,13 +5,9 @@ import pytest
 import trimesh
 
 from radiotwin.closeloop.crossfit import make_bases
-from radiotwin.effects.catalogue.roof_heights import (
-    Roof,
-    RoofHeights,
-    beside_the_others,
-    surely_off,
-)
+from radiotwin.effects.catalogue.roof_heights import RoofHeights, beside_the_others, surely_off
 from radiotwin.effects.params import QUANTILE_90
+from radiotwin.effects.places import Roof
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.fitting import add_effect

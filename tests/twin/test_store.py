@@ -12,7 +12,7 @@ import pytest
 from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.run import close_loop
 from radiotwin.effects import catalogue
-from radiotwin.effects.catalogue.roof_heights import Roof
+from radiotwin.effects.places import Roof
 from radiotwin.errors import BadInput
 from radiotwin.twin import Twin, check_twin_target, fit_twin
 from radiotwin.twin.model.model import FittedModel

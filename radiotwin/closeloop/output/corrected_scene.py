@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.boxes import Box, building_extents_m, buildings
-from radiotwin.effects.places import Correction, FoundAntenna, RaisedRoof
+from radiotwin.effects.places import Correction, FoundAntenna, Roof
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import as_numbers, read_cells, write_csv
 from radiotwin.io.files import atomic_folder, require_writable
@@ -106,13 +106,13 @@ def write_antenna(antenna: FoundAntenna, path: Path) -> None:
         "gain_dbi": np.round(gain_db - 10 * np.log10(mean), DECIMALS)}), path)
 
 
-def stretch(roof: RaisedRoof, base_m: float) -> float:
+def stretch(roof: Roof, base_m: float) -> float:
     """Return how much taller a building that stands on `base_m` is than on the map, a ratio."""
-    return 1.0 + roof.by_m / max(roof.height_m - base_m, abs(roof.by_m))
+    return 1.0 + roof.true_offset_m / max(roof.height_m - base_m, abs(roof.true_offset_m))
 
 
 def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[str],
-                        roofs: list[RaisedRoof], base_m: np.ndarray) -> pd.DataFrame | None:
+                        roofs: list[Roof], base_m: np.ndarray) -> pd.DataFrame | None:
     """Return the table of a scene's buildings as they are after the correction.
 
     Args:
@@ -143,7 +143,7 @@ def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[
         for row in np.flatnonzero(table["shape"].isin(shapes_of[roof.building])):
             raised_m = own_m + stretch(roof, own_m) * (top_m[row] - own_m)
             table.loc[row, ["top_m", "height_from", "height_sd_m"]] = [
-                f"{raised_m:.3f}", SOURCE, f"{max(roof.sd_m, MIN_SD_M):.1f}"]
+                f"{raised_m:.3f}", SOURCE, f"{max(roof.offset_sd_m, MIN_SD_M):.1f}"]
     return table
 
 
@@ -206,7 +206,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
         *centres_m[building, :2], above_m[building]) for building in gone]
     roofs = [roof for each in found for roof in each.roofs if roof.building not in gone]
     changes += [f"the roof at ({roof.x_m:.0f}, {roof.y_m:.0f}) m is "
-                f"{above_m[roof.building] + roof.by_m:.1f} m high, and "
+                f"{above_m[roof.building] + roof.true_offset_m:.1f} m high, and "
                 f"{above_m[roof.building]:.1f} m on the map"
                 for roof in roofs]
     config, antennas, declared = with_antennas(config, found, links, scene)
@@ -302,7 +302,7 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
 
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
-                roofs: list[RaisedRoof],
+                roofs: list[Roof],
                 base_m: np.ndarray) -> tuple[dict[int, set[str]], set[str]]:
     """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, roofs, and boxes.
 
@@ -327,7 +327,7 @@ def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
     return shapes_of, {shape.name for shape in shapes}
 
 
-def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[RaisedRoof],
+def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof],
                 base_m: np.ndarray) -> trimesh.Trimesh:
     """Return a mesh whose buildings (f,) are stretched to the heights of their roofs.
 

@@ -10,7 +10,6 @@ from radiotwin.closeloop.predict.blending import make_blend, needs_rest
 from radiotwin.closeloop.run import Loop
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import RadiusCalibration, calibrate_radii, whole_area
-from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
 from radiotwin.twin.twin import Twin
 
 
@@ -27,7 +26,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     model = loop.for_twin
     shadowing = model.whole.shadowing
     if shadowing is None and needs_rest(loop.prediction):
-        shadowing = CorrelatedShadowing.fit(model.whole, loop.seed)
+        shadowing = model.whole.rest(loop.seed)
     fitted = replace(model.whole.learnt,
                      **vars(_calibration(loop, scene)), shadowing=shadowing,
                      blend=make_blend(model, loop.prediction, loop.seed))

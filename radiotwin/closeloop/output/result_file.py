@@ -126,7 +126,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "dependences_before": [vars(each) for each in loop.dependences_before],
         "remaining": {"structured": bool(loop.remaining),
                       "drivers": [vars(each) for each in loop.remaining]},
-        "criteria": loop.criteria.to_json(), "notes": [*links.notes, *loop.found.notes]})
+        "criteria": vars(loop.criteria), "notes": [*links.notes, *loop.found.notes]})
 
 
 def scores(model: CrossFit, rows: np.ndarray | None = None) -> dict[str, float]:

@@ -97,8 +97,7 @@ def _openmp() -> ThreadpoolController:
     return ThreadpoolController().select(user_api="openmp")
 
 
-def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: int,
-             trees: int = TREES) -> np.ndarray:
+def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: int) -> np.ndarray:
     """Return what trees that were grown on some detected links predict of others [dB].
 
     Blanks are left out: with them at the level that kriging gives them, trees predict detected
@@ -110,40 +109,29 @@ def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: i
         train: (n,) bool or rows, to learn from.
         test: (m,) rows.
         seed: as of `grow_trees`.
-        trees: as of `grow_trees`.
     """
     rows = np.arange(len(part.links))[train]
     rows = rows[np.isfinite(part.links.level_db[rows])]
 
     def grow() -> np.ndarray:
-        forest = grow_trees(kind, part.features[rows], part.links.level_db[rows], seed, trees)
+        forest = grow_trees(kind, part.features[rows], part.links.level_db[rows], seed)
         return forest.predict(part.features[test])
 
-    inputs = (kind, part.features[rows], part.links.level_db[rows], part.features[test], seed,
-              trees)
+    inputs = kind, part.features[rows], part.links.level_db[rows], part.features[test], seed, TREES
     return kept("trees", inputs, grow, lambda found: ({"mean_db": found}, None),
                 lambda arrays, _: arrays["mean_db"])
 
 
-def law_db(kind: type[ChannelModel], links: Links, train: np.ndarray, test: np.ndarray,
-           like: RegressionKriging | None = None) -> np.ndarray:
-    """Return what a channel model that was fitted to some links predicts of others [dB].
-
-    The level of a link that is detected.
+def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,
+               like: RegressionKriging | None = None) -> ChannelModel:
+    """Return a channel model that is fitted to some links.
 
     Args:
         kind: of model.
         links: n links.
         train: (n,) bool or rows, to learn from.
-        test: (m,) rows.
         like: kriging whose correlation is taken; None: it is fitted.
     """
-    return _if_detected(fitted_law(kind, links, train, like), links, test)
-
-
-def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,
-               like: RegressionKriging | None = None) -> ChannelModel:
-    """Return a channel model of some links, as of `law_db`."""
     geometry, level_db = links.geometry.select(train), links.level_db[train]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of classes with few links
@@ -152,7 +140,8 @@ def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,
         return fit_once(kind, geometry, level_db, links.limit_db[train], 0)
 
 
-def _if_detected(law: ChannelModel, links: Links, test: np.ndarray) -> np.ndarray:
+def law_db(law: ChannelModel, links: Links, test: np.ndarray) -> np.ndarray:
+    """Return what a model predicts of rows (m,) of links that are detected [dB]."""
     mean_db, sd_db = law.predict(links.geometry.select(test))
     return mean_if_detected(mean_db, sd_db, links.limit_db[test])
 
@@ -163,8 +152,7 @@ def laws_for(links: Links, criteria: SelectionCriteria) -> list[type[ChannelMode
             if kind is not RegressionKriging or len(links) <= criteria.max_links_for_kriging]
 
 
-def held_out_baselines(model: CrossFit, parts: list[Part], criteria: SelectionCriteria,
-                       seed: int,
+def held_out_baselines(model: CrossFit, parts: list[Part], criteria: SelectionCriteria, seed: int
                        ) -> tuple[dict[str, np.ndarray], list[RegressionKriging]]:
     """Return the held-out prediction of other models.
 
@@ -188,11 +176,11 @@ def held_out_baselines(model: CrossFit, parts: list[Part], criteria: SelectionCr
             law = fitted_law(kind, part.links, fold.train)
             if isinstance(law, RegressionKriging):
                 kriging.append(law)
-            result[kind.name][test] = _if_detected(law, part.links, test)
+            result[kind.name][test] = law_db(law, part.links, test)
         for learner in (EXTRA_TREES, BOOSTING):
             result[learner][test] = trees_db(learner, part, fold.train, test, seed)
         for law in published:  # a device of unknown position is where the fold has it
-            result[law.name][test] = _if_detected(law, part.links, test)
+            result[law.name][test] = law_db(law, part.links, test)
     return result, kriging
 
 

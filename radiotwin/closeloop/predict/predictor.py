@@ -28,6 +28,7 @@ from radiotwin.closeloop.predict.baselines import (
     LAWS,
     TREES,
     Part,
+    fitted_law,
     grow_trees,
     held_out_baselines,
     law_db,
@@ -42,11 +43,7 @@ from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.runtime.processes import in_threads
 from radiotwin.twin.model.blend import FORESTS, NAMED, REST, TREES_ALONE, far_share
-from radiotwin.twin.model.correlated_shadowing import (
-    CorrelatedShadowing,
-    receivers_move,
-    standardised_residual,
-)
+from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing, receivers_move
 from radiotwin.twin.model.model import Fit
 
 HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
@@ -118,7 +115,7 @@ class _Learnt:
             if not len(test) or np.isfinite(part.links.level_db[~out]).sum() < MIN_LEARNT:
                 continue
             fit = replace(whole, train=~out).fit(self.fit)
-            rest = self.rest and self.rest.refit(fit)
+            rest = self.rest and fit.rest(0, self.rest)
             inner = _Learnt(fit, rest, self.kriging, part, self.names)
             errors.append(part.links.level_db[test, None] - inner.members_db(test, seed))
             shares.append(shares_of(part.links, ~out, test))
@@ -130,7 +127,8 @@ class _Learnt:
     def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
         """Return predictions (m, k) of rows (m,), by few trees and known correlations [dB]."""
         physics = physics_db(self.fit, self.rest, self.part, test, seed, AWAY_TREES)
-        laws = [law_db(kind, self.part.links, self.fit.train, test, self.kriging)
+        links = self.part.links
+        laws = [law_db(fitted_law(kind, links, self.fit.train, self.kriging), links, test)
                 for kind in LAWS if kind.name in self.names]
         return np.column_stack([physics, *laws])
 
@@ -159,7 +157,7 @@ def combined_prediction(model: CrossFit, with_rest: bool, criteria: SelectionCri
         """Return what is learnt outside a fold; its rows (m,), their members and far shares."""
         fold, part, rest = model.folds[number], parts[number], None
         if REST in names:
-            rest = fold.shadowing or CorrelatedShadowing.fit(fold, seed)
+            rest = fold.shadowing or fold.rest(seed)
         learnt = _Learnt(fold, rest, kriging[number] if kriging else None, part, names)
         test = np.flatnonzero((model.index == number) & fold.usable)
         members = np.column_stack([physics_db(fold, rest, part, test, seed),
@@ -247,7 +245,7 @@ def grown_forests(fit: Fit, part: Part, seed: int, trees: int = TREES,
         names: those that are asked for.
     """
     rows = np.flatnonzero(fit.train)
-    z = standardised_residual(fit)
+    z = fit.training_z
     mean_db, scale_db, _ = fit.reading_parts()
     level_db = mean_db[rows] + z * scale_db[rows]
     return {name: grow_trees(kind, part.common[rows], target, seed, trees)

@@ -155,7 +155,10 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
         refused = [each for each in fitted if isinstance(each, Trial)]
         for candidate in sorted(candidates, key=lambda each: -each.gain):
             inputs.on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
-            model = model or _within_flights(state.model, inputs)
+            if model is None:
+                links = located_links(state.model, inputs.links, inputs.base)
+                model = _in_other_folds(state.model, links, inputs.base,
+                                        _within_flights(links, inputs.seed))
             trial, extended = fit_and_score(model, candidate.effect, len(timed), inputs)
             if extended is not None:
                 trial = replace(trial, evidence_nats=candidate.evidence)
@@ -252,12 +255,6 @@ def _without(model: Model, place: int | None) -> Model:
                                if number != place])
 
 
-def _within_flights(model: CrossFit, inputs: SearchInputs) -> CrossFit:
-    """Return a model fitted to folds that leave part of each flight."""
-    links = located_links(model, inputs.links, inputs.base)
-    return _in_other_folds(model, links, inputs.base, _folds(links, inputs.seed))
-
-
 def _in_other_folds(model: CrossFit, links: Links, base: Base, folds: Folds) -> CrossFit:
     """Return the base with a model's effects as they are, fitted to other folds."""
     other = cross_validate(links, base, folds, training_parts(links, folds))
@@ -266,7 +263,8 @@ def _in_other_folds(model: CrossFit, links: Links, base: Base, folds: Folds) -> 
     return other
 
 
-def _folds(links: Links, seed: int) -> Folds:
+def _within_flights(links: Links, seed: int) -> Folds:
+    """Return folds that leave part of each flight."""
     by_device = len(links.anchors & set(links.device.tolist())) >= MIN_HELD_OUT_DEVICES
     return make_folds(links, seed, "device" if by_device and not devices_move(links) else "block")
 

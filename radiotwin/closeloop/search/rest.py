@@ -12,7 +12,6 @@ from radiotwin.closeloop.search.trials import Trial
 from radiotwin.effects.registry import trend_over
 from radiotwin.links import residual_variables
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
-from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
 
 
 def add_trends(state: SearchState, inputs: SearchInputs, variables: Sequence[str]) -> SearchState:
@@ -33,7 +32,7 @@ def add_shadowing(state: SearchState, inputs: SearchInputs) -> SearchState:
     """Interpolate the rest over the ground; keep that if it predicts held-out links better."""
     inputs.on_progress(SHADOWING)
     model = state.model
-    fields = [CorrelatedShadowing.fit(each, inputs.seed) for each in model.each]
+    fields = [each.rest(inputs.seed) for each in model.each]
     # If what a field learnt does not return on held-out flights, its mean may be right though its
     # certainty is not.
     for tried in (fields, [replace(each, certain=False) for each in fields]):

@@ -163,6 +163,7 @@ def score_model(model: CrossFit, extended: CrossFit, trial: Trial, block: np.nda
     per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
     p_value = min(tried * cross_fit_p_value(shares), 1.0)
     before_db, after_db = model.rmse_db(usable), extended.rmse_db(usable)
+    fall = float(np.log(before_db / after_db)) if before_db > 0 and after_db > 0 else 0.0
     # A receiver, or a device, is not in every fold.
     moved = np.bincount(model.index[usable], np.abs(gain[usable]), len(model.folds))
     touched = (moved >= MIN_MOVED * moved.max()) \
@@ -198,9 +199,5 @@ def score_model(model: CrossFit, extended: CrossFit, trial: Trial, block: np.nda
         reason = ("links with line of sight, where the base is surest, do not support it "
                   f"(p = {los_p:.2g})")
     return replace(trial, reason=reason, passed=not reason, nll_gain=total,
-                   rmse_db=extended.rmse_db(known), rmse_fall=_fall(before_db, after_db),
-                   p_value=p_value, gain_by_fold=shares)
-
-
-def _fall(before_db: float, after_db: float) -> float:
-    return float(np.log(before_db / after_db)) if before_db > 0 and after_db > 0 else 0.0
+                   rmse_db=extended.rmse_db(known), rmse_fall=fall, p_value=p_value,
+                   gain_by_fold=shares)

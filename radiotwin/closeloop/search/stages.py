@@ -97,16 +97,14 @@ class SearchState:
 Stage = Callable[[SearchState, SearchInputs], SearchState]
 
 
-def search(model: CrossFit | SearchState, stages: Iterable[Stage],
-           inputs: SearchInputs) -> SearchState:
+def search(state: SearchState, stages: Iterable[Stage], inputs: SearchInputs) -> SearchState:
     """Return what stages find, one after the other.
 
     Args:
-        model: to begin with; or the state that earlier stages have left.
+        state: to begin with.
         stages: that add effects to the model, or take them back, and log their trials.
         inputs: of every stage.
     """
-    state = model if isinstance(model, SearchState) else SearchState(model)
     for stage in stages:
         state = stage(state, inputs)
     return state

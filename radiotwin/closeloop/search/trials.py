@@ -1,13 +1,12 @@
 """Trials of effects, and their log, from which `closeloop.json` and the pages are made.
 
 A trial never changes. Where a later judgement changes what is said of it, a new trial with its
-number supersedes it: `TrialLog.trials` has the last word on each.
+number supersedes it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -91,18 +90,9 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class TrialLog:
-    """Everything that was said of any trial, in order.
+    """The last word on each trial, in the order in which they were recorded."""
 
-    Attributes:
-        words: trials; of several with one number the last counts.
-    """
-
-    words: tuple[Trial, ...] = ()
-
-    @cached_property
-    def trials(self) -> list[Trial]:
-        """The last word on each trial, in the order in which they were recorded."""
-        return list({each.number: each for each in self.words}.values())
+    trials: tuple[Trial, ...] = ()
 
     @property
     def kept(self) -> list[Trial]:
@@ -115,9 +105,8 @@ class TrialLog:
 
     def record(self, *trials: Trial) -> TrialLog:
         """Return the log with further trials, which get their numbers here."""
-        first = len(self.trials)
-        return TrialLog((*self.words, *(replace(each, number=number)
-                                        for number, each in enumerate(trials, start=first))))
+        return TrialLog((*self.trials, *(replace(each, number=number) for number, each in
+                                         enumerate(trials, start=len(self.trials)))))
 
     def supersede(self, *trials: Trial) -> TrialLog:
         """Return the log with a later word on trials that are in it.
@@ -125,8 +114,8 @@ class TrialLog:
         Raises:
             ValueError: a trial that was never recorded.
         """
-        known = range(len(self.trials))
-        unknown = [each.name for each in trials if each.number not in known]
-        if unknown:
+        later = {each.number: each for each in (*self.trials, *trials)}
+        if len(later) > len(self.trials):
+            unknown = [each.name for each in trials if each.number not in range(len(self.trials))]
             raise ValueError(f"trials of {', '.join(unknown)} are not in the log: record them")
-        return TrialLog((*self.words, *trials))
+        return TrialLog(tuple(later.values()))

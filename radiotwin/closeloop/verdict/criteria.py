@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 
 from radiotwin.errors import BadInput
 
@@ -100,7 +100,3 @@ class SelectionCriteria:
         """The same for what is given no name: held-out links are likelier, and err no more."""
         return replace(self, min_gain_nats=0.0, min_gain_per_link_nats=0.0, min_gaining_folds=0.0,
                        max_p_value=1.0, max_sign_flip_p_value=1.0, max_los_p_value=1.0)
-
-    def to_json(self) -> dict[str, float]:
-        """Return the thresholds by name."""
-        return asdict(self)

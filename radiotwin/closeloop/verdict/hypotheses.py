@@ -74,7 +74,10 @@ class Hypotheses:
         links, predicted = fit.links.select(fit.train), training.predict(fit)
         nuisance = _nuisance(links, predicted.mean_db)
         nuisance = Columns(nuisance.values / predicted.scale_db[:, None], nuisance.prior_sd)
-        residual_db = np.where(_says_something(fit), training.residual_db(fit), np.nan)
+        residual_db = training.residual_db(fit)
+        # A blank that was to be expected says nothing.
+        says = np.isfinite(training.level_db) | (residual_db < 0)
+        residual_db = np.where(says, residual_db, np.nan)
         moving = receivers_move(links)
         series = links.device if moving else links.receiver
         position_m = links.receiver_m if moving else links.device_m[links.device]
@@ -240,12 +243,6 @@ def _tamed(z: np.ndarray, near: np.ndarray) -> np.ndarray:
     """
     common = np.median(z[near], axis=1)
     return common + np.clip(z - common, -MAX_Z, MAX_Z)
-
-
-def _says_something(fit: Fit) -> np.ndarray:
-    """Return (m,) training links that were detected, or should have been."""
-    training = fit.model.training
-    return np.isfinite(training.level_db) | (training.residual_db(fit) < 0)
 
 
 def _nuisance(links: Links, mean_db: np.ndarray) -> Columns:

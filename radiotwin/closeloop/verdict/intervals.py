@@ -23,7 +23,7 @@ from scipy.stats import t
 
 from radiotwin.closeloop.crossfit import CrossFit, same_effects
 from radiotwin.closeloop.verdict.criteria import LEVELS_DB, MAX_SHARE, MIN_CLUSTERS, MIN_FOLDS
-from radiotwin.effects.params import Estimate, Parameter
+from radiotwin.effects.params import Parameter
 from radiotwin.inference.sandwich import MAX_WIDTH
 from radiotwin.inference.student import DOF
 from radiotwin.links import evidence_blocks
@@ -43,13 +43,14 @@ def effect_parameters(model: CrossFit) -> list[dict[str, Parameter]]:
     whole = linearise(model.whole)
     of_whole = estimates(whole)
     of_folds = [estimates(linearise(fold, _as_followed(whole, fold))) for fold in model.folds]
-    found = []
+    found, places = [], [same_effects(model.whole, fold) for fold in model.folds]
     for number, (effect, estimate) in enumerate(zip(model.whole.effects, of_whole, strict=True)):
-        reported = effect.parameters(model.links, estimate)
-        folds = [_of_fold(fold, own, model.whole, number)
-                 for fold, own in zip(model.folds, of_folds, strict=True)]
+        folds = [fold.effects[place].like(effect).parameters(fold.links, own[place])
+                 for fold, own, there in zip(model.folds, of_folds, places, strict=True)
+                 if (place := there[number]) is not None]
         found.append({name: _with_folds(parameter, [fold[name] for fold in folds if name in fold],
-                                        len(folds)) for name, parameter in reported.items()})
+                                        len(model.folds))
+                      for name, parameter in effect.parameters(model.links, estimate).items()})
     return found
 
 
@@ -69,15 +70,6 @@ def _as_followed(whole: Linearised, fold: Fit) -> dict[int, list[Secant]]:
             known[place] = [each.moved(whole.fit.train, fold.train)
                             for each in whole.secants[number]]
     return known
-
-
-def _of_fold(fold: Fit, own: list[Estimate], whole: Fit,
-             number: int) -> dict[str, Parameter]:
-    """Return an effect's parameters in one fold; empty where it was not found."""
-    place = same_effects(whole, fold)[number]
-    if place is None:
-        return {}
-    return fold.effects[place].like(whole.effects[number]).parameters(fold.links, own[place])
 
 
 def _with_folds(parameter: Parameter, folds: list[Parameter], count: int) -> Parameter:

@@ -31,10 +31,15 @@ class ResidualDependence:
 
 
 def dependences(model: CrossFit, seed: int) -> list[ResidualDependence]:
-    """Test the held-out residual of a model, without links on which an unforeseen fault acts."""
+    """Test for every variable if a model's held-out residual depends on it; the strongest first.
+
+    Links on which an unforeseen fault acts are left out.
+    """
     mean_db = model.held_out_mean_db
     residual_db = np.where(model.unforeseen, np.nan, model.links.level_db - mean_db)
-    return residual_dependences(model.links, residual_db, model.held_out_reading[1], mean_db, seed)
+    inputs = model.links, residual_db, model.held_out_reading[1], mean_db, seed
+    return kept("dependences", inputs, lambda: _tested(*inputs),
+                lambda found: ({}, [asdict(each) for each in found]), _read)
 
 
 def significant(dependences: list[ResidualDependence],
@@ -42,25 +47,6 @@ def significant(dependences: list[ResidualDependence],
     """Return those that are not chance and strong enough to matter."""
     return [each for each in dependences if each.p_value <= criteria.max_dependence_p_value
             and each.effect_db >= criteria.min_dependence_db]
-
-
-def residual_dependences(links: Links, residual_db: np.ndarray, scale_db: np.ndarray,
-                         mean_db: np.ndarray, seed: int) -> list[ResidualDependence]:
-    """Test every variable that the data have.
-
-    Args:
-        links: n links.
-        residual_db: (n,) of held-out links [dB]; NaN where there is none.
-        scale_db: (n,) error scale of their prediction [dB].
-        mean_db: (n,) their prediction [dB].
-        seed: of the permutations.
-
-    Returns:
-        the strongest first.
-    """
-    inputs = links, residual_db, scale_db, mean_db, seed
-    return kept("dependences", inputs, lambda: _tested(*inputs),
-                lambda found: ({}, [asdict(each) for each in found]), _read)
 
 
 def _read(_: dict[str, np.ndarray], content: Any) -> list[ResidualDependence]:

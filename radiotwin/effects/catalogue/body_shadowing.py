@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import allowed_of, no_body_frame, vary_patterns
+from radiotwin.effects.antennas import no_body_frame, report_patterns, vary_patterns
 from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.params import (
@@ -102,8 +102,7 @@ class BodyShadowing(GainEffect):
 
     @override
     def variation(self) -> Variation:
-        return vary_patterns(self.params.receivers,
-                             lambda receivers: self.with_params(self.Params(receivers=receivers)))
+        return vary_patterns(self, "receivers")
 
     @override
     def typical_patterns(self, view: ResidualView) -> list[Pattern]:
@@ -116,15 +115,8 @@ class BodyShadowing(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
-        reported: dict[str, Parameter] = {}
-        bodies_sd = np.reshape(estimate.params_sd, (len(self.params.receivers), -1))
-        for (receiver, body), sd in zip(self.params.receivers.items(), bodies_sd, strict=True):
-            for (field, each), field_sd in zip(quantities(body).items(), sd, strict=True):
-                value = getattr(body, field)
-                value = value % 360 if field == "azimuth_deg" else value
-                reported[f"body_{field}[{links.receiver_names[receiver]}]"] = Parameter.normal(
-                    value, field_sd, each["unit"], allowed_of(field, each))
-        return reported
+        return report_patterns(self.params.receivers, estimate.params_sd, links.receiver_names,
+                               prefix="body_")
 
 
 def _arrivals(links: Links) -> np.ndarray:

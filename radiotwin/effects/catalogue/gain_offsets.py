@@ -48,9 +48,6 @@ class _GainOffset(GainEffect):
 
     params: Params
 
-    def _names(self, links: Links) -> list[str]:
-        return getattr(links, f"{self.end}_names")
-
     def _index(self, links: Links) -> np.ndarray:
         return getattr(links, self.end)
 
@@ -101,7 +98,7 @@ class _GainOffset(GainEffect):
         order = np.argsort(estimate.coefficients)
         median = order[len(order) // 2]
         contrast = np.eye(len(order)) - np.eye(len(order))[median]
-        sd_db, names = estimate.sd_of(contrast), self._names(links)
+        sd_db, names = estimate.sd_of(contrast), getattr(links, f"{self.end}_names")
         return {f"offset_db[{names[member]}]": Parameter.normal(value_db, each_sd_db, "dB")
                 for member, value_db, each_sd_db in zip(
                     self.params.members, contrast @ estimate.coefficients, sd_db)}

@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
 
-from radiotwin.effects.arrays import LinkCache, subsample
+from radiotwin.effects.arrays import LinkCache, squares_about_mean, subsample
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.params import (
     Allowed,
@@ -87,8 +87,7 @@ class GroundReflection(GainEffect):
         wavelength_m = speed_of_light / part.frequency_hz
 
         def squares(offset_db: np.ndarray | float) -> float:
-            rest_db = view.residual_db[rows] - offset_db
-            return weight @ (rest_db - weight @ rest_db / weight.sum()) ** 2
+            return squares_about_mean(view.residual_db[rows] - offset_db, weight)
 
         before, best = squares(0.0), []
         heights_m = HEIGHTS[np.abs(HEIGHTS * wavelength_m) <= MAX_HEIGHT_M] * wavelength_m

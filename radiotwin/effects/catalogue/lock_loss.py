@@ -57,7 +57,7 @@ MAX_DROP_DB = 80.0  # the range of a good receiver
 
 
 @dataclass(frozen=True, eq=False)
-class Drops:
+class _Drops:
     """Drops of a receiver's level.
 
     Attributes:
@@ -83,16 +83,13 @@ class _States:
     nats: np.ndarray
 
 
-def find_drops(view: ResidualView, receiver: int, rows: np.ndarray, design_effect: float,
-               min_nats: float) -> Drops | None:
+def _find_drops(view: ResidualView, receiver: int, rows: np.ndarray) -> _Drops | None:
     """Return how the readings of a receiver drop now and then; None where they do not.
 
     Args:
         view: the training links.
         receiver: its index.
         rows: (n,) its detected links, with line of sight where there are any.
-        design_effect: how many links count as one.
-        min_nats: least gain.
     """
     every_db, _ = compared_where_possible_db(view)
     rest_db, instant = every_db[rows], _instants(view.links, rows)
@@ -100,7 +97,7 @@ def find_drops(view: ResidualView, receiver: int, rows: np.ndarray, design_effec
                  key=lambda each: each.nats.sum())
     single = _single_state(rest_db)
     nats = (states.nats / np.bincount(instant))[instant] - single
-    if (nats.sum() < min_nats * design_effect or states.drop_db < MIN_DROP_DB
+    if (nats.sum() < MIN_NATS * view.design_effect or states.drop_db < MIN_DROP_DB
             or states.drop_db < MIN_APART * states.scale_db or not 0 < states.share < MAX_SHARE):
         return None
     if not _comes_and_goes(view.links, rows, instant, states.low > 0.5):
@@ -110,7 +107,7 @@ def find_drops(view: ResidualView, receiver: int, rows: np.ndarray, design_effec
     low_db = states.level_db - 0.5 * states.drop_db
     if len(others) and (every_db[others] < low_db).mean() > MAX_OTHERS * (rest_db < low_db).mean():
         return None
-    return Drops(states.share, states.drop_db, nats)
+    return _Drops(states.share, states.drop_db, nats)
 
 
 def _instants(links: Links, rows: np.ndarray) -> np.ndarray:
@@ -201,8 +198,7 @@ class LockLoss(DetectionEffect):
             if probability is not None:
                 blank[receiver] = probability
             heard = rows[np.isfinite(links.level_db[rows])]
-            found = find_drops(view, receiver, heard, view.design_effect, MIN_NATS) \
-                if len(heard) >= MIN_LINKS else None
+            found = _find_drops(view, receiver, heard) if len(heard) >= MIN_LINKS else None
             if found is not None and _most_devices_gain(links.device[heard], found.nats):
                 shares[receiver], drops_db[receiver] = found.share, found.drop_db
         proposed = [self.Params(receivers=blank)] if blank else []

@@ -68,10 +68,11 @@ class NoiseFloor(ReceiverEffect):
             found[receiver] = max(
                 (-float(weight @ (residual_db + mean_db - floored(mean_db, floor_db)[0]) ** 2),
                  float(floor_db)) for floor_db in floors_db)[1]
-            every = np.flatnonzero(links.receiver == receiver)
+            every = np.flatnonzero(links.receiver == receiver)  # blanks, too
+            all_db = view.mean_db[every]
             nats, floor_db = max(
-                (self._gain_nats(view, every, floor_db), float(floor_db))
-                for floor_db in floors_db)
+                (float(view.gain_nats(every, floored(all_db, floor_db)[0] - all_db).sum()),
+                 float(floor_db)) for floor_db in floors_db)
             if nats > MIN_NATS:
                 own[receiver] = floor_db
         if not found:
@@ -86,12 +87,6 @@ class NoiseFloor(ReceiverEffect):
         return [*([self.Params(receivers=own, highest=highest, alone=True)] if alone else []),
                 *(self.Params(receivers=floors_db, highest=highest)
                   for floors_db in (found, *tried))]
-
-    @staticmethod
-    def _gain_nats(view: ResidualView, rows: np.ndarray, floor_db: float) -> float:
-        """Return how much likelier links (r,), blanks as well, become by a floor [nats]."""
-        change_db = floored(view.mean_db[rows], floor_db)[0] - view.mean_db[rows]
-        return float(view.gain_nats(rows, change_db).sum())
 
     @override
     def inputs(self, links: Links) -> np.ndarray:

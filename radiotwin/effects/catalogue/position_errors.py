@@ -5,6 +5,7 @@ No law of its own: the channel predicts again with the end elsewhere, lines of s
 
 from collections.abc import Iterator
 from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -38,12 +39,42 @@ TYPICAL_M = 10.0  # move of a device, for the slope of levels in its position
 MAX_RECEIVER_MOVE_M = 60.0  # along each axis
 
 
-class DevicePositionError(MovedEnd):
+class _PositionError(MovedEnd):
+    """An end that is by a constant off its given position.
+
+    Attributes:
+        step_m, max_move_m: first step and bound of the search along each axis.
+    """
+
+    figure = "links"
+    step_m: ClassVar[float]
+    max_move_m: ClassVar[float]
+    params: Any  # with `move_m`
+
+    @override
+    def implausible(self, coefficients: np.ndarray) -> str | None:
+        size_m = float(np.linalg.norm(self.params.move_m))
+        if size_m < MIN_MOVE_M:
+            return (f"it would be {size_m:.1f} m from its given position only; surveys and the "
+                    f"walls of maps are off by as much, and less than {MIN_MOVE_M:g} m is no "
+                    "effect")
+        return None
+
+    @override
+    def variation(self) -> Variation:
+        axes, most_m = len(self.params.move_m), self.max_move_m
+        return Variation(
+            np.array(self.params.move_m), np.full(axes, self.step_m), np.full(axes, -most_m),
+            np.full(axes, most_m), lambda move_m: self.changed(move_m=tuple(move_m.tolist())),
+            follows_paths=self.is_exact)
+
+
+class DevicePositionError(_PositionError):
     """A wrong position of an anchor and of all on its mast; one step finds one, the worst."""
 
     name = "device_position_error"
     settled_by = "fly past the device on two sides, close by, or survey it again"
-    figure = "links"
+    step_m, max_move_m = 6.0, MAX_MOVE_M
     confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern",
                      "device_gain_offset")
 
@@ -89,18 +120,6 @@ class DevicePositionError(MovedEnd):
         return links.with_devices(device_m)
 
     @override
-    def implausible(self, coefficients: np.ndarray) -> str | None:
-        return _too_near(self.params.move_m)
-
-    @override
-    def variation(self) -> Variation:
-        return Variation(
-            np.array(self.params.move_m), np.full(2, 6.0), np.full(2, -MAX_MOVE_M),
-            np.full(2, MAX_MOVE_M),
-            lambda move_m: self.changed(move_m=tuple(move_m.tolist())),
-            follows_paths=self.is_exact)
-
-    @override
     def correction(self, links: Links) -> Correction:
         params = self.params
         return Correction(moves_m=dict.fromkeys(site_of(links, params.device), params.move_m))
@@ -134,7 +153,7 @@ class DevicePositionError(MovedEnd):
                                                    estimate.params_sd, strict=True)}
 
 
-class ReceiverPositionError(MovedEnd):
+class ReceiverPositionError(_PositionError):
     """A constant error of all positions of a receiver; one step finds one receiver, the worst."""
 
     name = "receiver_position_error"
@@ -142,8 +161,8 @@ class ReceiverPositionError(MovedEnd):
                         "true_minus_given_y_m": "true − given position, north",
                         "true_minus_given_z_m": "true − given height"}
     settled_by = "fly one track forth and back"
-    figure = "links"
     of_receiver = True
+    step_m, max_move_m = 3.0, MAX_RECEIVER_MOVE_M
     confused_with = ("receiver_gain_offset",)
 
     class Params(EffectParams):
@@ -181,32 +200,12 @@ class ReceiverPositionError(MovedEnd):
         return links.with_receivers(links.receiver_m + np.array(self.params.move_m))
 
     @override
-    def implausible(self, coefficients: np.ndarray) -> str | None:
-        return _too_near(self.params.move_m)
-
-    @override
-    def variation(self) -> Variation:
-        return Variation(
-            np.array(self.params.move_m), np.full(3, 3.0), np.full(3, -MAX_RECEIVER_MOVE_M),
-            np.full(3, MAX_RECEIVER_MOVE_M),
-            lambda move_m: self.changed(move_m=tuple(move_m.tolist())),
-            follows_paths=self.is_exact)
-
-    @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         params = self.params
         name = links.receiver_names[params.receiver]
         return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(
                     move_m, sd, "m", Allowed(-MAX_RECEIVER_MOVE_M, MAX_RECEIVER_MOVE_M))
                 for axis, move_m, sd in zip("xyz", params.move_m, estimate.params_sd, strict=True)}
-
-
-def _too_near(move_m: tuple[float, ...]) -> str | None:
-    size_m = float(np.linalg.norm(move_m))
-    if size_m < MIN_MOVE_M:
-        return (f"it would be {size_m:.1f} m from its given position only; surveys and the walls "
-                f"of maps are off by as much, and less than {MIN_MOVE_M:g} m is no effect")
-    return None
 
 
 def _movable_anchors(links: Links) -> list[int]:

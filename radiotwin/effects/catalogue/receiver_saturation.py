@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.arrays import frequent_labels, squares_about_mean
 from radiotwin.effects.base import ReceiverEffect, ResidualView
 from radiotwin.effects.params import (
     Decibels,
@@ -72,7 +72,8 @@ class ReceiverSaturation(ReceiverEffect):
                     continue
                 for smoothness in SMOOTHNESS:
                     rest_db = residual_db - (_compress(mean_db, level_db, smoothness)[0] - mean_db)
-                    nats = 0.5 * (_squares(residual_db, weight) - _squares(rest_db, weight))
+                    nats = 0.5 * (squares_about_mean(residual_db, weight)
+                                  - squares_about_mean(rest_db, weight))
                     if nats > best_nats:
                         best_nats, best = nats, Compression(level_db, smoothness)
             if best and best_nats > MIN_NATS:
@@ -116,11 +117,6 @@ class ReceiverSaturation(ReceiverEffect):
                 Parameter.normal(compression.level_db, sd_db, unit)
                 for (receiver, compression), sd_db in zip(self.params.receivers.items(),
                                                           estimate.params_sd[::2])}
-
-
-def _squares(residual_db: np.ndarray, weight: np.ndarray) -> float:
-    """Return the weighted squares about the weighted mean."""
-    return weight @ (residual_db - weight @ residual_db / weight.sum()) ** 2
 
 
 def _compress(level_db: np.ndarray, saturation_db: float | np.ndarray,

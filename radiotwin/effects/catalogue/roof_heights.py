@@ -33,8 +33,8 @@ from radiotwin.effects.boxes import (
     cross,
     two_edges_db,
 )
-from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Length, Metres, Parameter
-from radiotwin.effects.places import Correction, RaisedRoof
+from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Parameter
+from radiotwin.effects.places import Correction, Roof
 from radiotwin.errors import BadInput
 from radiotwin.links import Links
 from radiotwin.scene.citymap import DOWN, CityMap
@@ -152,31 +152,6 @@ def _boxes(city: CityMap) -> dict[int, Box]:
     return found
 
 
-class Roof(NamedTuple):
-    """A roof of the map, and how much higher it is than the map says.
-
-    Attributes:
-        building: index, as `buildings` numbers them.
-        x_m, y_m, height_m: centre and height on the map [m].
-        offset_m: how much higher the one is that predicts links best [m].
-        offset_sd_m: standard deviation of `true_offset_m` [m].
-        common_m: what the other roofs have in common of it, which is the model's [m].
-    """
-
-    building: int
-    x_m: Metres
-    y_m: Metres
-    height_m: Metres
-    offset_m: Metres
-    offset_sd_m: Length
-    common_m: Metres = 0.0
-
-    @property
-    def true_offset_m(self) -> float:
-        """Estimate of true minus mapped height [m]."""
-        return self.offset_m - self.common_m
-
-
 class RoofHeights(GainEffect):
     """Roofs that are higher or lower than the map says."""
 
@@ -238,9 +213,7 @@ class RoofHeights(GainEffect):
 
     @override
     def correction(self, links: Links) -> Correction:
-        return Correction(roofs=tuple(
-            RaisedRoof(roof.building, roof.x_m, roof.y_m, roof.height_m, roof.true_offset_m,
-                       roof.offset_sd_m) for roof in surely_off(self.params.roofs)))
+        return Correction(roofs=tuple(surely_off(self.params.roofs)))
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:

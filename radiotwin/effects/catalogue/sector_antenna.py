@@ -16,7 +16,7 @@ from radiotwin.effects.antennas import (
     SectorEffect,
     SectorPattern,
     eligible_devices,
-    report_pattern,
+    report_patterns,
     vary_patterns,
 )
 from radiotwin.effects.arrays import subsample
@@ -57,8 +57,7 @@ class SectorAntenna(SectorEffect):
 
     @override
     def variation(self) -> Variation:
-        return vary_patterns(self.params.devices,
-                             lambda devices: self.changed(devices=devices))
+        return vary_patterns(self, "devices")
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
@@ -75,10 +74,10 @@ class SectorAntenna(SectorEffect):
         reported: dict[str, Parameter] = {}
         patterns_sd = np.reshape(estimate.params_sd, (len(self.params.devices), -1))
         for number, (device, pattern) in enumerate(self.params.devices.items()):
-            name = links.device_names[device]
-            reported |= report_pattern(pattern, patterns_sd[number], name,
-                                       links.city is not None and not self.params.straight)
-            reported[f"gain_db[{name}]"] = Parameter.normal(
+            reported |= report_patterns(
+                {device: pattern}, patterns_sd[number], links.device_names,
+                with_scattered=links.city is not None and not self.params.straight)
+            reported[f"gain_db[{links.device_names[device]}]"] = Parameter.normal(
                 estimate.coefficients[number], estimate.coefficients_sd[number], "dB")
         return reported
 

@@ -17,10 +17,10 @@ from typing_extensions import override
 from radiotwin.effects.antennas import (
     AntennaParams,
     no_body_frame,
-    report_pattern,
+    report_patterns,
     vary_patterns,
 )
-from radiotwin.effects.arrays import LinkCache, frequent_labels
+from radiotwin.effects.arrays import LinkCache, frequent_labels, squares_about_mean
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.params import (
     EffectParams,
@@ -120,17 +120,12 @@ class TiltedDipole(GainEffect):
 
     @override
     def variation(self) -> Variation:
-        return vary_patterns(self.params.receivers,
-                             lambda receivers: self.with_params(self.Params(receivers=receivers)))
+        return vary_patterns(self, "receivers")
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
-        reported: dict[str, Parameter] = {}
-        dipoles_sd = np.reshape(estimate.params_sd, (len(self.params.receivers), -1))
-        for (receiver, dipole), sd in zip(self.params.receivers.items(), dipoles_sd, strict=True):
-            reported |= report_pattern(dipole, sd, links.receiver_names[receiver],
-                                       links.city is not None)
-        return reported
+        return report_patterns(self.params.receivers, estimate.params_sd, links.receiver_names,
+                               with_scattered=links.city is not None)
 
 
 def _best_dipole(view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
@@ -138,16 +133,13 @@ def _best_dipole(view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
     links = view.links.select(rows)
     ray, residual_db, weight = -_unit(links.offset_m), view.residual_db[rows], view.weight[rows]
 
-    def squares(rest_db: np.ndarray) -> float:
-        return weight @ (rest_db - weight @ rest_db / weight.sum()) ** 2
-
     def after(tilt: float, azimuth: float) -> float:
         gain = dipole_gain(ray, _axis(links.receiver_axes, tilt, azimuth))
-        return squares(residual_db - 10 * np.log10(gain))
+        return squares_about_mean(residual_db - 10 * np.log10(gain), weight)
 
     best, tilt, azimuth = min((after(tilt, azimuth), tilt, azimuth)
                               for tilt in TILTS_DEG for azimuth in AZIMUTHS_DEG)
-    if 0.5 * (squares(residual_db) - best) > MIN_NATS:
+    if 0.5 * (squares_about_mean(residual_db, weight) - best) > MIN_NATS:
         return DipoleParams(tilt_deg=tilt, lean_azimuth_deg=azimuth)
     return None
 

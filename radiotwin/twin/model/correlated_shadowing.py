@@ -10,8 +10,8 @@ whatever they stand for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -20,9 +20,6 @@ from radiotwin.links import Links
 from radiotwin.links.sites import antenna_of, relatives_of
 from radiotwin.propagation.laws.kriging import MIN_POINTS, ResidualField
 from radiotwin.runtime.pieces import kept
-
-if TYPE_CHECKING:
-    from radiotwin.twin.model.model import Fit
 
 MIN_SD = 1e-6  # of a residual that is nothing
 LEAST_SHARED_SD = 0.1  # of what relatives say, in error scales: less is nearly nothing
@@ -192,21 +189,19 @@ class CorrelatedShadowing:
     relatives: Relatives | None = None
 
     @classmethod
-    def fit(cls, fit: Fit, seed: int) -> CorrelatedShadowing:
-        """Learn from the training links of a model what its channel and effects leave over."""
-        return cls._learnt(fit, seed)
+    def fit(cls, links: Links, train: np.ndarray, z: np.ndarray, seed: int,
+            like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
+        """Learn what a channel and effects leave over of links, see `Fit.rest`.
 
-    def refit(self, fit: Fit) -> CorrelatedShadowing:
-        """Return the same correlation with the residual of a model's training links."""
-        return replace(self._learnt(fit, 0, self), certain=self.certain)
-
-    @classmethod
-    def _learnt(cls, fit: Fit, seed: int,
-                like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
-        """Learn, with the correlations of another where one is given."""
-        z = standardised_residual(fit)
-        links, relatives = fit.links.select(fit.train), None
-        move = like.receivers_move if like else receivers_move(fit.links)
+        Args:
+            links: n links.
+            train: (n,) bool, m links that are learnt from.
+            z: (m,) their residuals [error scales].
+            seed: of the samples that correlations are fitted to.
+            like: another one, whose correlations are taken; None: they are fitted.
+        """
+        move = like.receivers_move if like else receivers_move(links)
+        links, relatives = links.select(train), None
         if move:
             field = like.relatives.field if like and like.relatives else None
             relatives = Relatives.fit(links, z, field, seed)
@@ -217,7 +212,7 @@ class CorrelatedShadowing:
         points = series, position_m, (z - z.mean()) / relative_sd
         field = (like.field.with_points(*points, kind) if like
                  else fitted_field("shadowing", ResidualField(), *points, seed, kind))
-        return cls(field, relative_sd, move, relatives=relatives)
+        return cls(field, relative_sd, move, like is None or like.certain, relatives)
 
     def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
         """Return what it adds (n,) [error scales], and the share (n,) left of the error scale."""
@@ -259,12 +254,6 @@ def _points(links: Links,
     if receivers_move:
         return links.device, links.receiver_m, links.receiver
     return links.receiver, links.device_m[links.device], None
-
-
-def standardised_residual(fit: Fit) -> np.ndarray:
-    """Return the residuals of a model's training links (n,) [error scales]; outliers clipped."""
-    training = fit.model.training
-    return np.clip(training.residual_db(fit) / training.predict(fit).scale_db, -MAX_Z, MAX_Z)
 
 
 def receivers_move(links: Links) -> bool:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -201,7 +203,8 @@ def along_paths(fit: Fit, without: Fit) -> Fit:
         they are not, or may not be asked for (`Effect.always_exact`).
     """
     effect, gain = fit.effects[-1], without.objective - fit.objective
-    if not effect.always_exact or gain < MIN_GAIN_NATS or not _changes_few(fit):
+    changes_few = np.count_nonzero(fit.model.terms[-1].offset_db) <= MAX_FOLLOWED_LINKS
+    if not effect.always_exact or gain < MIN_GAIN_NATS or not changes_few:
         return fit
     found = kept("effect-along-paths", (fit, without), lambda: _best_along_paths(fit, without),
                  _write_addition, _reader(fit.model.with_effects(fit.effects[:-1]), effect))
@@ -227,7 +230,7 @@ def prepare_additions(without: Sequence[Fit], effects: Sequence[Effect], executo
     parts: KeptParts[tuple[int, int], Piece | None] = KeptParts(
         "effect", lambda piece: (without[piece[0]], effects[piece[1]], like),
         lambda found: found, lambda arrays, content: (arrays, content))
-    function = _Addition(list(without), list(effects), like)
+    function = partial(_added, list(without), list(effects), like)
     # A worker holds links, map and models as this process does, and no more.
     memory_bytes = max(WORKER_BYTES, resident_bytes(os.getpid()))
     job: Job[tuple[int, int], Piece | None] = Job("fitting effects", function,
@@ -235,17 +238,10 @@ def prepare_additions(without: Sequence[Fit], effects: Sequence[Effect], executo
     executor.run_ahead(job, pieces, parts)
 
 
-@dataclass(frozen=True)
-class _Addition:
-    """Adds effects to fits, by the number of each; arguments as of `prepare_additions`."""
-
-    without: list[Fit]
-    effects: list[Effect]
-    like: Effect | None
-
-    def __call__(self, piece: tuple[int, int]) -> Piece | None:
-        fit, effect = self.without[piece[0]], self.effects[piece[1]]
-        return _write_addition(_best_addition(fit, effect, self.like))
+def _added(without: list[Fit], effects: list[Effect], like: Effect | None,
+           piece: tuple[int, int]) -> Piece | None:
+    """Add an effect to a fit, by the number of each."""
+    return _write_addition(_best_addition(without[piece[0]], effects[piece[1]], like))
 
 
 def _write_addition(found: Fit | None) -> Piece | None:
@@ -285,17 +281,13 @@ def _best_addition(fit: Fit, effect: Effect, like: Effect | None) -> Fit | None:
     found = [_best_of_a_kind(fit, each, like is not None) for each in kinds.values()]
     if not found:
         return None
-    best = min(found, key=_objective)
+    best = min(found, key=attrgetter("objective"))
     exactly = like is not None and like.always_exact and like.is_same(like.exactly())
     if like is None or not exactly or fit.objective - best.objective < MIN_GAIN_NATS:
         return best
     best = with_exact_levels(best)
     near = _near(fit, like)
     return near if near.objective < best.objective else best
-
-
-def _objective(fit: Fit) -> float:
-    return fit.objective
 
 
 def _best_along_paths(fit: Fit, without: Fit) -> Fit:
@@ -320,15 +312,10 @@ def _best_of_a_kind(fit: Fit, proposed: list[Effect], is_fold: bool) -> Fit:
     if proposed[0].stage == "gain" and len(tried) > MAX_PROPOSALS:  # only gains have a score
         tried.sort(key=lambda each: -fit.view.score(each.terms[-1].select(fit.train)))
         tried = tried[:MAX_PROPOSALS]
-    best = min((each.fit(fit) for each in tried), key=_objective)
+    best = min((each.fit(fit) for each in tried), key=attrgetter("objective"))
     if fit.objective - best.objective < MIN_GAIN_NATS:
         return best
     return refine(best, descents=1 if is_fold else DESCENTS)
-
-
-def _changes_few(fit: Fit) -> bool:
-    """Return whether the last effect changes so few links that their paths can be followed."""
-    return int(np.count_nonzero(fit.model.terms[-1].offset_db)) <= MAX_FOLLOWED_LINKS
 
 
 def _is_exact(fit: Fit) -> bool:
@@ -396,9 +383,9 @@ def _near(fit: Fit, like: Effect) -> Fit:
             moved = fitted(variation.effect(np.clip(values, variation.low, variation.high)))
             if moved.objective < least:
                 least, numbers[number] = moved.objective, values[number]
-            best = min(best, moved, key=_objective)
+            best = min(best, moved, key=attrgetter("objective"))
     together = fitted(variation.effect(np.clip(numbers, variation.low, variation.high)))
-    return min(best, together, key=_objective)
+    return min(best, together, key=attrgetter("objective"))
 
 
 def with_exact_levels(fit: Fit) -> Fit:

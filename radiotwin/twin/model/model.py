@@ -30,6 +30,7 @@ from radiotwin.links.links import Prediction
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.blend import Blend
+from radiotwin.twin.model.correlated_shadowing import MAX_Z as MAX_REST_Z
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
 
 VIEWS = 8  # that are remembered: of a model and its folds, which every candidate asks for
@@ -274,6 +275,17 @@ class Fit(FitResult):
             self.coefficients[:model.level_columns.shape[1]],
             self.scale_db, model.dof, model.links.device_m, tuple(model.links.receiver_names),
             model.links.first_s, sd_db, shadowing=self.shadowing, unheard=Unheard.of(self, sd_db))
+
+    @property
+    def training_z(self) -> np.ndarray:
+        """(m,) residuals of the training links [error scales]; outliers are clipped."""
+        training = self.model.training
+        z = training.residual_db(self) / training.predict(self).scale_db
+        return np.clip(z, -MAX_REST_Z, MAX_REST_Z)
+
+    def rest(self, seed: int, like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
+        """Return what interpolates the residuals of the training links, see `like` there."""
+        return CorrelatedShadowing.fit(self.links, self.train, self.training_z, seed, like)
 
     def predict(self, links: Links) -> Prediction:
         """Return the levels that are expected of any links, with the same devices and receivers."""
