@@ -76,10 +76,9 @@ def make_folds(links: Links, seed: int, by: str = "auto") -> Folds:
     rng = np.random.default_rng(seed)
     if by == "auto":
         by = "flight" if _flights_are_alike(links) else "block"
-    if by == "flight":
-        return Folds(by, deal_groups(_require_several(links.flight, by), MAX_FOLDS, rng))
-    if by == "quadrant":
-        return Folds(by, deal_groups(_require_several(_quadrants(links), by), MAX_FOLDS, rng))
+    if by in ("flight", "quadrant"):
+        groups = links.flight if by == "flight" else _quadrants(links)
+        return Folds(by, deal_groups(_require_several(groups, by), MAX_FOLDS, rng))
     if by == "device":
         # A device whose position is to be found from its own links cannot be left out.
         known = np.isin(links.device, sorted(links.anchors))
@@ -277,11 +276,11 @@ class CrossFit:
         return self.extended(whole, folds)
 
     def held_out(self, of: Callable[[Fit], np.ndarray]) -> np.ndarray:
-        """Return a value (n,) of each link, from the fold that has not seen it."""
-        result = np.full(len(self.index), np.nan)
-        for number, fold in enumerate(self.folds):
-            own = self.index == number
-            result[own] = of(fold)[own]
+        """Return values (…, n) of each link, from the fold that has not seen it."""
+        of_folds = [of(fold) for fold in self.folds]
+        result = np.full(of_folds[0].shape, np.nan)
+        for number, values in enumerate(of_folds):
+            result[..., self.index == number] = values[..., self.index == number]
         return result
 
     @cached_property
@@ -292,18 +291,13 @@ class CrossFit:
         return mean_db + shift * scale_db, np.hypot(scale_db * left, unheard_db)
 
     @property
-    def held_out_scales(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) error scale without shadowing, and (n,) sd of unheard levels [dB]; NaN = none."""
+    def held_out_scales(self) -> np.ndarray:
+        """(2, n) error scale without shadowing, and sd of unheard levels [dB]; NaN = none."""
         return self._held_out_parts[1:]
 
     @cached_property
-    def _held_out_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        mean_db, scale_db, unheard_db = np.full((3, len(self.index)), np.nan)
-        for number, fold in enumerate(self.folds):
-            own = self.index == number
-            mean_db[own], scale_db[own], unheard_db[own] = (
-                each[own] for each in fold.reading_parts())
-        return mean_db, scale_db, unheard_db
+    def _held_out_parts(self) -> np.ndarray:
+        return self.held_out(lambda fold: np.array(fold.reading_parts()))
 
     @cached_property
     def held_out_nll(self) -> np.ndarray:

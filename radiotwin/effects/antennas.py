@@ -116,14 +116,25 @@ def report_patterns(patterns: Mapping[int, EffectParams], params_sd: np.ndarray,
     return reported
 
 
-def no_body_frame(links: Links) -> str | None:
-    """Return why directions in the receivers' body frames are unknown; None where they are not."""
-    if np.isnan(links.heading_deg).all():
-        return "there is no heading_deg, so directions in the receiver's body frame are unknown"
-    heading = np.radians(links.heading_deg)
-    if np.nanstd(np.cos(heading)) + np.nanstd(np.sin(heading)) < MIN_HEADING_SD:
-        return "the heading never changes, so body and world frame cannot be distinguished"
-    return None
+class BodyFrameEffect(GainEffect):
+    """Receivers with patterns that are fixed to their bodies: `Params` has them by index."""
+
+    settled_by = "fly the same track in both directions"
+    figure = "pattern"
+    of_receiver = True
+
+    @override
+    def unavailable(self, links: Links) -> str | None:
+        if np.isnan(links.heading_deg).all():
+            return "there is no heading_deg, so directions in the receiver's body frame are unknown"
+        heading = np.radians(links.heading_deg)
+        if np.nanstd(np.cos(heading)) + np.nanstd(np.sin(heading)) < MIN_HEADING_SD:
+            return "the heading never changes, so body and world frame cannot be distinguished"
+        return None
+
+    @override
+    def variation(self) -> Variation:
+        return vary_patterns(self, "receivers")
 
 
 class SectorPattern(AntennaParams):

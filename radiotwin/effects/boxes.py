@@ -63,13 +63,17 @@ class Box(NamedTuple):
                              turn_deg=self.turn_deg + 90.0 * quarters)
 
     @property
+    def axes(self) -> np.ndarray:
+        """(2, 2) unit vectors along its length and its width."""
+        turn = np.radians(self.turn_deg)
+        return np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+
+    @property
     def outline_m(self) -> np.ndarray:
         """(5, 2) corners from above, the last one like the first [m]."""
-        turn = np.radians(self.turn_deg)
         corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * 0.5 * (
             self.length_m, self.width_m)
-        rotation = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-        return corners @ rotation + (self.x_m, self.y_m)
+        return corners @ self.axes + (self.x_m, self.y_m)
 
 
 def grid_around(box: Box, margin_m: float, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -119,10 +123,8 @@ def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
         a_m: (n, 3) first ends [m].
         b_m: (n, 3) second ends [m].
     """
-    turn = np.radians(box.turn_deg)
-    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     half = 0.5 * np.array([box.length_m, box.width_m])
-    start, end = ((point[:, :2] - (box.x_m, box.y_m)) @ axes.T for point in (a_m, b_m))
+    start, end = ((point[:, :2] - (box.x_m, box.y_m)) @ box.axes.T for point in (a_m, b_m))
     enter, leave, crosses = _shares_within(start, end, half)
     rise = b_m[:, 2] - a_m[:, 2]
     step = end - start

@@ -283,8 +283,7 @@ def _free_position(position_m: np.ndarray, device: DeviceConfig, scene: Scene,
 
 def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
     """Shrink a box until no point (n, 3) [m] is inside, for each on the side that costs least."""
-    turn = np.radians(box.turn_deg)
-    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    axes = box.axes
     high = np.array([0.5 * box.length_m, 0.5 * box.width_m, box.height_m])
     low = np.array([-high[0], -high[1], 0.0])
     for point in np.column_stack([(points_m[:, :2] - (box.x_m, box.y_m)) @ axes.T, points_m[:, 2]]):

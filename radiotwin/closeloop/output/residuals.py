@@ -121,7 +121,6 @@ class Residuals(Summarised):
         return links_table(self.table, self.origin)
 
     def __len__(self) -> int:
-        """Return the number of links."""
         return len(self.table)
 
     def __bool__(self) -> bool:

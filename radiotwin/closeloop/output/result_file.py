@@ -205,7 +205,6 @@ def check_report(report: dict[str, Any], source: object = "closeloop.json") -> d
 
 
 def _step(step: Step) -> dict[str, Any]:
-    """Return a step's probabilities, the likeliest first."""
     ordered = sorted(step.probabilities.items(), key=lambda item: -item[1])
     return {"step": step.number + 1, "unnamed_nats": step.unnamed_nats, "rest_db": step.rest_db,
             "noise_db": step.noise_db,

@@ -3,13 +3,10 @@
 Near measured places interpolation and trees know most, and far from them physics does. So each
 member of the combination has a weight near measurements and one far from them, with a smooth
 transition. The weights are those with the least held-out error on other folds: no reading has a
-part in the members by which it is predicted, and no error of its fold has one in the weights. That
-the other folds' models have learnt from it is all that is not held out. Weights from within the
-other folds (nested cross-validation) are those of models that have learnt from less: with one of
-six sectors held out interpolation predicts best, and with two of them worst. For a few numbers that
-many readings choose nesting is not needed (Wainer and Cawley 2021, 'Nested cross-validation when
-selecting classifiers is overzealous for most practical applications', Expert Systems with
-Applications 182).
+part in the members by which it is predicted, and no error of its fold has one in the weights. For a
+few numbers that many readings choose, nested cross-validation is not needed (Wainer and Cawley
+2021, 'Nested cross-validation when selecting classifiers is overzealous for most practical
+applications', Expert Systems with Applications 182).
 """
 
 from __future__ import annotations
@@ -107,8 +104,7 @@ class _Learnt:
             rows = np.sort(rng.choice(rows, MAX_AWAY_LINKS, replace=False))
         part, quadrant = self.part.select(rows), _quadrant(self.fit.links)[rows]
         whole = self.fit.model.restrict(rows)
-        errors, shares, scales = [np.zeros((0, len(self.names)))], [np.zeros(0)], [np.zeros(0)]
-        tested = [np.zeros(0, dtype=int)]
+        found = [(np.zeros((0, len(self.names))), np.zeros(0), np.zeros(0), rows[:0])]
         for each in range(4):
             out = quadrant == each
             test = np.flatnonzero(out & np.isfinite(part.links.level_db))
@@ -117,12 +113,11 @@ class _Learnt:
             fit = replace(whole, train=~out).fit(self.fit)
             rest = self.rest and fit.rest(0, self.rest)
             inner = _Learnt(fit, rest, self.kriging, part, self.names)
-            errors.append(part.links.level_db[test, None] - inner.members_db(test, seed))
-            shares.append(shares_of(part.links, ~out, test))
-            scales.append(fit.reading_parts()[1][test])
-            tested.append(rows[test])
-        return (np.concatenate(errors), np.concatenate(shares), np.concatenate(scales),
-                np.concatenate(tested))
+            found.append((part.links.level_db[test, None] - inner.members_db(test, seed),
+                          shares_of(part.links, ~out, test), fit.reading_parts()[1][test],
+                          rows[test]))
+        errors_db, shares, scales_db, tested = (np.concatenate(each) for each in zip(*found))
+        return errors_db, shares, scales_db, tested
 
     def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
         """Return predictions (m, k) of rows (m,), by few trees and known correlations [dB]."""

@@ -11,15 +11,14 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import no_body_frame, report_patterns, vary_patterns
+from radiotwin.effects.antennas import BodyFrameEffect, report_patterns
 from radiotwin.effects.arrays import frequent_labels, subsample
-from radiotwin.effects.base import GainEffect, ResidualView
+from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import (
     EffectParams,
     Estimate,
     Parameter,
     ReceiverIndex,
-    Variation,
     quantities,
     quantity,
 )
@@ -51,14 +50,11 @@ class Body(EffectParams):
         return self.depth_db * _share(arrival @ middle, self.width_deg)
 
 
-class BodyShadowing(GainEffect):
+class BodyShadowing(BodyFrameEffect):
     """Receivers that lose more on one side."""
 
     name = "body_shadowing"
-    settled_by = "fly the same track in both directions"
     variant = "loss around the body"
-    figure = "pattern"
-    of_receiver = True
     parameter_labels = {"body_depth_db": "loss through the body",
                         "body_azimuth_deg": "body, from the heading",
                         "body_elevation_deg": "body, up from the deck",
@@ -72,10 +68,6 @@ class BodyShadowing(GainEffect):
             min_length=1, description="Body of each receiver, by index.")
 
     params: Params
-
-    @override
-    def unavailable(self, links: Links) -> str | None:
-        return no_body_frame(links)
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
@@ -99,10 +91,6 @@ class BodyShadowing(GainEffect):
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
             gain_db[rows] = -body.loss_db(_arrivals(links.select(rows)))
         return gain_db
-
-    @override
-    def variation(self) -> Variation:
-        return vary_patterns(self, "receivers")
 
     @override
     def typical_patterns(self, view: ResidualView) -> list[Pattern]:

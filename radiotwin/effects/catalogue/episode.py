@@ -322,7 +322,6 @@ def _agrees(links: Links, value_db: np.ndarray, weight: np.ndarray, known: np.nd
 
 
 def _is_low(links: Links, rows: np.ndarray) -> bool:
-    """Return whether receivers are below most roofs."""
     place_m = links.receiver_m[rows]
     ground_m = 0.0 if links.city is None else links.city.ground_height_m(*place_m[:, :2].T)
     return bool(np.median(place_m[:, 2] - ground_m) < LOW_M)

@@ -167,7 +167,6 @@ class FaultyFlight(GainEffect):
 
 
 def _flights(view: ResidualView) -> list[_Flight]:
-    """Return every flight of every receiver with links enough."""
     links = view.links
     seen = np.isfinite(links.level_db)
     pairs = np.unique(np.column_stack([links.receiver, links.flight])[seen], axis=0)

@@ -92,11 +92,9 @@ class _GainDrift(GainEffect):
         return tuple(form for form in self.forms if form != again)
 
     def index(self, links: Links) -> np.ndarray:
-        """Return the index (n,) of the receiver or device of each link."""
         return getattr(links, self.end)
 
     def drifts(self) -> dict[int, Drift]:
-        """Return the drifts by index of the receiver or device."""
         return getattr(self.params, f"{self.end}s")
 
     @override
@@ -112,7 +110,6 @@ class _GainDrift(GainEffect):
         return Change(self.index(links), member, when_s)
 
     def _members(self, links: Links) -> list[int]:
-        """Return the receivers or devices that may drift."""
         return frequent_labels(self.index(links)[np.isfinite(links.time_s)], MIN_LINKS)
 
     @override

@@ -287,7 +287,6 @@ def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]
 
 
 def _most_devices_gain(device: np.ndarray, nats: np.ndarray) -> bool:
-    """Return whether most devices with enough links gain."""
     counts, sums = np.bincount(device), np.bincount(device, weights=nats)
     enough = counts >= MIN_DEVICE_LINKS
     return not enough.any() or float((sums[enough] > 0).mean()) > MIN_DEVICES

@@ -84,7 +84,6 @@ class MappedVegetation(GainEffect):
             Allowed(low=0.0, high=5.0))}
 
     def _kinds(self, links: Links) -> list[str]:
-        """Return the kinds that enough links pass."""
         return [kind for kind in KINDS
                 if (self._through_m(links, kind) >= MIN_THROUGH_M).sum() >= MIN_LINKS]
 

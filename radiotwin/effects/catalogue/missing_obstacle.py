@@ -356,7 +356,6 @@ def built_share(links: Links, box: Box, found: Iterable[Box] = ()) -> float:
 
 @lru_cache(maxsize=32)
 def _with_box(city: CityMap, box: Box) -> CityMap:
-    """Return a map with a box on its ground."""
     import trimesh  # slow to load, and needed for exact levels only
 
     pose = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))

@@ -121,7 +121,6 @@ class ReceiverSaturation(ReceiverEffect):
 
 def _compress(level_db: np.ndarray, saturation_db: float | np.ndarray,
               smoothness: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reading (n,) and its slope (n,)."""
     over = (level_db - saturation_db) * smoothness * np.log(10) / 10
     reading_db = level_db - np.logaddexp(0, over) / smoothness * 10 / np.log(10)
     # A slope of e^-60 is none, but can be divided by.

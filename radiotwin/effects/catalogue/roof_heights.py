@@ -286,7 +286,6 @@ class _Search:
         return most_db
 
     def roofs(self) -> tuple[Roof, ...]:
-        """Return every roof that is off."""
         label, centres_m = buildings(self._city)
         priors_m = building_height_sds_m(self._city)
         tall_m = centres_m[:, 2] - building_extents_m(self._city, label)[0][:, 2]

@@ -14,22 +14,10 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import (
-    AntennaParams,
-    no_body_frame,
-    report_patterns,
-    vary_patterns,
-)
+from radiotwin.effects.antennas import AntennaParams, BodyFrameEffect, report_patterns
 from radiotwin.effects.arrays import LinkCache, frequent_labels, squares_about_mean
-from radiotwin.effects.base import GainEffect, ResidualView
-from radiotwin.effects.params import (
-    EffectParams,
-    Estimate,
-    Parameter,
-    ReceiverIndex,
-    Variation,
-    quantity,
-)
+from radiotwin.effects.base import ResidualView
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, quantity
 from radiotwin.links import Links
 from radiotwin.propagation.laws.followed_paths import free_space, rays_of, through_antenna_db
 
@@ -71,14 +59,11 @@ def dipole_gain(ray: np.ndarray, axis: np.ndarray) -> np.ndarray:
     return DIRECTIVITY * np.maximum(field**2, MIN_GAIN)
 
 
-class TiltedDipole(GainEffect):
+class TiltedDipole(BodyFrameEffect):
     """A dipole for each receiver that fits better with one."""
 
     name = "antenna_pattern"
-    settled_by = "fly the same track in both directions"
     variant = "tilted dipole of a receiver"
-    figure = "pattern"
-    of_receiver = True
     parameter_labels = {"lean_azimuth_deg": "azimuth of the tilt, from the heading"}
     confused_with = ("body_shadowing", "receiver_gain_offset")
 
@@ -92,10 +77,6 @@ class TiltedDipole(GainEffect):
 
     def __init__(self) -> None:
         self._arrivals = LinkCache()
-
-    @override
-    def unavailable(self, links: Links) -> str | None:
-        return no_body_frame(links)
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
@@ -117,10 +98,6 @@ class TiltedDipole(GainEffect):
                                           partial(_Arrivals.of, links, rows))
             offset_db[rows] = arrivals.offset_db(dipole)
         return offset_db
-
-    @override
-    def variation(self) -> Variation:
-        return vary_patterns(self, "receivers")
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:

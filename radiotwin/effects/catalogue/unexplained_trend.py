@@ -109,6 +109,5 @@ class UnexplainedTrend(GainEffect):
         return result
 
     def _value(self, links: Links, level_at: LevelAt) -> np.ndarray:
-        """Return the variable (n,)."""
         return self._values.get(
             links, (level_at,), lambda: residual_variable(self.variable, links, level_at(links)))

@@ -307,7 +307,6 @@ def _best_along_paths(fit: Fit, without: Fit) -> Fit:
 
 
 def _best_of_a_kind(fit: Fit, proposed: list[Effect], is_fold: bool) -> Fit:
-    """Return the best of some proposals, refined where it gains."""
     tried = [fit.model.with_effects([*fit.effects, each]) for each in proposed]
     if proposed[0].stage == "gain" and len(tried) > MAX_PROPOSALS:  # only gains have a score
         tried.sort(key=lambda each: -fit.view.score(each.terms[-1].select(fit.train)))
@@ -319,7 +318,6 @@ def _best_of_a_kind(fit: Fit, proposed: list[Effect], is_fold: bool) -> Fit:
 
 
 def _is_exact(fit: Fit) -> bool:
-    """Return whether the last effect has exact levels."""
     last = fit.effects[-1]
     return last.is_same(last.exactly())
 

@@ -436,7 +436,6 @@ class FittedModel:
         return self._without(lambda each: not each.is_cause or each.in_paths)
 
     def _without(self, left_out: Callable[[Effect], bool]) -> FittedModel:
-        """Return the same without some effects."""
         kept = [number for number, each in enumerate(self.effects) if not left_out(each)]
         return replace(self, effects=tuple(self.effects[number] for number in kept),
                        coefficients=tuple(self.coefficients[number] for number in kept))
