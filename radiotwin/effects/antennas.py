@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 from typing_extensions import override
 
 from radiotwin.effects.arrays import LinkCache, frequent_labels, one_hot
@@ -42,22 +42,6 @@ FRONT_TO_BACK_DB = (12.0, 25.0)
 VERTICALS_DEG = ((0.0, 360.0), (0.0, 15.0), (-6.0, 15.0), (-12.0, 15.0), (0.0, 40.0),
                  (-10.0, 40.0), (15.0, 40.0), (40.0, 65.0))
 AROUND_DEG = np.arange(0.0, 360.0, 5.0)  # azimuths over which a pattern is averaged
-
-
-class AntennaParams(EffectParams):
-    """Pattern of one antenna.
-
-    Subclass it with `quantity` fields; the last is the power on paths that are not followed, which
-    counts only where there is a 3D map.
-    """
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_values(cls, given: Any) -> Any:
-        """Accept the bare values in order, as version 0.1 wrote them."""
-        if isinstance(given, list | tuple):
-            return dict(zip(cls.model_fields, given, strict=True))
-        return given
 
 
 def vary_patterns(effect: Effect, end: str) -> Variation:
@@ -137,7 +121,7 @@ class BodyFrameEffect(GainEffect):
         return vary_patterns(self, "receivers")
 
 
-class SectorPattern(AntennaParams):
+class SectorPattern(EffectParams):
     """Pattern of one sector antenna; by default flat in elevation."""
 
     azimuth_deg: float = quantity(

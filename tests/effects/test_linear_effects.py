@@ -66,6 +66,6 @@ def test_no_offset_is_proposed_where_one_member_only_has_enough_links(links, vie
 
 
 def test_a_member_without_an_estimate_has_the_standard_deviation_of_the_others(links):
-    params = DeviceGainOffset.Params.model_validate({"members": [0, 1], "spread_db": 2.5})  # as version 0.1 wrote it
+    params = DeviceGainOffset.Params(members=[0, 1], offsets_sd_db=2.5)
     np.testing.assert_array_equal(DeviceGainOffset().with_params(params).term(links, None).unheard_sd_db,
                                   np.where(links.device == 2, 2.5, 0.0))

@@ -88,13 +88,8 @@ def with_antennas(config: SceneConfig, found: Sequence[Correction], links: Links
     return config.model_copy(update={"devices": list(devices.values())}), files, changes
 
 
-def write_antenna(antenna: FoundAntenna, path: Path) -> None:
-    """Write a pattern about its own boresight, with its tilt, as lossless: its mean power is 1.
-
-    Args:
-        antenna: as it was found; what the data did not determine is as it was fitted.
-        path: `.csv`, as `radiotwin.scene.antennas.read_pattern` reads it.
-    """
+def _write_antenna(antenna: FoundAntenna, path: Path) -> None:
+    """Write a pattern about its own boresight, with its tilt, as lossless: its mean power is 1."""
     elevation, azimuth = (axis.ravel() for axis in np.meshgrid(ELEVATION_DEG, AZIMUTH_DEG,
                                                                indexing="ij"))
     gain_db = antenna.gain_db(azimuth, elevation)
@@ -106,27 +101,21 @@ def write_antenna(antenna: FoundAntenna, path: Path) -> None:
         "gain_dbi": np.round(gain_db - 10 * np.log10(mean), DECIMALS)}), path)
 
 
-def stretch(roof: Roof, base_m: float) -> float:
+def _stretch(roof: Roof, base_m: float) -> float:
     """Return how much taller a building that stands on `base_m` is than on the map, a ratio."""
     return 1.0 + roof.true_offset_m / max(roof.height_m - base_m, abs(roof.true_offset_m))
 
 
-def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[str],
+def _corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[str],
                         roofs: list[Roof], base_m: np.ndarray) -> pd.DataFrame | None:
-    """Return the table of a scene's buildings as they are after the correction.
+    """Return the table of a scene's buildings, as texts, after the correction; None without one.
 
     Args:
         scene: before it.
-        shapes_of: the shapes in `city.xml` of each building, as `buildings` numbers them.
+        shapes_of: the shapes in `city.xml` of each building.
         left: shapes that the corrected scene still has.
         roofs: whose heights are corrected.
         base_m: (buildings,) what each stands on, before it [m].
-
-    Returns:
-        all its columns as texts; None where the scene has no such table.
-
-    Raises:
-        BadInput: the table cannot be read, or lies outside the folder.
     """
     path = scene.folder / "buildings.csv"
     if not path.is_file():
@@ -141,7 +130,7 @@ def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[
     for roof in roofs:
         own_m = float(base_m[roof.building])
         for row in np.flatnonzero(table["shape"].isin(shapes_of[roof.building])):
-            raised_m = own_m + stretch(roof, own_m) * (top_m[row] - own_m)
+            raised_m = own_m + _stretch(roof, own_m) * (top_m[row] - own_m)
             table.loc[row, ["top_m", "height_from", "height_sd_m"]] = [
                 f"{raised_m:.3f}", SOURCE, f"{max(roof.offset_sd_m, MIN_SD_M):.1f}"]
     return table
@@ -220,12 +209,12 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     with atomic_folder(folder) as temporary:
         base_m = building_extents_m(scene.city, label)[0][:, 2]
         shapes_of, left = _write_city(scene, temporary, keep, boxes, roofs, base_m)
-        table = corrected_buildings(scene, shapes_of, left, roofs, base_m)
+        table = _corrected_buildings(scene, shapes_of, left, roofs, base_m)
         if table is not None:
             write_csv(table, temporary / "buildings.csv")
         scene.copy_antennas(temporary)
         for file, antenna in antennas.items():
-            write_antenna(antenna, temporary / file)
+            _write_antenna(antenna, temporary / file)
         write_config(config.model_copy(update={"provenance": provenance}), temporary / "scene.toml")
         draw_preview(Scene.load(temporary), temporary / "preview.png")
     return changes
@@ -337,7 +326,7 @@ def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof],
         mine = np.unique(mesh.faces[label == roof.building])
         if len(mine):
             own_m = float(base_m[roof.building])
-            vertices_m[mine, 2] = own_m + stretch(roof, own_m) * (vertices_m[mine, 2] - own_m)
+            vertices_m[mine, 2] = own_m + _stretch(roof, own_m) * (vertices_m[mine, 2] - own_m)
     return trimesh.Trimesh(vertices_m, mesh.faces, process=False)
 
 

@@ -91,9 +91,6 @@ class _Learnt:
         the links that are held out still decide is, of a few numbers for all: the place of a box,
         the length of a correlation.
 
-        Args:
-            seed: of trees and samples.
-
         Returns:
             (r, k) measured minus predicted by each member [dB], (r,) far shares, (r,) error scales
             of named effects [dB], and (r,) rows of the links.
@@ -114,14 +111,14 @@ class _Learnt:
             rest = self.rest and fit.rest(0, self.rest)
             inner = _Learnt(fit, rest, self.kriging, part, self.names)
             found.append((part.links.level_db[test, None] - inner.members_db(test, seed),
-                          shares_of(part.links, ~out, test), fit.reading_parts()[1][test],
+                          _shares_of(part.links, ~out, test), fit.reading_parts()[1][test],
                           rows[test]))
         errors_db, shares, scales_db, tested = (np.concatenate(each) for each in zip(*found))
         return errors_db, shares, scales_db, tested
 
     def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
         """Return predictions (m, k) of rows (m,), by few trees and known correlations [dB]."""
-        physics = physics_db(self.fit, self.rest, self.part, test, seed, AWAY_TREES)
+        physics = _physics_db(self.fit, self.rest, self.part, test, seed, AWAY_TREES)
         links = self.part.links
         laws = [law_db(fitted_law(kind, links, self.fit.train, self.kriging), links, test)
                 for kind in LAWS if kind.name in self.names]
@@ -155,9 +152,9 @@ def combined_prediction(model: CrossFit, with_rest: bool, criteria: SelectionCri
             rest = fold.shadowing or fold.rest(seed)
         learnt = _Learnt(fold, rest, kriging[number] if kriging else None, part, names)
         test = np.flatnonzero((model.index == number) & fold.usable)
-        members = np.column_stack([physics_db(fold, rest, part, test, seed),
+        members = np.column_stack([_physics_db(fold, rest, part, test, seed),
                                    *(baselines[name][test] for name in laws)])
-        return learnt, test, members, shares_of(part.links, fold.train, test)
+        return learnt, test, members, _shares_of(part.links, fold.train, test)
 
     members, share = np.full((len(links), len(names)), np.nan), np.ones(len(links))
     with warnings.catch_warnings():  # whose filters threads leave as another one had them
@@ -193,18 +190,10 @@ def _quadrant(links: Links) -> np.ndarray:
     return above @ np.array([1, 2])
 
 
-def shares_of(links: Links, train: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """Return how far some links are from all measured ones, in 0..1, see `far_share`.
+def _shares_of(links: Links, train: np.ndarray, test: np.ndarray) -> np.ndarray:
+    """Return how far rows (m,) of links are from the measured ones, in 0..1, see `far_share`.
 
     By the end that moves, from where it was measured with the same other end.
-
-    Args:
-        links: n links.
-        train: (n,) bool or rows, measured.
-        test: (m,) rows.
-
-    Returns:
-        (m,)
     """
     moving_m, other = (links.receiver_m, links.device) if receivers_move(links) else (
         links.device_m[links.device], links.receiver)
@@ -248,20 +237,11 @@ def grown_forests(fit: Fit, part: Part, seed: int, trees: int = TREES,
             for name, kind in zip(both, (EXTRA_TREES, BOOSTING), strict=True) if name in names}
 
 
-def physics_db(fit: Fit, rest: CorrelatedShadowing | None, part: Part, test: np.ndarray,
+def _physics_db(fit: Fit, rest: CorrelatedShadowing | None, part: Part, test: np.ndarray,
                seed: int, trees: int = TREES) -> np.ndarray:
     """Return levels by named effects and trees, alone and together, and with the rest [dB].
 
-    Args:
-        fit: to some of n links.
-        rest: interpolated, of these; None: not asked for.
-        part: the links, with the features of trees.
-        test: (m,) rows.
-        seed: of the trees.
-        trees: number of them.
-
-    Returns:
-        (m, 5), or (m, 6) with the rest, level of a link that is detected.
+    Of rows (m,) of links, if they are detected: (m, 5), or (m, 6) with the rest.
     """
     limit_db, mean_db, scale_db, unheard_db = (each[test] for each in (
         fit.model.limit_db, *fit.reading_parts()))

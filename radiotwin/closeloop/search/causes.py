@@ -106,7 +106,7 @@ def _one_more(state: SearchState, available: list[Effect], causes: bool,
             tried = [*(each for each in tried if each.waiting is None), *asked]
             state, tried = _judged(state, tried, hypotheses, inputs.criteria)
         if not _passed(tried):
-            together = probable_together(state, [each for each in tried if each.trial.passed],
+            together = _probable_together(state, [each for each in tried if each.trial.passed],
                                          len(available), inputs)
             if together and _all_borne_out(together[-1].model, len(together)):
                 return _keep_together(state, tried, together)
@@ -190,15 +190,11 @@ def _all_borne_out(model: CrossFit, last: int) -> bool:
                    for number in range(count - last, count))
 
 
-def probable_together(state: SearchState, supported: Sequence[Tried], tried: int,
+def _probable_together(state: SearchState, supported: Sequence[Tried], tried: int,
                       inputs: SearchInputs) -> list[Tried]:
     """Return effects that are probable together, in order; none where there are none.
 
-    Args:
-        state: before a step of which no candidate is probable enough, with what the step says.
-        supported: its candidates that held-out links support.
-        tried: number of candidates.
-        inputs: of the search.
+    Of a step none of whose `tried` candidates is probable enough by itself.
     """
     criteria, step = inputs.criteria, state.steps[-1]
     ranked = sorted(supported, key=lambda each: -each.trial.probability)
@@ -364,18 +360,15 @@ def _told_apart(log: TrialLog) -> TrialLog:
 
 def _settled(model: CrossFit) -> CrossFit:
     """Return a model with exact levels where these explain its training links better."""
-    return with_moved_limits(model.map(with_exact_levels))
+    return _with_moved_limits(model.map(with_exact_levels))
 
 
-def with_moved_limits(model: CrossFit) -> CrossFit:
+def _with_moved_limits(model: CrossFit) -> CrossFit:
     """Return a model in which limits are moved by the offsets of receivers that were kept last.
 
     A receiver hears the same signals whatever its cable or calibration adds to its readings. Where
     its blanks begin as many decibels from the usual limit as its readings are off, that is one
-    fault.
-
-    Args:
-        model: of n links; a last effect without such offsets leaves it as it is.
+    fault. A last effect without such offsets leaves the model as it is.
     """
     whole = model.whole
     last = whole.effects[-1]

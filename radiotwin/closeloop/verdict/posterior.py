@@ -172,20 +172,16 @@ def _probabilities(scores: Sequence[Trial], unnamed: float, rest_db: float,
     total = sum(found.values())
     missing = float(np.prod([1 - each for each in found.values()]))
     best = max([0.0, *(score.nats for score in scores if np.isfinite(score.nats))])
-    none = missing * probability_of_nothing(best, unnamed, rest_db, noise_db)
+    none = missing * _probability_of_nothing(best, unnamed, rest_db, noise_db)
     # Two effects may both be there: shares of what is not "none" nor without a name.
     named = {name: each * (1 - missing) / total for name, each in found.items()} if total else {}
     return named | {NONE: none, OTHER: missing - none}
 
 
-def probability_of_nothing(best: float, unnamed: float, rest_db: float, noise_db: float) -> float:
+def _probability_of_nothing(best: float, unnamed: float, rest_db: float, noise_db: float) -> float:
     """Return the probability that nothing is hidden where no effect of the catalogue is.
 
-    Args:
-        best: most evidence for an effect [nats].
-        unnamed: most evidence for a curve without a name [nats].
-        rest_db: standard deviation of what belongs to places [dB].
-        noise_db: and of what belongs to nothing [dB].
+    From the most evidence for an effect, and for a curve without a name [nats].
     """
     weights = calibration()["nothing"]
     values = [*np.arcsinh(np.array([best, unnamed]) / NATS), np.log(max(rest_db, 0.1)),

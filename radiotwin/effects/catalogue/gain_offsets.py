@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from pydantic import AliasChoices, Field
+from pydantic import Field
 from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels, one_hot
@@ -42,8 +42,7 @@ class _GainOffset(GainEffect):
         """Who has an offset."""
 
         members: Unique[int] = Field(description="Indices of those with an offset.")
-        offsets_sd_db: float = Field(validation_alias=AliasChoices("offsets_sd_db", "spread_db"),
-                                     ge=0, le=1000,
+        offsets_sd_db: float = Field(ge=0, le=1000,
                                      description="Standard deviation of the offsets [dB].")
 
     params: Params

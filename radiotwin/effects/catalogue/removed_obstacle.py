@@ -1,8 +1,6 @@
 """A building of the map that does not exist any more.
 
-No law of its own: links near it have the channel's level over the map without it. (Not exactly, as
-in some twins' files: links that only this building blocks have the channel's level with nothing in
-their way.)
+No law of its own: links near it have the channel's level over the map without it.
 
 The buildings that most links behind them have lost less to than the model says are tried. Maps give
 many a roof too high, and links that pass just below its edge gain from that building's removal as

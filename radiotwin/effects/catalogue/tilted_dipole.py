@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import AntennaParams, BodyFrameEffect, report_patterns
+from radiotwin.effects.antennas import BodyFrameEffect, report_patterns
 from radiotwin.effects.arrays import LinkCache, frequent_labels, squares_about_mean
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, quantity
@@ -30,7 +30,7 @@ TILTS_DEG = np.arange(0.0, 60.1, 5.0)  # that are tried
 AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0)
 
 
-class DipoleParams(AntennaParams):
+class DipoleParams(EffectParams):
     """Attitude of one receiver's dipole in the body frame."""
 
     tilt_deg: float = quantity(0.0, unit="deg", low=0.0, high=85.0, step=4.0,

@@ -50,14 +50,8 @@ class RelativesState(FieldState):
     passed_on: list[Annotated[float, Field(ge=0, le=1)]]
 
 
-def fitted_field(what: str, field: ResidualField, *points: Any) -> ResidualField:
-    """Return a field after its fit to points, or one that was, see `radiotwin.runtime.pieces.kept`.
-
-    Args:
-        what: name of the finished parts.
-        field: empty.
-        points: arguments of `ResidualField.fit`.
-    """
+def _fitted_field(what: str, field: ResidualField, *points: Any) -> ResidualField:
+    """Return an empty field after its fit to points (`ResidualField.fit`), or one that was kept."""
     return kept(what, points, lambda: field.fit(*points), ResidualField.state,
                 ResidualField.from_state)
 
@@ -109,7 +103,7 @@ class Relatives:
         points = series, links.receiver_m[rows], (z[rows] - z[rows].mean()) / relative_sd
         kind = links.receiver[rows]
         if field is None:
-            field = fitted_field("relatives", ResidualField(PAIRS), *points, seed, kind)
+            field = _fitted_field("relatives", ResidualField(PAIRS), *points, seed, kind)
         else:
             field = field.with_points(*points, kind)
         mean = relative_sd * field.mean(links.device, links.receiver_m, links.receiver)
@@ -211,7 +205,7 @@ class CorrelatedShadowing:
         series, position_m, kind = _points(links, move)
         points = series, position_m, (z - z.mean()) / relative_sd
         field = (like.field.with_points(*points, kind) if like
-                 else fitted_field("shadowing", ResidualField(), *points, seed, kind))
+                 else _fitted_field("shadowing", ResidualField(), *points, seed, kind))
         return cls(field, relative_sd, move, like is None or like.certain, relatives)
 
     def at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
