@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -28,7 +28,6 @@ from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDis
 from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_known, fit_links, reliable_m
 from radiotwin.twin.fit_paths import LOST_M, best_dof, fit_paths, relocation_from
-from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
 from radiotwin.twin.model.model import Fit, Model
 from radiotwin.twin.twin import Twin
 
@@ -264,15 +263,14 @@ class CrossFit:
         """Return the same base with other effects."""
         return CrossFit(whole, tuple(folds), self.index, self.twin)
 
-    def map(self, function: Callable[[Fit], Fit]) -> CrossFit:
-        """Return what a function makes of the whole, then of the folds, as `extended` does."""
-        whole, *folds = (function(each) for each in self.each)
-        return self.extended(whole, folds)
+    def map(self, function: Callable[..., Fit], *further: Iterable[Any]) -> CrossFit:
+        """Return what a function makes of the whole, then of the folds, as `extended` does.
 
-    def with_shadowing(self, shadowing: list[CorrelatedShadowing]) -> CrossFit:
-        """Return the same with interpolated shadowing: the whole's, then the folds'."""
-        whole, *folds = (replace(each, shadowing=own)
-                         for each, own in zip(self.each, shadowing, strict=True))
+        Args:
+            function: of a fit, and of its own of each of the `further` arguments.
+            further: for the whole, then for the folds.
+        """
+        whole, *folds = (function(*own) for own in zip(self.each, *further, strict=True))
         return self.extended(whole, folds)
 
     def held_out(self, of: Callable[[Fit], np.ndarray]) -> np.ndarray:

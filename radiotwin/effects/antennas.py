@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import LinkCache, frequent_labels, one_hot
+from radiotwin.effects.arrays import frequent_labels, one_hot
 from radiotwin.effects.base import Effect, GainEffect, LevelAt, Term
 from radiotwin.effects.params import (
     Allowed,
@@ -215,9 +215,6 @@ class SectorEffect(GainEffect):
 
     params: Params
 
-    def __init__(self) -> None:
-        self._rays = LinkCache()
-
     @override
     def unavailable(self, links: Links) -> str | None:
         if not eligible_devices(links):
@@ -230,7 +227,7 @@ class SectorEffect(GainEffect):
         for device, pattern in self.params.devices.items():
             rows = np.flatnonzero(links.device == device)
             if len(rows):
-                rays = self._rays.get(links, (device, self.params.straight),
+                rays = self.of_links.get(links, (device, self.params.straight),
                                       partial(Rays.of, links, rows, self.params.straight))
                 offset_db[rows] = rays.offset_db(pattern)
         return Term(offset_db, one_hot(links.device, list(self.params.devices)),

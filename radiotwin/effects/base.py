@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, 
 
 import numpy as np
 
+from radiotwin.effects.arrays import LinkCache
 from radiotwin.effects.params import (
     Allowed,
     EffectParams,
@@ -148,6 +149,7 @@ class Effect(ABC):
             because it has not been traced; "" = it is judged as effects are on the whole.
         params: of one that was found, an instance of `Params`; the catalogue's own have none.
         levels: which levels of the channel its term asks for, see `Levels`.
+        of_links: what it has derived from links, whatever its parameters.
     """
 
     name: ClassVar[str]
@@ -174,6 +176,9 @@ class Effect(ABC):
 
     params: EffectParams
     levels: Levels = "quick"
+
+    def __init__(self) -> None:
+        self.of_links = LinkCache()
 
     @property
     def label(self) -> str:

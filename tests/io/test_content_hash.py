@@ -45,7 +45,7 @@ def test_another_process_finds_the_same():
 def test_what_an_effect_remembers_decides_nothing():
     effect = TiltedDipole()
     before = content_hash(effect)
-    effect._arrivals.get(LinkGeometry(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1, bool), np.zeros(1, int)), "x", list)
+    effect.of_links.get(LinkGeometry(np.zeros((1, 3)), np.zeros((1, 3)), np.ones(1, bool), np.zeros(1, int)), "x", list)
     assert content_hash(effect) == before
 
 

@@ -36,7 +36,7 @@ def add_shadowing(state: SearchState, inputs: SearchInputs) -> SearchState:
     # If what a field learnt does not return on held-out flights, its mean may be right though its
     # certainty is not.
     for tried in (fields, [replace(each, certain=False) for each in fields]):
-        extended = model.with_shadowing(tried)
+        extended = model.map(lambda fit, own: replace(fit, shadowing=own), tried)
         trial = score_model(model, extended, Trial(SHADOWING, step=state.step), None, 1, inputs,
                             nlos_only=True)
         if not trial.reason:

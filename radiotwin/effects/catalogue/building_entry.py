@@ -17,7 +17,7 @@ from pydantic import Field
 from scipy.special import ndtri
 from typing_extensions import override
 
-from radiotwin.effects.arrays import LinkCache, city_of
+from radiotwin.effects.arrays import city_of
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, quantity
 from radiotwin.links import Links
@@ -91,9 +91,6 @@ class BuildingEntry(GainEffect):
 
     params: Params
 
-    def __init__(self) -> None:
-        self._entering = LinkCache()
-
     @override
     def unavailable(self, links: Links) -> str | None:
         if missing := super().unavailable(links):
@@ -156,4 +153,4 @@ class BuildingEntry(GainEffect):
             measured = links.receiver >= 0  # others are points of a map, whose places are exact
             receiver[measured] = chance_inside(city, links.receiver_m[measured])
             return np.where(links.los, 0.0, np.where(device, 1 - receiver, receiver))
-        return self._entering.get(links, None, derive)
+        return self.of_links.get(links, None, derive)

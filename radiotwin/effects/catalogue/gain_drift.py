@@ -83,6 +83,7 @@ class _GainDrift(GainEffect):
     params: _DriftParams
 
     def __init__(self, between_flights: bool = False) -> None:
+        super().__init__()
         self._between_flights = between_flights
 
     @property

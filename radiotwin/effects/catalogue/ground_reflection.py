@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
 
-from radiotwin.effects.arrays import LinkCache, squares_about_mean, subsample
+from radiotwin.effects.arrays import squares_about_mean, subsample
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.params import (
     Allowed,
@@ -68,9 +68,6 @@ class GroundReflection(GainEffect):
 
     params: Params
 
-    def __init__(self) -> None:
-        self._bounces = LinkCache()
-
     @override
     def unavailable(self, links: Links) -> str | None:
         if not np.isfinite(links.frequency_hz):
@@ -104,7 +101,7 @@ class GroundReflection(GainEffect):
     @override
     def gain_db(self, links: Links) -> np.ndarray:
         offset_db = np.zeros(len(links))
-        clear, device_m, receiver_m = self._bounces.get(links, None, lambda: _bounces(links))
+        clear, device_m, receiver_m = self.of_links.get(links, None, lambda: _bounces(links))
         rows = np.flatnonzero(clear)
         offset_db[rows] = two_ray_db(
             device_m[rows], receiver_m[rows], links.frequency_hz,

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import LinkCache, city_of
+from radiotwin.effects.arrays import city_of
 from radiotwin.effects.base import GainEffect, ResidualView
 from radiotwin.effects.losses import UNKNOWN_MAX_LOSS_DB, max_loss_db
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
@@ -42,9 +42,6 @@ class MappedVegetation(GainEffect):
             "Of a link through it, at the frequency [dB]."))
 
     params: Params
-
-    def __init__(self) -> None:
-        self._through = LinkCache()
 
     @override
     def unavailable(self, links: Links) -> str | None:
@@ -96,4 +93,4 @@ class MappedVegetation(GainEffect):
             return vegetation.metres_through(links.device_m[links.device], links.receiver_m,
                                              city.ground_height_m if city.terrain is not None
                                              else None)
-        return self._through.get(links, kind, measure)
+        return self.of_links.get(links, kind, measure)

@@ -18,7 +18,7 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
 
-from radiotwin.effects.arrays import LinkCache, city_of, ends_above, ends_above_ground, subsample
+from radiotwin.effects.arrays import city_of, ends_above, ends_above_ground, subsample
 from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.boxes import (
     BESIDE_UNKNOWN,
@@ -95,9 +95,6 @@ class MissingObstacle(GainEffect):
             "left on the other paths."))
 
     params: Params
-
-    def __init__(self) -> None:
-        self._shadows, self._known = LinkCache(), LinkCache()
 
     @override
     def unavailable(self, links: Links) -> str | None:
@@ -197,8 +194,8 @@ class MissingObstacle(GainEffect):
         from radiotwin.propagation.laws.followed_paths import KnownPaths, UprightBox
 
         city, rows = city_of(links, self.name), np.flatnonzero(self._near(links, box))
-        known = self._known.get(links, "paths", lambda: KnownPaths(links.geometry, city))
-        level_db = self._known.get(links, (level_at, "levels"),
+        known = self.of_links.get(links, "paths", lambda: KnownPaths(links.geometry, city))
+        level_db = self.of_links.get(links, (level_at, "levels"),
                                    lambda: np.full(len(links), np.nan))
         if np.isnan(level_db[rows]).any():
             around = self._near(links, box, NEAR_M + MARGIN_M) & np.isnan(level_db)
@@ -233,7 +230,7 @@ class MissingObstacle(GainEffect):
         def derive() -> np.ndarray:
             hidden = links.with_los(np.zeros(len(links), bool))
             return level_at(hidden, not by_class) - level_at(links, not by_class)
-        return self._shadows.get(links, (level_at, by_class), derive)
+        return self.of_links.get(links, (level_at, by_class), derive)
 
     @override
     def exactly(self) -> Effect:

@@ -15,7 +15,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from radiotwin.effects.antennas import BodyFrameEffect, report_patterns
-from radiotwin.effects.arrays import LinkCache, frequent_labels, squares_about_mean
+from radiotwin.effects.arrays import frequent_labels, squares_about_mean
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, quantity
 from radiotwin.links import Links
@@ -75,9 +75,6 @@ class TiltedDipole(BodyFrameEffect):
 
     params: Params
 
-    def __init__(self) -> None:
-        self._arrivals = LinkCache()
-
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links, found = view.links, {}
@@ -94,7 +91,7 @@ class TiltedDipole(BodyFrameEffect):
         offset_db = np.zeros(len(links))
         for receiver, dipole in self.params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
-            arrivals = self._arrivals.get(links, receiver,
+            arrivals = self.of_links.get(links, receiver,
                                           partial(_Arrivals.of, links, rows))
             offset_db[rows] = arrivals.offset_db(dipole)
         return offset_db

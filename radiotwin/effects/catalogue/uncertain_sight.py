@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from typing_extensions import override
 
-from radiotwin.effects.arrays import LinkCache, city_of
+from radiotwin.effects.arrays import city_of
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, quantity
 from radiotwin.links import Links
@@ -47,9 +47,6 @@ class UncertainSight(GainEffect):
                 "Difference of level between both classes that errors near walls are of [dB]."))
 
     params: Params
-
-    def __init__(self) -> None:
-        self._chances = LinkCache()
 
     @override
     def unavailable(self, links: Links) -> str | None:
@@ -91,4 +88,4 @@ class UncertainSight(GainEffect):
             for seed in range(MAPS):
                 seen += links.with_city(perturbed_map(city, WALL_SD_M, HEIGHT_SD_M, seed)).los
             return seen / (MAPS + 1)
-        return self._chances.get(links, None, derive)
+        return self.of_links.get(links, None, derive)

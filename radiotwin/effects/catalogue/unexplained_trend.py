@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import LinkCache, curve_basis, curve_knots
+from radiotwin.effects.arrays import curve_basis, curve_knots
 from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, Unique
 from radiotwin.links import Links, residual_variable
@@ -56,10 +56,10 @@ class UnexplainedTrend(GainEffect):
 
     def __init__(self, variable: str) -> None:
         """Make the effect for a variable of `residual_variables`."""
+        super().__init__()
         self.variable = variable
         self.variant = f"{OVER}{variable}"  # type: ignore[misc]  # one class for every variable
         self.uses = ("quality",) if variable == "quality" else ()  # type: ignore[misc]
-        self._values = LinkCache()
 
     @override
     @classmethod
@@ -109,5 +109,5 @@ class UnexplainedTrend(GainEffect):
         return result
 
     def _value(self, links: Links, level_at: LevelAt) -> np.ndarray:
-        return self._values.get(
+        return self.of_links.get(
             links, (level_at,), lambda: residual_variable(self.variable, links, level_at(links)))
