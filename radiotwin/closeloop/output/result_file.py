@@ -174,13 +174,7 @@ def write_report(report: dict[str, Any], path: Path) -> None:
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """Read a `closeloop.json`.
-
-    Args:
-        path: of the file.
-
-    Returns:
-        its content; each field has the type of `ReportRecord`.
+    """Read a `closeloop.json`; each field of what is returned has the type of `ReportRecord`.
 
     Raises:
         BadInput: it cannot be read, it is of another version, or it is damaged.

@@ -93,12 +93,8 @@ def _sd_ratio(model: CrossFit, prediction: CombinedPrediction,
     """Return the error's sd over that of named effects, near and far.
 
     The greater of two estimates each: from held-out links, and from these and whole quadrants
-    that were held out. A map extrapolates, and few places do not tell what that costs.
-
-    Args:
-        model: as of `make_blend`.
-        prediction: likewise.
-        but: a fold whose links have no part in it; -1: all have.
+    that were held out. A map extrapolates, and few places do not tell what that costs. Links of
+    the fold `but` have no part in it.
     """
     scale_db, unheard_db = model.held_out_scales
     # What levels that nobody knows are off by is not the combination's error.

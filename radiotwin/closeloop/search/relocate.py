@@ -100,11 +100,7 @@ def _located_anew(fit: Fit, links: Links, mine: np.ndarray,
                   base: Base) -> tuple[Model, list[TwinDevice]]:
     """Return one model with its devices where its base, over the corrected map, has them.
 
-    Args:
-        fit: with effects.
-        links: n links as the base was given them.
-        mine: (n,) bool, those that it learns from.
-        base: locates.
+    Of links as the base was given them, from those in `mine` (n,).
     """
     model = fit.model
     with warnings.catch_warnings():

@@ -246,11 +246,9 @@ def _tamed(z: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 def _nuisance(links: Links, mean_db: np.ndarray) -> Columns:
-    """Return what every base may be wrong in, of n links [dB].
+    """Return what every base may be wrong in [dB].
 
-    Args:
-        links: n links.
-        mean_db: (n,) the base's prediction: weak levels are those of ways that it does not follow.
+    Also over its prediction (n,): weak levels are those of ways that it does not follow.
     """
     slope = np.log10(links.distance_m / 100.0)
     blocks, prior_sd_db = [], []

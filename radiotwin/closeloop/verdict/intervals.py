@@ -191,10 +191,7 @@ def _held_out(model: CrossFit, number: int
 def _reach(pull: np.ndarray, share: np.ndarray, label: np.ndarray) -> float:
     """Return half the width of the slope's 90 % interval, where links (n,) of a label err alike.
 
-    Args:
-        pull: (n,) what each link moves the slope by.
-        share: (n,) of the information on it.
-        label: (n,) cluster of each link.
+    Each moves the slope by its `pull`, and has a `share` of the information on it.
     """
     own = np.unique(label, return_inverse=True)[1].ravel()
     shares = np.bincount(own, weights=share)

@@ -222,15 +222,10 @@ def _timed_rows(links: Links, receiver: int | None, flight: str | None) -> np.nd
 
 def _strongest(links: Links, every_db: np.ndarray, weights: np.ndarray,
                rows: np.ndarray) -> _Window | None:
-    """Return the window in which a loss, or an attenuation, explains most.
+    """Return the window in which a loss, or an attenuation, explains most of compared residuals.
 
-    Twice: over the whole time, then over finer ends around what was found.
-
-    Args:
-        links: n links.
-        every_db: (n,) compared residuals [dB].
-        weights: (n,) what each counts [1/dB²].
-        rows: (r,) links that it may be among.
+    Among rows (r,) of n links. Twice: over the whole time, then over finer ends around what was
+    found.
     """
     time_s, rest_db, weight = links.time_s[rows], every_db[rows], weights[rows]
     distance_km = links.distance_m[rows] / 1000

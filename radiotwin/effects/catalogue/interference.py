@@ -162,18 +162,10 @@ def _fall_db(links: Links, position_m: Sequence[float] | np.ndarray,
 
 def _gains(view: ResidualView, rows: np.ndarray,
            positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return half of the drop of the weighted squares of some links by an emitter [nats].
+    """Return half of the drop of the weighted squares of rows (r,) by each of p emitters [nats].
 
-    A level and a slope for each class of line of sight are fitted beside it, because the channel's
-    have taken up part of the interference.
-
-    Args:
-        view: residuals.
-        rows: (r,) links.
-        positions_m: (p, 2) x and y of emitters [m].
-
-    Returns:
-        (p, q) nats, and the levels (p, q) of `Interference.Params` [dB].
+    With each of q levels, (p, q), and these (p, q) [dB]. A level and a slope for each class of line
+    of sight are fitted beside it: the channel's have taken up part of the interference.
     """
     part = view.links.select(rows)
     root = np.sqrt(view.weight[rows])

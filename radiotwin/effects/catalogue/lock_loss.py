@@ -84,13 +84,7 @@ class _States:
 
 
 def _find_drops(view: ResidualView, receiver: int, rows: np.ndarray) -> _Drops | None:
-    """Return how the readings of a receiver drop now and then; None where they do not.
-
-    Args:
-        view: the training links.
-        receiver: its index.
-        rows: (n,) its detected links, with line of sight where there are any.
-    """
+    """Return how the readings (n,) of a receiver drop now and then; None where they do not."""
     every_db, _ = compared_where_possible_db(view)
     rest_db, instant = every_db[rows], _instants(view.links, rows)
     states = max((_two_states(rest_db, instant, drop_db) for drop_db in FIRST_DROPS_DB),
@@ -271,9 +265,7 @@ def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
 def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the likeliest dropout probability, and the gain of each link by it (n,) [nats].
 
-    Args:
-        below: (n,) probability of a level below the limit.
-        blank: (n,) bool.
+    Of links with a probability of a level below the limit, (n,), and whether they are blank.
     """
     below = np.maximum(below, MIN_PROBABILITY)
 

@@ -349,10 +349,5 @@ def _contrast_db(links: Links, level_at: LevelAt) -> np.ndarray:
 
 
 def _level_db(loss_db: np.ndarray, contrast_db: np.ndarray) -> np.ndarray:
-    """Return the level of a way over roofs beside what is left on others, over that without [dB].
-
-    Args:
-        loss_db: (n,) over roofs [dB].
-        contrast_db: (n,) how much less is on the others [dB].
-    """
+    """Return the level (n,) of a way over roofs beside the less that is on others [dB]."""
     return 10 * np.log10(10 ** (-loss_db / 10) + 10 ** (-contrast_db / 10))

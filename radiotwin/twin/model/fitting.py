@@ -340,11 +340,8 @@ def _exactly_beside(fit: Fit) -> Fit:
 def _over_known_paths(fit: Fit, is_near: bool = False) -> Fit:
     """Search for exact parameters of the last effect with levels that are nearly exact.
 
-    Those of known paths (`missing_obstacle`), of which a value takes milliseconds.
-
-    Args:
-        fit: that is searched from; returned where it is better, or the effect knows none.
-        is_near: whether it is known to be near the best.
+    Those of known paths (`missing_obstacle`), of which a value takes milliseconds. Where the effect
+    knows none, or they are no better, the fit is returned as it is.
     """
     last = fit.effects[-1]
     exact = last.exactly() if fit.channel.follows_paths else None
