@@ -279,9 +279,7 @@ class Fit(FitResult):
     @property
     def training_z(self) -> np.ndarray:
         """(m,) residuals of the training links [error scales]; outliers are clipped."""
-        training = self.model.training
-        z = training.residual_db(self) / training.predict(self).scale_db
-        return np.clip(z, -MAX_REST_Z, MAX_REST_Z)
+        return np.clip(self.view.residual_db / self.view.scale_db, -MAX_REST_Z, MAX_REST_Z)
 
     def rest(self, seed: int, like: CorrelatedShadowing | None = None) -> CorrelatedShadowing:
         """Return what interpolates the residuals of the training links, see `like` there."""
@@ -360,12 +358,7 @@ class Unheard:
 
     @classmethod
     def of(cls, fit: Fit, device_sd_db: float) -> Unheard | None:
-        """Return that of devices without a training link; None if each has one.
-
-        Args:
-            fit: of a model.
-            device_sd_db: as of `FittedModel` [dB].
-        """
+        """Return that of devices without a training link; None if each has one."""
         links, own_db, declared = fit.links, np.zeros(len(fit.links)), set[int]()
         for number, (each, term) in enumerate(zip(fit.effects, fit.model.terms, strict=True)):
             if each.is_declared:
