@@ -439,18 +439,14 @@ class FittedModel:
         Where the links have no receivers (a map's have none) those are faultless: effects of
         receivers are left out.
         """
-        if not links.receiver_names:
-            return self._without(lambda each: not each.is_on_maps())._on_links(links)
-        return self._on_links(links)
-
-    def _on_links(self, links: Links) -> Fit:
-        model = Model.build(links, self.channel, self.dof).with_effects(self.effects)
-        coefficients = [self.level_coefficients, *self.coefficients]
+        own = self if links.receiver_names else self._without(lambda each: not each.is_on_maps())
+        model = Model.build(links, self.channel, self.dof).with_effects(own.effects)
+        coefficients = [self.level_coefficients, *own.coefficients]
         needed = [model.level_columns, *(term.columns for term in model.terms)]
-        for own, columns in zip(coefficients, needed, strict=True):
-            if len(own) != columns.shape[1]:
-                raise BadInput(f"the twin has {len(own)} coefficients where {columns.shape[1]} are "
-                               "needed for these links; run `radiotwin fit` again")
+        for given, columns in zip(coefficients, needed, strict=True):
+            if len(given) != columns.shape[1]:
+                raise BadInput(f"the twin has {len(given)} coefficients where {columns.shape[1]} "
+                               "are needed for these links; run `radiotwin fit` again")
         return Fit(np.concatenate(coefficients), self.scale_db, np.nan, model)
 
     def predict(self, links: Links) -> Prediction:
