@@ -1,14 +1,17 @@
 """Skips what a machine cannot run, with the reason; the order of the tests."""
 
+import base64
 import uuid
 
 import pytest
 
 from radiotwin.runtime import cuda, llvm
+from radiotwin.scene.plot import draw_preview
 
 LONG = ("examples", "tests/test_api", "tests/test_examples", "tests/marl", "tests/cli", "tests/twin", "tests/closeloop",
         "tests/trace", "tests/runtime", "tests/studies")
 """What has the longest tests; they come first, so that at the end no worker waits for one of them."""
+PIXEL_PNG = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGNgAAAAAgABSK+kcQAAAABJRU5ErkJggg==")
 GPU_TRIALS = {"tracing": cuda.tracing_refusal, "training": cuda.torch_refusal}
 
 
@@ -34,6 +37,23 @@ def own_cache(tmp_path_factory, monkeypatch):
     folder = tmp_path_factory.getbasetemp() / f"cache-{uuid.uuid4().hex}"
     monkeypatch.setenv("RADIOTWIN_CACHE", str(folder))
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def plain_preview():
+    """A picture of one pixel in the place of a scene's preview, whose drawing takes most of the time of a small build."""
+    def draw(scene, path):
+        path.write_bytes(PIXEL_PNG)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("radiotwin.scene.build.draw_preview", draw)
+        yield draw
+
+
+@pytest.fixture
+def drawn_preview(monkeypatch):
+    """The preview as ever."""
+    monkeypatch.setattr("radiotwin.scene.build.draw_preview", draw_preview)
 
 
 @pytest.fixture(scope="session")

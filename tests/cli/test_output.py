@@ -70,6 +70,7 @@ def test_the_real_command(run_installed, run, tmp_path):
     document = json.loads(done.stdout)
     assert document["scene"]["devices"] == 7 and document["scene"]["materials"][0]["name"]
     assert any("wrote city" in message for message in document["messages"])
+    assert (tmp_path / "city" / "preview.png").stat().st_size > 10_000
     quiet = run("build-scene preset:small -o again -q", tmp_path)
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "") and (tmp_path / "again/scene.toml").is_file()
     text = run("build-scene preset:small --check", tmp_path).stdout

@@ -27,6 +27,7 @@ from tests.cli.strangers import (
 )
 
 PLANNING = "--scene scene --truth segmented --algorithm random --twin log-distance --real-episodes 1 --compare false --out run"
+pytestmark = pytest.mark.usefixtures("drawn_preview")
 stranger = Strangers()
 
 EVIL = """#include <fcntl.h>

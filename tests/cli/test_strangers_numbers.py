@@ -11,6 +11,7 @@ import pytest
 
 from tests.cli.strangers import FIT, MAP, STORED, SURVEY, Strangers, check_stranger
 
+pytestmark = pytest.mark.usefixtures("drawn_preview")
 stranger = Strangers()
 
 

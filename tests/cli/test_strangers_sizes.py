@@ -22,6 +22,7 @@ from tests.cli.strangers import (
     write_town,
 )
 
+pytestmark = pytest.mark.usefixtures("drawn_preview")
 stranger = Strangers()
 LINKS = ("time_s,flight,receiver,receiver_x_m,receiver_y_m,receiver_z_m,device,gain_db\n", "0,f,r,1,2,60,d0,-80\n")
 

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 import trimesh
 
+from radiotwin.closeloop.output import corrected_scene
 from radiotwin.closeloop.output.corrected_scene import (
     _free_position,
     _moved,
@@ -29,11 +30,19 @@ from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import STANDARD, itu_material, with_pairs
+from radiotwin.scene.plot import draw_preview
 from radiotwin.scene.readers import MapOptions, build_scene_from_map
 from radiotwin.trace import SolverSettings, trace_gains
 from tests.terrains import incline, terrain_map
 
+pytestmark = pytest.mark.usefixtures("plain")
+
 BOX = [130.0, 45.0, 24.0, 14.0, 70.0, 30.0]  # on a street of the small scene
+
+
+@pytest.fixture
+def plain(plain_preview, monkeypatch):
+    monkeypatch.setattr(corrected_scene, "draw_preview", plain_preview)
 
 
 def loop_of(scene, *found):
@@ -56,9 +65,11 @@ def tallest(scene):
     return int(centres_m[:, 2].argmax()), *centres_m[centres_m[:, 2].argmax()]
 
 
-def test_a_traced_box_is_in_the_way_as_long_wide_and_turned_as_it_was_found(small_scene, tmp_path):
+def test_a_traced_box_is_in_the_way_as_long_wide_and_turned_as_it_was_found(small_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(corrected_scene, "draw_preview", draw_preview)
     loop = loop_of(small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
     changes = write_corrected_scene(loop, small_scene, tmp_path / "new")
+    assert (tmp_path / "new" / "preview.png").stat().st_size > 10_000
     assert changes == ["a box of 24 x 14 m, 70 m high, stands at (130, 45) m"]
     city = Scene.load(tmp_path / "new").city
     for turn_deg, half_m in ((30.0, 12.0), (120.0, 7.0)):  # along it and across

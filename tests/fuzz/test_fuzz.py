@@ -18,8 +18,9 @@ from tests.fuzz.sandbox import CANARY, prepare_case, run_watched
 from tests.fuzz.targets import TARGETS
 from tests.worlds import quickened
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork") or not os.path.isdir("/proc/self"),
-                                reason="cases run in forked children that are watched through /proc")
+pytestmark = [pytest.mark.usefixtures("drawn_preview"), pytest.mark.skipif(
+    not hasattr(os, "fork") or not os.path.isdir("/proc/self"),
+    reason="cases run in forked children that are watched through /proc")]
 QUICK = {target.kind: target for target in TARGETS if not target.slow}.values()  # one of each kind
 KNOWN = [loads(line) for line in CORPUS.read_text().splitlines()]
 
