@@ -3,14 +3,13 @@
 The figures read nothing else, so that they do not depend on how the loop fits its models.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from radiotwin.closeloop.run import Loop
 from radiotwin.closeloop.verdict.residual_tests import significant
+from radiotwin.effects.base import Effect
 from radiotwin.effects.params import Parameter
 from radiotwin.effects.places import Mark
 from radiotwin.links import Links, evidence_blocks, residual_variables
@@ -68,12 +67,7 @@ class EffectData:
     """An effect that was found, and its contribution while all other effects stay as they are.
 
     Attributes:
-        name: name in the catalogue.
-        figure: kind of figure that the effect asks for; empty: chosen by stage.
-        stage: stage of the model that the effect acts in.
-        nlos_only: whether it acts on links without line of sight only.
-        of_receiver: whether it belongs to a receiver.
-        params: nonlinear parameters.
+        found: the effect with its parameters.
         mark: how maps mark where it is; None: it has no place.
         parameters: printed parameters with their 90 % intervals.
         links: measured links.
@@ -81,12 +75,7 @@ class EffectData:
         with_db: (n,) predicted level with it [dB].
     """
 
-    name: str
-    figure: str
-    stage: str
-    nlos_only: bool
-    of_receiver: bool
-    params: Mapping[str, Any]
+    found: Effect
     mark: Mark | None
     parameters: dict[str, Parameter]
     links: DrawnLinks
@@ -111,16 +100,16 @@ class EffectData:
     @property
     def member_kind(self) -> str:
         """Return `device` or `receiver` where the effect differs between them, else ``""``."""
-        if "devices" in self.params:
+        if "devices" in dict(self.found.params):
             return "device"
-        return "receiver" if self.of_receiver else ""
+        return "receiver" if self.found.of_receiver else ""
 
     @property
     def shown(self) -> np.ndarray:
         """Return the (n,) mask of links to draw: for a receiver those with line of sight."""
         detected = np.isfinite(self.residual_db)
         clear = detected & self.links.los
-        return clear if self.of_receiver and clear.sum() >= MIN_LOS_LINKS else detected
+        return clear if self.found.of_receiver and clear.sum() >= MIN_LOS_LINKS else detected
 
     def panels(self) -> list[tuple[str, np.ndarray]]:
         """Return title and links (indices) of the members that the effect changes most."""
@@ -200,10 +189,8 @@ def _effects(loop: Loop, links: DrawnLinks) -> list[EffectData]:
     for number, (effect, parameters) in enumerate(zip(whole.effects, loop.parameters,
                                                        strict=True)):
         without_db = whole.without(number).readings().mean_db
-        effects.append(EffectData(
-            effect.name, effect.figure, effect.stage, effect.nlos_only, effect.of_receiver,
-            dict(effect.params), effect.mark(whole.links), parameters, links,
-            np.where(whole.usable, without_db, np.nan), with_db))
+        effects.append(EffectData(effect, effect.mark(whole.links), parameters, links,
+                                  np.where(whole.usable, without_db, np.nan), with_db))
     return effects
 
 

@@ -64,7 +64,7 @@ ON_MAP = ("place_of_ray", "place_of_receiver")  # variables that the residual ma
 
 def effect_figure(effect: EffectData, background: MapBackground) -> Figure:
     """Draw an effect in the figure that suits it."""
-    kind = effect.figure or FIGURE_OF_STAGE.get(effect.stage, "")
+    kind = effect.found.figure or FIGURE_OF_STAGE.get(effect.found.stage, "")
     return FIGURES.get(kind, variable_figure)(effect, background)
 
 
@@ -134,7 +134,7 @@ def pattern_figure(effect: EffectData, _: MapBackground) -> Figure:
 def histogram_figure(effect: EffectData, _: MapBackground) -> Figure:
     """Draw the distribution of the residuals that the effect changes, without and with it."""
     rows, los = np.isfinite(effect.residual_db), effect.links.los
-    nlos = effect.nlos_only and (rows & ~los).any()
+    nlos = effect.found.nlos_only and (rows & ~los).any()
     rows = rows & ~los if nlos else rows
     without_db = effect.residual_db[rows]
     with_db = without_db - effect.contribution_db[rows]
@@ -169,7 +169,7 @@ def interval_figure(effect: EffectData, background: MapBackground) -> Figure:
     members = [name.partition("[")[2].removesuffix("]") for name, _ in chosen]
     ax.set_yticks(range(len(chosen)), [shorten(member, 24) for member in members])
     ax.axvline(0, color="0.4", linewidth=0.8)
-    label = parameter_label(chosen[0][0].partition("[")[0], parameter_labels(effect.name))
+    label = parameter_label(chosen[0][0].partition("[")[0], parameter_labels(effect.found.name))
     ax.set(xlabel=f"{label}, with 90 % interval [{chosen[0][1].unit}]",
            ylim=(-0.7, len(chosen) - 0.3))
     hide_spines(ax)
@@ -284,7 +284,7 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
         save(level_map, folder / "level_map.png")
     save(dependence_figure(data), folder / "drivers.png")
     for rank, effect in enumerate(data.effects, start=1):
-        save(effect_figure(effect, background), folder / effect_picture(rank, effect.name))
+        save(effect_figure(effect, background), folder / effect_picture(rank, effect.found.name))
     if data.interpolated_db is not None:
         save(contribution_map_figure(data.interpolated_db, background),
              folder / effect_picture(len(data.effects) + 1, SHADOWING))
