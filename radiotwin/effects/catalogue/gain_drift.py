@@ -263,7 +263,7 @@ def _shape(drift: Drift, links: Links, time_s: np.ndarray,
         return np.exp(-links.time_in_flight_s / number)
     if form == "step":
         return (time_s >= number).astype(float)
-    low, high = span_s or (np.nanmin(time_s), np.nanmax(time_s))  # twins of version 0.1 have none
+    low, high = span_s or (np.nanmin(time_s), np.nanmax(time_s))  # files need not have it
     return (time_s - number) / max(high - low, 1.0)
 
 
