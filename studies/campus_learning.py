@@ -49,7 +49,6 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
     test = np.setdiff1d(np.arange(len(links)), rows)
     loop = close_loop(measured.select(learnt), scene, "twin", seed, hold_out="block")
     twin = corrected_twin(loop, scene)
-    assert twin.fitted is not None
     named = replace(twin, fitted=replace(twin.fitted, shadowing=None, blend=None))
     others = links.select(test)
     by_twin, dof = twin.predict(others), twin.fitted.dof

@@ -16,6 +16,7 @@ from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
 from radiotwin.twin import Twin
+from radiotwin.twin.model.model import FittedModel
 
 NOTED_TRANSMITTERS = 100  # of a frequency, whose links are compared with a law's validity
 PATH_RECEIVERS = 5_000  # whose paths are followed at a time: bounds the memory
@@ -166,6 +167,9 @@ def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]
         found.append("transmitters of other frequencies get the twin's law, which was "
                      f"learnt at {scene.config.radio.frequency_hz / 1e9:g} GHz")
 
+    unmeasured = replace(twin, fitted=FittedModel.of_channel(twin.channel.trend)) \
+        if twin.fitted.is_channel_alone else twin
+
     def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
         each, device = transmitters[row], np.full(len(receiver_m), rows[row])
         if rows[row] < known:
@@ -178,12 +182,8 @@ def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]
                       device_m=device_m, anchors=frozenset(range(len(device_m)))),
             world=World(frequency_hz=scene.config.radio.frequency_hz, city=scene.city,
                         is_gain=True))
-        if twin.fitted is None:
-            mean_db, sd_db = twin.channel.trend.predict(links.geometry)
-        else:
-            levels = twin.predict(links)
-            mean_db, sd_db = levels.mean_db, levels.sd_db
-        return mean_db + antenna_gain_db(each, receiver_m), sd_db
+        levels = unmeasured.predict(links)
+        return levels.mean_db + antenna_gain_db(each, receiver_m), levels.sd_db
 
     return GainSource(f"twin: {twin.description}", predict, lambda receiver_m: found, has_power)
 

@@ -18,6 +18,7 @@ from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import LocalizeSettings, TwinDevice, localize
+from radiotwin.twin.model.model import FittedModel
 from radiotwin.twin.twin import Twin
 
 
@@ -163,4 +164,4 @@ def make_twin(links: Links, scene: Scene | None, channel: ChannelModel,
             provenance["origin"] = scene.config.origin.model_dump()
     provenance |= {"links": len(links), "radiotwin_version": radiotwin.__version__}
     level = "gain_db" if links.is_gain else "rssi_dbm"
-    return Twin(channel, devices, level, links.usual_limit_db, provenance)
+    return Twin(FittedModel.of_channel(channel), devices, level, links.usual_limit_db, provenance)

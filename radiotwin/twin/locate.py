@@ -10,9 +10,8 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import to_geographic, to_local
 from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import Origin
-from radiotwin.links import Links, prepare_links
+from radiotwin.links import Links, link_geometry, prepare_links
 from radiotwin.links.alignment import in_known_frame
-from radiotwin.links.links import Columns, Ends
 from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
@@ -74,10 +73,11 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
         raise BadInput(f"the measurements have {unknown.level_column}, the twin is of "
                        f"{twin.level}; both need the same")
     links = prepare_links(unknown, scene, to_locate=True)
-    model = _by_channel(twin, links) if twin.fitted is None else twin.fitted.for_positions()
+    alone = twin.fitted.is_channel_alone
+    model = _by_channel(twin, links) if alone else twin.fitted.for_positions()
     strangers = [name for name in links.receiver_names if name not in model.receivers]
     notes = list(links.notes)
-    if twin.fitted is None:
+    if alone:
         notes.append("the twin is of `radiotwin fit`, which does not learn how far links of one "
                      "device err alike: the devices may be farther away than their radii say. "
                      "Radii of a twin of `radiotwin close-loop` allow for it")
@@ -123,11 +123,8 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
     channel, known = twin.channel.trend, np.isfinite(twin.device_m).all(axis=1)
     rows = np.unique(np.linspace(0, len(links) - 1, MAX_PROBES).astype(int))
     device = np.flatnonzero(known)[np.arange(len(rows)) % known.sum()]
-    probes = Links(
-        columns=Columns.unmeasured(links.receiver_m[rows], device, twin.limit_db),
-        ends=Ends(device_names=[each.device for each in twin.devices],
-                  device_m=np.nan_to_num(twin.device_m), anchors=frozenset()),
-        world=links.world).geometry
+    probes = link_geometry(twin.device_m, links.receiver_m[rows], device, links.city,
+                           links.frequency_hz)
     sd_db, group = channel.predict(probes)[1], channel.error_group(probes)
     usual_db = [np.median(sd_db[group == each] if (group == each).any() else sd_db)
                 for each in range(channel.error_groups(probes))]

@@ -134,11 +134,12 @@ class TwinRecord(_Strict):
 def encode_twin(twin: Twin) -> tuple[str, bytes]:
     """Return the contents of a twin's two files: the record, and the channel."""
     fitted = twin.fitted
-    beside = fitted.blend.state()[0] if fitted and fitted.blend else None
+    beside = fitted.blend.state()[0] if fitted.blend else None
     record = {"schema": SCHEMA, "channel": {"model": twin.channel.name, "file": CHANNEL_FILE},
               "level": twin.level, "limit_db": twin.limit_db,
               "devices": [device.record for device in twin.devices],
-              "fitted": _fitted_record(fitted) if fitted else None, "provenance": twin.provenance}
+              "fitted": None if fitted.is_channel_alone else _fitted_record(fitted),
+              "provenance": twin.provenance}
     return json.dumps(record, indent=1, allow_nan=False), encode_channel(twin.channel, beside)
 
 
@@ -158,10 +159,10 @@ def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
         content = TwinRecord.model_validate(given)
         if content.channel.model != model.name:
             raise ValueError(f"the channel is {model.name}, not {content.channel.model[:60]}")
-        fitted = None if content.fitted is None else _fitted(
+        fitted = FittedModel.of_channel(model) if content.fitted is None else _fitted(
             content.fitted, model, content.devices, beside)
-        return {"channel": model, "devices": content.devices, "level": content.level,
-                "limit_db": content.limit_db, "provenance": content.provenance, "fitted": fitted}
+        return {"fitted": fitted, "devices": content.devices, "level": content.level,
+                "limit_db": content.limit_db, "provenance": content.provenance}
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise BadInput(f"{source} is damaged ({type(error).__name__}: {str(error)[:500]}); run "
                        "`radiotwin fit` again") from None

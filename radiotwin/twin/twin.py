@@ -26,7 +26,6 @@ from radiotwin.display import (
 from radiotwin.effects.base import Effect
 from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, place
-from radiotwin.inference.gaussian import detection_probability
 from radiotwin.io.files import atomic_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import read_bytes, read_text, require_within
@@ -98,22 +97,25 @@ class Twin(Summarised):
     """A learnt model of all links of a scene.
 
     Attributes:
-        channel: fitted.
+        fitted: the channel, and levels, effects and errors fitted upon it; the channel alone where
+            `close-loop` did not look and the channel does not need levels.
         devices: in the order of the measurements' `devices.csv`.
         level: `gain_db`, or `rssi_dbm` where transmit power is unknown.
         limit_db: level below which receivers do not detect [dB]: the median of theirs, see
             `Links.usual_limit_db`; None where it was not known.
         provenance: measurements, scene, seed and version that made it.
-        fitted: levels, effects and errors fitted upon the channel; None where `close-loop` did not
-            look and the channel does not need levels.
     """
 
-    channel: ChannelModel
+    fitted: FittedModel
     devices: list[TwinDevice]
     level: str
     limit_db: float | None
     provenance: dict = field(default_factory=dict)
-    fitted: FittedModel | None = None
+
+    @property
+    def channel(self) -> ChannelModel:
+        """As it was fitted first, without levels that are fitted again."""
+        return self.fitted.channel
 
     @property
     def device_m(self) -> np.ndarray:
@@ -123,21 +125,19 @@ class Twin(Summarised):
     @property
     def effects(self) -> tuple[Effect, ...]:
         """Effects that `close-loop` found."""
-        return self.fitted.effects if self.fitted else ()
+        return self.fitted.effects
 
     @property
     def is_corrected(self) -> bool:
         """Whether effects or interpolated shadowing were added to it."""
-        return bool(self.effects) or (self.fitted is not None and self.fitted.shadowing is not None)
+        return bool(self.effects) or self.fitted.shadowing is not None
 
     @property
     def residual_field(self) -> ResidualField | None:
         """Interpolation of the residual; None where the twin has none."""
         if isinstance(self.channel, RegressionKriging | PathKriging):
             return self.channel.field
-        if self.fitted is not None and self.fitted.shadowing is not None:
-            return self.fitted.shadowing.field
-        return None
+        return None if self.fitted.shadowing is None else self.fitted.shadowing.field
 
     @property
     def origin(self) -> Origin | None:
@@ -149,7 +149,7 @@ class Twin(Summarised):
     def description(self) -> str:
         """Channel and effects, in one line."""
         names = [each.name for each in self.effects]
-        if self.fitted is not None and self.fitted.shadowing is not None:
+        if self.fitted.shadowing is not None:
             names.append(SHADOWING)
         return self.channel.name + (f" with {', '.join(names)}" if names else "")
 
@@ -179,16 +179,10 @@ class Twin(Summarised):
         Returns:
             of n links.
         """
-        size = CHUNK_WITH_EFFECTS if self.fitted else CHUNK
+        size = CHUNK if self.fitted.is_channel_alone else CHUNK_WITH_EFFECTS
         chunks = [links] if len(links) <= size else [
             links.select(slice(start, start + size)) for start in range(0, len(links), size)]
-        return Prediction.concatenate([self._predict(chunk) for chunk in chunks])
-
-    def _predict(self, links: Links) -> Prediction:
-        if self.fitted is not None:
-            return self.fitted.predict(links)
-        mean_db, sd_db = self.channel.predict(links.geometry)
-        return Prediction(mean_db, sd_db, detection_probability(mean_db, sd_db, links.limit_db))
+        return Prediction.concatenate([self.fitted.predict(chunk) for chunk in chunks])
 
     def radio_map(self, scene: Scene) -> RadioMap:
         """Return mean and standard deviation of the level over a scene's lattice.
@@ -384,7 +378,7 @@ class Twin(Summarised):
         if self.channel.follows_paths or not self.channel.uses_map:
             return
         # A level and a slope for each class; without any, `radiotwin fit` made it with a map.
-        with_map = self.fitted is None or len(self.fitted.level_coefficients) > 2
+        with_map = self.fitted.is_channel_alone or len(self.fitted.level_coefficients) > 2
         if with_map and scene is None:
             raise BadInput(f"the twin was made with a 3D map (scene "
                            f"{self.provenance.get('scene', 'unknown')}), and none is given; give "

@@ -77,11 +77,12 @@ def twin_in():
     from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
     from radiotwin.twin import Twin
     from radiotwin.twin.localize import TwinDevice
+    from radiotwin.twin.model.model import FittedModel
 
     def make(folder):
         lines = {"lines": np.array([[-40.0, -3.5, 7.0], [-40.0, -2.1, 4.0]])}
         channel = SegmentedLogDistance.from_state(lines, {"borrowed": None})
-        Twin(channel, [TwinDevice.anchor("roof", -60.0, -50.0, 40.0)], "gain_db", None).save(folder)
+        Twin(FittedModel.of_channel(channel), [TwinDevice.anchor("roof", -60.0, -50.0, 40.0)], "gain_db", None).save(folder)
     return make
 
 

@@ -1,5 +1,7 @@
 """The loop with a 3D map that has a building too many or too few, in worlds made of two plain laws."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,6 +12,7 @@ from radiotwin.closeloop.run import close_loop
 from radiotwin.links.measurements import Measurements
 from radiotwin.report.closeloop_data import collect
 from radiotwin.twin import Twin
+from radiotwin.twin.model.model import FittedModel
 
 LAWS = {True: (-30.0, -2.5, 1.4), False: (-35.0, -3.04, 2.2)}  # with line of sight, and without: level, slope, noise
 
@@ -90,7 +93,7 @@ def test_a_building_that_the_map_lacks_is_found_and_goes_into_the_twin(small_sce
     assert report["error"]["after"]["rmse_db"] < 0.85 * report["error"]["before"]["rmse_db"]
     corrected_twin(loop, small_scene).save(tmp_path / "twin")
     corrected = Twin.load(tmp_path / "twin")
-    plain = Twin(corrected.channel, corrected.devices, corrected.level, corrected.limit_db)
+    plain = replace(corrected, fitted=FittedModel.of_channel(corrected.channel))
 
     def blocked(a, b):
         return ~small_scene.city.line_of_sight(a, b) | hits(*box, a, b)
@@ -137,7 +140,7 @@ def test_walls_that_are_off_are_no_cause_but_part_of_the_base(small_scene, tmp_p
     corrected_twin(loop, small_scene).save(tmp_path / "twin")
     twin = Twin.load(tmp_path / "twin")
     assert [each.name for each in twin.fitted.effects] == ["uncertain_sight"]
-    plain = Twin(twin.channel, twin.devices, twin.level, twin.limit_db)
+    plain = replace(twin, fitted=FittedModel.of_channel(twin.channel))
     before = error_db(plain.radio_map(small_scene), small_scene, blocked)
     assert error_db(twin.radio_map(small_scene), small_scene, blocked) < 0.98 * before
 

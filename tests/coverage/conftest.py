@@ -13,6 +13,7 @@ from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import itu_material
 from radiotwin.twin import Twin
 from radiotwin.twin.localize import TwinDevice
+from radiotwin.twin.model.model import FittedModel
 
 FREQUENCY_HZ = 2e9
 FREE_SPACE_AT_1_M_DB = 20 * math.log10(299_792_458.0 / FREQUENCY_HZ / (4 * math.pi))
@@ -36,7 +37,7 @@ def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x
 
 def make_twin(devices, exponent=2.0, intercept_db=FREE_SPACE_AT_1_M_DB, sd_db=1e-6, level="gain_db"):
     """Return a twin of declared devices with the law intercept - 10 exponent log10(d)."""
-    return Twin(LogDistance(LogDistanceLine(intercept_db, -exponent, sd_db)),
+    return Twin(FittedModel.of_channel(LogDistance(LogDistanceLine(intercept_db, -exponent, sd_db))),
                 [TwinDevice.anchor(*device) for device in devices], level, None)
 
 

@@ -16,6 +16,7 @@ from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.twin import Twin
 from radiotwin.twin.localize import TwinDevice
+from radiotwin.twin.model.model import FittedModel
 
 pytestmark = pytest.mark.slow
 
@@ -51,7 +52,8 @@ def test_three_sites_at_street_level_within_five_minutes(helsinki, tmp_path, wit
     source = f"{scene.folder}"
     if with_twin:
         channel = SegmentedLogDistance.from_state({"lines": LINES}, {"borrowed": None})
-        Twin(channel, [TwinDevice.anchor("kamppi", *SITES["kamppi"])], "gain_db", None).save(tmp_path / "twin")
+        Twin(FittedModel.of_channel(channel), [TwinDevice.anchor("kamppi", *SITES["kamppi"])], "gain_db",
+             None).save(tmp_path / "twin")
         source = f"twin --scene {scene.folder}"
     start_s = time.monotonic()
     options = "--transmitters sites.csv -o out --bandwidth-hz 20e6 --noise-figure-db 9"

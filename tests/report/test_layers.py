@@ -12,6 +12,7 @@ from radiotwin.report import run_page as city
 from radiotwin.report import run_page as layers
 from radiotwin.report.run_page import NOT_DETECTED, pack, pack_db
 from radiotwin.twin import Twin, TwinDevice
+from radiotwin.twin.model.model import FittedModel
 
 
 def unpacked(packed):
@@ -112,6 +113,6 @@ def test_devices_and_tracks_beyond_what_can_be_drawn_are_counted(run_folder, mon
 def test_positions_that_no_city_has_are_not_drawn(tmp_path):
     far = [TwinDevice("a", 1e16, 0.0, 1.5, "anchor", True, 0.0, None),
            TwinDevice("b", 5.0, 5.0, 1.5, "anchor", True, 0.0, None)]
-    run = Run(tmp_path, twin=Twin(None, far, "gain_db", None))
+    run = Run(tmp_path, twin=Twin(FittedModel.of_channel(None), far, "gain_db", None))
     assert [each["true"] for each in layers.device_layer(run)] == [None, [5.0, 5.0, 1.5]]
     assert layers.bounds_m(run) == [4.0, 6.0, 4.0, 6.0], "a browser would count to 1e16"

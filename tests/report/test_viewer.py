@@ -7,6 +7,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import Run, read_run, write_report
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin import Twin, TwinDevice
+from radiotwin.twin.model.model import FittedModel
 
 BUTTONS = ("oblique", "above")
 
@@ -137,7 +138,8 @@ def test_names_from_a_file_are_never_run(opened, tmp_path):
     name = "</script><img src=x onerror=\"document.title='run'\"><b>"
     devices = [TwinDevice(name, 10.0, 20.0, 1.5, "unknown", True, 4.0, None),
                TwinDevice("a", 0.0, 0.0, 1.5, "anchor", True, 0.0, None)]
-    write_report(Run(tmp_path, twin=Twin(None, devices, "gain_db", None)), tmp_path / "page.html")
+    twin = Twin(FittedModel.of_channel(None), devices, "gain_db", None)
+    write_report(Run(tmp_path, twin=twin), tmp_path / "page.html")
     page = opened(tmp_path / "page.html")
     assert page.title() == f"radiotwin: {tmp_path.name}" and page.locator("img").count() == 0
     assert name in page.inner_text("table"), "it is shown as it is"

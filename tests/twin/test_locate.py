@@ -37,7 +37,7 @@ def test_a_device_is_found_by_three_packets_of_each_gateway_and_by_the_silence_o
     channel = LogDistance(LogDistanceLine(-40.0, -2.5, 2.0))
     fitted = FittedModel(channel, (), (), np.zeros(2), np.array([2.0]), 30.0, np.array([[100.0, 100.0, 1.5]]), ("g0",),
                          np.nan, 0.0)
-    twin = Twin(channel, [TwinDevice.anchor("a", 100.0, 100.0, 1.5)], "gain_db", LIMIT_DB, {}, fitted)
+    twin = Twin(fitted, [TwinDevice.anchor("a", 100.0, 100.0, 1.5)], "gain_db", LIMIT_DB)
     used, plain = [], module.locate
 
     def locate(model, links, *others):
@@ -110,7 +110,7 @@ def test_a_twin_of_fit_locates_a_device_that_it_has_not_seen(run, tmp_path, smal
 
 
 def test_what_follows_paths_or_lacks_its_map_does_not_locate():
-    law, paths = (Twin(channel, [], "gain_db", None) for channel in (SegmentedLogDistance(), ImagePaths()))
+    law, paths = (Twin(FittedModel.of_channel(channel), [], "gain_db", None) for channel in (SegmentedLogDistance(), ImagePaths()))
     with pytest.raises(BadInput, match="made with a 3D map"):
         module.check_can_locate(law, None)
     with pytest.raises(BadInput, match="close-loop --base twin makes one"):

@@ -76,7 +76,7 @@ def check(record, channel, measured):
         try:
             predicted = twin.predict(twin.links(receiver_m, np.arange(20) % len(twin.devices), NO_MAP))
             assert np.isfinite([predicted.mean_db, predicted.sd_db]).all()
-            if twin.fitted and len(twin.devices) == len(measured.device_names):
+            if not twin.fitted.is_channel_alone and len(twin.devices) == len(measured.device_names):
                 twin.predict(measured)
         except BadInput:
             return "refused"

@@ -21,7 +21,7 @@ def twin(channel, classes):
     device = TwinDevice.anchor("a", 10.0, 10.0, 1.5)
     fitted = FittedModel(channel, (), (), np.zeros(2 * classes), np.full(classes, 2.0), 5.0,
                          np.array([[10.0, 10.0, 1.5]]), (), np.nan, 0.0)
-    return Twin(channel, [device], "gain_db", -110.0, {}, fitted)
+    return Twin(fitted, [device], "gain_db", -110.0)
 
 
 def test_a_map_is_neither_forgotten_nor_added(small_scene):

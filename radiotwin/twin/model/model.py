@@ -17,7 +17,7 @@ import numpy as np
 
 from radiotwin.effects.base import DetectionEffect, Effect, LevelAt, LimitEffect, ResidualView, Term
 from radiotwin.errors import BadInput
-from radiotwin.inference import censored_regression
+from radiotwin.inference import censored_regression, gaussian
 from radiotwin.inference.censored_regression import (
     CensoredRegression,
     FitResult,
@@ -419,6 +419,17 @@ class FittedModel:
     blend: Blend | None = None
     unheard: Unheard | None = None
 
+    @classmethod
+    def of_channel(cls, channel: ChannelModel) -> FittedModel:
+        """Return a channel alone, with the Gaussian errors that it states; it has no scales."""
+        nothing = np.empty(0)
+        return cls(channel, (), (), nothing, nothing, np.inf, np.empty((0, 3)), (), np.nan, 0.0)
+
+    @property
+    def is_channel_alone(self) -> bool:
+        """Whether nothing was fitted upon the channel."""
+        return not len(self.scale_db)
+
     def for_positions(self) -> FittedModel:
         """Return the same without what takes too long for each place where a device may be.
 
@@ -451,6 +462,10 @@ class FittedModel:
 
     def predict(self, links: Links) -> Prediction:
         """Return the levels that are expected of links, see `Prediction`."""
+        if self.is_channel_alone:
+            mean_db, sd_db = self.channel.predict(links.geometry)
+            detected = gaussian.detection_probability(mean_db, sd_db, links.limit_db)
+            return Prediction(mean_db, sd_db, detected)
         fit = self.on_links(links)
         model = fit.model
         mean_db, scale_db, unheard_db = fit.reading_parts()
