@@ -190,6 +190,9 @@ class Summarised(ABC):
     def _summary(self) -> Summary:
         """Summary that is shown."""
 
+    def __bool__(self) -> bool:
+        return True  # of no devices or links, too
+
     def __repr__(self) -> str:
         return self._summary.text()
 

@@ -361,9 +361,6 @@ class Measurements(Summarised):
         """Return the number of links."""
         return len(self.table)
 
-    def __bool__(self) -> bool:
-        return True
-
     @property
     def _summary(self) -> Summary:
         seen = np.isfinite(self.level_db)

@@ -177,9 +177,6 @@ class Scene(Summarised):
         """Return the number of declared devices."""
         return len(self.config.devices)
 
-    def __bool__(self) -> bool:
-        return True  # a scene without devices is one, too
-
     def __getstate__(self) -> dict[str, object]:
         """Leave the 3D map out: it is read again from the folder where it is needed."""
         return {"folder": Path(os.path.abspath(self.folder)), "config": self.config}

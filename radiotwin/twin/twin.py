@@ -291,9 +291,6 @@ class Twin(Summarised):
         """Return the number of devices."""
         return len(self.devices)
 
-    def __bool__(self) -> bool:
-        return True
-
     @property
     def _summary(self) -> Summary:
         unknown = [each for each in self.devices if each.role == "unknown"]

@@ -123,9 +123,6 @@ class Residuals(Summarised):
     def __len__(self) -> int:
         return len(self.table)
 
-    def __bool__(self) -> bool:
-        return True
-
     @property
     def _summary(self) -> Summary:
         rmse = [f"{self.rmse_db(when):.2f} dB" for when in WHEN]
