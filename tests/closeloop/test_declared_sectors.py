@@ -16,7 +16,7 @@ from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds,
 from radiotwin.closeloop.output.corrected_twin import corrected_twin
 from radiotwin.closeloop.predict.baselines import EXTRA_TREES, grow_trees
 from radiotwin.closeloop.search.declared import add_declared
-from radiotwin.closeloop.search.stages import SearchInputs, search
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.effects.antennas import SectorPattern
 from radiotwin.effects.base import GainEffect
 from radiotwin.effects.catalogue.declared_sectors import DeclaredSectors
@@ -67,7 +67,7 @@ def taken(measurements):
     folds = make_folds(links, 0, "device")
     kind = make_bases(None, 0)["log-distance"]
     base = cross_validate(links, kind, folds, training_parts(links, folds))
-    result = search(base, [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
+    result = search(SearchState(base), [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
     whole, parameters = result.model.whole, {}
     for each, estimate in zip(whole.effects, estimates(linearise(whole)), strict=True):
         parameters |= each.parameters(links, estimate)
@@ -101,7 +101,7 @@ def test_azimuths_that_the_readings_contradict_are_left_out_and_told(turn_deg):
 def test_where_no_azimuth_is_declared_nothing_is_said_of_it():
     measurements = network(2)
     found = taken(replace(measurements, devices=measurements.devices.drop(columns="azimuth_deg")))
-    assert (found.variants, found.scores, found.note) == ([], [], "")
+    assert (found.variants, found.scores, found.note) == ([], (), "")
 
 
 @pytest.mark.usefixtures("short_report")
@@ -241,7 +241,7 @@ def test_of_two_forms_held_out_links_choose(forms):
     folds = make_folds(links, 0, "device")
     kind = make_bases(None, 0)["log-distance"]
     model = cross_validate(links, kind, folds, training_parts(links, folds))
-    result = search(model, [add_declared], SearchInputs(links, kind, folds, tuple(form() for form in forms)))
+    result = search(SearchState(model), [add_declared], SearchInputs(links, kind, folds, tuple(form() for form in forms)))
     [effect] = result.model.whole.effects
     assert effect.variant == "all of it"
     assert [each.reason for each in result.log.trials if not each.kept] == ["all of it gain more"]
@@ -270,7 +270,7 @@ def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
     folds = make_folds(links, 0, "device")
     kind = make_bases(None, 0)["log-distance"]
     base = cross_validate(links, kind, folds, training_parts(links, folds))
-    result = search(base, [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
+    result = search(SearchState(base), [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
     fields = [each.rest(0) for each in result.model.each]
     model = result.model.map(lambda fit, own: replace(fit, shadowing=own), fields)
     mean_db, scale_db = model.held_out_reading

@@ -5,7 +5,7 @@ import pytest
 
 from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
 from radiotwin.closeloop.search.causes import add_causes
-from radiotwin.closeloop.search.stages import SearchInputs, search
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.effects.catalogue.detection_limit import DetectionLimit
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.links import prepare_links
@@ -28,7 +28,7 @@ def test_one_fault_has_one_name(open_ground, off_db, limit_moves, named):
     folds = make_folds(links, 0)
     base = LogDistanceBase(None, 0)
     model = cross_validate(links, base, folds, training_parts(links, folds))
-    result = search(model, [add_causes], SearchInputs(links, base, folds, (ReceiverGainOffset(), DetectionLimit())))
+    result = search(SearchState(model), [add_causes], SearchInputs(links, base, folds, (ReceiverGainOffset(), DetectionLimit())))
     assert [each.name for each in result.model.whole.effects] == named
     used_db = [float(np.median(result.model.whole.model.limit_db[links.receiver == receiver])) for receiver in (0, 1)]
     assert used_db == pytest.approx([LIMIT_DB, LIMIT_DB + 6.0 * limit_moves], abs=1.0)

@@ -4,7 +4,7 @@ import pytest
 
 from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
 from radiotwin.closeloop.search.causes import add_causes
-from radiotwin.closeloop.search.stages import SearchInputs, search
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
@@ -22,7 +22,7 @@ def selected(open_ground):
         folds = make_folds(links, 0)
         base = LogDistanceBase(None, 0)
         model = cross_validate(links, base, folds, training_parts(links, folds))
-        return search(model, [add_causes], SearchInputs(links, base, folds, (DevicePositionError(), ReceiverGainOffset()),
+        return search(SearchState(model), [add_causes], SearchInputs(links, base, folds, (DevicePositionError(), ReceiverGainOffset()),
                                                         SelectionCriteria(min_probability=min_probability)))
     return run
 
