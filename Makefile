@@ -32,7 +32,7 @@ APT_INSTALL := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock:
 
 help:
 	@echo "make demo    set up, then the whole chain on a small city"
-	@echo "make test     set up, then every test but the slow ones (about ten minutes on two cores)"
+	@echo "make test     set up, then every test but the slow ones (about eight minutes on two cores)"
 	@echo "make test-all every test: statistics over many seeds, real data where it is, long chains"
 	@echo "make test-flower the tests of federation over Flower, in an environment of their own"
 	@echo "make lint     ruff and mypy"
