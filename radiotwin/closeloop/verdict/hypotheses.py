@@ -209,7 +209,7 @@ def _slopes(fit: Fit) -> Columns:
         return Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0))
     here = variation.effect(variation.values)
     if not here.is_same(effect):  # it varies with quicker levels than it has
-        model = model.with_last(here)
+        model = model.with_effect_at(-1, here)
     mean_db, slopes_db = model.training.predict(fit).mean_db, []
     # Of paths those that folds will ask for, too.
     share = NEAR_SHARE if variation.follows_paths else STEP_SHARE
@@ -218,7 +218,7 @@ def _slopes(fit: Fit) -> Columns:
         if values[number] + step > variation.high[number]:
             step = -step
         values[number] += step
-        changed = model.with_last(variation.effect(values)).training.predict(fit)
+        changed = model.with_effect_at(-1, variation.effect(values)).training.predict(fit)
         slopes_db.append((changed.mean_db - mean_db) / step)
     width = variation.high - variation.low
     return Columns(np.column_stack(slopes_db), width / np.sqrt(12.0))

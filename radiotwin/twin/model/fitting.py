@@ -167,7 +167,7 @@ def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray, steps
 def _better(fit: Fit, last: Effect, variation: Variation, numbers: np.ndarray) -> Fit:
     """Return the fit with the last effect's numbers changed, where that is better."""
     effect = variation.effect(np.clip(numbers, variation.low, variation.high))
-    better = fit.with_last(effect)
+    better = fit.with_effect_at(-1, effect)
     prior = last.neg_log_prior() - effect.neg_log_prior()
     gain = fit.objective - better.objective + fit.view.design_effect * prior
     return better if gain > 0 else fit
@@ -332,7 +332,7 @@ def _exactly_beside(fit: Fit) -> Fit:
     variation, exactly = last.variation(), last.exactly()
     if variation is None or exactly is None or len(variation.values) > MAX_EXACT_NUMBERS:
         return fit
-    beside = refine(fit.with_last(exactly), evaluations=EXACT_EVALUATIONS, descents=1,
+    beside = refine(fit.with_effect_at(-1, exactly), evaluations=EXACT_EVALUATIONS, descents=1,
                     max_links=MAX_EXACT_LINKS)
     return beside if beside.objective < fit.objective else fit
 
@@ -348,10 +348,10 @@ def _over_known_paths(fit: Fit, is_near: bool = False) -> Fit:
     variation = None if exact is None else exact.variation()
     if variation is None or variation.follows_paths:
         return fit
-    start = fit.with_last(variation.effect(variation.values))
+    start = fit.with_effect_at(-1, variation.effect(variation.values))
     found = refine(start, descents=1, anywhere=not is_near).effects[-1].exactly()
     assert found is not None
-    exactly = fit.with_last(found)
+    exactly = fit.with_effect_at(-1, found)
     return exactly if exactly.objective < fit.objective else fit
 
 
@@ -391,7 +391,7 @@ def with_exact_levels(fit: Fit) -> Fit:
         exactly = each.exactly()
         if exactly is None or each.is_same(exactly):
             continue
-        other = fit.with_effects([*fit.effects[:number], exactly, *fit.effects[number + 1:]])
+        other = fit.with_effect_at(number, exactly)
         if other.objective < fit.objective:
             fit = other
     return fit

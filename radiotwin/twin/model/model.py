@@ -124,9 +124,11 @@ class Model:
             known[each] if each in known else each.term(self.links, self.level_at)
             for each in effects))
 
-    def with_last(self, effect: Effect) -> Model:
-        """Return the same with another effect in place of the last one."""
-        return self.with_effects([*self.effects[:-1], effect])
+    def with_effect_at(self, place: int, effect: Effect) -> Model:
+        """Return the same with another effect at a place; -1: the last."""
+        effects = list(self.effects)
+        effects[place] = effect
+        return self.with_effects(effects)
 
     def restrict(self, rows: np.ndarray) -> Model:
         """Return the model of some links (r,), all to be learnt from."""
@@ -255,9 +257,9 @@ class Fit(FitResult):
         """Return the model with other effects, fitted again from these coefficients."""
         return self.model.with_effects(effects).fit(self)
 
-    def with_last(self, effect: Effect) -> Fit:
-        """Return the same with another effect in place of the last one."""
-        return self.model.with_last(effect).fit(self)
+    def with_effect_at(self, place: int, effect: Effect) -> Fit:
+        """Return the same with another effect at a place, fitted again; -1: the last."""
+        return self.model.with_effect_at(place, effect).fit(self)
 
     def without(self, place: int) -> Fit:
         """Return the fit with one effect taken away; nothing else is changed."""

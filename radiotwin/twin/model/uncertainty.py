@@ -162,8 +162,7 @@ def _secant(fit: Fit, number: int, variation: Variation, i: int, step: float) ->
         if moved_by == 0:
             continue
         other = variation.effect(numbers)
-        moved = model.with_effects([*model.effects[:number], other,
-                                    *model.effects[number + 1:]]).training
+        moved = model.with_effect_at(number, other).training
         there = moved.predict(fit)
         change = np.zeros((3, n))
         if blanking:
