@@ -95,7 +95,6 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
     search = candidate_search(city, depth)
     candidates = search.candidates(device_m)
     kinds = _kinds(candidates)
-    # Fields are added here: with Sionna RT's wedge they would step at the shadow boundary
     wave_number = 2 * np.pi * frequency_hz / speed_of_light
     slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
     buffer = PathBuffer.allocate(PATH_CHUNK)

@@ -32,6 +32,7 @@ def test_diffraction_is_that_of_the_ray_tracer(corner):
     xml_path, device_m, receiver_m = corner
     settings = SolverSettings(samples_per_src=1_000_000, max_depth=1, batch_receivers=10)
     traced_db = PathGains(xml_path, FREQUENCY_HZ, settings).gains(device_m, receiver_m)
-    powers = path_powers(CityMap.from_xml(xml_path), device_m, receiver_m, FREQUENCY_HZ, depth=1)
+    powers = path_powers(CityMap.from_xml(xml_path), device_m, receiver_m, FREQUENCY_HZ, depth=1,
+                         wedge="sionna")
     assert (powers.diffracted > 0).all() and (powers.direct == 0).all()
     np.testing.assert_allclose(10 * np.log10(powers.total), traced_db, atol=0.02)

@@ -67,7 +67,7 @@ def test_gains_are_those_of_the_powers(listed, small_scene):
     made, _ = listed
     device = np.repeat(np.arange(len(small_scene.device_m)), len(POINTS_M))
     total = powers_of_links(small_scene.city, small_scene.device_m, np.tile(POINTS_M, (len(small_scene.device_m), 1)),
-                            device, small_scene.config.radio.frequency_hz, wedge="luebbers").total
+                            device, small_scene.config.radio.frequency_hz).total
     found = made["reason"].to_numpy() == ""
     assert np.allclose(made["gain_db"].to_numpy()[found], 10 * np.log10(total[found]))
 

@@ -45,7 +45,7 @@ def test_powers_of_the_paths_add_up_to_those_of_the_channel(town, turn, monkeypa
     device_m = turn([[0.0, 0.0, 1.5]], angle_rad)[0]
     receiver_m = turn(np.random.default_rng(0).uniform([-60, -60, 1], [100, 60, 60], (40, 3)), angle_rad)
     city = town(angle_rad)
-    total = path_powers(city, device_m, receiver_m, FREQUENCY_HZ, wedge="luebbers").total
+    total = path_powers(city, device_m, receiver_m, FREQUENCY_HZ).total
     parts = rays_of(city, device_m, receiver_m)
     power = sum(np.bincount(rays.receiver, weights=np.abs(rays.amplitude) ** 2, minlength=40) for rays in parts)
     assert np.allclose(power, total, rtol=1e-9) and len(parts) == 6
