@@ -67,6 +67,9 @@ def coverage(
         metavar="FILE.geojson", help="Areas whose covered shares are wanted, too.")] = None,
     indoor_loss_db: Annotated[float | None, typer.Option(
         help="Predict inside buildings, too, with this loss; they are left out otherwise.")] = None,
+    aclr_db: Annotated[float, typer.Option(
+        help="Adjacent-channel leakage ratio of the transmitters: what a channel gets of one in "
+             "either of the next two.")] = 45.0,
     rate: Annotated[str, typer.Option(
         metavar="SHARE,SINR,CAP", help="Rate by SINR: share of Shannon's bound, least SINR [dB], "
                                        "greatest rate [bit/s/Hz] (3GPP TR 36.942).")
@@ -90,6 +93,7 @@ def coverage(
         height_m=height, step_m=step, extent_m=parse_extent(extent), tx_power_dbm=tx_power_dbm,
         bandwidth_hz=bandwidth_hz, noise_figure_db=noise_figure_db, load=load,
         threshold_dbm=threshold_dbm, reliability=reliability, indoor_loss_db=indoor_loss_db,
+        aclr_db=aclr_db,
         classes_dbm=tuple(parse_numbers("--classes", classes)),
         rate=RateModel(*parse_numbers("--rate", rate, 3)))
     settings.check()

@@ -11,6 +11,7 @@ from radiotwin.errors import BadInput
 Bounds = tuple[float, float, float, float]
 MIN_STEP_M = 0.01
 REFERENCE_K = 290.0  # temperature that noise figures refer to (ITU-R P.372-16, Sec. 2)
+LEAKAGE_CHANNELS = 2  # neighbours on each side into which a transmitter leaks
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class CoverageSettings:
         classes_dbm: lower ends of the legend's classes of received power, descending [dBm].
         reliability: share of the locations in a cell that must reach the threshold.
         indoor_loss_db: loss into buildings [dB]; None: cells inside buildings are left out.
+        aclr_db: adjacent-channel leakage ratio of the transmitters [dB]; 45 dB is required of base
+            stations of LTE and NR (3GPP TS 36.104, Sec. 6.6.2; TS 38.104, Sec. 6.6.3).
         rate: rate by SINR.
     """
 
@@ -63,6 +66,7 @@ class CoverageSettings:
     classes_dbm: tuple[float, ...] = (-75.0, -85.0, -95.0, -105.0, -115.0)
     reliability: float = 0.9
     indoor_loss_db: float | None = None
+    aclr_db: float = 45.0
     rate: RateModel = field(default_factory=RateModel)
 
     def check(self) -> None:
@@ -77,6 +81,7 @@ class CoverageSettings:
             ("threshold", self.threshold_dbm, -250.0, 100.0, "dBm"),
             ("reliability", self.reliability, 0.5, 0.999, ""),
             ("indoor loss", self.indoor_loss_db, 0.0, 200.0, "dB"),
+            ("adjacent-channel leakage ratio", self.aclr_db, 0.0, 200.0, "dB"),
             ("share of Shannon's bound", self.rate.share, 1e-3, 1.0, ""),
             ("least SINR", self.rate.min_sinr_db, -50.0, 50.0, "dB"),
             ("greatest spectral efficiency", self.rate.max_bps_hz, 1e-3, 100.0, "bit/s/Hz"))
@@ -141,26 +146,50 @@ def location_probability(power_dbm: np.ndarray, sd_db: np.ndarray,
     return np.where(np.isnan(sd_db) & ~np.isnan(power_dbm), np.nan, share)
 
 
+def channel_overlap(frequencies_hz: np.ndarray, bandwidth_hz: float,
+                    aclr_db: float) -> np.ndarray:
+    """Return the share of a transmitter's power that falls into another one's channel.
+
+    A transmitter's power density is even within its channel, and lower by the leakage ratio in the
+    two neighbouring channels on each side; that of the standards holds for both. A receiver takes
+    in all of its channel and nothing else.
+
+    Args:
+        frequencies_hz: (f,) middles of the channels [Hz].
+        bandwidth_hz: of each channel [Hz].
+        aclr_db: adjacent-channel leakage ratio [dB].
+
+    Returns:
+        (f, f), of the receiver's channel and of the transmitter's.
+    """
+    apart = np.abs(frequencies_hz[:, None] - frequencies_hz) / bandwidth_hz
+    inside = np.clip(1 - apart, 0, 1)
+    near = np.clip(LEAKAGE_CHANNELS + 1 - apart, 0, 1)  # within the channel and its neighbours
+    return inside + (near - inside) * 10 ** (-aclr_db / 10)
+
+
 class ServerTally:
     """Best server and interference of n receivers, while transmitters are added one by one.
 
-    Transmitters of one frequency interfere with each other, each with its power times its load.
+    Others interfere with their power times their load, as far as it falls into the channel of the
+    best server.
 
     Args:
         n: number of receivers.
-        frequencies: number of different frequencies.
+        overlap: (f, f) of the different channels, see `channel_overlap`.
     """
 
-    def __init__(self, n: int, frequencies: int) -> None:
+    def __init__(self, n: int, overlap: np.ndarray) -> None:
         self.power_dbm = np.full(n, np.nan)
         self.sd_db = np.full(n, np.nan)
         self.server = np.full(n, -1, dtype=np.int32)
-        self._frequency = np.zeros(n, dtype=np.int64)
+        self._overlap = overlap
+        self._channel = np.zeros(n, dtype=np.int64)
         self._load = np.zeros(n)
-        self._others_mw = np.zeros((frequencies, n))
+        self._others_mw = np.zeros((len(overlap), n))
 
     def add(self, row: int, power_dbm: np.ndarray, sd_db: np.ndarray | float, load: float,
-            frequency: int) -> None:
+            channel: int) -> None:
         """Add a transmitter.
 
         Args:
@@ -168,18 +197,18 @@ class ServerTally:
             power_dbm: (n,) received from it [dBm]; NaN where it is not detected.
             sd_db: (n,) standard deviation of that [dB].
             load: share of the time that it is active.
-            frequency: number of its frequency.
+            channel: number of its channel.
         """
         heard = np.isfinite(power_dbm)
         best = heard & ((self.server < 0) | (power_dbm > self.power_dbm))
         beaten = np.flatnonzero(best & (self.server >= 0))
-        self._others_mw[self._frequency[beaten], beaten] += (
+        self._others_mw[self._channel[beaten], beaten] += (
             self._load[beaten] * 10 ** (self.power_dbm[beaten] / 10))
         weaker = heard & ~best
-        self._others_mw[frequency, weaker] += load * 10 ** (power_dbm[weaker] / 10)
+        self._others_mw[channel, weaker] += load * 10 ** (power_dbm[weaker] / 10)
         self.power_dbm[best] = power_dbm[best]
         self.sd_db[best] = np.broadcast_to(sd_db, best.shape)[best]
-        self.server[best], self._load[best], self._frequency[best] = row, load, frequency
+        self.server[best], self._load[best], self._channel[best] = row, load, channel
 
     def sinr_db(self, noise_dbm: float) -> np.ndarray:
         """Return the (n,) ratio of the best server's power to noise and interference [dB].
@@ -187,5 +216,5 @@ class ServerTally:
         Args:
             noise_dbm: noise power [dBm].
         """
-        others_mw = self._others_mw[self._frequency, np.arange(len(self.server))]
+        others_mw = np.einsum("nf,fn->n", self._overlap[self._channel], self._others_mw)
         return self.power_dbm - 10 * np.log10(10 ** (noise_dbm / 10) + others_mw)

@@ -14,6 +14,7 @@ from radiotwin.coverage.radio import (
     Bounds,
     CoverageSettings,
     ServerTally,
+    channel_overlap,
     location_probability,
     rate_bps,
     thermal_noise_dbm,
@@ -115,7 +116,7 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene,
     attributes: dict[str, Any] = {
         "schema": SCHEMA, "model": gains.description, "scene": scene.config.name,
         "height_m": grid.height_m, "step_m": grid.step_m, "bandwidth_hz": bandwidth_hz,
-        "noise_figure_db": noise_figure_db, "noise_dbm": noise_dbm,
+        "noise_figure_db": noise_figure_db, "noise_dbm": noise_dbm, "aclr_db": settings.aclr_db,
         "threshold_dbm": settings.threshold_dbm, "reliability": settings.reliability,
         "radiotwin_version": radiotwin.__version__}
     dataset = _dataset(values, chosen, grid, attributes, scene)
@@ -224,6 +225,7 @@ def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], g
              bandwidth_hz: float) -> dict[str, np.ndarray]:
     """Predict all cells, some rows at a time; return variables (ny, nx) by name."""
     frequencies_hz = sorted({each.frequency_hz or 0.0 for each in transmitters})
+    overlap = channel_overlap(np.array(frequencies_hz), bandwidth_hz, settings.aclr_db)
     shape, ground = grid.shape, ground_of(scene.city)
     values = {name: np.full(shape, np.nan, np.float32) for name in (
         "received_power_dbm", "received_power_sd_db", "snr_db", "sinr_db", "rate_bps",
@@ -238,7 +240,7 @@ def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], g
             used = np.flatnonzero(~indoor if settings.indoor_loss_db is None else
                                   np.ones(len(indoor), bool))
             index = used + rows.start * shape[1]
-            tally = ServerTally(len(used), len(frequencies_hz))
+            tally = ServerTally(len(used), overlap)
             entry_db = np.where(indoor[used], settings.indoor_loss_db or 0.0, 0.0)
             for row, each in enumerate(transmitters):
                 mean_db, sd_db = gains.predict(row, receiver_m[used], index)
@@ -295,9 +297,14 @@ def _summary(dataset: xr.Dataset, transmitters: list[Transmitter], grid: Coverag
              gains: GainSource, settings: CoverageSettings, areas: Sequence[Area],
              bandwidth_hz: float, scene: Scene) -> dict[str, Any]:
     left_out = int(dataset["indoor"].sum()) if settings.indoor_loss_db is None else 0
+    notes = gains.notes(_some_receivers(dataset, grid, scene))
+    gaps_hz = np.diff(sorted({each.frequency_hz or 0.0 for each in transmitters}))
+    if (gaps_hz < bandwidth_hz).any():
+        notes.append(f"channels of {bandwidth_hz / 1e6:g} MHz whose frequencies are "
+                     f"{gaps_hz.min() / 1e6:g} MHz apart overlap in part, and interfere there")
     return {
-        **dataset.attrs, "notes": gains.notes(_some_receivers(dataset, grid, scene)),
-        "above_ground": grid.above_ground, "cells": int(np.prod(grid.shape)),
+        **dataset.attrs, "notes": notes, "above_ground": grid.above_ground,
+        "cells": int(np.prod(grid.shape)),
         "cells_left_out_indoors": left_out, "indoor_loss_db": settings.indoor_loss_db,
         "load": settings.load,
         "rate_model": {"share": settings.rate.share, "min_sinr_db": settings.rate.min_sinr_db,

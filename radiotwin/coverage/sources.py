@@ -89,7 +89,8 @@ def _source_of_law(kind: type[PublishedLaw], scene: Scene,
             rows = [row for row, each in enumerate(transmitters)
                     if each.frequency_hz == frequency_hz][:NOTED_TRANSMITTERS]
             device = np.repeat(rows, len(receiver_m))
-            some = link_geometry(device_m, np.tile(receiver_m, (len(rows), 1)), device, None)
+            some = link_geometry(device_m, np.tile(receiver_m, (len(rows), 1)), device, scene.city,
+                                 float(frequency_hz or np.nan))
             found += law.outside(some) if len(some) else []
         return list(dict.fromkeys(found))
 

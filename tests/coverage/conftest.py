@@ -19,8 +19,8 @@ FREQUENCY_HZ = 2e9
 FREE_SPACE_AT_1_M_DB = 20 * math.log10(299_792_458.0 / FREQUENCY_HZ / (4 * math.pi))
 
 
-def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x, y: 0.0, **radio):
-    """Write a scene of flat or tilted ground, with other shapes on it, about 47.5 N, 8.7 E."""
+def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x, y: 0.0, terrain=False, **radio):
+    """Write a scene of flat or tilted ground, perhaps declared as terrain, with other shapes on it, about 47.5 N, 8.7 E."""
     corners = [(x, y, ground_z_m(x, y)) for x, y in ((-600, -600), (600, -600), (600, 600), (-600, 600))]
     ground = trimesh.Trimesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)
     folder.mkdir(parents=True)
@@ -31,6 +31,8 @@ def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x
               "extent": {"x_min_m": -half_m, "x_max_m": half_m, "y_min_m": -half_m, "y_max_m": half_m},
               "lattice": {"step_m": 50.0, "altitudes_m": [1.5]},
               "devices": [{"device": name, "x_m": x, "y_m": y, "z_m": z} for name, x, y, z in devices]}
+    if terrain:
+        config["terrain"] = {"shape": "ground"}
     write_config(parse_config(config, "scene.toml"), folder / "scene.toml")
     return Scene.load(folder)
 

@@ -14,6 +14,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import coverage_figures
 from radiotwin.scene.antennas import Antenna, Pattern
 from radiotwin.scene.lattice import Lattice
+from tests.coverage.conftest import write_scene
 
 FREE_SPACE_AT_1_M_DB = 20 * math.log10(299_792_458.0 / 2e9 / (4 * math.pi))
 
@@ -91,6 +92,22 @@ def test_transmitters_of_other_frequencies_do_not_interfere(build, twin_of):
         predict_coverage("cost231_wi", scene, [Transmitter("a", np.array([0, 0, 9.0]), 1.0, frequency_hz=28e9)])
 
 
+@pytest.mark.parametrize(("apart_hz", "share"), [(0.0, 1.0), (1e3, 1 - 5e-5), (5e6, 0.75), (20e6, 10**-4.5), (60e6, 0.0)])
+def test_of_overlapping_channels_the_common_part_interferes(build, apart_hz, share):
+    """Free space by hand (ITU-R P.525) at a mast's line of sight, and the share of the two bands that overlaps."""
+    scene = build()
+    pair = [Transmitter("A", np.array([-100.0, 0, 30]), 40.0, frequency_hz=2e9),
+            Transmitter("B", np.array([100.0, 0, 30]), 40.0, frequency_hz=2e9 + apart_hz)]
+    coverage = predict_coverage("al_hourani_suburban", scene, pair, CoverageSettings(
+        step_m=10.0, bandwidth_hz=20e6, noise_figure_db=7.0, extent_m=(-100, 100, -100, 100)))
+    loss_db = [20 * math.log10(4 * math.pi * math.hypot(5 - x_m, 5, 28.5) * f_hz / 299_792_458) + 0.1
+               for x_m, f_hz in ((-100, 2e9), (100, 2e9 + apart_hz))]
+    noise_mw = 1.380649e-23 * 290 * 20e6 * 1e3 * 10**0.7
+    sinr_db = 40 - loss_db[1] - 10 * math.log10(noise_mw + share * 10 ** ((40 - loss_db[0]) / 10))
+    assert power_at(coverage, 5, 5, "best_server") == 1
+    assert power_at(coverage, 5, 5, "sinr_db") == pytest.approx(sinr_db, abs=0.02)
+
+
 def test_noise_follows_bandwidth_and_noise_figure(build, twin_of):
     devices = [("a", 0.0, 0.0, 10.0)]
     scene = build(devices=devices)
@@ -138,8 +155,29 @@ def test_a_published_law_sees_the_building(build, house):
     for x_m, alpha, beta_db, gamma in ((55.0, 2.29, 28.6, 1.96), (135.0, 4.39, -6.27, 2.30)):
         distance_m = math.sqrt(x_m**2 + 5.0**2 + 28.5**2)
         loss_db = 10 * alpha * math.log10(distance_m) + beta_db + 10 * gamma * math.log10(2.0)
+        free_db = 20 * math.log10(distance_m) - FREE_SPACE_AT_1_M_DB
+        if x_m > 120:  # behind the building: Sec. 4.2.1 adds free space
+            loss_db = free_db + 10 * math.log10(10 ** ((loss_db - free_db) / 10) + 1)
         assert power_at(coverage, x_m, 5.0) == pytest.approx(30.0 - loss_db, abs=0.01)
     assert power_at(coverage, 135.0, 5.0, "received_power_sd_db") == pytest.approx(6.89)
+
+
+def test_notes_are_on_the_class_that_each_link_has(build, house):
+    """P.1411-12, Table 8: 55 to 1,200 m with sight, 260 to 1,200 m without; cells hide behind a row of houses."""
+    scene = build(house(100, -300, 120, 300, 20), devices=[("a", 0.0, 0.0, 30.0)])
+    behind = CoverageSettings(step_m=10.0, extent_m=(130, 160, -50, 50))
+    note, = (each for each in predict_coverage("p1411", scene, settings=behind).summary["notes"] if "distance" in each)
+    assert "published is 260 to 1200 m" in note and "55" not in note
+    before = CoverageSettings(step_m=10.0, extent_m=(60, 90, -50, 50))
+    assert not any("distance" in each for each in predict_coverage("p1411", scene, settings=before).summary["notes"])
+
+
+def test_heights_of_notes_are_above_the_ground(tmp_path, house):
+    """A mast of 30 m on a plateau of 60 m, receivers at 1.5 m: COST 231's 4 to 50 m and 1 to 3 m hold."""
+    scene = write_scene(tmp_path / "hill", [house(-300, -300, -280, 300, 80)], [("a", 0.0, 0.0, 90.0)],
+                        ground_z_m=lambda x, y: 60.0, terrain=True)
+    notes = predict_coverage("cost231_wi", scene, settings=CoverageSettings(step_m=50.0)).summary["notes"]
+    assert not any("height" in each for each in notes)
 
 
 def test_an_antenna_points_where_it_is_turned_to(build):

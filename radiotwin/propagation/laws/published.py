@@ -314,8 +314,8 @@ class P1411(PublishedLaw):
     Where both ends are below the mean roof: Sec. 4.1.1, Table 4. Where the higher end is above it:
     Sec. 4.2.1, Table 8, published for 2.2 to 73 GHz. Both are L = 10 alpha log10 d + beta + 10
     gamma log10 f, with d in metres and f in GHz (Eqs. 1 and 20). Links without line of sight are
-    those of urban high-rise, the only ones published below 10 GHz; as the recommendation has it,
-    their loss is not below that of free space.
+    those of urban high-rise, the only ones published below 10 GHz. Of them A = L - L_FS, and the
+    loss is L_FS + 10 log10(10^(A / 10) + 1), with L_FS of free space, as the recommendation has it.
     """
 
     name = "p1411"
@@ -339,7 +339,8 @@ class P1411(PublishedLaw):
         loss_db = (10 * alpha * links.log_distance + beta_db
                    + 10 * gamma * np.log10(self.frequency_hz / 1e9))
         if not los:
-            loss_db = np.maximum(loss_db, free_space_db(links.distance_m, self.frequency_hz))
+            free_db = free_space_db(links.distance_m, self.frequency_hz)
+            loss_db = free_db + 10 * np.log10(10 ** ((loss_db - free_db) / 10) + 1)
         return Branch(loss_db, sd_db)
 
     def _is_over(self, links: LinkGeometry) -> np.ndarray:
