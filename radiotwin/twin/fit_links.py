@@ -17,7 +17,7 @@ from radiotwin.propagation.laws.base import MIN_DETECTED
 from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
-from radiotwin.twin.localize import LocalizeSettings, TwinDevice, localize
+from radiotwin.twin.localize import LawError, LocalizeSettings, TwinDevice, localize
 from radiotwin.twin.model.model import FittedModel
 from radiotwin.twin.twin import Twin
 
@@ -48,7 +48,9 @@ def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int
                           zip(links.device_names, links.device_m, is_anchor, strict=True)]
     unknown = np.flatnonzero(~is_anchor)
     if len(unknown):
-        found = _locate(links, scene, fitted.trend, unknown, seed, start, settings)
+        law_error = None if isinstance(fitted, PublishedLaw) else LawError.learnt(
+            fitted.trend, channel.uses_map, *_known_links(links, anchors_m)[:2])
+        found = _locate(links, scene, fitted.trend, law_error, unknown, seed, start, settings)
         for index, each in zip(unknown, found, strict=True):
             devices[index] = each
     if fitted.trend is not fitted:
@@ -131,8 +133,9 @@ def _published(links: Links, device_m: np.ndarray, scene: Scene,
     return fitted
 
 
-def _locate(links: Links, scene: Scene, channel: ChannelModel, unknown: np.ndarray, seed: int,
-            start: Twin | None, settings: LocalizeSettings | None) -> list[TwinDevice]:
+def _locate(links: Links, scene: Scene, channel: ChannelModel, law_error: LawError | None,
+            unknown: np.ndarray, seed: int, start: Twin | None,
+            settings: LocalizeSettings | None) -> list[TwinDevice]:
     start_m = None
     if start is not None:
         before = {device.device: (device.x_m, device.y_m) for device in start.devices}
@@ -147,7 +150,7 @@ def _locate(links: Links, scene: Scene, channel: ChannelModel, unknown: np.ndarr
         "devices": {int(index): links.device_names[index] for index in unknown},
         "bounds": scene.config.extent.bounds, "city": links.city,
         "z_m": np.nan_to_num(links.device_m[unknown, 2], nan=ASSUMED_HEIGHT_M),
-        "limit_db": limit_db, "seed": seed,
+        "limit_db": limit_db, "seed": seed, "law_error": law_error,
         "start_m": start_m, "settings": settings}
     return kept("positions", (*measured, options), partial(localize, *measured, **options),
                 lambda found: ({}, [each.record for each in found]),

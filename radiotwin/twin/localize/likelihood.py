@@ -8,6 +8,9 @@ position's estimate beyond what independence would give.
 
 [1] Varin, Reid, Firth, "An overview of composite likelihood methods", Statistica Sinica 21, 2011,
 section 2.3.
+
+A law that was learnt from few links is wrong in the same way on all links of a device. That error
+adds to the correlation of the residuals (`LawError`).
 """
 
 from __future__ import annotations
@@ -20,11 +23,14 @@ import numpy as np
 from scipy.spatial.distance import pdist, squareform
 from scipy.special import ndtr
 
+from radiotwin.links import LinkGeometry
 from radiotwin.twin.localize.observations import (
+    Channel,
     DeviceObservations,
     DirectChannel,
     LinkTable,
     Observations,
+    link_grid,
 )
 
 if TYPE_CHECKING:
@@ -38,6 +44,9 @@ OUTLIER_SHARE = 0.02  # probability that the channel does not explain a level at
 OUTLIER_SPAN_DB = 100.0  # width of the outliers' uniform density: the range of plausible levels
 CHUNK_LINKS = 1 << 18  # links that are predicted at a time: bounds memory
 SLOPE_STEP_M = 2.0  # to each side, of the difference quotient of a link's mean
+# Prior standard deviation of a law's level at 100 m [dB], and of its slope [dB per decade]: what a
+# class of links that no anchor has may be off by. Laws published for cities spread by less.
+LAW_SD_DB = 10.0
 
 
 @dataclass(frozen=True)
@@ -49,17 +58,98 @@ class DeviceResiduals:
         z: (n,) residuals in standard deviations.
         slope: (n, 2) change of the link's mean with the device's x and y at constant line of sight,
             in standard deviations per metre.
+        law: (n, p) error of the link's mean from each of the p independent errors of the law, in
+            standard deviations.
+        links_per_row: detected links for each of the n that were kept.
     """
 
     receiver_m: np.ndarray
     z: np.ndarray
     slope: np.ndarray
+    law: np.ndarray
+    links_per_row: float = 1.0
 
     def thinned(self) -> DeviceResiduals:
         """Return at most MAX_POSITIONS of them, evenly over the rows, with outliers clipped."""
         pick = slice(None, None, -(-len(self.z) // MAX_POSITIONS) or 1)
         return DeviceResiduals(self.receiver_m[pick], np.clip(self.z[pick], -MAX_Z, MAX_Z),
-                               self.slope[pick])
+                               self.slope[pick], self.law[pick],
+                               len(self.z) / max(len(self.z[pick]), 1))
+
+
+@dataclass(frozen=True, eq=False)
+class LawError:
+    """Standard error of a law's level and slope, for each class of line of sight.
+
+    Whatever the form of a channel, it knows the level and the slope of its class no better than a
+    line through the same links does.
+
+    Attributes:
+        by_class: whether the law distinguishes line of sight.
+        root_db: (4, 4) R, where R R' is the covariance of level at 100 m and slope per decade
+            without line of sight, then with it [dB].
+    """
+
+    by_class: bool
+    root_db: np.ndarray
+
+    @classmethod
+    def learnt(cls, channel: Channel, by_class: bool, links: LinkGeometry,
+               level_db: np.ndarray) -> LawError:
+        """Return the error of a channel that was learnt from n links.
+
+        The weighted least squares of a line, with the sandwich covariance A^-1 (sum_ij rho_ij x_i
+        x_j') A^-1 where residuals of one device are correlated between receivers.
+
+        Args:
+            channel: as it was learnt.
+            by_class: whether it distinguishes line of sight.
+            links: n links.
+            level_db: (n,) [dB]; NaN: not detected.
+        """
+        detected = np.flatnonzero(np.isfinite(level_db))
+        links, level_db = links.select(detected), level_db[detected]
+        mean_db, sd_db = channel.predict(links)
+        z, columns = (level_db - mean_db) / sd_db, _law_columns(links, by_class) / sd_db[:, None]
+        parts = []
+        for device in np.unique(links.device):
+            rows = links.device == device
+            parts.append(DeviceResiduals(links.receiver_m[rows], z[rows], np.zeros((rows.sum(), 2)),
+                                         columns[rows]).thinned())
+        correlation = residual_correlation(parts)
+        information, covariance = np.zeros((2, 4, 4)) + np.eye(4) / LAW_SD_DB**2
+        for each in parts:
+            information += each.links_per_row * each.law.T @ each.law
+            covariance += _score_covariance(each, each.law, correlation)
+        inverse = np.linalg.inv(information)
+        value, vector = np.linalg.eigh(inverse @ covariance @ inverse)
+        return cls(by_class, vector * np.sqrt(np.maximum(value, 0.0)))
+
+    def of_links(self, links: LinkGeometry) -> np.ndarray:
+        """Return the errors (n, 4) [dB] of n links' means: R, seen by each link."""
+        return _law_columns(links, self.by_class) @ self.root_db
+
+
+def _law_columns(links: LinkGeometry, by_class: bool) -> np.ndarray:
+    """Return level and slope (n, 4) without line of sight, and with it."""
+    line = np.column_stack([np.ones(len(links)), np.log10(links.distance_m / 100.0)])
+    los = links.los[:, None] if by_class else np.ones((len(links), 1), dtype=bool)
+    return np.column_stack([line * ~los, line * los])
+
+
+def _score_covariance(residuals: DeviceResiduals, columns: np.ndarray,
+                      correlation: np.ndarray) -> np.ndarray:
+    """Return sum_ij rho_ij c_i c_j' (p, p) over all links, of columns c (n, p) of those kept.
+
+    Args:
+        residuals: of the device.
+        columns: (n, p)
+        correlation: (N_BINS,) of residuals by distance, as from `residual_correlation`.
+    """
+    bins = np.minimum((squareform(pdist(residuals.receiver_m)) / BIN_M).astype(int), N_BINS)
+    rho = np.append(correlation, 0.0)[bins]
+    np.fill_diagonal(rho, 1.0 / residuals.links_per_row)  # pairs of links grow with its square
+    return residuals.links_per_row**2 * columns.T @ rho @ columns
 
 
 def residual_correlation(devices: list[DeviceResiduals]) -> np.ndarray:
@@ -92,9 +182,9 @@ def residual_correlation(devices: list[DeviceResiduals]) -> np.ndarray:
 def design_effect(residuals: DeviceResiduals, correlation: np.ndarray) -> float:
     """Return the factor by which to divide a device's log-likelihood.
 
-    trace(H^-1 J) / 2 with H = sum_i a_i a_i', J = sum_ij rho_ij a_i a_j' over the slopes a: the
-    mean widening of the position's variance; times the residuals' mean square, where that is above
-    1 (the standard deviation is too small).
+    trace(H^-1 J) / 2 with H = sum_i a_i a_i', J = sum_ij (rho_ij + l_i l_j') a_i a_j' over the
+    slopes a and the errors l of the law: the mean widening of the position's variance; times the
+    residuals' mean square, where that is above 1 (the standard deviation is too small).
 
     Args:
         residuals: of the device.
@@ -105,11 +195,10 @@ def design_effect(residuals: DeviceResiduals, correlation: np.ndarray) -> float:
     """
     if len(residuals.z) < 3:
         return 1.0
-    bins = np.minimum((squareform(pdist(residuals.receiver_m)) / BIN_M).astype(int), N_BINS)
-    rho = np.append(correlation, 0.0)[bins]
-    np.fill_diagonal(rho, 1.0)
-    information = residuals.slope.T @ residuals.slope
-    score_covariance = residuals.slope.T @ rho @ residuals.slope
+    information = residuals.links_per_row * residuals.slope.T @ residuals.slope
+    by_law = residuals.links_per_row * residuals.slope.T @ residuals.law
+    score_covariance = _score_covariance(residuals, residuals.slope, correlation) \
+        + by_law @ by_law.T
     widening = np.trace(np.linalg.pinv(information) @ score_covariance) / 2.0
     return float(max(1.0, widening) * max(1.0, np.mean(residuals.z**2)))
 
@@ -133,6 +222,7 @@ class Likelihood:
         z_m: height of the devices [m].
         city: 3D map; None: every link has line of sight.
         limit_db: limit of detection [dB]; None only where nothing is `missed`.
+        law_error: of the channel; None: it is exact.
         repeat_share: f, 1 until it is set.
     """
 
@@ -142,6 +232,7 @@ class Likelihood:
     z_m: float
     city: CityMap | None
     limit_db: float | None
+    law_error: LawError | None = None
     repeat_share: float = 1.0
 
     def of_devices(self, devices: Sequence[int] | np.ndarray, xy_m: np.ndarray) -> np.ndarray:
@@ -198,14 +289,17 @@ class Likelihood:
         data = self.observations.devices[k]
         mean_db, sd_db = self.link_at(k, xy_m)
         merged_sd_db = sd_db * np.sqrt(self.variance_share(data.count))
-        los = np.repeat(self._line_of_sight(xy_m[None], data.seen), 4, axis=0)
+        los = self._line_of_sight(xy_m[None], data.seen)
+        receiver_m = self.observations.receiver_m[data.seen]
+        law_db = np.zeros((len(data.seen), 0)) if self.law_error is None else \
+            self.law_error.of_links(link_grid(xy_m[None], self.z_m, receiver_m, los, data.device))
+        los = np.repeat(los, 4, axis=0)
         steps = SLOPE_STEP_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
         around, _ = self.channel.look_up(xy_m + steps, data.seen, los, data.device)
         slope = np.column_stack([around[0] - around[1], around[2] - around[3]])
         slope = slope / (2 * SLOPE_STEP_M)
-        return DeviceResiduals(self.observations.receiver_m[data.seen],
-                               (data.level_db - mean_db) / merged_sd_db,
-                               slope / merged_sd_db[:, None])
+        return DeviceResiduals(receiver_m, (data.level_db - mean_db) / merged_sd_db,
+                               slope / merged_sd_db[:, None], law_db / merged_sd_db[:, None])
 
     def variance_share(self, count: np.ndarray) -> np.ndarray:
         """Return the variance of the mean of `count` repeats over the channel's variance."""

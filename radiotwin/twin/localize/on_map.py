@@ -16,7 +16,12 @@ import numpy as np
 from radiotwin.errors import BadInput
 from radiotwin.runtime.console import progress
 from radiotwin.twin.localize.estimate import TwinDevice
-from radiotwin.twin.localize.likelihood import Likelihood, design_effect, residual_correlation
+from radiotwin.twin.localize.likelihood import (
+    LawError,
+    Likelihood,
+    design_effect,
+    residual_correlation,
+)
 from radiotwin.twin.localize.observations import (
     Channel,
     DeviceObservations,
@@ -258,6 +263,7 @@ def localize(
     seed: int,
     settings: LocalizeSettings | None = None,
     start_m: np.ndarray | None = None,
+    law_error: LawError | None = None,
 ) -> list[TwinDevice]:
     """Estimate every device's position with the channel as it is.
 
@@ -281,6 +287,7 @@ def localize(
         seed: of the swarms; the same seed gives the same estimates.
         settings: of the search; None: the defaults.
         start_m: (k, 2) an earlier estimate of each, where one more swarm starts [m]; NaN: none.
+        law_error: of the channel, which widens the radii; None: it is exact.
 
     Returns:
         the devices in their order.
@@ -301,7 +308,7 @@ def localize(
         rows = np.flatnonzero(usable & (z_m == z))
         index = np.array([observations.devices[k].device for k in rows])
         links = tabulate(channel, observations.receiver_m, z, bounds, index, rng)
-        likelihood = Likelihood(observations, links, rows, z, city, limit_db)
+        likelihood = Likelihood(observations, links, rows, z, city, limit_db, law_error)
         searches.append(Search(likelihood, bounds, settings))
     found: dict[int, tuple[Posterior, Search]] = {}
     with progress("locating", total=settings.iterations + 3 * len(devices)) as advance:

@@ -28,7 +28,7 @@ def test_paths_find_a_device_in_a_narrow_street_that_a_law_puts_where_it_would_s
     true_m, scene, name = narrow_street.position_m, narrow_street.scene, narrow_street.name
     links = prepare_links(narrow_street.measured, scene)
     law = fit_links(links, scene, SegmentedLogDistance, 0)
-    relocation = relocation_from(scene, 100.0)
+    relocation = relocation_from(scene, np.inf)
     assert np.linalg.norm(found(law, name)[0] - true_m) > 15
     position_m, radius_m = found(fit_paths(links, scene, law, relocation), name)
     assert np.linalg.norm(position_m - true_m) < min(4.0, max(radius_m, 2.0))
@@ -71,7 +71,7 @@ def test_as_many_threads_as_there_are_find_the_same_to_the_bit(narrow_street, mo
     law, twins = fit_links(links, scene, SegmentedLogDistance, 0), []
     for count in (1, 3):
         monkeypatch.setattr("radiotwin.runtime.processes.thread_count", lambda count=count: count)
-        twins.append(fit_paths(links, Scene.load(RBM), law, relocation_from(scene, 100.0)))
+        twins.append(fit_paths(links, Scene.load(RBM), law, relocation_from(scene, np.inf)))
     assert twins[0].devices == twins[1].devices
     assert found(twins[0], narrow_street.name)[0].tolist() != found(law, narrow_street.name)[0].tolist()
 
