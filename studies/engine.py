@@ -1,7 +1,7 @@
 """Accuracy and cost of the path engine (`radiotwin.propagation.paths`): `engine`.
 
 Accuracy: links without line of sight above -128 dB, against Sionna RT with a million rays, as it is
-released and without the two faults that `studies.mended_sionna` describes. Paths of both are
+released and as `radiotwin.trace.mended` mends it. Paths of both are
 matched by kind and length, so that each difference is a path that one of them lacks or another
 gain of the same path. Cost: set-up and time a link, the tracer's in the same run, and growth with
 the number of faces.
@@ -24,7 +24,6 @@ from radiotwin.scene.build import BuildOptions, build_scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains
-from studies.mended_sionna import mended
 from studies.path_pairs import FoundPath, SionnaPaths, engine_paths, matched
 from studies.runner import Study
 from studies.tables import markdown, number, scene_folder
@@ -88,7 +87,7 @@ def measure_accuracy(seed: int, settings: dict) -> dict:
     with _scene(settings) as scene:
         draw = _draw(scene, rng)
         wanted = -(-settings["links"] // len(scene.device_m))
-        sionna, chosen, theirs = SionnaPaths(scene, SAMPLES), [], []
+        sionna, chosen, theirs = SionnaPaths(scene, SAMPLES, "sionna"), [], []
         for device_m in scene.device_m:
             points_m, ends_m = draw(device_m)[:6 * wanted], np.empty((0, 3))
             found: list[list[FoundPath]] = []
@@ -102,8 +101,8 @@ def measure_accuracy(seed: int, settings: dict) -> dict:
                     break
             chosen.append((device_m, ends_m))
             theirs += found[:wanted]
-        with mended():
-            better = [paths for ends in chosen for paths in sionna.paths(*ends)]
+        mended = SionnaPaths(scene, SAMPLES, "reciprocal")
+        better = [paths for ends in chosen for paths in mended.paths(*ends)]
         for name, truth in (("released", theirs), ("mended", better)):
             for wedge in ("sionna", "luebbers"):
                 ours = [paths for ends in chosen for paths in engine_paths(scene, *ends, wedge)]

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import Scene, SolverSettings, list_paths
+from radiotwin.trace.mended import mended
 from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE
 from radiotwin.trace.solver import candidate_search, import_sionna, load_city
 from studies.runner import Study
@@ -108,7 +109,7 @@ def _sionna_paths(scene: Scene, points_m: np.ndarray, samples: int, seed: int) -
         for first in range(0, len(points_m), len(ends)):
             for end, point_m in zip(ends, points_m[first:first + len(ends)]):
                 end.position = point_m.tolist()
-            with candidate_search(TABLE_SIZE, DIFFRACTION_PROBABILITY):
+            with candidate_search(TABLE_SIZE, DIFFRACTION_PROBABILITY), mended("reciprocal"):
                 paths = solver(city, max_depth=settings.max_depth, samples_per_src=samples,
                                max_num_paths_per_src=settings.max_num_paths_per_src,
                                refraction=False, diffraction=True, seed=seed + 1)

@@ -63,11 +63,12 @@ class SionnaPaths:
     Args:
         scene: that the links are in.
         samples: rays from each device.
+        diffraction: as in `SolverSettings`.
     """
 
-    def __init__(self, scene: Scene, samples: int) -> None:
+    def __init__(self, scene: Scene, samples: int, diffraction: Any) -> None:
         self._settings = SolverSettings(samples_per_src=samples, max_depth=DEPTH,
-                                        batch_receivers=10)
+                                        batch_receivers=10, diffraction=diffraction)
         self._solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, self._settings)
         self._found: list[list[FoundPath]] = []
         self._combine = self._solver._combine

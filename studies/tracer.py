@@ -29,7 +29,7 @@ ROWS: dict[str, dict] = {
     "`high` (500,000 samples)": {"quality": "high"},
     "depth 3": {"quality": "default", "max_depth": 3},
     "depth 5": {"quality": "default", "max_depth": 5},
-    "no diffraction": {"quality": "default", "diffraction": False}}
+    "no diffraction": {"quality": "default", "diffraction": "off"}}
 
 
 def tracer_cases(seed: int) -> dict[str, dict]:

@@ -42,6 +42,8 @@ TargetDb = Annotated[float | None, typer.Option(
          "few links, is within this [dB].")]
 Combining = Annotated[str, typer.Option(
     help="power (sum of the paths' powers) or coherent (sum of their fields).")]
+Diffraction = Annotated[str | None, typer.Option(
+    help="reciprocal (the same in both directions), sionna (as released) or off [reciprocal].")]
 Radius = Annotated[float | None, typer.Option(
     help="Leave out what lies farther from the lines of a batch's links [m; 400 in cities of more "
          "than 5,000 shapes, inf (the whole city) in others].")]

@@ -11,6 +11,7 @@ from radiotwin.cli.options import (
     Cluster,
     Combining,
     ComputeDevice,
+    Diffraction,
     OnlyDevices,
     PointsFile,
     Quality,
@@ -206,6 +207,7 @@ def trace(
     solver: Annotated[str, typer.Option(
         help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
     combining: Combining = "power",
+    diffraction: Diffraction = None,
     devices: OnlyDevices = None,
     radius: Radius = None,
     seed: RaySeed = 1,
@@ -231,8 +233,8 @@ def trace(
     out = out or truth_path(scene, names)
     keep_inputs(out, *scene.files)
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
-                         combining=combining, seed=seed, radius_m=radius,
-                         compute_device=used)
+                         combining=combining, diffraction=diffraction, seed=seed,
+                         radius_m=radius, compute_device=used)
     worker_count(workers)  # a plan needs none, but a mistake is one
     if plan:
         _print_plan(scene, settings, names)
@@ -275,6 +277,7 @@ def gains(
     devices: OnlyDevices = None,
     combining: Annotated[str, typer.Option(
         "--sum", help="power (of the paths' powers) or coherent (of their fields).")] = "power",
+    diffraction: Diffraction = None,
     quality: Quality = None,
     target_db: TargetDb = None,
     radius: Radius = None,
@@ -298,8 +301,8 @@ def gains(
     scene, names = Scene.load(folder), split_names(devices)
     keep_inputs(out, points, *scene.files)
     points_m = read_points(points, scene.config.origin, scene.city)
-    settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed,
-                         radius_m=radius, compute_device=used)
+    settings = _settings(scene, points_m, names, quality, target_db, combining=combining,
+                         diffraction=diffraction, seed=seed, radius_m=radius, compute_device=used)
     with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
         table = trace_points(scene, points_m, settings, out, names, executor)
     notice(pieces.progress)
@@ -358,6 +361,8 @@ def _settings(scene: "Scene", points_m: "np.ndarray", devices: list[str] | None,
     from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.trace import SolverSettings, choose_quality
 
+    if others["diffraction"] is None:
+        del others["diffraction"]
     if target_db is None:
         return SolverSettings.of_quality(quality or "default", **others)
     if quality is not None:

@@ -16,10 +16,11 @@ too high. Depth 3 instead of 4 saves a sixth of the time at a cost of 1.5 dB; pa
 """
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from radiotwin.errors import BadInput
+from radiotwin.trace import mended
 
 QUALITIES: dict[str, dict[str, int]] = {
     "fast": {"samples_per_src": 30_000},
@@ -51,7 +52,9 @@ class SolverSettings:
         batch_receivers: Positions solved in one call (`paths` only). The call takes about 0.5 GiB
             and 36 bytes * `max_depth * samples_per_src * batch_receivers`.
         max_num_paths_per_src: Candidate paths that one call can hold (`paths` only).
-        diffraction: First-order diffraction at the edges of buildings.
+        diffraction: First-order diffraction at the edges of buildings: `reciprocal`, the same in
+            both directions and exact for conductors (`radiotwin.trace.mended`, the default where
+            the installed Sionna RT is the one that it mends); `sionna`, as released; `off`.
         refraction: Paths through walls. Off, as buildings are hollow shells in the usual city
             model: a ray that enters one meets no inner walls, floors or furniture.
         combining: `power` adds the powers of paths (the mean over fading), `coherent` their fields.
@@ -67,7 +70,8 @@ class SolverSettings:
     samples_per_src: int = 100_000
     batch_receivers: int = 100
     max_num_paths_per_src: int = 1_000_000
-    diffraction: bool = True
+    diffraction: Literal["reciprocal", "sionna", "off"] = field(
+        default_factory=mended.default_diffraction)
     refraction: bool = False
     combining: Literal["power", "coherent"] = "power"
     seed: int = 1
@@ -76,10 +80,16 @@ class SolverSettings:
 
     def __post_init__(self) -> None:
         for name, allowed in (("solver", ("paths", "map")), ("combining", ("power", "coherent")),
+                              ("diffraction", ("reciprocal", "sionna", "off")),
                               ("compute_device", ("cpu", "cuda"))):
             if getattr(self, name) not in allowed:
                 raise BadInput(f"{name} = {getattr(self, name)!r} is unknown; allowed are "
                                f"{', '.join(allowed)}")
+        installed = mended.installed_version()
+        if self.diffraction == "reciprocal" and installed != mended.KNOWN_VERSION:
+            raise BadInput(f"diffraction = 'reciprocal' mends Sionna RT {mended.KNOWN_VERSION}, "
+                           f"and {installed} is installed; take diffraction = 'sionna', or pip "
+                           f"install sionna-rt=={mended.KNOWN_VERSION}")
         if self.solver == "map" and self.combining == "coherent":
             raise BadInput("the solver `map` averages powers over cells: combining = 'coherent' "
                            "needs the solver `paths`")
@@ -133,11 +143,15 @@ class SolverSettings:
     def attributes(self) -> dict[str, Any]:
         """Return all that decides a gain, as attributes of a NetCDF file (without booleans).
 
-        The processor is not among them: maps of it are the same on every machine.
+        The processor is not among them: maps of it are the same on every machine. `wedge` is there
+        for `reciprocal` only: a map with `diffraction` 1 and no `wedge` has Sionna RT's own.
         """
         own = {name: int(value) if isinstance(value, bool) else value
                for name, value in asdict(self).items()
                if name != "radius_m" or self.is_tiled}
+        own["diffraction"] = int(self.diffraction != "off")
+        if self.diffraction == "reciprocal":
+            own["wedge"] = self.diffraction
         if self.compute_device == "cpu":
             del own["compute_device"]
         return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY,

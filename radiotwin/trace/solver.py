@@ -31,6 +31,7 @@ from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.folder import CityShape, read_city, write_city
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.materials import permittivity, ranges_text
+from radiotwin.trace.mended import mended
 from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE, SolverSettings
 
 log = logging.getLogger(__name__)
@@ -280,11 +281,12 @@ class PathGains:
         self._transmitter.position = [float(value) for value in device_m]
         for receiver, point_m in zip(self._receivers, padded_m):
             receiver.position = [float(value) for value in point_m]
-        with candidate_search(TABLE_SIZE, DIFFRACTION_PROBABILITY):
+        with candidate_search(TABLE_SIZE, DIFFRACTION_PROBABILITY), mended(settings.diffraction):
             paths = self._solver(
                 self._city, max_depth=settings.max_depth, samples_per_src=settings.samples_per_src,
                 max_num_paths_per_src=settings.max_num_paths_per_src,
-                refraction=settings.refraction, diffraction=settings.diffraction, seed=seed)
+                refraction=settings.refraction, diffraction=settings.diffraction != "off",
+                seed=seed)
         power, bound = (sums[:len(points_m)] for sums in self._combine(paths, antennas))
         del paths
         self._calls += 1
@@ -365,13 +367,15 @@ class CellGains:
         settings, lattice = self.settings, self.lattice
         step_m = lattice.step_m
         self._transmitter.position = [float(value) for value in device_m]
-        radio_map = self._solver(
-            self._city,
-            center=[float(np.mean(lattice.x_m)), float(np.mean(lattice.y_m)), float(z_m)],
-            orientation=[0.0, 0.0, 0.0], cell_size=[step_m, step_m],
-            size=[len(lattice.x_m) * step_m, len(lattice.y_m) * step_m],
-            samples_per_tx=settings.samples_per_src, max_depth=settings.max_depth,
-            refraction=settings.refraction, diffraction=settings.diffraction, seed=settings.seed)
+        with mended(settings.diffraction):
+            radio_map = self._solver(
+                self._city,
+                center=[float(np.mean(lattice.x_m)), float(np.mean(lattice.y_m)), float(z_m)],
+                orientation=[0.0, 0.0, 0.0], cell_size=[step_m, step_m],
+                size=[len(lattice.x_m) * step_m, len(lattice.y_m) * step_m],
+                samples_per_tx=settings.samples_per_src, max_depth=settings.max_depth,
+                refraction=settings.refraction, diffraction=settings.diffraction != "off",
+                seed=settings.seed)
         power = np.array(radio_map.path_gain, dtype=float).reshape(-1)
         del radio_map
         drjit.flush_malloc_cache()

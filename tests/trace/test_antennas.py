@@ -65,7 +65,7 @@ def test_another_scene_folder_gets_the_files(with_antennas, tmp_path):
 def test_free_space_has_both_antennas_in_it(with_antennas):
     """Expected: Friis with the gains of both patterns along the straight line, each in its own direction."""
     scene = Scene.load(with_antennas)
-    settings = SolverSettings(samples_per_src=1000, batch_receivers=8, diffraction=False)
+    settings = SolverSettings(samples_per_src=1000, batch_receivers=8, diffraction="off")
     solver = PathGains(None, 2.4e9, settings)
     way_m = np.array([[100, 0, 0], [100, 0, 50], [-100, 0, 20], [60, -80, 30], [0, 90, -40], [50, 50, 50]], dtype=float)
     antennas = scene.device_antennas[0], scene.uav_antenna

@@ -96,7 +96,7 @@ def test_a_street_between_metal_walls_may_bring_nine_decibels(tmp_path):
     width_m, device_y_m = 4.0, 1.3
     corners = [(x, y, z) for y in (0.0, width_m) for x, z in ((-2000, -2000), (2000, -2000), (2000, 2000), (-2000, 2000))]
     walls = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6)], process=False)
-    settings = SolverSettings(samples_per_src=100_000, batch_receivers=8, max_num_paths_per_src=20_000, diffraction=False)
+    settings = SolverSettings(samples_per_src=100_000, batch_receivers=8, max_num_paths_per_src=20_000, diffraction="off")
     points_m = np.array([(x_m, y_m, 1.0) for x_m in (15.0, 30.0, 60.0, 90.0) for y_m in (0.7, 2.9)])
     solved_db = solver(tmp_path, walls, Material("metal", itu="metal"), settings).solve(
         np.array([0.0, device_y_m, 0.0]), points_m)
@@ -154,7 +154,7 @@ def test_knife_edge_in_the_shadow(tmp_path):
 
 def test_without_diffraction_the_shadow_has_no_path(tmp_path):
     settings = SolverSettings(samples_per_src=20_000, batch_receivers=1, max_num_paths_per_src=20_000,
-                              diffraction=False)
+                              diffraction="off")
     gain_db = solver(tmp_path, thin_screen(), Material("metal", itu="metal"), settings).solve(
         np.array([-100.0, 0.0, 20.0]), np.array([(100.0, 0.0, 20.0)]))
     assert np.isnan(gain_db).all()

@@ -39,9 +39,12 @@ def test_the_field_has_no_step(corner, receivers_m):
 
 @pytest.mark.slow
 @pytest.mark.llvm
-def test_that_of_sionna_rt_has_one(corner, receivers_m, tmp_path):
+@pytest.mark.parametrize("diffraction", ["sionna", "reciprocal"])
+def test_that_of_sionna_rt_has_one_until_it_is_mended(corner, receivers_m, tmp_path, diffraction):
     """Of 2.2.0; where this fails, its coefficient has changed, and docs/results.md with it."""
     write_city(tmp_path, [CityShape("block", corner, METAL)])
-    settings = SolverSettings(samples_per_src=300_000, batch_receivers=2, max_depth=1, combining="coherent")
+    settings = SolverSettings(samples_per_src=300_000, batch_receivers=2, max_depth=1, combining="coherent",
+                              diffraction=diffraction)
     before_db, after_db = PathGains(tmp_path / "city.xml", 2.4e9, settings).solve(DEVICE_M, receivers_m)
-    assert abs(after_db - before_db) > 10
+    assert (abs(after_db - before_db) > 10) == (diffraction == "sionna")
+    assert diffraction == "sionna" or abs(after_db - before_db) < 3  # over 3 mm, as that of the engine above

@@ -1,0 +1,155 @@
+"""Sionna RT's diffraction as it is mended, against the uniform theory of diffraction, written here from the papers.
+
+Kouyoumjian and Pathak, Proc. IEEE 62(11), 1974, eq. 25-29 at normal incidence, with the reflections of Luebbers,
+IEEE Trans. AP 32(1), 1984, at the smaller of the angles of the two rays to each face; slabs by ITU-R P.2040-4, eq. 43a.
+"""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.special import modfresnelm
+
+from radiotwin.errors import BadInput
+from radiotwin.scene.folder import CityShape, write_city
+from radiotwin.scene.materials import Material
+from radiotwin.trace import mended
+from radiotwin.trace.settings import SolverSettings
+from radiotwin.trace.solver import PathGains
+
+FREQUENCY_HZ = 2.4e9
+WAVELENGTH_M = 299_792_458.0 / FREQUENCY_HZ
+K = 2 * np.pi / WAVELENGTH_M
+PERMITTIVITY, CONDUCTIVITY, THICKNESS_M = 5.24, 0.1, 0.3
+METAL = Material("metal", itu="metal")
+STONE = Material("stone", relative_permittivity=PERMITTIVITY, conductivity_s_per_m=CONDUCTIVITY, thickness_m=THICKNESS_M)
+SETTINGS = SolverSettings(samples_per_src=50_000, batch_receivers=8, max_num_paths_per_src=20_000)
+NEAR_M = np.array([0.5, 1.0, 2.0, 5.0, 12.0, 25.0])
+
+
+def transition(x):
+    return 2j * np.sqrt(x) * np.exp(1j * x) * modfresnelm(np.sqrt(x))[0]
+
+
+def slab(sine, is_soft):
+    eta = PERMITTIVITY - 1j * CONDUCTIVITY / (2 * np.pi * FREQUENCY_HZ * 8.8541878128e-12)
+    root = np.sqrt(eta - 1 + sine**2)
+    once = (sine - root) / (sine + root) if is_soft else (eta * sine - root) / (eta * sine + root)
+    through = np.exp(-2j * K * THICKNESS_M * root)
+    return once * (1 - through) / (1 - once**2 * through)
+
+
+def wedge(before_m, after_m, phi_in, phi, n, material, is_soft):
+    """Coefficient [m^0.5] of angles from face 0; soft: field along the edge."""
+    if material is METAL:
+        at_0 = at_n = -1 if is_soft else 1
+    else:
+        at_0, at_n = slab(np.sin(min(phi, phi_in)), is_soft), slab(np.sin(n * np.pi - max(phi, phi_in)), is_soft)
+    spread_m = before_m * after_m / (before_m + after_m)
+
+    def term(beta, sign):
+        turns = np.round((beta + sign * np.pi) / (2 * np.pi * n))
+        a = 2 * np.cos((2 * np.pi * n * turns - beta) / 2) ** 2
+        return transition(K * spread_m * a) / np.tan((np.pi + sign * beta) / (2 * n))
+
+    return -np.exp(-0.25j * np.pi) / (2 * n * np.sqrt(2 * np.pi * K)) * (
+        term(phi - phi_in, 1) + term(phi - phi_in, -1) + at_0 * term(phi + phi_in, -1) + at_n * term(phi + phi_in, 1))
+
+
+def gain(before_m, after_m, coefficient):
+    return (WAVELENGTH_M / (4 * np.pi)) ** 2 * abs(coefficient) ** 2 / (before_m * after_m * (before_m + after_m))
+
+
+def both_ways(folder, shapes, far_m, near_m, **others):
+    write_city(folder, shapes)
+    solver = PathGains(folder / "city.xml", FREQUENCY_HZ, SolverSettings(**(SETTINGS.__dict__ | others)))
+    return solver.solve(far_m, near_m), np.concatenate([solver.solve(end_m, far_m[None]) for end_m in near_m])
+
+
+def prism(material, corners, z_m=1000.0, axis="z"):
+    """A wedge along an axis with its edge at the origin: no way around its other edges with one diffraction."""
+    points = [(*corner, z) for z in (-z_m, z_m) for corner in ((0, 0), *corners)]
+    points = np.array(points, dtype=float)
+    if axis == "y":
+        points = points[:, [0, 2, 1]]
+    return CityShape("wedge", trimesh.convex.convex_hull(points), material)
+
+
+@pytest.mark.llvm
+@pytest.mark.parametrize("axis", ["z", "y"])
+@pytest.mark.parametrize("material", [METAL, STONE], ids=["metal", "slab"])
+def test_a_right_corner_is_the_closed_form_in_both_directions(tmp_path, material, axis):
+    """Vertical antennas: along an upright edge (soft), and across one that lies (hard)."""
+    box = prism(material, ((60, 0), (0, 60), (60, 60)) if axis == "z" else ((600, 0), (0, -600), (600, -600)), axis=axis)
+    # Faces x > 0 (of the device close by) and x = 0; mirrored in z where the edge lies
+    sign = 1.0 if axis == "z" else -1.0
+    far = np.array([-30.0, 20.0 * sign])
+    near = np.column_stack([np.full(6, 40.0), -NEAR_M * sign])
+    expected = []
+    for end in near:
+        before_m, after_m = np.hypot(*far), np.hypot(*end)
+        phi_in = np.arctan2(-far[0], far[1] * sign)  # from the face x = 0
+        phi = 1.5 * np.pi - np.arctan2(-end[1] * sign, end[0])
+        expected.append(gain(before_m, after_m, wedge(before_m, after_m, phi_in, phi, 1.5, material, axis == "z")))
+
+    def placed(points):
+        return np.insert(np.atleast_2d(points), 2 if axis == "z" else 1, 3.0, axis=1)
+
+    towards_db, from_db = both_ways(tmp_path, [box], placed(far)[0], placed(near))
+    assert towards_db == pytest.approx(10 * np.log10(expected), abs=0.1)
+    assert from_db == pytest.approx(towards_db, abs=0.1)
+
+
+@pytest.mark.llvm
+def test_behind_an_edge_with_an_obtuse_inside_a_receiver_close_to_the_face_is_reached(tmp_path):
+    """An inside of 120 degrees: as released, the way from the edge to the receiver is tested from within the wall."""
+    corner = np.deg2rad(120)
+    shape = prism(METAL, ((600, 0), (600 * np.cos(corner), 600 * np.sin(corner))))
+    n = (2 * np.pi - corner) / np.pi
+    far, near = np.array([-30.0, 30.0]), np.column_stack([np.full(6, 40.0), -NEAR_M])
+    phi_in = np.arctan2(far[1], far[0]) - corner
+    before_m = np.hypot(*far)
+    expected = [gain(before_m, after_m, wedge(before_m, after_m, phi_in, n * np.pi - np.arctan2(-end[1], end[0]), n,
+                                              METAL, True))
+                for end in near for after_m in [np.hypot(*end)]]
+    towards_db, from_db = both_ways(tmp_path, [shape], np.append(far, 3.0), np.column_stack([near, np.full(6, 3.0)]))
+    assert towards_db == pytest.approx(10 * np.log10(expected), abs=0.1)
+    assert from_db == pytest.approx(towards_db, abs=0.1)
+
+
+@pytest.mark.llvm
+def test_a_reflection_after_the_edge_counts_its_way_once(tmp_path):
+    """A metal screen behind the corner: the receiver's image is reached over the same edge, and no other path is."""
+    box = prism(METAL, ((60, 0), (0, 60), (60, 60)))
+    sides = [(x, -30.0, z) for x, z in ((19, -900), (60, -900), (60, 900), (19, 900))]
+    screen = CityShape("screen", trimesh.Trimesh(sides, [(0, 1, 2), (0, 2, 3)], process=False), METAL)
+    far_m, near_m = np.array([-30.0, 20.0, 3.0]), np.array([[40.0, -5.0, 3.0]])
+    before_m, phi_in = np.hypot(30, 20), np.arctan2(30, 20)
+    expected = sum(gain(before_m, np.hypot(40, y), wedge(before_m, np.hypot(40, y), phi_in, 1.5 * np.pi - np.arctan2(y, 40),
+                                                         1.5, METAL, True)) for y in (5.0, 55.0))
+    towards_db, from_db = both_ways(tmp_path, [box, screen], far_m, near_m)
+    assert towards_db == pytest.approx(10 * np.log10(expected), abs=0.1)
+    assert from_db == pytest.approx(towards_db, abs=0.1)
+
+
+@pytest.mark.llvm
+def test_as_released_is_one_setting_away(tmp_path):
+    """Seen with Sionna RT 2.2.0: -107 dB from the wall for -139 dB."""
+    box = prism(METAL, ((60, 0), (0, 60), (60, 60)))
+    near_m = np.array([[40.0, -0.5, 3.0]])
+    _, from_db = both_ways(tmp_path, [box], np.array([-30.0, 20.0, 3.0]), near_m, diffraction="sionna")
+    assert from_db == pytest.approx(-106.5, abs=0.7)
+
+
+def test_another_version_is_used_as_it_is_with_a_warning(monkeypatch):
+    monkeypatch.setattr(mended, "installed_version", lambda: "2.3.0")
+    with pytest.warns(UserWarning, match=r"Sionna RT 2\.3\.0 is installed.*known for 2\.2\.0 only"):
+        assert SolverSettings().diffraction == "sionna"
+    with pytest.raises(BadInput, match=r"'reciprocal' mends Sionna RT 2\.2\.0, and 2\.3\.0 is installed; take"):
+        SolverSettings(diffraction="reciprocal")
+
+
+def test_the_wedge_is_in_the_attributes_and_the_shipped_maps_have_none():
+    assert SolverSettings(diffraction="reciprocal").attributes()["wedge"] == "reciprocal"
+    for name, number in (("sionna", 1), ("off", 0)):
+        attributes = SolverSettings(diffraction=name).attributes()
+        assert attributes["diffraction"] == number and "wedge" not in attributes
