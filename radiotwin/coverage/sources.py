@@ -14,7 +14,6 @@ from radiotwin.propagation.laws import channel_named
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.scene import Scene
-from radiotwin.scene.antennas import Antenna
 from radiotwin.twin import Twin
 from radiotwin.twin.model.model import FittedModel
 
@@ -98,7 +97,7 @@ def _source_of_law(kind: type[PublishedLaw], scene: Scene,
 
 
 def _source_of_paths(scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the sum of the powers of all paths, through the antennas; nothing is fitted."""
+    """Return the sum of the powers of all paths, each through the antenna; nothing is fitted."""
     def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
         from radiotwin.propagation.paths.powers import path_powers  # numba is large
 
@@ -108,26 +107,14 @@ def _source_of_paths(scene: Scene, transmitters: Sequence[Transmitter]) -> GainS
             ends_m = receiver_m[start:start + PATH_RECEIVERS]
             found = path_powers(scene.city, each.position_m, ends_m,
                                 float(each.frequency_hz or np.nan))
-            parts.append(found.total if each.antenna is None else
-                         _through_antenna(found.departures, found.total, each.antenna))
-        with np.errstate(divide="ignore"):
-            gain_db = 10 * np.log10(np.concatenate(parts))
-        return np.where(np.isfinite(gain_db), gain_db, np.nan), None
+            with np.errstate(divide="ignore"):
+                gain_db = 10 * np.log10(found.total)
+            if each.antenna is not None:
+                gain_db += found.directions.antenna_gain_db(len(ends_m), each.antenna)
+            parts.append(np.where(np.isfinite(gain_db), gain_db, np.nan))
+        return np.concatenate(parts), None
 
     return GainSource("raytrace: paths over the 3D map, powers added", predict)
-
-
-def _through_antenna(departures: np.ndarray, power: np.ndarray, antenna: Antenna) -> np.ndarray:
-    """Return the power (n,) of paths through an antenna, by their mean direction in each sector.
-
-    Args:
-        departures: (n, sectors, 3) power times direction, see `PathPowers`.
-        power: (n,) of all paths, from an isotropic antenna.
-        antenna: of the transmitter.
-    """
-    in_sector = np.linalg.norm(departures, axis=2)
-    weighted = in_sector * 10 ** (antenna.gain_dbi(departures) / 10)
-    return power * weighted.sum(axis=1) / np.maximum(in_sector.sum(axis=1), 1e-300)
 
 
 def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:

@@ -8,6 +8,7 @@ too, has the mean of the pattern. Where the paths over the map explain less than
 to the receiver, as over a map with guessed heights, the gain is that of the straight line.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -29,7 +30,7 @@ from radiotwin.effects.params import (
 )
 from radiotwin.effects.places import Correction, FoundAntenna
 from radiotwin.links import Links
-from radiotwin.propagation.laws.followed_paths import free_space, rays_of, through_antenna_db
+from radiotwin.propagation.laws.followed_paths import Rays
 
 MIN_LINKS = 100  # of a device whose antenna is looked for
 MIN_NATS = 4.0  # that a pattern must gain to be proposed
@@ -153,48 +154,44 @@ def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray,
         pattern: of the antenna.
     """
     max_db = pattern.front_to_back_db
-    # Rays come in single precision.
-    off = (np.asarray(azimuth_deg, dtype=float) - pattern.azimuth_deg + 180) % 360 - 180
-    above = np.asarray(elevation_deg, dtype=float) - pattern.tilt_deg
+    turn = azimuth_deg - pattern.azimuth_deg
+    off = turn - 360 * np.round(turn / 360)  # as of a remainder, which takes ten times as long
+    above = elevation_deg - pattern.tilt_deg
     horizontal_db = np.minimum(12 * (off / pattern.beamwidth_deg) ** 2, max_db)
     vertical_db = np.minimum(12 * (above / pattern.vertical_beamwidth_deg) ** 2, max_db)
     return -np.minimum(horizontal_db + vertical_db, max_db)
 
 
-class Rays(NamedTuple):
+class Departures(NamedTuple):
     """Directions in which links leave their device.
 
     Attributes:
-        power: (n, sectors) power gain of what leaves into each sector.
-        azimuth_deg, elevation_deg: (n, sectors) its direction.
-        free: (n,) power gain in free space; 0 where the straight line is all.
+        rays: at the device.
+        azimuth_deg, elevation_deg: (p,) of the rays.
     """
 
-    power: np.ndarray
+    rays: Rays
     azimuth_deg: np.ndarray
     elevation_deg: np.ndarray
-    free: np.ndarray
 
     @classmethod
-    def of(cls, links: Links, rows: np.ndarray, straight: bool) -> "Rays":
+    def of(cls, links: Links, rows: np.ndarray, straight: bool) -> "Departures":
         """Return those of some links, which are followed over the map unless they are straight."""
-        links = links.select(rows)
-        if straight or links.city is None:
-            return cls(np.ones((len(links), 1)), links.azimuth_deg[:, None],
-                       links.elevation_deg[:, None], np.zeros(len(links)))
-        ray = rays_of(links, "departures")
-        power = np.linalg.norm(ray, axis=2)
-        sine = ray[..., 2] / np.maximum(power, 1e-30)
-        return cls(power, np.degrees(np.arctan2(ray[..., 0], ray[..., 1])),
-                   np.degrees(np.arcsin(np.clip(sine, -1, 1))), free_space(links.geometry))
+        rays = Rays.of(links.select(rows), of_device=True, straight=straight)
+        east, north, up = rays.direction.T
+        return cls(rays, np.degrees(np.arctan2(east, north)),
+                   np.degrees(np.arcsin(np.clip(up, -1, 1))))
 
     def offset_db(self, pattern: SectorPattern) -> np.ndarray:
         """Return (n,) what a pattern adds to each link [dB]."""
-        gain = 10 ** (sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern) / 10)
+        gain = _linear(sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern))
         at_tilt = np.full(len(AROUND_DEG), pattern.tilt_deg)
-        mean_gain = np.mean(10 ** (sector_pattern_db(AROUND_DEG, at_tilt, pattern) / 10))
-        return through_antenna_db(self.power, gain, self.free * 10 ** (pattern.scattered_db / 10),
-                                  float(mean_gain))
+        mean_gain = np.mean(_linear(sector_pattern_db(AROUND_DEG, at_tilt, pattern)))
+        return self.rays.through_antenna_db(gain, pattern.scattered_db, float(mean_gain))
+
+
+def _linear(gain_db: np.ndarray) -> np.ndarray:
+    return np.exp(gain_db * (math.log(10) / 10))
 
 
 class SectorEffect(GainEffect):
@@ -227,9 +224,9 @@ class SectorEffect(GainEffect):
         for device, pattern in self.params.devices.items():
             rows = np.flatnonzero(links.device == device)
             if len(rows):
-                rays = self.of_links.get(links, (device, self.params.straight),
-                                      partial(Rays.of, links, rows, self.params.straight))
-                offset_db[rows] = rays.offset_db(pattern)
+                departures = self.of_links.get(links, (device, self.params.straight),
+                                      partial(Departures.of, links, rows, self.params.straight))
+                offset_db[rows] = departures.offset_db(pattern)
         return Term(offset_db, one_hot(links.device, list(self.params.devices)),
                     np.full(len(self.params.devices), LEVEL_SD_DB))
 

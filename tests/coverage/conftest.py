@@ -19,12 +19,13 @@ FREQUENCY_HZ = 2e9
 FREE_SPACE_AT_1_M_DB = 20 * math.log10(299_792_458.0 / FREQUENCY_HZ / (4 * math.pi))
 
 
-def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x, y: 0.0, terrain=False, **radio):
+def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x, y: 0.0, terrain=False,
+                ground="concrete", **radio):
     """Write a scene of flat or tilted ground, perhaps declared as terrain, with other shapes on it, about 47.5 N, 8.7 E."""
     corners = [(x, y, ground_z_m(x, y)) for x, y in ((-600, -600), (600, -600), (600, 600), (-600, 600))]
-    ground = trimesh.Trimesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)
+    mesh = trimesh.Trimesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)
     folder.mkdir(parents=True)
-    write_city(folder, [CityShape("ground", ground, itu_material("concrete")),
+    write_city(folder, [CityShape("ground", mesh, itu_material(ground)),
                         *(CityShape(f"house{i}", shape, itu_material("concrete")) for i, shape in enumerate(shapes))])
     config = {"name": "open", "origin": {"latitude_deg": 47.5, "longitude_deg": 8.7},
               "radio": {"frequency_hz": FREQUENCY_HZ, "tx_power_dbm": 30.0, "bandwidth_hz": 10e6, "noise_dbm": -95.0} | radio,

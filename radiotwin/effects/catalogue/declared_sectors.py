@@ -28,7 +28,7 @@ from radiotwin.effects.antennas import (
     MIN_LINKS,
     MIN_NATS,
     VERTICALS_DEG,
-    Rays,
+    Departures,
     SectorEffect,
     SectorPattern,
     allowed_of,
@@ -293,7 +293,7 @@ def _best_shape(view: ResidualView, devices: list[int],
         rows = subsample(every, MAX_PROPOSE_LINKS)
         if len(rows):
             parts.append((device, rows, np.full(len(rows), len(every) / len(rows)),
-                          Rays.of(view.links, rows, straight)))
+                          Departures.of(view.links, rows, straight)))
     rows, times = (np.concatenate([part[column] for part in parts]) for column in (1, 2))
     residual_db = view.residual_db[rows]
     weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])

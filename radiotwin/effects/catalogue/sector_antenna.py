@@ -12,7 +12,7 @@ from radiotwin.effects.antennas import (
     MAX_PROPOSE_LINKS,
     MIN_NATS,
     VERTICALS_DEG,
-    Rays,
+    Departures,
     SectorEffect,
     SectorPattern,
     eligible_devices,
@@ -111,7 +111,7 @@ def _best_patterns(view: ResidualView, devices: list[int],
 def _best_pattern(view: ResidualView, rows: np.ndarray,
                   straight: bool) -> tuple[SectorPattern, float]:
     """Return the pattern of a grid that fits links best, and its gain over a level alone [nats]."""
-    rays, residual_db = Rays.of(view.links, rows, straight), view.residual_db[rows]
+    rays, residual_db = Departures.of(view.links, rows, straight), view.residual_db[rows]
     weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
 
     def nats(offset_db: np.ndarray) -> float:

@@ -19,7 +19,7 @@ from radiotwin.effects.arrays import frequent_labels, squares_about_mean
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, quantity
 from radiotwin.links import Links
-from radiotwin.propagation.laws.followed_paths import free_space, rays_of, through_antenna_db
+from radiotwin.propagation.laws.followed_paths import Rays
 
 MIN_LINKS = 100  # of a receiver with line of sight, to propose its dipole
 MIN_NATS = 4.0  # that a dipole must gain to be proposed
@@ -51,7 +51,7 @@ def dipole_gain(ray: np.ndarray, axis: np.ndarray) -> np.ndarray:
     Returns:
         (…,) relative to an isotropic antenna.
     """
-    cosine = (ray * axis).sum(axis=-1)
+    cosine = np.einsum("...i,...i->...", ray, axis)
     # The wave's electric field lies in the vertical plane through the ray.
     flat = np.sqrt(np.maximum(1 - ray[..., 2] ** 2, 1e-9))
     along = (axis[..., 2] - ray[..., 2] * cosine) / flat
@@ -122,35 +122,25 @@ class _Arrivals(NamedTuple):
     """Directions from which links arrive at their receiver.
 
     Attributes:
-        ray: (n, sectors, 3) unit vectors towards where they come from, in the world.
-        power: (n, sectors) power gain.
+        rays: at the receiver.
         axes: (n, 3, 3) of the receiver, see `Links.receiver_axes`.
-        free: (n,) power gain in free space; 0 without a map, where the straight line is all.
     """
 
-    ray: np.ndarray
-    power: np.ndarray
+    rays: Rays
     axes: np.ndarray
-    free: np.ndarray
 
     @classmethod
     def of(cls, links: Links, rows: np.ndarray) -> "_Arrivals":
         """Return those of some links, which are followed over the map."""
         links = links.select(rows)
-        if links.city is None:
-            return cls(-_unit(links.offset_m)[:, None], np.ones((len(links), 1)),
-                       links.receiver_axes, free_space(links.geometry))
-        ray = rays_of(links, "arrivals")
-        power = np.linalg.norm(ray, axis=2)
-        return cls(ray / np.maximum(power, 1e-30)[..., None], power, links.receiver_axes,
-                   free_space(links.geometry))
+        return cls(Rays.of(links, of_device=False), links.receiver_axes)
 
     def offset_db(self, dipole: DipoleParams) -> np.ndarray:
         """Return (n,) what the dipole adds to each link [dB]."""
         axis = _axis(self.axes, dipole.tilt_deg, dipole.lean_azimuth_deg)
-        gain = dipole_gain(self.ray, axis[:, None])
-        scattered = self.free * 10 ** (dipole.scattered_db / 10)
-        return through_antenna_db(self.power, gain, scattered, MEAN_GAIN)
+        gain = dipole_gain(self.rays.direction,
+                           axis.astype(self.rays.direction.dtype)[self.rays.link])
+        return self.rays.through_antenna_db(gain, dipole.scattered_db, MEAN_GAIN)
 
 
 def _axis(axes: np.ndarray, tilt_deg: float, azimuth_deg: float) -> np.ndarray:

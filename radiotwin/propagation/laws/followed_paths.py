@@ -7,7 +7,9 @@ straight line only, as those of knife edges, which the caller adds.
 
 import time
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,18 +17,26 @@ from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkGeometry, Links
-from radiotwin.propagation.paths.powers import paths_with_points
+from radiotwin.propagation.paths.powers import (
+    COMPONENTS,
+    NO_DIRECTIONS,
+    PathDirections,
+    path_powers,
+    paths_with_points,
+)
 from radiotwin.runtime.compiled import njit
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.pieces import KeptParts, Piece
 from radiotwin.runtime.processes import in_threads
+from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import CityMap
 
 GRID_M = 0.5  # estimated positions of devices are rounded to it, and share their paths
-MAX_REMEMBERED = 300_000  # links: 200 MB
+MAX_REMEMBERED_BYTES = 3 * 10**8  # of paths: of 250,000 links in a city
 MIN_REMEMBERED = 2  # devices, however many links they have
 BATCH_LINKS = 50_000  # of devices that are followed side by side: 30 MB
 LINK_CHUNK = 1000  # whose paths are held before the weakest go: tens of megabytes
+UNIT_STEPS = 2**15 - 1  # of a component of a direction that is remembered: 0.002 degrees
 WEAKEST = 1e-3  # of a link's strongest path: most are weaker, and together they carry little
 MIN_STEP_M = 1e-9  # a shorter leg along an axis is none along it
 
@@ -36,8 +46,6 @@ def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> 
 
     Kinds are components of `radiotwin.propagation.paths.PathPowers`; None: all.
     """
-    from radiotwin.propagation.paths.powers import COMPONENTS  # late: numba is large
-
     columns = [COMPONENTS.index(kind) for kind in (COMPONENTS if kinds is None else kinds)]
     power = np.zeros(len(geometry))
     for rows, followed, index in _by_device(geometry):
@@ -50,8 +58,6 @@ def interaction_gains(geometry: LinkGeometry) -> np.ndarray:
 
     A path with an edge is diffracted, whatever else it has.
     """
-    from radiotwin.propagation.paths.powers import COMPONENTS
-
     diffracted = np.array(["diffracted" in kind for kind in COMPONENTS])
     direct = np.array([kind == "direct" for kind in COMPONENTS])
     power = np.zeros((len(geometry), 3))
@@ -62,17 +68,44 @@ def interaction_gains(geometry: LinkGeometry) -> np.ndarray:
     return power
 
 
-def rays_of(links: Links, end: str) -> np.ndarray:
-    """Return power times direction of the paths at one end of links, (n, sectors, 3).
+def paths_of(geometry: LinkGeometry) -> PathDirections:
+    """Return power and directions of the single paths of links."""
+    parts = [NO_DIRECTIONS]
+    for rows, followed, index in _by_device(geometry):
+        some = followed.paths.of_links(index)
+        parts.append(some._replace(link=rows[some.link].astype(np.int32)))
+    joined = PathDirections.joined(parts)
+    scale = np.float32(1 / UNIT_STEPS)
+    return joined._replace(departure=joined.departure * scale, arrival=joined.arrival * scale)
 
-    `departures` or `arrivals`, see `radiotwin.propagation.paths.PathPowers`.
+
+def antenna_gain_db(geometry: LinkGeometry, device_antennas: Sequence[Antenna | None],
+                    receiver_antenna: Antenna | None = None) -> np.ndarray:
+    """Return what declared antennas add to links (n,) [dB].
+
+    Each path has the gains of the directions in which it leaves and arrives. Without a map, or
+    where there is no path, they are those of the straight line.
+
+    Args:
+        geometry: of the links.
+        device_antennas: of each device by its row; None: isotropic.
+        receiver_antenna: of all receivers; None: isotropic.
     """
-    from radiotwin.propagation.paths.powers import SECTORS
-
-    rays = np.zeros((len(links), SECTORS, 3), dtype=np.float32)
-    for rows, followed, index in _by_device(links.geometry):
-        rays[rows] = getattr(followed, end)[index]
-    return rays
+    gain_db = np.zeros(len(geometry))
+    for device in np.unique(geometry.device).tolist():
+        antenna = device_antennas[device]
+        if antenna is None and receiver_antenna is None:
+            continue
+        rows = np.flatnonzero(geometry.device == device)
+        links = geometry.select(rows)
+        straight_m = links.receiver_m - links.device_m
+        for end, way_m in ((antenna, straight_m), (receiver_antenna, -straight_m)):
+            if end is not None:
+                gain_db[rows] += end.gain_dbi(way_m)
+        if geometry.city is not None:
+            along_db = paths_of(links).antenna_gain_db(len(rows), antenna, receiver_antenna)
+            gain_db[rows] = np.where(np.isfinite(along_db), along_db, gain_db[rows])
+    return gain_db
 
 
 def free_space(geometry: LinkGeometry) -> np.ndarray:
@@ -85,15 +118,64 @@ def free_space(geometry: LinkGeometry) -> np.ndarray:
     return (speed_of_light / geometry.frequency_hz / (4 * np.pi * geometry.distance_m)) ** 2
 
 
-def through_antenna_db(power: np.ndarray, gain: np.ndarray, scattered: np.ndarray,
-                       mean_gain: float) -> np.ndarray:
-    """Return what an antenna adds to links (n,) [dB].
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Directions in which the paths of n links leave one of their ends.
 
-    Rays have a power, and the antenna a linear gain in their directions, (n, sectors); scattered
-    power (n,) comes from everywhere, so that the mean gain over all directions applies to it.
+    Attributes:
+        link: (p,) row of the link, ascending.
+        power: (p,) power gain.
+        direction: (p, 3) unit vectors from that end along the path.
+        free: (n,) power gain in free space; 0 where the straight line is all that is known.
     """
-    received = (power * gain).sum(axis=1) + scattered * mean_gain
-    return 10 * np.log10(received / (power.sum(axis=1) + scattered))
+
+    link: np.ndarray
+    power: np.ndarray
+    direction: np.ndarray
+    free: np.ndarray
+
+    @classmethod
+    def of(cls, links: Links, of_device: bool, straight: bool = False) -> "Rays":
+        """Return those at the devices or at the receivers of links.
+
+        Without a map, or if `straight`, each link has one, along the straight line.
+        """
+        if straight or links.city is None:
+            way_m = links.offset_m if of_device else -links.offset_m
+            length_m = np.maximum(np.linalg.norm(way_m, axis=1, keepdims=True), 1e-9)
+            return cls(np.arange(len(links)), np.ones(len(links)), way_m / length_m,
+                       np.zeros(len(links)))
+        paths = paths_of(links.geometry)
+        return cls(paths.link, paths.power, paths.departure if of_device else paths.arrival,
+                   free_space(links.geometry))
+
+    @cached_property
+    def _reached(self) -> tuple[np.ndarray, np.ndarray]:
+        """Links that have rays, and the first ray of each."""
+        return np.unique(self.link, return_index=True)
+
+    @cached_property
+    def _isotropic(self) -> np.ndarray:
+        return self._sums(self.power)
+
+    def _sums(self, power: np.ndarray) -> np.ndarray:
+        """Return the sums (n,) over the rays (p,) of each link."""
+        sums, (reached, first) = np.zeros(len(self.free)), self._reached
+        sums[reached] = np.add.reduceat(power, first, dtype=float)  # a third of bincount's time
+        return sums
+
+    def through_antenna_db(self, gain: np.ndarray, scattered_db: float,
+                           mean_gain: float) -> np.ndarray:
+        """Return what an antenna adds to the links (n,) [dB].
+
+        Args:
+            gain: (p,) of the antenna in the directions of the rays, linear.
+            scattered_db: power that comes from everywhere, under that in free space [dB].
+            mean_gain: of the antenna over all directions, which applies to it, linear.
+        """
+        scattered = self.free * 10 ** (scattered_db / 10)
+        received = self._sums(self.power * gain) + scattered * mean_gain
+        return 10 * np.log10(received / (self._isotropic + scattered))
 
 
 class _Followed(NamedTuple):
@@ -102,17 +184,29 @@ class _Followed(NamedTuple):
     Attributes:
         ends: (n,) keys of the ends, sorted.
         powers: (n, kinds)
-        departures, arrivals: (n, sectors, 3)
+        paths: of rows of the ends; directions times `UNIT_STEPS`, int16.
     """
 
     ends: np.ndarray
     powers: np.ndarray
-    departures: np.ndarray
-    arrivals: np.ndarray
+    paths: PathDirections
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes [bytes]."""
+        return sum(each.nbytes for each in (self.ends, self.powers, *self.paths))
+
+    def and_others(self, other: "_Followed") -> "_Followed":
+        """Return these paths and those to other ends."""
+        ends = np.concatenate([self.ends, other.ends])
+        order = np.argsort(ends)
+        others = other.paths._replace(link=other.paths.link + np.int32(len(self.ends)))
+        return _Followed(ends[order], np.concatenate([self.powers, other.powers])[order],
+                         PathDirections.joined([self.paths, others]).of_links(order))
 
 
 _Position = tuple[float, float, float]  # [m]
-_NewPaths = tuple[np.ndarray, np.ndarray, np.ndarray]
+_NewPaths = tuple[np.ndarray, PathDirections]  # as of `_Followed`
 
 _remembered: OrderedDict[tuple[CityMap, _Position, float], _Followed] = OrderedDict()
 
@@ -147,11 +241,8 @@ def followed_from_m(geometry: LinkGeometry, row: int) -> _Position:
 def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
             frequency_hz: float) -> list[tuple[_Followed, np.ndarray]]:
     """Return the paths from positions to ends (n, 3) of each, and the row of each end."""
-    from radiotwin.propagation.paths.powers import COMPONENTS, SECTORS
-
-    no_rays = np.zeros((0, SECTORS, 3), dtype=np.float32)
-    nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))), no_rays,
-                        no_rays)
+    nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))),
+                        _packed(NO_DIRECTIONS))
     keys = [_keys(ends_m) for _, ends_m in wanted]
     # Sectors of one mast are at one place: what one has followed serves the others.
     at: dict[_Position, list[int]] = {}
@@ -169,14 +260,11 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
             missing[position_m] = new, (position_m, ends_m[unknown][first])
     followed = _new_paths(city, [asked for _, asked in missing.values()], frequency_hz)
     for (position_m, (new, _)), found in zip(missing.items(), followed, strict=True):
-        old = known[position_m]
-        order = np.argsort(np.concatenate([old.ends, new]))
-        known[position_m] = _Followed(*(np.concatenate([each, more])[order]
-                                        for each, more in zip(old, (new, *found), strict=True)))
+        known[position_m] = known[position_m].and_others(_Followed(new, *found))
     for position_m, each in known.items():
         _remembered[city, position_m, frequency_hz] = each
     while len(_remembered) > MIN_REMEMBERED \
-            and sum(len(each.ends) for each in _remembered.values()) > MAX_REMEMBERED:
+            and sum(each.nbytes for each in _remembered.values()) > MAX_REMEMBERED_BYTES:
         _remembered.popitem(last=False)
     return [(known[position_m], np.searchsorted(known[position_m].ends, ends))
             for (position_m, _), ends in zip(wanted, keys, strict=True)]
@@ -184,26 +272,27 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
 
 def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
                frequency_hz: float) -> list[_NewPaths]:
-    """Return powers, departures and arrivals as of `_Followed` from positions to ends (n, 3)."""
+    """Return powers and paths as of `_Followed` from positions to ends (n, 3)."""
     if not asked:  # as most often: no bar, and no numba, for what is remembered
         return []
-    from radiotwin.propagation.paths.powers import COMPONENTS, SECTORS, path_powers
-
     def follow(number: int) -> _NewPaths:
         position_m, ends_m = asked[number]
         found = path_powers(city, np.array(position_m), ends_m, frequency_hz)
-        powers = np.column_stack([getattr(found, name) for name in COMPONENTS])
-        return powers, found.departures.astype(np.float32), found.arrivals.astype(np.float32)
+        return np.column_stack([getattr(found, name) for name in COMPONENTS]), \
+            _packed(found.directions)
 
     def write(found: _NewPaths) -> Piece:
-        return dict(zip(_Followed._fields[1:], found, strict=True)), None
+        return {"powers": found[0], **found[1]._asdict()}, None
 
     def read(arrays: dict[str, np.ndarray], _: Any) -> _NewPaths:
-        values = arrays["powers"], arrays["departures"], arrays["arrivals"]
-        ends = len(values[0])
-        if [each.shape for each in values] != [(ends, len(COMPONENTS)), *[(ends, SECTORS, 3)] * 2]:
-            raise ValueError("other shapes")
-        return values
+        powers, paths = arrays.pop("powers"), PathDirections(**arrays)
+        link, count = paths.link, len(paths.link)
+        if powers.shape[1:] != (len(COMPONENTS),) \
+                or [each.shape for each in paths] != [(count,), (count,), *[(count, 3)] * 2] \
+                or (count and not 0 <= link[0] <= link[-1] < len(powers)) \
+                or (np.diff(link) < 0).any():
+            raise ValueError("other shapes, or links that do not ascend")
+        return powers, paths
 
     parts: KeptParts[int, _NewPaths] = KeptParts(
         "paths", lambda number: (city, *asked[number], frequency_hz), write, read)
@@ -225,6 +314,12 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
             parts.put(number, value, [], seconds)
             found[number] = value
     return [found[number] for number in range(len(asked))]
+
+
+def _packed(paths: PathDirections) -> PathDirections:
+    """Return paths with directions times `UNIT_STEPS`, in half of the memory."""
+    return paths._replace(**{end: np.round(getattr(paths, end) * UNIT_STEPS).astype(np.int16)
+                             for end in ("departure", "arrival")})
 
 
 def _keys(positions_m: np.ndarray) -> np.ndarray:

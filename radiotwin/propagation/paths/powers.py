@@ -1,6 +1,6 @@
 """Power of the paths between devices and receivers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -13,13 +13,14 @@ from radiotwin.propagation.paths.fields import path_gains
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
 from radiotwin.propagation.paths.interactions import LUEBBERS, SIONNA, Slabs, slabs_of
 from radiotwin.propagation.paths.two_edges import paths_over_two_edges, two_edge_gains
+from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import CityMap
 
 WEDGES = {"luebbers": LUEBBERS, "sionna": SIONNA}
 PATH_CHUNK = 50_000  # paths at once: about 30 MB
 DARK_CHUNK = 100  # receivers at once that only two edges may reach
 DEPTH = 4  # interactions of a path at most
-SECTORS = 24  # of azimuth, 15 degrees each
+NEGLECTED = 1e-5  # of a link's power, carried by its weakest paths, whose directions are not kept
 
 
 class PathsWithPoints(NamedTuple):
@@ -36,6 +37,59 @@ class PathsWithPoints(NamedTuple):
     power: np.ndarray
     points_m: np.ndarray
     points: np.ndarray
+
+
+class PathDirections(NamedTuple):
+    """Power and directions of single paths, for antennas, by ascending link.
+
+    The weakest paths of a link, which carry less than `NEGLECTED` of its power together, are left
+    out: 0.04 dB at most, with an antenna whose gain varies by 30 dB over the paths of the link.
+
+    Attributes:
+        link: (p,) int32 row of the link.
+        power: (p,) float32 linear gain between isotropic antennas.
+        departure: (p, 3) float32 unit vectors from the device along the path.
+        arrival: (p, 3) float32 unit vectors from the receiver along the path.
+    """
+
+    link: np.ndarray
+    power: np.ndarray
+    departure: np.ndarray
+    arrival: np.ndarray
+
+    @classmethod
+    def joined(cls, parts: Sequence["PathDirections"]) -> "PathDirections":
+        """Return the paths of several parts, by ascending link."""
+        link = np.concatenate([part.link for part in parts])
+        order = np.argsort(link, kind="stable")
+        return cls(*(np.concatenate(each)[order] for each in zip(*parts, strict=True)))
+
+    def of_links(self, rows: np.ndarray) -> "PathDirections":
+        """Return the paths of some links (r,), each with its place among them as the link."""
+        first, end = (np.searchsorted(self.link, rows, side) for side in ("left", "right"))
+        count = end - first
+        # The k-th path of the part is the k-th of its link after the paths of the links before
+        path = np.arange(count.sum()) + np.repeat(first - (np.cumsum(count) - count), count)
+        return PathDirections(np.repeat(np.arange(len(rows), dtype=np.int32), count),
+                              *(each[path] for each in self[1:]))
+
+    def antenna_gain_db(self, links: int, device_antenna: Antenna | None,
+                        receiver_antenna: Antenna | None = None) -> np.ndarray:
+        """Return what antennas at the ends add to links (links,) [dB]; NaN where there is no path.
+
+        Each path has the gains of its own directions, and stays vertically polarised.
+        """
+        gain_dbi = np.zeros(len(self.link))
+        for antenna, ray in ((device_antenna, self.departure), (receiver_antenna, self.arrival)):
+            if antenna is not None:
+                gain_dbi += antenna.gain_dbi(ray)
+        with np.errstate(invalid="ignore"):
+            return 10 * np.log10(np.bincount(self.link, self.power * 10 ** (gain_dbi / 10), links)
+                                 / np.bincount(self.link, self.power, links))
+
+
+NO_DIRECTIONS = PathDirections(np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.float32),
+                               *np.zeros((2, 0, 3), dtype=np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +109,7 @@ class PathPowers:
         reflected_diffracted: one diffraction, and reflections before or after it.
         diffracted_2: diffractions at two edges; looked for where there is no other path.
         ground: one reflection, by the ground: z = 0, or a triangle of the terrain.
-        departures: (n, SECTORS, 3) power times the unit vector from the device along the path,
-            summed over the paths that leave the device in each sector of azimuth; the first
-            sector begins at east, they go on counter-clockwise.
-        arrivals: (n, SECTORS, 3) the same at the receiver, from the receiver along the path.
+        directions: of the single paths.
     """
 
     direct: np.ndarray
@@ -69,8 +120,7 @@ class PathPowers:
     reflected_diffracted: np.ndarray
     diffracted_2: np.ndarray
     ground: np.ndarray
-    departures: np.ndarray
-    arrivals: np.ndarray
+    directions: PathDirections
 
     @property
     def total(self) -> np.ndarray:
@@ -78,7 +128,7 @@ class PathPowers:
         return np.sum([getattr(self, name) for name in COMPONENTS], axis=0)
 
 
-COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
+COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-1]
 
 
 def path_powers(
@@ -114,10 +164,9 @@ def path_powers(
     wave_number = 2 * np.pi * frequency_hz / speed_of_light
     powers = np.zeros((len(COMPONENTS), len(receiver_m)))
     powers[0] = _direct(city, device_m, receiver_m, wave_number)
-    departures, arrivals = np.zeros((2, len(receiver_m), SECTORS, 3))
-    straight_m = receiver_m - device_m
-    _add_rays(departures, np.arange(len(receiver_m)), straight_m, powers[0])
-    _add_rays(arrivals, np.arange(len(receiver_m)), -straight_m, powers[0])
+    seen = np.flatnonzero(powers[0])
+    straight_m = receiver_m[seen] - device_m
+    directions = [_directions(seen, powers[0, seen], straight_m, -straight_m)]
     search = candidate_search(city, depth)
     buffer = PathBuffer.allocate(PATH_CHUNK)
     slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
@@ -128,21 +177,21 @@ def path_powers(
         link, points_m = buffer.receiver[clear], buffer.points_m[clear]
         last, path = buffer.count[clear] - 1, np.arange(len(clear))
         np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
-        _add_rays(departures, link, points_m[:, 1] - points_m[:, 0], gain)
-        _add_rays(arrivals, link, points_m[path, last - 1] - points_m[path, last], gain)
+        directions.append(_directions(link, gain, points_m[:, 1] - points_m[:, 0],
+                                      points_m[path, last - 1] - points_m[path, last]))
     dark = np.flatnonzero(powers.sum(axis=0) == 0)
-    seen = np.unique(candidates.edge[(candidates.before[:, 0] < 0)])
+    edges = np.unique(candidates.edge[(candidates.before[:, 0] < 0)])
     for first in range(0, len(dark) if depth > 1 else 0, DARK_CHUNK):
         part = dark[first:first + DARK_CHUNK]
-        pairs = paths_over_two_edges(city, search.surfaces, search.facet_edges, seen, device_m,
+        pairs = paths_over_two_edges(city, search.surfaces, search.facet_edges, edges, device_m,
                                      receiver_m[part])
         gain = two_edge_gains(search.surfaces, wave_number, slabs, WEDGES[wedge], pairs.edge,
                               pairs.points_m)
         link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)
         np.add.at(powers, (COMPONENTS.index("diffracted_2"), link), gain)
-        _add_rays(departures, link, legs_m[:, 0], gain)
-        _add_rays(arrivals, link, -legs_m[:, 2], gain)
-    return PathPowers(*powers, departures, arrivals)  # type: ignore[call-arg]  # a row a kind
+        directions.append(_directions(link, gain, legs_m[:, 0], -legs_m[:, 2]))
+    return PathPowers(*powers, _strongest(  # type: ignore[call-arg]  # a row a kind
+        PathDirections.joined(directions), len(receiver_m)))
 
 
 def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
@@ -183,12 +232,25 @@ def clear_paths_gains(
                                 clear)
 
 
-def _add_rays(sums: np.ndarray, link: np.ndarray, ray_m: np.ndarray, power: np.ndarray) -> None:
-    """Add power times direction of rays (p, 3) of links (p,) to sums (n, SECTORS, 3)."""
-    azimuth_rad = np.arctan2(ray_m[:, 1], ray_m[:, 0]) % (2 * np.pi)
-    sector = (azimuth_rad * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
-    length_m = np.maximum(np.linalg.norm(ray_m, axis=1, keepdims=True), 1e-9)
-    np.add.at(sums, (link, sector), ray_m / length_m * power[:, None])
+def _directions(link: np.ndarray, power: np.ndarray, departure_m: np.ndarray,
+                arrival_m: np.ndarray) -> PathDirections:
+    """Return paths (p,) of links by their first and last legs (p, 3), each away from its end."""
+    departure, arrival = (
+        (leg_m / np.maximum(np.linalg.norm(leg_m, axis=1, keepdims=True), 1e-9)).astype(np.float32)
+        for leg_m in (departure_m, arrival_m))
+    return PathDirections(link.astype(np.int32), power.astype(np.float32), departure, arrival)
+
+
+def _strongest(paths: PathDirections, links: int) -> PathDirections:
+    """Return paths without the weakest, which carry less than `NEGLECTED` of a link together."""
+    total = np.bincount(paths.link, paths.power, links)
+    share = paths.power / np.maximum(total, 1e-300)[paths.link]
+    order = np.lexsort((share, paths.link))
+    upto = np.cumsum(share[order])
+    before = np.concatenate([[0.0], upto])[np.searchsorted(paths.link, paths.link)]
+    kept = np.zeros(len(share), dtype=bool)
+    kept[order] = upto - before > NEGLECTED
+    return PathDirections(*(each[kept] for each in paths))
 
 
 def _direct(

@@ -7,7 +7,6 @@ import trimesh
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws import followed_paths
 from radiotwin.propagation.laws.followed_paths import path_gains
-from radiotwin.propagation.paths import powers
 from radiotwin.runtime.pieces import keep_pieces
 from radiotwin.scene.citymap import CityMap
 
@@ -50,20 +49,20 @@ def test_several_devices_are_followed_as_each_by_itself(geometry, monkeypatch, t
 
 def test_what_is_remembered_is_bounded(geometry, monkeypatch):
     followed_paths._remembered.clear()
-    monkeypatch.setattr(followed_paths, "MAX_REMEMBERED", 0)
+    monkeypatch.setattr(followed_paths, "MAX_REMEMBERED_BYTES", 0)
     path_gains(geometry)
     assert len(followed_paths._remembered) == followed_paths.MIN_REMEMBERED
 
 
 def test_sectors_of_one_mast_are_followed_once(geometry, monkeypatch):
     """Two of the devices stand at one place; each had the other's paths forgotten."""
-    asked, follow = [], powers.path_powers
+    asked, follow = [], followed_paths.path_powers
 
     def spied(city, device_m, receiver_m, *more):
         asked.append(len(receiver_m))
         return follow(city, device_m, receiver_m, *more)
 
-    monkeypatch.setattr(powers, "path_powers", spied)
+    monkeypatch.setattr(followed_paths, "path_powers", spied)
     followed_paths._remembered.clear()
     first = path_gains(geometry)
     assert len(asked) == PLACES and sum(asked) == len(geometry)

@@ -7,7 +7,7 @@ from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.propagation.paths import path_powers
-from radiotwin.propagation.paths.powers import COMPONENTS
+from radiotwin.propagation.paths.powers import COMPONENTS, PathDirections
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import itu_material
 from tests.propagation.links import powers_of_links
@@ -37,19 +37,35 @@ def test_one_wall(city_of, line_of_slab):
 
 
 def test_directions_of_departure_and_arrival(city_of):
-    """The same wall: the direct ray leaves northwards, the reflected one north-eastwards; both with their power."""
+    """The same wall: straight north, off the wall by north-east, off the ground 20 m below; each with its power."""
     powers = path_powers(city_of((10, -200, 12, 200, 50)), [0, 0, 20], [[0, 20.0, 20]], FREQUENCY_HZ, depth=1)
-    diagonal = np.sqrt(0.5)
-    for rays, north in ((powers.departures[0], 1), (powers.arrivals[0], -1)):
-        level = rays[np.abs(rays[:, 2]) < 1e-3 * np.abs(rays).max(axis=1)]
-        found = sorted(level[np.abs(level).max(axis=1) > 0].tolist(), key=lambda ray: ray[0])
-        expected = diagonal * powers.reflected_1[0] * np.array([1, north, 0])
-        # The ray off the ground leaves in the direct ray's sector, downwards.
-        ground = rays[np.abs(rays[:, 2]).argmax()]
-        assert ground[2] < 0 and np.linalg.norm(ground) <= powers.direct[0] + powers.ground[0]
-        np.testing.assert_allclose(found[-1], expected, rtol=1e-4, atol=1e-12)
-        down = powers.ground[0] / np.hypot(20, 40) * np.array([20, 40])
-        np.testing.assert_allclose(ground[1:], [north * (powers.direct[0] + down[0]), -down[1]], rtol=1e-4)
+    diagonal, down = np.sqrt(0.5), np.array([1, 2]) / np.sqrt(5)
+    kinds = powers.direct[0], powers.reflected_1[0], powers.ground[0]
+    expected = [[0, 1, 0], [diagonal, diagonal, 0], [0, down[0], -down[1]]]
+    paths = powers.directions
+    for power, departure in zip(kinds, expected, strict=True):
+        path, = np.flatnonzero(np.isclose(paths.power, power, rtol=1e-6))
+        np.testing.assert_allclose(paths.departure[path], departure, atol=1e-6)
+        np.testing.assert_allclose(paths.arrival[path], np.array(departure) * [1, -1, 1], atol=1e-6)
+    assert paths.power.sum() == pytest.approx(powers.total[0], rel=1e-5) and not paths.link.any()
+
+
+def test_only_the_weakest_directions_are_left_out(town, links):
+    """Those of a link carry less than a hundred-thousandth of its power together."""
+    device_m, receiver_m, device = links
+    powers = powers_of_links(town(), device_m, receiver_m, device)
+    kept = np.bincount(powers.directions.link, powers.directions.power, len(receiver_m))
+    reached = powers.total > 0
+    assert (np.abs(kept / powers.total - 1)[reached] < 1.1e-5).all() and not kept[~reached].any()
+    assert (np.diff(powers.directions.link) >= 0).all()
+
+
+def test_directions_of_some_links():
+    link = np.array([0, 0, 2, 3, 3, 3])
+    every = PathDirections(link, np.arange(6.0), *np.zeros((2, 6, 3)))
+    some = every.of_links(np.array([3, 1, 0, 3]))
+    assert some.link.tolist() == [0, 0, 0, 2, 2, 3, 3, 3]
+    assert some.power.tolist() == [3, 4, 5, 0, 1, 3, 4, 5]
 
 
 def test_only_the_ground(line_of_slab):
@@ -132,7 +148,10 @@ def test_powers_are_reciprocal(town, links):
     few = np.arange(8)
     back = powers_of_links(town(0.3), receiver_m[few], device_m[device[few]], few, depth=2)
     assert np.allclose(stacked(there)[:, few], stacked(back), rtol=1e-6, atol=1e-16)
-    assert np.allclose(there.departures[few], back.arrivals, rtol=1e-6, atol=1e-16)
+    forth, back_again = there.directions.of_links(few), back.directions
+    sums = [[np.bincount(paths.link, paths.power * way[:, axis], len(few)) for axis in range(3)]
+            for paths, way in ((forth, forth.departure), (back_again, back_again.arrival))]
+    assert np.allclose(*sums, rtol=1e-4, atol=1e-14)
 
 
 def test_chunks_change_nothing(town, links, monkeypatch):

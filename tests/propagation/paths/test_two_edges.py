@@ -128,4 +128,4 @@ def test_only_where_nothing_else_arrives():
     receiver_m = np.array([RECEIVER_M, [230.0, 0, 60]])
     powers = path_powers(two_roofs(30, 34), DEVICE_M, receiver_m, FREQUENCY_HZ)
     assert (powers.diffracted_2 > 0).tolist() == [True, False] and powers.total[1] > powers.total[0] > 0
-    assert np.linalg.norm(powers.departures[0].sum(axis=0)) == pytest.approx(powers.total[0])
+    assert powers.directions.of_links(np.array([0])).power.sum() == pytest.approx(powers.total[0])
