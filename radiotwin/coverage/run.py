@@ -162,11 +162,14 @@ def _check_outdoors(transmitters: list[Transmitter], scene: Scene) -> None:
     """Raise BadInput about a transmitter inside a building; a scene's own are checked before."""
     for each in transmitters:
         x_m, y_m, z_m = each.position_m
-        if scene.city.inside(each.position_m[None])[0]:
+        where = str(scene.city.misplaced(each.position_m)[0])
+        if where:
             top_m = float(scene.city.height_at(x_m, y_m))
-            raise BadInput(f"transmitter {each.name!r} at ({x_m:g}, {y_m:g}, {z_m:g}) m is inside "
-                           f"a building {top_m:.1f} m high; move it, or put it on the roof (z_m > "
-                           f"{top_m:.1f})")
+            raise BadInput(f"transmitter {each.name!r} at ({x_m:g}, {y_m:g}, {z_m:g}) m is {where}"
+                           + (f" {top_m:.1f} m high; move it, or put it on the roof (z_m > "
+                              f"{top_m:.1f})" if where == "inside a building" else
+                              "; z_m counts from the datum: raise it" if where == "below the ground"
+                              else " of the city; move it 0.01 m or more off it"))
 
 
 def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Transmitter],

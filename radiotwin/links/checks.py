@@ -257,10 +257,9 @@ def refuse_misplaced_anchors(links: Links, scene: Scene) -> None:
         raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} is more "
                        f"than {MAX_APART_M / 1000:g} km from the middle of the receivers; both "
                        "need one frame, in metres")
-    for index in anchors[scene.city.inside(links.device_m[anchors])]:
+    misplaced = scene.city.misplaced(links.device_m[anchors])
+    for index, where in zip(anchors[misplaced != ""], misplaced[misplaced != ""]):
         x_m, y_m, z_m = links.device_m[index]
-        below = scene.city.below_ground(links.device_m[[index]])[0]
-        where = "below the ground" if below else "inside a building"
         raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} at "
                        f"({x_m:g}, {y_m:g}, {z_m:g}) m is {where} of the scene; correct "
                        "its position, or the scene's frame")

@@ -30,6 +30,7 @@ from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import connected
 from radiotwin.scene.vegetation import Vegetation
 
+ON_SURFACE_M = 1e-3  # closer to a surface an antenna is on it [m]
 SKIN_M = 0.01  # step past a surface before the next is looked for [m]
 GROUND_M = 0.05  # faces this close to z = 0 are the ground [m]
 SIGHT_CHUNK = 1 << 16  # lines of sight of one thread at a time
@@ -266,6 +267,21 @@ class CityMap:
             (n,) bool
         """
         return self._depth(np.atleast_2d(np.asarray(points_m, dtype=float))) > 0
+
+    def misplaced(self, points_m: np.ndarray) -> np.ndarray:
+        """Return why no antenna can be at points (n, 3) [m], empty where one can, (n,) str.
+
+        It is `below the ground`, `inside a building`, or `on a surface`: within `ON_SURFACE_M` of a
+        wall, a roof or the ground, where rays would begin on either side of it.
+        """
+        points_m = np.atleast_2d(np.asarray(points_m, dtype=float))
+        inside = self.inside(points_m)
+        on, below = np.zeros_like(inside), np.zeros_like(inside)
+        below[inside] = self.below_ground(points_m[inside])
+        for step_m in np.concatenate([np.eye(3), -np.eye(3)]) * ON_SURFACE_M:
+            on[inside] |= ~self.inside(points_m[inside] + step_m)
+        return np.select([on, below, inside],
+                         ["on a surface", "below the ground", "inside a building"], default="")
 
     def metres_inside(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Return the length of each segment that lies within buildings.

@@ -302,15 +302,20 @@ class Scene(Summarised):
     def _check_devices(self) -> None:
         """Raise BadInput if a device or an end of a flight is in a building or the ground."""
         path = self.folder / "scene.toml"
-        for device, bad in zip(self.config.devices, self.city.inside(self.device_m)):
-            if bad and self.city.below_ground(np.array([[device.x_m, device.y_m, device.z_m]]))[0]:
+        for device, where in zip(self.config.devices, self.city.misplaced(self.device_m)):
+            if where == "on a surface":
+                raise BadInput(
+                    f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
+                    f"{device.z_m:g}) m is on a surface of the city, from where rays would begin "
+                    "on either side of it; move it 0.01 m or more off the wall, roof or ground")
+            if where == "below the ground":
                 ground_m = float(self.city.ground_height_m(device.x_m, device.y_m))
                 raise BadInput(
                     f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
                     f"{device.z_m:g}) m is below the ground, which is {ground_m:.1f} m above the "
                     "datum there; z_m counts from the datum: raise it, or give above_ground_m "
                     "instead")
-            if bad:
+            if where:
                 top_m = float(self.city.height_at(device.x_m, device.y_m))
                 raise BadInput(
                     f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
@@ -321,13 +326,10 @@ class Scene(Summarised):
                 for end, x_m, y_m in (("start", uav.start_x_m, uav.start_y_m),
                                       ("terminal", uav.terminal_x_m, uav.terminal_y_m))]
         points_m = np.array([point_m for *_, point_m in ends], dtype=float).reshape(-1, 3)
-        for (uav, end, (x_m, y_m, z_m)), bad in zip(ends, self.city.inside(points_m)):
-            if bad:
-                below = self.city.below_ground(np.array([[x_m, y_m, z_m]]))[0]
-                raise BadInput(
-                    f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, {z_m:g}) m is "
-                    f"{'below the ground' if below else 'inside a building'}; move it or raise "
-                    "altitude_m")
+        for (uav, end, (x_m, y_m, z_m)), where in zip(ends, self.city.misplaced(points_m)):
+            if where:
+                raise BadInput(f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, {z_m:g}) m "
+                               f"is {where}; move it or raise altitude_m")
 
     def content_hash(self) -> str:
         """Return the SHA-256 of all inputs of a gain map.

@@ -7,6 +7,7 @@ import trimesh
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.presets import building_meshes, preset_boxes
+from tests.terrains import incline, terrain_map
 
 
 def city_of(boxes) -> CityMap:
@@ -78,6 +79,16 @@ def test_inside_and_height_equal_exact_boxes():
     city = city_of(boxes)
     np.testing.assert_allclose(city.height_at(points_m[:, 0], points_m[:, 1]), height_m, atol=0.01)
     np.testing.assert_array_equal(city.inside(points_m)[far_from_roof], (points_m[:, 2] < height_m)[far_from_roof])
+
+
+def test_an_antenna_on_a_wall_or_below_the_terrain_is_not_inside_a_building():
+    box = trimesh.creation.box(bounds=[[-10, -10, 0], [10, 10, 20]])
+    box.apply_translation([0, 0, 100])
+    city = terrain_map(incline(0.0, 0.0), building=box)
+    walls = [(10, 3, 105), (-10, 3, 105), (3, 10, 105), (3, -10, 105), (10, 10, 105), (3, 4, 120)]
+    assert set(city.misplaced(walls)) == {"on a surface"}
+    others = {(50, 0, 90): "below the ground", (0, 0, 105): "inside a building", (50, 0, 101): "", (0, 0, 120.02): ""}
+    assert city.misplaced(list(others)).tolist() == list(others.values())
 
 
 def test_a_shell_without_a_bottom_is_a_building():

@@ -9,19 +9,22 @@ import pytest
 import trimesh
 from scipy.special import modfresnelm
 
+from radiotwin.coverage import CoverageSettings, Transmitter, predict_coverage
 from radiotwin.errors import BadInput
+from radiotwin.propagation.paths.listing import list_paths
 from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import Material
-from radiotwin.trace import mended
+from radiotwin.trace import mended, trace_gains
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains
+from tests.coverage.conftest import write_scene
 
 FREQUENCY_HZ = 2.4e9
 WAVELENGTH_M = 299_792_458.0 / FREQUENCY_HZ
 K = 2 * np.pi / WAVELENGTH_M
-PERMITTIVITY, CONDUCTIVITY, THICKNESS_M = 5.24, 0.1, 0.3
+PERMITTIVITY, CONDUCTIVITY, THICKNESS_M = 5.24, 0.0462 * 2.4**0.7822, 0.1  # concrete of P.2040-4, Table 3
 METAL = Material("metal", itu="metal")
-STONE = Material("stone", relative_permittivity=PERMITTIVITY, conductivity_s_per_m=CONDUCTIVITY, thickness_m=THICKNESS_M)
+CONCRETE = Material("concrete", relative_permittivity=PERMITTIVITY, conductivity_s_per_m=CONDUCTIVITY, thickness_m=THICKNESS_M)
 SETTINGS = SolverSettings(samples_per_src=50_000, batch_receivers=8, max_num_paths_per_src=20_000)
 NEAR_M = np.array([0.5, 1.0, 2.0, 5.0, 12.0, 25.0])
 
@@ -76,7 +79,7 @@ def prism(material, corners, z_m=1000.0, axis="z"):
 
 @pytest.mark.llvm
 @pytest.mark.parametrize("axis", ["z", "y"])
-@pytest.mark.parametrize("material", [METAL, STONE], ids=["metal", "slab"])
+@pytest.mark.parametrize("material", [METAL, CONCRETE], ids=["metal", "concrete"])
 def test_a_right_corner_is_the_closed_form_in_both_directions(tmp_path, material, axis):
     """Vertical antennas: along an upright edge (soft), and across one that lies (hard)."""
     box = prism(material, ((60, 0), (0, 60), (60, 60)) if axis == "z" else ((600, 0), (0, -600), (600, -600)), axis=axis)
@@ -129,6 +132,36 @@ def test_a_reflection_after_the_edge_counts_its_way_once(tmp_path):
     towards_db, from_db = both_ways(tmp_path, [box, screen], far_m, near_m)
     assert towards_db == pytest.approx(10 * np.log10(expected), abs=0.1)
     assert from_db == pytest.approx(towards_db, abs=0.1)
+
+
+@pytest.mark.llvm
+def test_a_mast_on_a_roof_has_one_gain_whatever_computes_it(tmp_path):
+    """0.02 to 3 m above its roof, receiver in the street: over the edge, and over the edge and off the ground."""
+    roof_m, edge_m, far_m, z_m = 20.0, 20.0, np.array([40.0, 80.0]), 1.5
+    house = trimesh.creation.box(bounds=[[-edge_m, -400, 0], [edge_m, 400, roof_m]])
+    masts = [(f"mast{height_m:g}", 0.0, 0.0, roof_m + height_m) for height_m in (0.02, 0.3, 3.0)]
+    scene = write_scene(tmp_path / "scene", [house], masts, frequency_hz=FREQUENCY_HZ, sensitivity_dbm=-140.0)
+    points_m = np.column_stack([edge_m + far_m, np.zeros(2), np.full(2, z_m)])
+    expected = np.zeros((3, 2))
+    for row, (*_, top_m) in enumerate(masts):
+        before_m, phi_in = np.hypot(edge_m, top_m - roof_m), np.arctan2(top_m - roof_m, edge_m)
+        for column, away_m in enumerate(far_m):
+            for down_m in (roof_m - z_m, roof_m + z_m):  # the receiver, and its image
+                after_m, phi = np.hypot(away_m, down_m), np.pi + np.arctan2(down_m, away_m)
+                power = gain(before_m, after_m, wedge(before_m, after_m, phi_in, phi, 1.5, CONCRETE, False))
+                expected[row, column] += power if down_m < roof_m else power * abs(slab(down_m / after_m, False)) ** 2
+    expected_db = 10 * np.log10(expected)
+    assert np.ptp(expected_db[:, 0]) > 10  # the roof takes as much from a mast close to it
+    traced_db = trace_gains(scene, scene.device_m, points_m, SETTINGS)
+    listed = list_paths(scene, points_m)
+    power = np.bincount(listed["link_of_path"], 10 ** (listed["path_gain_db"].to_numpy() / 10), 6).reshape(3, 2)
+    covered_dbm = [float(predict_coverage(
+        "raytrace", scene, [Transmitter("mast", device_m, tx_power_dbm=0.0)],
+        CoverageSettings(step_m=10.0, height_m=z_m, extent_m=(x_m - 5, x_m + 5, -5.0, 5.0))
+    ).dataset["received_power_dbm"].item()) for device_m in scene.device_m for x_m in points_m[:, 0]]
+    assert traced_db == pytest.approx(expected_db, abs=0.1)
+    assert 10 * np.log10(power) == pytest.approx(expected_db, abs=0.1)
+    assert np.reshape(covered_dbm, (3, 2)) == pytest.approx(expected_db, abs=0.1)
 
 
 @pytest.mark.llvm
