@@ -1,7 +1,7 @@
 """Coverage of a network, block by block: best server, SINR, rate and location probability."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from radiotwin.coverage.radio import (
 from radiotwin.coverage.sources import (
     GainSource,
     altitude_row,
+    completed,
     source_of_map,
     source_of_twin,
     source_over,
@@ -129,8 +130,8 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
                   given: Sequence[Transmitter] | None, devices: list[str] | None,
                   settings: CoverageSettings) -> list[Transmitter]:
     found = scene_transmitters(scene) if given is None else list(given)
-    if given is None and isinstance(source, Twin):
-        found = twin_transmitters(source, found)
+    if isinstance(source, Twin):
+        found = completed(source, twin_transmitters(source, found) if given is None else found)
     elif given is None and isinstance(source, RadioMap):
         by_name = {each.name: each for each in found}
         # Where a device of the map is does not matter, and may not be declared.
@@ -150,11 +151,14 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
     if given is not None:
         _check_outdoors(found, scene)
     tx_power_dbm = settings.tx_power_dbm
-    if isinstance(source, Twin) and source.level == "rssi_dbm":
+    if isinstance(source, Twin) and not source.has_gains:
         if tx_power_dbm is not None:
-            raise BadInput("the twin's levels are received powers, with the transmit power in "
-                           "them; leave --tx-power-dbm out")
-        tx_power_dbm = scene.config.radio.tx_power_dbm
+            raise BadInput("the twin's levels are received powers, with transmit powers in them "
+                           "that nobody declared; leave --tx-power-dbm out, or declare "
+                           "tx_power_dbm in devices.csv and fit again")
+        return [replace(each, load=settings.load if each.load is None else each.load,
+                        frequency_hz=each.frequency_hz or scene.config.radio.frequency_hz)
+                for each in found]
     return with_defaults(found, scene, tx_power_dbm, settings.load)
 
 
@@ -249,7 +253,7 @@ def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], g
                 mean_db, sd_db = gains.predict(row, receiver_m[used], index)
                 power_dbm = mean_db - entry_db
                 if not gains.has_power:
-                    power_dbm = power_dbm + each.tx_power_dbm
+                    power_dbm = power_dbm + each.fed_dbm
                 tally.add(row, power_dbm, np.nan if sd_db is None else sd_db, each.load or 0.0,
                           frequencies_hz.index(each.frequency_hz or 0.0))
                 advance(1)
@@ -316,7 +320,9 @@ def _summary(dataset: xr.Dataset, transmitters: list[Transmitter], grid: Coverag
         "reliability_quantile": float(ndtri(settings.reliability)),
         "transmitters": [
             {"device": each.name, **dict(zip(("x_m", "y_m", "z_m"), _known(each.position_m))),
-             "tx_power_dbm": None if gains.has_power else each.tx_power_dbm, "load": each.load,
+             "tx_power_dbm": None if gains.has_power else each.tx_power_dbm,
+             **({"cable_loss_db": each.cable_loss_db} if each.cable_loss_db else {}),
+             "load": each.load,
              "frequency_hz": each.frequency_hz, "antenna": each.antenna is not None,
              **({} if each.antenna is None else {"azimuth_deg": each.antenna.azimuth_deg,
                                                  "tilt_deg": each.antenna.tilt_deg})}

@@ -6,14 +6,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from radiotwin.coverage.transmitters import Transmitter
+from radiotwin.display import some
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkGeometry, link_geometry
+from radiotwin.links.declared import Declared, Radio
 from radiotwin.links.links import Columns, Ends, Links, World
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import channel_named
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.scene import Scene
+from radiotwin.scene.antennas import Antenna
 from radiotwin.twin import Twin
 from radiotwin.twin.model.model import FittedModel
 
@@ -120,8 +123,9 @@ def _source_of_paths(scene: Scene, transmitters: Sequence[Transmitter]) -> GainS
 def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
     """Return the source of a twin: of its own devices, or its law for transmitters elsewhere.
 
-    Measured levels hold the antennas of the twin's devices. Transmitters that were not measured
-    get the law of all devices, and the pattern of their antenna along the straight line.
+    Transmitters that were not measured get the law of all devices, and the pattern of their antenna
+    along the straight line. What the devices of the twin declare was taken off before the law was
+    learnt, so it may be declared anew; an antenna that they do not declare stays in their levels.
 
     Args:
         twin: learnt in the scene.
@@ -134,7 +138,7 @@ def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]
     """
     twin.require_map(scene)
     twin.warn_of_another_scene(scene, scene.content_hash())
-    has_power, known = twin.level == "rssi_dbm", len(twin.devices)
+    has_power, known = not twin.has_gains, len(twin.devices)
     located = {each.device: (row, each.position_m) for row, each in enumerate(twin.devices)
                if each.located}
     rows = []
@@ -144,36 +148,86 @@ def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]
     new = [each.name for each, row in zip(transmitters, rows) if row == known]
     if new and has_power:
         raise BadInput(f"{new[0]} is not a device of the twin, whose levels are received "
-                       "powers: what another transmitter would send is not known; import the "
-                       "measurements as gains, or leave it out with --devices")
-    found = []
-    if new:
-        found.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
-                     "the twin's law for any device is used")
+                       "powers: what another transmitter would send is not known; declare "
+                       "tx_power_dbm in devices.csv and fit again, or leave it out with --devices")
+    found = _notes_of_twin(twin, transmitters, rows, has_power)
     if any(each.frequency_hz not in (None, scene.config.radio.frequency_hz)
            for each in transmitters):
-        found.append("transmitters of other frequencies get the twin's law, which was "
-                     f"learnt at {scene.config.radio.frequency_hz / 1e9:g} GHz")
+        found.append("transmitters of other frequencies get the twin's law, moved by 20 lg f as in "
+                     f"free space: it was learnt at {scene.config.radio.frequency_hz / 1e9:g} GHz")
+    frequency_hz = scene.config.radio.frequency_hz if np.isnan(twin.declared.frequency_hz) \
+        else twin.declared.frequency_hz
 
     unmeasured = replace(twin, fitted=FittedModel.of_channel(twin.channel.trend)) \
         if twin.fitted.is_channel_alone else twin
 
     def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
         each, device = transmitters[row], np.full(len(receiver_m), rows[row])
-        if rows[row] < known:
+        if has_power:
             levels = twin.predict(twin.links(receiver_m, device, scene))
+            return levels.mean_db, levels.sd_db
+        radios = [Radio()] * (known + 1)
+        radios[rows[row]] = Radio(antenna=each.antenna, frequency_hz=each.frequency_hz)
+        if rows[row] < known:
+            if _antenna_of(twin, rows[row]) is None:  # it is a part of what was learnt
+                radios[rows[row]] = Radio(frequency_hz=each.frequency_hz)
+            links = twin.links(receiver_m, device, scene).with_ends(
+                declared=Declared(tuple(radios[:known]), frequency_hz, False))
+            levels = twin.predict(links)
             return levels.mean_db, levels.sd_db
         device_m = np.vstack([np.nan_to_num(twin.device_m), each.position_m])
         links = Links(
             columns=Columns.unmeasured(receiver_m, device, twin.limit_db),
             ends=Ends(device_names=[*(device.device for device in twin.devices), each.name],
-                      device_m=device_m, anchors=frozenset(range(len(device_m)))),
+                      device_m=device_m, anchors=frozenset(range(len(device_m))),
+                      declared=Declared(tuple(radios), frequency_hz, False)),
             world=World(frequency_hz=scene.config.radio.frequency_hz, city=scene.city,
                         is_gain=True))
         levels = unmeasured.predict(links)
-        return levels.mean_db + antenna_gain_db(each, receiver_m), levels.sd_db
+        return levels.mean_db, levels.sd_db
 
     return GainSource(f"twin: {twin.description}", predict, lambda receiver_m: found, has_power)
+
+
+def _antenna_of(twin: Twin, row: int) -> Antenna | None:
+    """Return the antenna that a device of a twin was declared to have when it was fitted."""
+    return twin.declared.radios[row].antenna if twin.declared.radios else None
+
+
+def _notes_of_twin(twin: Twin, transmitters: Sequence[Transmitter], rows: list[int],
+                   has_power: bool) -> list[str]:
+    """Return what is not measured, not known, or not used of transmitters, a sentence each.
+
+    Args:
+        twin: that predicts.
+        transmitters: of the network.
+        rows: of each among the twin's devices; that after the last one: of none.
+        has_power: whether its levels are powers that nobody declares.
+    """
+    known, found = len(twin.devices), []
+    new = [each for each, row in zip(transmitters, rows) if row == known]
+    through = [each.name for each in new if each.antenna is not None]
+    undeclared = [each.device for row, each in enumerate(twin.devices)
+                  if _antenna_of(twin, row) is None]
+    if new:
+        found.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
+                     "the twin's law for any device is used")
+    if through and len(undeclared) == known:
+        found.append("the law of the twin's devices contains whatever antennas they have, and the "
+                     f"antenna of {some(through)} is added to it: unless they are isotropic it "
+                     "counts twice; declare their antennas in devices.csv (antenna, azimuth_deg, "
+                     "tilt_deg) and fit again")
+    unused = [each.name for each, row in zip(transmitters, rows)
+              if row < known and each.antenna is not None and _antenna_of(twin, row) is None]
+    if unused:
+        found.append(f"the antenna of {some(unused)} is not used: it is in the measured levels; "
+                     "declared in devices.csv when the twin is fitted, it can be another")
+    if has_power and any(each.tx_power_dbm is not None for each in transmitters):
+        powers = [each.name for each in transmitters if each.tx_power_dbm is not None]
+        found.append(f"tx_power_dbm of {some(powers)} is not used: the twin's levels are received "
+                     "powers of devices whose powers nobody declared; declare them in devices.csv "
+                     "and fit again")
+    return found
 
 
 def source_of_map(radio_map: RadioMap, level: int,
@@ -205,11 +259,19 @@ def source_of_map(radio_map: RadioMap, level: int,
 
 
 def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Transmitter]:
-    """Return the located devices of a twin, with power and load of those declared by that name."""
+    """Return the located devices of a twin, with what is declared by that name."""
     by_name = {each.name: each for each in declared}
     return [replace(by_name.get(each.device, Transmitter(each.device, np.empty(0))),
                     position_m=np.array(each.position_m, dtype=float))
             for each in twin.devices if each.located]
+
+
+def completed(twin: Twin, transmitters: Sequence[Transmitter]) -> list[Transmitter]:
+    """Return transmitters with what they do not declare as devices of that name in a twin do."""
+    radio_of = dict(zip((each.device for each in twin.devices), twin.declared.radios))
+    return [replace(each, **{name: getattr(radio_of[each.name], name) for name in (
+        "tx_power_dbm", "cable_loss_db", "antenna", "frequency_hz") if getattr(each, name) is None})
+        if each.name in radio_of else each for each in transmitters]
 
 
 def antenna_gain_db(transmitter: Transmitter, receiver_m: np.ndarray) -> np.ndarray | float:

@@ -15,12 +15,13 @@ from radiotwin.io.budgets import DEVICES
 from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import name_fault
 from radiotwin.io.inputs import require_within
-from radiotwin.links.measurements import refuse_limits
+from radiotwin.links.declared import tx_power_dbm as declared_power_dbm
+from radiotwin.links.measurements import RADIO, refuse_limits
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna, read_pattern
 
 _LOCAL, _GLOBAL = ("x_m", "y_m"), ("latitude_deg", "longitude_deg")
-_OPTIONAL = ("tx_power_dbm", "azimuth_deg", "tilt_deg", "load", "frequency_hz")
+_OPTIONAL = (*RADIO, "load")
 _NAMED = 10  # transmitters in a message
 MAX_TILT_DEG = 90.0
 
@@ -34,6 +35,7 @@ class Transmitter:
         position_m: (3,) x, y, and z above the ground datum [m]; NaN where it is not known, as of a
             radio map's devices.
         tx_power_dbm: None: not declared [dBm].
+        cable_loss_db: between transmitter and antenna [dB]; None: not declared.
         antenna: None: isotropic.
         load: share of the time that it is active, 0 to 1; None: not declared.
         frequency_hz: None: that of the scene.
@@ -45,6 +47,12 @@ class Transmitter:
     antenna: Antenna | None = None
     load: float | None = None
     frequency_hz: float | None = None
+    cable_loss_db: float | None = None
+
+    @property
+    def fed_dbm(self) -> float:
+        """Power that reaches the antenna [dBm]."""
+        return (self.tx_power_dbm or 0.0) - (self.cable_loss_db or 0.0)
 
 
 def scene_transmitters(scene: Scene) -> list[Transmitter]:
@@ -57,8 +65,9 @@ def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
     """Read a table of transmitters, such as `devices.csv`.
 
     Columns: `device`, `x_m, y_m` or `latitude_deg, longitude_deg`, and `z_m` above the ground
-    datum. Optional: `tx_power_dbm`, `load`, `frequency_hz`, and `antenna` (a file below the table's
-    folder) with `azimuth_deg` and `tilt_deg` (upwards) as in `scene.toml`.
+    datum. Optional: `tx_power_dbm` or `eirp_dbm`, `cable_loss_db`, `load`, `frequency_hz`, and
+    `antenna` (a file below the table's folder) with `azimuth_deg` and `tilt_deg` (upwards) as in
+    `scene.toml`.
 
     Args:
         path: `.csv`, `.csv.gz` or `.parquet`.
@@ -93,9 +102,13 @@ def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
     antennas = _antennas(path, table, columns)
     values = {name: [None if np.isnan(value) else float(value) for value in columns[name]]
               if name in columns else [None] * len(table) for name in _OPTIONAL}
+    powers_dbm = [declared_power_dbm(name, power_dbm, eirp_dbm, loss_db or 0.0, antenna)
+                  for name, power_dbm, eirp_dbm, loss_db, antenna in zip(
+                      names, values["tx_power_dbm"], values["eirp_dbm"], values["cable_loss_db"],
+                      antennas)]
     return [Transmitter(*row) for row in zip(
-        names, position_m, values["tx_power_dbm"], antennas, values["load"],
-        values["frequency_hz"])]
+        names, position_m, powers_dbm, antennas, values["load"], values["frequency_hz"],
+        values["cable_loss_db"])]
 
 
 def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Transmitter]:
@@ -128,9 +141,12 @@ def with_defaults(transmitters: list[Transmitter], scene: Scene, tx_power_dbm: f
         BadInput: a power that nobody declared.
     """
     radio = scene.config.radio
+    unknown = [each.name for each in transmitters if each.tx_power_dbm is None]
+    if tx_power_dbm is not None and not unknown:
+        warnings.warn(f"the transmit power of {tx_power_dbm:g} dBm for transmitters that declare "
+                      "none is not used: all of them declare theirs", stacklevel=4)
     if tx_power_dbm is None and radio.declares_power:
         tx_power_dbm = radio.tx_power_dbm
-    unknown = [each.name for each in transmitters if each.tx_power_dbm is None]
     if unknown and tx_power_dbm is None:
         raise BadInput(
             f"the transmit power of {some(unknown, _NAMED)} is not known: "

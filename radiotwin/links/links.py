@@ -17,6 +17,7 @@ import pandas as pd
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
+from radiotwin.links.declared import NOTHING, Declared
 from radiotwin.scene.citymap import CityMap
 
 Value = TypeVar("Value")
@@ -284,6 +285,7 @@ class Ends:
         boresight_deg: (k,) declared azimuth of each device's antenna, clockwise from north [deg];
             NaN where none is, and where None is given.
         tilt_deg: (k,) declared tilt of each device's antenna, upwards [deg]; likewise.
+        declared: what is declared of the devices' powers, cables, antennas and carriers.
         flown: when and where receivers measured.
     """
 
@@ -294,6 +296,7 @@ class Ends:
     flight_names: list[str] = field(default_factory=list)
     boresight_deg: np.ndarray = None  # type: ignore[assignment]  # filled in below, as the next
     tilt_deg: np.ndarray = None  # type: ignore[assignment]
+    declared: Declared = NOTHING
     flown: Flown = Flown()
 
     def __post_init__(self) -> None:
@@ -370,6 +373,7 @@ class Links:
     anchors = _Of[frozenset[int]]("ends")
     boresight_deg = _Of[np.ndarray]("ends")
     tilt_deg = _Of[np.ndarray]("ends")
+    declared = _Of[Declared]("ends")
     first_s = _Of[float]("ends.flown")
     last_s = _Of[float]("ends.flown")
     tracks = _Of[Tracks]("ends.flown")
@@ -389,6 +393,19 @@ class Links:
                             self.city, self.frequency_hz, estimated)
 
     @cached_property
+    def declared_db(self) -> np.ndarray | float:
+        """What is declared of the devices, in the levels (n,) [dB], see `Declared.added_db`."""
+        return self.declared.added_db(self.device, self.offset_m)
+
+    @property
+    def channel_data(self) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
+        """What a channel learns from: the links, their gains and the limits of these (n,) [dB].
+
+        Gains between isotropic antennas, as far as powers and antennas are declared.
+        """
+        return self.geometry, self.level_db - self.declared_db, self.limit_db - self.declared_db
+
+    @cached_property
     def receiver_limits_db(self) -> np.ndarray:
         """(r,) limit of detection of each receiver [dB], the median over its links; else -inf."""
         limits_db = pd.Series(self.limit_db).groupby(self.receiver).median()
@@ -398,6 +415,11 @@ class Links:
     def level_unit(self) -> str:
         """Unit of the levels, and of limits."""
         return "dB" if self.is_gain else "dBm"
+
+    @property
+    def has_gains(self) -> bool:
+        """Whether gains between antennas are known: levels are, or the devices' powers are."""
+        return self.is_gain or self.declared.knows_powers
 
     @property
     def usual_limit_db(self) -> float | None:
@@ -518,8 +540,11 @@ class Links:
             names: k names.
             anchors: indices of the devices whose positions are declared.
         """
+        radio = np.full(len(names), -1)
+        radio[device] = self.device
         links = self.with_columns(device=device, known_los=None)
-        return links.with_ends(device_m=device_m, device_names=names, anchors=anchors)
+        return links.with_ends(device_m=device_m, device_names=names, anchors=anchors,
+                               declared=self.declared.of_devices(radio))
 
     def located(self, device_m: np.ndarray) -> Links:
         """Return the links of devices that have a position in (k, 3) [m], there; NaN: none."""

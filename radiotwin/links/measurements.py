@@ -1,9 +1,9 @@
 """Measured levels of links, and their devices: two tables, checked when they are read."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,7 +36,7 @@ from radiotwin.geo import (
     read_frame,
     write_frame,
 )
-from radiotwin.io.budgets import DEVICES
+from radiotwin.io.budgets import DEVICES, DOCUMENT_BYTES
 from radiotwin.io.cells import (
     as_numbers,
     check_suffix,
@@ -48,8 +48,9 @@ from radiotwin.io.cells import (
 )
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import MAX_POSITION_M, Origin, name_fault
-from radiotwin.io.inputs import is_within
+from radiotwin.io.inputs import is_within, read_bytes, require_within
 from radiotwin.links.view import links_dataset, links_table, of_device, plot_links
+from radiotwin.scene.antennas import Pattern, parse_pattern
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
@@ -59,6 +60,7 @@ if TYPE_CHECKING:
 
 LEVELS = ["gain_db", "rssi_dbm"]
 _TEXT = {"flight", "receiver", "device", "role"}
+_FILES = {"antenna"}  # columns of names of files, which may be empty
 # Limits that no measurement exceeds: what lies beyond them is another unit or a placeholder.
 MAX_LEVEL_DB = 300.0
 FREQUENCIES_HZ = (1e6, 450e9)  # as of a scene; materials of ITU-R P.2040 end at 450 GHz
@@ -67,12 +69,15 @@ MAX_SPAN_S = 3.2e9  # a century, the longest campaign
 MAX_TILT_DEG = 90.0
 MAX_ANGLE_DEG = 1e6  # thousands of turns in one direction, which some compasses count
 MAX_POWER_DBM = 300.0  # as of a level
+MAX_CABLE_LOSS_DB = 100.0
 MAX_QUALITY = 1e15  # whole numbers are exact up to there
 # Columns of the two files, as in docs/conventions.md.
 REQUIRED = ["flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device"]
 OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality", "receiver_above_ground_m"]
 DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
-DEVICE_OPTIONAL = ["frequency_hz", "tx_power_dbm", "azimuth_deg", "tilt_deg", "above_ground_m"]
+# What is declared of a device's radio, besides its antenna.
+RADIO = ["tx_power_dbm", "eirp_dbm", "cable_loss_db", "frequency_hz", "azimuth_deg", "tilt_deg"]
+DEVICE_OPTIONAL = [*RADIO, "above_ground_m"]
 ROLES = ("anchor", "unknown")
 _RECEIVER_POSITION = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
 _DEVICE_POSITION = ["x_m", "y_m", "z_m"]
@@ -92,6 +97,8 @@ def read_columns(path: Path, required: list[str], optional: list[str],
     for name in table.columns:
         if name in _TEXT:
             table[name] = _names(path, name, table[name])
+        elif name in _FILES:
+            table[name] = table[name].fillna("").astype(str).str.strip()
         else:
             cells = table[name]
             table[name] = _numbers(path, name, cells, name in may_be_empty)
@@ -164,8 +171,11 @@ def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
     if name == "tilt_deg":
         refuse(np.abs(numbers) > MAX_TILT_DEG,
                f"is no tilt; allowed are -{MAX_TILT_DEG:g} (down) to {MAX_TILT_DEG:g} (up)")
+    if name == "cable_loss_db":
+        refuse((numbers < 0) | (numbers > MAX_CABLE_LOSS_DB),
+               f"is no loss; allowed are 0 to {MAX_CABLE_LOSS_DB:g} dB")
     for ending, limit in (("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM),
-                          ("quality", MAX_QUALITY)):
+                          ("eirp_dbm", MAX_POWER_DBM), ("quality", MAX_QUALITY)):
         if name.endswith(ending):
             refuse(np.abs(numbers) > limit,
                    f"is out of range; allowed are -{limit:g} to {limit:g}")
@@ -179,11 +189,13 @@ class Measurements(Summarised):
         table: one row per link, columns as in `measurements.csv`; NaN level = not detected.
         devices: one row per device, columns as in `devices.csv`; NaN x, y where unknown.
         origin: of the local frame of both; None where it is not known.
+        antenna_files: content of the devices' antenna files, by their names in `devices`.
     """
 
     table: pd.DataFrame
     devices: pd.DataFrame
     origin: Origin | None = None
+    antenna_files: Mapping[str, bytes] = field(default_factory=dict)
 
     @property
     def level_column(self) -> str:
@@ -204,6 +216,16 @@ class Measurements(Summarised):
     def device_index(self) -> np.ndarray:
         """Row of each link's device in `devices`, (n,)."""
         return pd.Index(self.devices["device"]).get_indexer(self.table["device"])
+
+    @cached_property
+    def patterns(self) -> dict[str, Pattern]:
+        """Patterns of the devices' antennas, by the files' names in `devices`.
+
+        Raises:
+            BadInput: a file holds no pattern.
+        """
+        return {name: parse_pattern(Path(name), content)
+                for name, content in self.antenna_files.items()}
 
     @property
     def device_m(self) -> np.ndarray:
@@ -226,8 +248,7 @@ class Measurements(Summarised):
         Args:
             mask: (n,) bool.
         """
-        return Measurements(self.table[np.asarray(mask)].reset_index(drop=True), self.devices,
-                            self.origin)
+        return replace(self, table=self.table[np.asarray(mask)].reset_index(drop=True))
 
     def moved(self, position_m: Callable[[np.ndarray], np.ndarray],
               origin: Origin | None) -> "Measurements":
@@ -237,16 +258,19 @@ class Measurements(Summarised):
             position_m: converts (n, 3) positions [m] to that frame; NaN where unknown.
             origin: of that frame.
         """
-        return Measurements(moved_positions(self.table, _RECEIVER_POSITION, position_m),
-                            moved_positions(self.devices, _DEVICE_POSITION, position_m), origin)
+        return replace(
+            self, table=moved_positions(self.table, _RECEIVER_POSITION, position_m),
+            devices=moved_positions(self.devices, _DEVICE_POSITION, position_m), origin=origin)
 
     def on_ground(self, ground_height_m: GroundHeight | None) -> "Measurements":
         """Return the same links with all heights above the datum; see `above_datum`."""
         if "receiver_above_ground_m" not in self.table and "above_ground_m" not in self.devices:
             return self
-        return Measurements(
-            above_datum(self.table, "measurements", _RECEIVER_POSITION, ground_height_m),
-            above_datum(self.devices, "devices", _DEVICE_POSITION, ground_height_m), self.origin)
+        table, devices = (above_datum(rows, name, position, ground_height_m)
+                          for rows, name, position in (
+                              (self.table, "measurements", _RECEIVER_POSITION),
+                              (self.devices, "devices", _DEVICE_POSITION)))
+        return replace(self, table=table, devices=devices)
 
     def in_frame(self, origin: Origin) -> "Measurements":
         """Return the same links in the frame about another origin, converted exactly.
@@ -296,6 +320,9 @@ class Measurements(Summarised):
             if self.origin is not None:
                 frame = together.enter_context(atomic_path(path.parent / FRAME_FILE))
                 write_frame(self.origin, frame)
+            for name, content in self.antenna_files.items():
+                (path.parent / name).parent.mkdir(parents=True, exist_ok=True)
+                together.enter_context(atomic_path(path.parent / name)).write_bytes(content)
             devices = together.enter_context(atomic_path(path.parent / "devices.csv"))
             links = together.enter_context(atomic_path(path))
             write_csv(self.devices, devices)
@@ -445,7 +472,7 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
         devices = moved_positions(devices, _DEVICE_POSITION,
                                   lambda position_m: between_frames(position_m, of_devices, origin))
     _check_spread(path, table, devices_path, devices)
-    return Measurements(table, devices, origin)
+    return Measurements(table, devices, origin, read_antenna_files(devices_path, devices))
 
 
 def read_devices(path: Path | str) -> pd.DataFrame:
@@ -455,7 +482,8 @@ def read_devices(path: Path | str) -> pd.DataFrame:
         BadInput: names file, row and column of the first value that cannot be used.
     """
     path = Path(path)
-    devices = read_columns(path, DEVICE_REQUIRED, DEVICE_OPTIONAL, _DEVICE_MAY_BE_EMPTY)
+    devices = read_columns(path, DEVICE_REQUIRED, [*DEVICE_OPTIONAL, "antenna"],
+                           _DEVICE_MAY_BE_EMPTY)
     if devices.empty:
         raise BadInput(f"{path}: has no rows; it needs one for each device")
     DEVICES.check(len(devices), path)
@@ -475,6 +503,25 @@ def read_devices(path: Path | str) -> pd.DataFrame:
         raise BadInput(f"{path}: row {row + 2}: anchor {devices['device'][row]!r} has no x_m, y_m; "
                        "fill them in or give it the role unknown")
     return devices
+
+
+def read_antenna_files(path: Path, devices: pd.DataFrame) -> dict[str, bytes]:
+    """Read the antenna files below a table's folder that its column `antenna` names, by that name.
+
+    Args:
+        path: of the table.
+        devices: its rows.
+
+    Raises:
+        BadInput: a file that is missing, elsewhere, or no pattern.
+    """
+    files = {}
+    for row, name in enumerate(devices.get("antenna", ())):
+        if name and name not in files:
+            file = require_within(path.parent, path.parent / name, f"{path}, row {row + 2}")
+            files[name] = read_bytes(file, "pattern of an antenna", DOCUMENT_BYTES)
+            parse_pattern(file, files[name])
+    return files
 
 
 def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,

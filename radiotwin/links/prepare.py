@@ -22,6 +22,7 @@ from radiotwin.links.checks import (
     unmapped_ends,
     useless_receivers,
 )
+from radiotwin.links.declared import Declared, complete, radios_of
 from radiotwin.links.limits import estimate_limits
 from radiotwin.links.links import RESTART_NOTE, Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements
@@ -176,20 +177,25 @@ def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
     notes += ceiling_notes(receiver, receiver_names, level_db)
     is_gain = measurements.level_column == "gain_db"
     frequency_hz = _frequency_hz(measurements, scene)
-    notes += _other_frequencies(_column(measurements.devices, "frequency_hz")[kept_devices],
-                                frequency_hz)
+    devices = measurements.devices.iloc[kept_devices]
+    notes += _other_frequencies(_column(devices, "frequency_hz"), frequency_hz)
+    radios, assumed = complete(list(devices["device"]), radios_of(
+        devices, measurements.patterns, scene), not is_gain, scene)
+    notes += assumed
     columns = Columns(
         level_db=level_db, limit_db=np.full(len(level_db), -np.inf), receiver_m=receiver_m,
         device=device, receiver=receiver, flight=flight, time_s=_column(table, "time_s"),
         heading_deg=heading_deg % 360, pitch_deg=_column(table, "pitch_deg"),
         roll_deg=_column(table, "roll_deg"), quality=_column(table, "quality"))
-    devices = measurements.devices.iloc[kept_devices]
+    # A pattern that is known in all directions is no sector of which only the azimuth is declared.
+    of_sector = np.array([radio.antenna is None for radio in radios]) if radios else True
     ends = Ends(
         device_names=list(devices["device"]), receiver_names=list(receiver_names),
         flight_names=list(flight_names), device_m=device_m,
         anchors=frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist()),
-        boresight_deg=_column(devices, "azimuth_deg"), tilt_deg=_column(devices, "tilt_deg"),
-        flown=Flown.of(columns))
+        boresight_deg=np.where(of_sector, _column(devices, "azimuth_deg"), np.nan),
+        tilt_deg=np.where(of_sector, _column(devices, "tilt_deg"), np.nan),
+        declared=Declared(radios, frequency_hz, not is_gain), flown=Flown.of(columns))
     city = scene.city if scene is not None else None
     links = Links(columns=columns, ends=ends, notes=tuple(notes),
                   world=World(frequency_hz=frequency_hz, city=city, is_gain=is_gain))
@@ -216,8 +222,9 @@ def _other_frequencies(declared_hz: np.ndarray, frequency_hz: float) -> list[str
     known_ghz = np.unique(declared_hz[np.isfinite(declared_hz)]) / 1e9
     span = " to ".join(f"{each:g}" for each in known_ghz[[0, -1]][:len(known_ghz)])
     return [f"devices work at {span} GHz, and all are computed at {frequency_hz / 1e9:g} GHz: "
-            "losses of walls, edges and trees are those of that frequency; give measurements of "
-            "one band at a time, with a scene of its frequency_hz"]
+            "levels are moved by 20 lg f, as in free space, and losses of walls, edges and trees "
+            "are those of that frequency; give measurements of one band at a time, with a scene of "
+            "its frequency_hz"]
 
 
 def _column(table: pd.DataFrame, name: str) -> np.ndarray:

@@ -136,11 +136,23 @@ def read_pattern(path: Path | str) -> Pattern:
             contradict each other, or too large; with file and row.
     """
     path = Path(path)
+    return parse_pattern(path, read_bytes(path, "pattern of an antenna", DOCUMENT_BYTES))
+
+
+def parse_pattern(path: Path, text: bytes) -> Pattern:
+    """Return the antenna pattern of a file's content, see `read_pattern`.
+
+    Args:
+        path: of the file, whose suffix tells the format.
+        text: its content.
+
+    Raises:
+        BadInput: as `read_pattern`.
+    """
     readers = {".msi": _read_msi, ".pln": _read_msi, ".csv": _read_csv}
     if path.suffix.lower() not in readers:
         raise BadInput(f"{path}: unknown format {path.suffix!r} of an antenna; allowed are "
                        f"{', '.join(readers)}")
-    text = read_bytes(path, "pattern of an antenna", DOCUMENT_BYTES)
     pattern = readers[path.suffix.lower()](path, text)
     if not -MAX_GAIN_DBI <= pattern.peak_dbi <= MAX_GAIN_DBI:
         raise BadInput(f"{path}: a gain of {pattern.peak_dbi:g} dBi is not possible; allowed is up "

@@ -21,6 +21,8 @@ from radiotwin.twin.localize import LawError, LocalizeSettings, TwinDevice, loca
 from radiotwin.twin.model.model import FittedModel
 from radiotwin.twin.twin import Twin
 
+MAX_POWER_APART_DB = 3.0  # between declared and fitted powers; more hints at a loss
+
 
 def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int,
               start: Twin | None = None, settings: LocalizeSettings | None = None) -> Twin:
@@ -67,10 +69,9 @@ def fit_known(links: Links, channel: type[ChannelModel], seed: int) -> Twin:
     Raises:
         BadInput: links that no channel can be learnt from.
     """
-    geometry = links.geometry
-    check_fit_data(geometry, links.level_db,
-                   needs_los=channel.uses_map and links.city is not None)
-    fitted = fit_once(channel, geometry, links.level_db, links.limit_db, seed)
+    geometry, gain_db, limit_db = links.channel_data
+    check_fit_data(geometry, gain_db, needs_los=channel.uses_map and links.city is not None)
+    fitted = fit_once(channel, geometry, gain_db, limit_db, seed)
     devices = [TwinDevice.anchor(name, *position_m)
                for name, position_m in zip(links.device_names, links.device_m, strict=True)]
     return make_twin(links, None, fitted, devices)
@@ -106,24 +107,33 @@ def _fit_channel(links: Links, device_m: np.ndarray, channel: type[ChannelModel]
 
 def _known_links(links: Links, device_m: np.ndarray
                  ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
-    """Return the m links of devices with a position in `device_m` (k, 3), levels and limits."""
+    """Return the m links of devices with a position in `device_m` (k, 3), gains and limits."""
     known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
-    geometry = link_geometry(device_m, links.receiver_m[known], links.device[known], links.city,
-                             links.frequency_hz)
-    return geometry, links.level_db[known], links.limit_db[known]
+    receiver_m, device = links.receiver_m[known], links.device[known]
+    geometry = link_geometry(device_m, receiver_m, device, links.city, links.frequency_hz)
+    declared_db = links.declared.added_db(device, receiver_m - device_m[device])
+    return geometry, links.level_db[known] - declared_db, links.limit_db[known] - declared_db
 
 
 def _published(links: Links, device_m: np.ndarray, scene: Scene,
                law: type[PublishedLaw]) -> PublishedLaw:
     """Return a law as it was published; warn of the transmit power, where levels are powers.
 
-    That is the median over detected links of anchors of what it must be, or the declared one.
+    That is the declared one of each device, or else the median over detected links of anchors of
+    what it must be, or the scene's.
     """
     geometry, level_db, limit_db = _known_links(links, device_m)
     fitted = law().fit(geometry, level_db, limit_db)
     if links.is_gain:
         return fitted
     surplus_db = level_db - fitted.predict(geometry)[0]
+    if links.has_gains:
+        apart_db = float(np.nanmedian(surplus_db)) if np.isfinite(surplus_db).any() else 0.0
+        if abs(apart_db) > MAX_POWER_APART_DB:
+            warnings.warn(f"with the declared powers, levels of the anchors' links are "
+                          f"{apart_db:+.1f} dB from what {law.name} predicts (median): is there a "
+                          "loss, or a gain of an antenna, that is not declared?", stacklevel=4)
+        return fitted
     if np.isfinite(surplus_db).sum() >= MIN_DETECTED:
         fitted.power_dbm, how = float(np.nanmedian(surplus_db)), "fitted to the anchors' links"
     else:
@@ -146,12 +156,13 @@ def _locate(links: Links, scene: Scene, channel: ChannelModel, law_error: LawErr
     limit_db = float(links.limit_db[known].max()) if known.any() else None
     rows = np.isin(links.device, unknown) & (known | np.isfinite(links.level_db))
     measured = links.receiver_m[rows], links.device[rows], links.level_db[rows], channel
+    declared = {} if links.declared.adds_nothing else {"declared": links.declared}
     options: dict[str, Any] = {
         "devices": {int(index): links.device_names[index] for index in unknown},
         "bounds": scene.config.extent.bounds, "city": links.city,
         "z_m": np.nan_to_num(links.device_m[unknown, 2], nan=ASSUMED_HEIGHT_M),
         "limit_db": limit_db, "seed": seed, "law_error": law_error,
-        "start_m": start_m, "settings": settings}
+        "start_m": start_m, "settings": settings, **declared}
     return kept("positions", (*measured, options), partial(localize, *measured, **options),
                 lambda found: ({}, [each.record for each in found]),
                 lambda _, content: [TwinDevice.from_record(each) for each in content])
@@ -167,4 +178,5 @@ def make_twin(links: Links, scene: Scene | None, channel: ChannelModel,
             provenance["origin"] = scene.config.origin.model_dump()
     provenance |= {"links": len(links), "radiotwin_version": radiotwin.__version__}
     level = "gain_db" if links.is_gain else "rssi_dbm"
-    return Twin(FittedModel.of_channel(channel), devices, level, links.usual_limit_db, provenance)
+    return Twin(FittedModel.of_channel(channel), devices, level, links.usual_limit_db, provenance,
+                links.declared)

@@ -136,7 +136,7 @@ def _image_paths(links: Links, law: Twin, device_m: np.ndarray) -> ImagePaths:
     """Return the channel, its diffuse power fitted to links of devices that have a position."""
     channel = ImagePaths(law.channel)
     located = links.located(device_m)
-    return channel.fit_diffuse(located.geometry, located.level_db, located.limit_db)
+    return channel.fit_diffuse(*located.channel_data)
 
 
 def fit_over_wrong_map(links: Links, scene: Scene, seed: int, start: Twin | None,
@@ -184,7 +184,7 @@ def _shift(links: Links, seed: int) -> Shift:
     known = links.located(links.device_m)
     if not len(known):
         return NO_SHIFT
-    informative = drop_uninformative(known.geometry, known.level_db, known.limit_db)
+    informative = drop_uninformative(*known.channel_data)
     return estimate_shift(*informative, seed)
 
 
@@ -234,7 +234,7 @@ def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:
 def _found(links: Links, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
     """Return the errors of a map that is not shifted any more, from devices that are not lost."""
     known = links.located(reliable_m(devices, LOST_M))
-    informative = drop_uninformative(known.geometry, known.level_db, known.limit_db)
+    informative = drop_uninformative(*known.channel_data)
     error, diffuse = estimate_other_errors(*informative, seed)
     return replace(error, shift_m=shift_m), diffuse
 
@@ -243,7 +243,7 @@ def _channel(links: Links, devices: list[TwinDevice], found: Found, seed: int) -
     """Fit the channel to all devices that are located; kriging alone to those that are lost."""
     lost = tuple(np.flatnonzero(~np.isfinite(reliable_m(devices, LOST_M)).all(axis=1)).tolist())
     known = links.located(reliable_m(devices))
-    data = known.geometry, known.level_db, known.limit_db, seed
+    data = *known.channel_data, seed
     inputs = PathKriging, *data, str(found[0].state()), found[1], lost
     return kept("channel", inputs, lambda: PathKriging(found, lost).fit(*data), PathKriging.state,
                 PathKriging.from_state)

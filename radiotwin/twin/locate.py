@@ -12,6 +12,7 @@ from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, link_geometry, prepare_links
 from radiotwin.links.alignment import in_known_frame
+from radiotwin.links.declared import as_learnt
 from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
@@ -73,6 +74,8 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
         raise BadInput(f"the measurements have {unknown.level_column}, the twin is of "
                        f"{twin.level}; both need the same")
     links = prepare_links(unknown, scene, to_locate=True)
+    declared, assumed = as_learnt(links.device_names, links.declared, twin.declared, scene)
+    links = links.with_ends(declared=declared).with_notes(*assumed)
     alone = twin.fitted.is_channel_alone
     model = _by_channel(twin, links) if alone else twin.fitted.for_positions()
     strangers = [name for name in links.receiver_names if name not in model.receivers]

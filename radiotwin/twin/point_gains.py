@@ -78,7 +78,7 @@ def gains_at(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray,
         row_of = {each.device: row for row, each in enumerate(source.devices)}
         index = np.repeat([row_of[name] for name in devices], len(points_m))
         links = source.links(np.tile(points_m, (len(devices), 1)), index, scene)
-        level_db = source.predict(links).mean_db - source.power_dbm(scene)
+        level_db = source.predict(links).mean_db - source.power_dbm(scene)[index]
         gain_db = level_db.reshape(len(devices), len(points_m))
     return np.where(inside, np.nan, gain_db)
 

@@ -6,6 +6,7 @@ The content of `twin.json` is typed and bounded; the bounds are far beyond what 
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,10 +20,19 @@ from radiotwin.errors import BadInput
 from radiotwin.io.files import require_writable
 from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import parse_json
+from radiotwin.links.declared import NOTHING, Declared, Radio
 from radiotwin.links.links import Columns, Ends, Flown, Links, World
+from radiotwin.links.measurements import (
+    FREQUENCIES_HZ,
+    MAX_ANGLE_DEG,
+    MAX_CABLE_LOSS_DB,
+    MAX_POWER_DBM,
+    MAX_TILT_DEG,
+)
 from radiotwin.propagation.laws import ChannelModel
-from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB
+from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB, require_array
 from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_channel
+from radiotwin.scene.antennas import MAX_GAIN_DBI, Antenna, Pattern
 from radiotwin.twin.localize.estimate import Name, TwinDevice
 from radiotwin.twin.model.blend import Blend
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing
@@ -32,6 +42,7 @@ if TYPE_CHECKING:
     from radiotwin.twin.twin import Twin
 
 SCHEMA = "radiotwin.twin/2"
+PATTERN = "pattern"  # begins the names of arrays of antennas' patterns, with their number
 CHANNEL_FILE = "channel.safetensors"
 _Decibels = Annotated[float, Field(ge=-MAX_DB, le=MAX_DB)]
 _SdDb = Annotated[float, Field(ge=1e-9, le=MAX_SD_DB)]
@@ -88,6 +99,30 @@ class FittedRecord(_Strict):
         return receivers
 
 
+class AntennaRecord(_Strict):
+    """Antenna of a device; its pattern is beside the channel."""
+
+    pattern: Annotated[int, Field(ge=0)]
+    azimuth_deg: Annotated[float, Field(ge=-MAX_ANGLE_DEG, le=MAX_ANGLE_DEG)]
+    tilt_deg: Annotated[float, Field(ge=-MAX_TILT_DEG, le=MAX_TILT_DEG)]
+
+
+class RadioRecord(_Strict):
+    """What is declared of the radio of a device."""
+
+    tx_power_dbm: Annotated[float, Field(ge=-2 * MAX_POWER_DBM, le=2 * MAX_POWER_DBM)] | None
+    cable_loss_db: Annotated[float, Field(ge=0, le=MAX_CABLE_LOSS_DB)]
+    antenna: AntennaRecord | None
+    frequency_hz: Annotated[float, Field(ge=FREQUENCIES_HZ[0], le=FREQUENCIES_HZ[1])] | None
+
+
+class DeclaredRecord(_Strict):
+    """What is declared of each device's radio, and the frequency that the channel computes at."""
+
+    radios: list[RadioRecord]
+    frequency_hz: Annotated[float, Field(ge=FREQUENCIES_HZ[0], le=FREQUENCIES_HZ[1])] | None
+
+
 class ChannelRecord(_Strict):
     """Where the channel is, and what it is."""
 
@@ -115,6 +150,7 @@ class TwinRecord(_Strict):
     limit_db: _Decibels | None
     provenance: dict[str, _Json]
     fitted: FittedRecord | None = None
+    declared: DeclaredRecord | None = None
 
     @field_validator("devices")
     @classmethod
@@ -134,12 +170,15 @@ class TwinRecord(_Strict):
 def encode_twin(twin: Twin) -> tuple[str, bytes]:
     """Return the contents of a twin's two files: the record, and the channel."""
     fitted = twin.fitted
-    beside = fitted.blend.state()[0] if fitted.blend else None
+    declared, patterns = _declared_record(twin.declared)
+    beside = patterns | (fitted.blend.state()[0] if fitted.blend else {})
     record = {"schema": SCHEMA, "channel": {"model": twin.channel.name, "file": CHANNEL_FILE},
               "level": twin.level, "limit_db": twin.limit_db,
               "devices": [device.record for device in twin.devices],
               "fitted": None if fitted.is_channel_alone else _fitted_record(fitted),
               "provenance": twin.provenance}
+    if declared is not None:
+        record["declared"] = declared
     return json.dumps(record, indent=1, allow_nan=False), encode_channel(twin.channel, beside)
 
 
@@ -159,10 +198,13 @@ def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
         content = TwinRecord.model_validate(given)
         if content.channel.model != model.name:
             raise ValueError(f"the channel is {model.name}, not {content.channel.model[:60]}")
+        patterns = {name: beside.pop(name) for name in list(beside) if name.startswith(PATTERN)}
+        declared = _declared(content, patterns)
         fitted = FittedModel.of_channel(model) if content.fitted is None else _fitted(
             content.fitted, model, content.devices, beside)
         return {"fitted": fitted, "devices": content.devices, "level": content.level,
-                "limit_db": content.limit_db, "provenance": content.provenance}
+                "limit_db": content.limit_db, "provenance": content.provenance,
+                "declared": declared}
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise BadInput(f"{source} is damaged ({type(error).__name__}: {str(error)[:500]}); run "
                        "`radiotwin fit` again") from None
@@ -180,6 +222,55 @@ def check_twin_target(folder: Path) -> None:
     if foreign:
         raise BadInput(f"{folder} holds {foreign[0]}, which is not a twin's and would be lost; "
                        "choose another output folder, or move it away")
+
+
+def _declared_record(declared: Declared) -> tuple[dict[str, Any] | None, dict[str, np.ndarray]]:
+    """Return the record of what is declared, None of nothing, and its patterns as arrays."""
+    if not declared.radios:
+        return None, {}
+    patterns: dict[int, Pattern] = {}
+    radios = []
+    for radio in declared.radios:
+        antenna = None
+        if radio.antenna is not None:
+            patterns[id(radio.antenna.pattern)] = radio.antenna.pattern
+            antenna = {"pattern": list(patterns).index(id(radio.antenna.pattern)),
+                       "azimuth_deg": radio.antenna.azimuth_deg,
+                       "tilt_deg": radio.antenna.tilt_deg}
+        radios.append({"tx_power_dbm": radio.tx_power_dbm, "cable_loss_db": radio.cable_loss_db,
+                       "antenna": antenna, "frequency_hz": radio.frequency_hz})
+    known_hz = None if np.isnan(declared.frequency_hz) else declared.frequency_hz
+    return {"radios": radios, "frequency_hz": known_hz}, {
+        f"{PATTERN}{number}/{each.name}": getattr(pattern, each.name)
+        for number, pattern in enumerate(patterns.values()) for each in fields(pattern)}
+
+
+def _declared(content: TwinRecord, arrays: dict[str, np.ndarray]) -> Declared:
+    """Return what a record declares, with the patterns of its arrays."""
+    record = content.declared
+    if record is None:
+        if arrays:
+            raise ValueError("patterns beside the channel belong to no device")
+        return NOTHING
+    if len(record.radios) != len(content.devices):
+        raise ValueError(f"{len(record.radios)} radios are declared of {len(content.devices)} "
+                         "devices")
+    patterns = []
+    for number in range(len(arrays) // len(fields(Pattern))):
+        own = {name.removeprefix(f"{PATTERN}{number}/"): array for name, array in arrays.items()}
+        azimuth_deg = require_array(own, "azimuth_deg", (None,), 0, 360)
+        elevation_deg = require_array(own, "elevation_deg", (None,), -90, 90)
+        if len(elevation_deg) < 2 or not len(azimuth_deg) \
+                or not all((np.diff(axis) > 0).all() for axis in (azimuth_deg, elevation_deg)):
+            raise ValueError("angles of a pattern are not in order")
+        patterns.append(Pattern(azimuth_deg, elevation_deg, require_array(
+            own, "gain_dbi", (len(elevation_deg), len(azimuth_deg)), -MAX_DB, MAX_GAIN_DBI)))
+    return Declared(tuple(
+        Radio(radio.tx_power_dbm, radio.cable_loss_db, None if radio.antenna is None else Antenna(
+            patterns[radio.antenna.pattern], radio.antenna.azimuth_deg, radio.antenna.tilt_deg),
+            radio.frequency_hz)
+        for radio in record.radios), np.nan if record.frequency_hz is None else record.frequency_hz,
+        content.level == "rssi_dbm")
 
 
 def _fitted_record(fitted: FittedModel) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from radiotwin.geo import is_same_frame, place
 from radiotwin.io.files import atomic_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import read_bytes, read_text, require_within
+from radiotwin.links.declared import NOTHING, Declared
 from radiotwin.links.links import Columns, Ends, Links, Prediction, World
 from radiotwin.maps.form import MapStream
 from radiotwin.maps.radiomap import RadioMap
@@ -104,6 +105,8 @@ class Twin(Summarised):
         limit_db: level below which receivers do not detect [dB]: the median of theirs, see
             `Links.usual_limit_db`; None where it was not known.
         provenance: measurements, scene, seed and version that made it.
+        declared: of the devices' powers, cables, antennas and carriers; what of it is in the levels
+            was taken off them before anything was learnt, and is put back where they are predicted.
     """
 
     fitted: FittedModel
@@ -111,6 +114,7 @@ class Twin(Summarised):
     level: str
     limit_db: float | None
     provenance: dict = field(default_factory=dict)
+    declared: Declared = NOTHING
 
     @property
     def channel(self) -> ChannelModel:
@@ -126,6 +130,11 @@ class Twin(Summarised):
     def effects(self) -> tuple[Effect, ...]:
         """Effects that `close-loop` found."""
         return self.fitted.effects
+
+    @property
+    def has_gains(self) -> bool:
+        """Whether its levels are gains, or powers of devices that declare their transmit power."""
+        return self.level == "gain_db" or self.declared.knows_powers
 
     @property
     def is_corrected(self) -> bool:
@@ -165,7 +174,8 @@ class Twin(Summarised):
         return Links(
             columns=Columns.unmeasured(receiver_m, device, self.limit_db),
             ends=Ends(device_names=[each.device for each in self.devices],
-                      device_m=np.nan_to_num(self.device_m), anchors=anchors),
+                      device_m=np.nan_to_num(self.device_m), anchors=anchors,
+                      declared=self.declared),
             world=World(frequency_hz=scene.config.radio.frequency_hz, city=scene.city,
                         is_gain=self.level == "gain_db"))
 
@@ -214,18 +224,18 @@ class Twin(Summarised):
             receiver_m = lattice.positions_m
             links = self.links(receiver_m, np.full(len(receiver_m), rows[device]), scene)
             predicted = self.predict(links)
-            values = {"gain_db": predicted.mean_db - power_dbm, "los": links.los,
+            values = {"gain_db": predicted.mean_db - power_dbm[rows[device]], "los": links.los,
                       "sigma_db": predicted.sd_db}
             return {name: value.reshape(lattice.shape) for name, value in values.items()}
 
         limit_db = scene.config.gain_limit_db if self.limit_db is None \
-            else self.limit_db - power_dbm
+            else self.limit_db - float(np.median(power_dbm))
         attributes = {"source": f"twin:{self.description}",
                       "frequency_hz": scene.config.radio.frequency_hz,
                       "gain_limit_db": limit_db, "scene_hash": scene_hash,
                       "radiotwin_version": radiotwin.__version__}
-        if self.level == "rssi_dbm":
-            attributes["tx_power_dbm"] = power_dbm
+        if self.level == "rssi_dbm" and not np.ptp(power_dbm):
+            attributes["tx_power_dbm"] = float(power_dbm[0])
         return MapStream(list(rows), scene.lattice, attributes, ("gain_db", "los", "sigma_db"),
                          make).placed(scene.config.origin)
 
@@ -324,22 +334,26 @@ class Twin(Summarised):
         """
         return cls(**decode_twin(record, channel, source))
 
-    def power_dbm(self, scene: Scene) -> float:
-        """Return the transmit power that is in the twin's levels [dBm]; of gains it is 0.
+    def power_dbm(self, scene: Scene) -> np.ndarray:
+        """Return the transmit power that is in the levels of each device (k,) [dBm]; 0 of gains.
 
         Warns:
-            Levels are received powers, and the scene has the default of 0 dBm.
+            Levels are received powers, no device declares its power, and the scene has the default
+            of 0 dBm.
         """
         if self.level == "gain_db":
-            return 0.0
+            return np.zeros(len(self))
+        if self.declared.knows_powers:
+            return np.array([radio.tx_power_dbm for radio in self.declared.radios])
         radio = scene.config.radio
         if not radio.declares_power:
             warnings.warn(f"the twin's levels are received powers, and gains are what they are "
                           f"above the transmit power: the default of "
                           f"{scene.folder / 'scene.toml'} is taken, {radio.tx_power_dbm:g} dBm. If "
-                          "the devices send at another power, write it there as tx_power_dbm; "
-                          "gains are off by the difference, and levels are not", stacklevel=3)
-        return radio.tx_power_dbm
+                          "the devices send at another power, write it there as tx_power_dbm, or "
+                          "in devices.csv before the twin is fitted; gains are off by the "
+                          "difference, and levels are not", stacklevel=3)
+        return np.full(len(self), radio.tx_power_dbm)
 
     def warn_of_another_scene(self, scene: Scene, scene_hash: str) -> None:
         """Warn where the twin was learnt in another scene than one with this hash."""

@@ -132,18 +132,19 @@ def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,
         train: (n,) bool or rows, to learn from.
         like: kriging whose correlation is taken; None: it is fitted.
     """
-    geometry, level_db = links.geometry.select(train), links.level_db[train]
+    geometry, gain_db, limit_db = links.select(train).channel_data
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of classes with few links
         if like is not None and kind is RegressionKriging:
-            return like.refit(geometry, level_db, links.limit_db[train])
-        return fit_once(kind, geometry, level_db, links.limit_db[train], 0)
+            return like.refit(geometry, gain_db, limit_db)
+        return fit_once(kind, geometry, gain_db, limit_db, 0)
 
 
 def law_db(law: ChannelModel, links: Links, test: np.ndarray) -> np.ndarray:
     """Return what a model predicts of rows (m,) of links that are detected [dB]."""
-    mean_db, sd_db = law.predict(links.geometry.select(test))
-    return mean_if_detected(mean_db, sd_db, links.limit_db[test])
+    part = links.select(test)
+    mean_db, sd_db = law.predict(part.geometry)
+    return mean_if_detected(mean_db + part.declared_db, sd_db, part.limit_db)
 
 
 def laws_for(links: Links, criteria: SelectionCriteria) -> list[type[ChannelModel]]:
@@ -188,21 +189,21 @@ def published_laws(links: Links) -> list[PublishedLaw]:
     """Return laws of recommendations, fitted to nothing.
 
     Of those that hold at the frequency and for most of the heights and distances. Levels must be
-    gains, for no recommendation knows the transmit power.
+    gains, or powers of devices whose transmit power is declared: no recommendation knows it.
 
     Args:
         links: n links.
     """
-    if not links.is_gain or np.isnan(links.frequency_hz):
+    if not links.has_gains or np.isnan(links.frequency_hz):
         return []
-    laws, geometry = [], links.geometry
+    laws, data = [], links.channel_data
     for kind in BUILT_IN:
         if not issubclass(kind, PublishedLaw):
             continue
         try:
-            law = kind().fit(geometry, links.level_db, links.limit_db)
+            law = kind().fit(*data)
         except BadInput:  # another frequency, or no map
             continue
-        if law.inside(geometry).mean() >= MIN_INSIDE:
+        if law.inside(data[0]).mean() >= MIN_INSIDE:
             laws.append(law)
     return laws

@@ -25,6 +25,7 @@ from radiotwin.effects.params import (
 )
 from radiotwin.effects.places import Mark
 from radiotwin.links import Links
+from radiotwin.links.declared import NOTHING
 
 HEIGHT_M = 1.5  # of the emitter
 REFERENCE_M = 100.0  # distance of its level
@@ -155,7 +156,8 @@ def _fall_db(links: Links, position_m: Sequence[float] | np.ndarray,
     ground_m = 0.0 if links.city is None else float(links.city.ground_height_m(*position_m))
     emitter_m = np.array([*position_m, ground_m + HEIGHT_M])
     if level_at is not None:
-        return level_at(links.with_devices(np.tile(emitter_m, (len(links.device_m), 1))))
+        emitter = links.with_devices(np.tile(emitter_m, (len(links.device_m), 1)))
+        return level_at(emitter.with_ends(declared=NOTHING)) + links.declared.usual_db
     distance_m = np.linalg.norm(links.receiver_m - emitter_m, axis=1)
     return -20 * np.log10(np.maximum(distance_m, 1.0) / REFERENCE_M)
 

@@ -86,7 +86,7 @@ class ChannelModel(ABC):
     def level_at(self, links: Links, exact: bool = False) -> np.ndarray:
         """Return the mean level (n,) [dB] of measured links, of `quick` unless it must be exact."""
         channel = self if exact else self.quick
-        return channel.predict(links.geometry)[0]
+        return channel.predict(links.geometry)[0] + links.declared_db
 
     def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Return what of the channel is fitted again together with effects.

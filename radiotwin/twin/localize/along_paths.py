@@ -334,7 +334,7 @@ class _Search:
                                        links.frequency_hz)
         channel = self.by_paths.fit.channel
         assert isinstance(channel, ImagePaths)
-        return channel.level_db(power, links.geometry)
+        return channel.level_db(power, links.geometry) + links.declared_db
 
     def _try(self, positions_m: Iterable[np.ndarray]) -> list[float]:
         """Return the negative log-likelihood by paths of each position (2,) [nats]."""

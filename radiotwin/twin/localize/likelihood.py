@@ -24,6 +24,7 @@ from scipy.spatial.distance import pdist, squareform
 from scipy.special import ndtr
 
 from radiotwin.links import LinkGeometry
+from radiotwin.links.declared import NOTHING, Declared
 from radiotwin.twin.localize.observations import (
     Channel,
     DeviceObservations,
@@ -223,6 +224,7 @@ class Likelihood:
         city: 3D map; None: every link has line of sight.
         limit_db: limit of detection [dB]; None only where nothing is `missed`.
         law_error: of the channel; None: it is exact.
+        declared: of the devices by their index: what is in the levels beside the channel.
         repeat_share: f, 1 until it is set.
     """
 
@@ -233,6 +235,7 @@ class Likelihood:
     city: CityMap | None
     limit_db: float | None
     law_error: LawError | None = None
+    declared: Declared = NOTHING
     repeat_share: float = 1.0
 
     def of_devices(self, devices: Sequence[int] | np.ndarray, xy_m: np.ndarray) -> np.ndarray:
@@ -258,7 +261,9 @@ class Likelihood:
             for i, data in enumerate(every):
                 if link is None or self.channel.by_device:
                     link = self.channel.look_up(xy_m[part], rows, los, data.device)
-                total[i, part] = self._score(data, rows, *link)
+                mean_db, sd_db = link
+                mean_db = self._with_declared(mean_db, xy_m[part], rows, data.device)
+                total[i, part] = self._score(data, rows, mean_db, sd_db)
         return total
 
     def link_at(self, k: int, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -274,7 +279,7 @@ class Likelihood:
         data = self.observations.devices[k]
         los = self._line_of_sight(xy_m[None], data.seen)
         mean_db, sd_db = self.channel.look_up(xy_m[None], data.seen, los, data.device)
-        return mean_db[0], sd_db[0]
+        return self._with_declared(mean_db, xy_m[None], data.seen, data.device)[0], sd_db[0]
 
     def residuals(self, k: int, xy_m: np.ndarray) -> DeviceResiduals:
         """Return standardised residuals of a device's merged levels, and their slopes.
@@ -296,6 +301,7 @@ class Likelihood:
         los = np.repeat(los, 4, axis=0)
         steps = SLOPE_STEP_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
         around, _ = self.channel.look_up(xy_m + steps, data.seen, los, data.device)
+        around = self._with_declared(around, xy_m + steps, data.seen, data.device)
         slope = np.column_stack([around[0] - around[1], around[2] - around[3]])
         slope = slope / (2 * SLOPE_STEP_M)
         return DeviceResiduals(receiver_m, (data.level_db - mean_db) / merged_sd_db,
@@ -304,6 +310,23 @@ class Likelihood:
     def variance_share(self, count: np.ndarray) -> np.ndarray:
         """Return the variance of the mean of `count` repeats over the channel's variance."""
         return 1.0 - self.repeat_share + self.repeat_share / count
+
+    def _with_declared(self, mean_db: np.ndarray, xy_m: np.ndarray, rows: np.ndarray,
+                       device: int) -> np.ndarray:
+        """Return the channel's mean (p, c) with what is declared of a device [dB].
+
+        Args:
+            mean_db: (p, c) [dB].
+            xy_m: (p, 2) positions of the device [m].
+            rows: (c,) of the receivers.
+            device: its index.
+        """
+        if self.declared.adds_nothing:
+            return mean_db
+        ends_m = np.column_stack([xy_m, np.full(len(xy_m), self.z_m)])
+        ray_m = (self.observations.receiver_m[rows] - ends_m[:, None]).reshape(-1, 3)
+        added_db = self.declared.added_db(np.full(len(ray_m), device), ray_m)
+        return mean_db + np.reshape(added_db, mean_db.shape).astype(np.float32)
 
     def _line_of_sight(self, xy_m: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return line of sight (p, c) between positions (p, 2) and rows (c,) of the receivers."""

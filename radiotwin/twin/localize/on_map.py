@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from radiotwin.errors import BadInput
+from radiotwin.links.declared import NOTHING, Declared
 from radiotwin.runtime.console import progress
 from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.localize.likelihood import (
@@ -264,6 +265,7 @@ def localize(
     settings: LocalizeSettings | None = None,
     start_m: np.ndarray | None = None,
     law_error: LawError | None = None,
+    declared: Declared = NOTHING,
 ) -> list[TwinDevice]:
     """Estimate every device's position with the channel as it is.
 
@@ -288,6 +290,7 @@ def localize(
         settings: of the search; None: the defaults.
         start_m: (k, 2) an earlier estimate of each, where one more swarm starts [m]; NaN: none.
         law_error: of the channel, which widens the radii; None: it is exact.
+        declared: of the devices by their index: what is in the levels beside the channel.
 
     Returns:
         the devices in their order.
@@ -308,7 +311,7 @@ def localize(
         rows = np.flatnonzero(usable & (z_m == z))
         index = np.array([observations.devices[k].device for k in rows])
         links = tabulate(channel, observations.receiver_m, z, bounds, index, rng)
-        likelihood = Likelihood(observations, links, rows, z, city, limit_db, law_error)
+        likelihood = Likelihood(observations, links, rows, z, city, limit_db, law_error, declared)
         searches.append(Search(likelihood, bounds, settings))
     found: dict[int, tuple[Posterior, Search]] = {}
     with progress("locating", total=settings.iterations + 3 * len(devices)) as advance:

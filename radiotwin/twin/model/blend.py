@@ -104,7 +104,7 @@ class Blend:
                 predicted = forest.predict(features)
                 members[name] = predicted if name in TREES_ALONE else mean_db + predicted * scale_db
         for name, law in self.laws.items():
-            members[name] = law.predict(geometry)[0]
+            members[name] = law.predict(geometry)[0] + links.declared_db
         names = list(self.weights)
         blended_db = combine(np.column_stack([members[name] for name in names]), share,
                              np.transpose([self.weights[name] for name in names]))

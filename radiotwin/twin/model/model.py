@@ -48,7 +48,7 @@ class Model:
         train: (n,) bool, links that are learnt from.
         usable: (n,) bool, links to devices that have a position.
         channel: fitted already.
-        channel_db: (n,) its mean level [dB].
+        channel_db: (n,) its mean level, with what is declared of the devices [dB].
         level_columns: (n, p0) what is fitted again of the channel: `ChannelModel.level_columns`.
         level_prior_sd_db: (p0,) prior standard deviations of it.
         group: (n,) index of the error scale.
@@ -84,7 +84,8 @@ class Model:
             device_m: (k, 3) where the channel has the devices [m], NaN for one that it has nowhere;
                 None: where the links have them.
             train: (n,) bool, links to learn from; None: all.
-            channel_db: (n,) the channel's mean level where it is known already [dB].
+            channel_db: (n,) mean level by the channel and by what is declared of the devices, where
+                it is known already [dB].
         """
         usable = np.ones(len(links), dtype=bool)
         if device_m is not None:
@@ -93,7 +94,7 @@ class Model:
             links = links.with_devices(np.where(np.isfinite(device_m), device_m, 0.0))
         geometry = links.geometry
         if channel_db is None:
-            channel_db = channel.predict(geometry)[0]
+            channel_db = channel.predict(geometry)[0] + links.declared_db
         columns, prior_sd_db = channel.level_columns(geometry)
         return cls(links, usable if train is None else train & usable, usable, channel, channel_db,
                    columns, prior_sd_db, channel.error_group(geometry),
@@ -466,6 +467,7 @@ class FittedModel:
         """Return the levels that are expected of links, see `Prediction`."""
         if self.is_channel_alone:
             mean_db, sd_db = self.channel.predict(links.geometry)
+            mean_db = mean_db + links.declared_db
             detected = gaussian.detection_probability(mean_db, sd_db, links.limit_db)
             return Prediction(mean_db, sd_db, detected)
         fit = self.on_links(links)

@@ -1,0 +1,273 @@
+"""What is declared of each device's radio: power, cable, antenna and carrier, and what that adds.
+
+A channel model knows gains between isotropic antennas at one frequency. The level of a link is that
+gain, and the power that its device feeds to its antenna, the antenna's gain in the direction of the
+receiver, and 20 lg of the carriers' ratio (Friis 1946, 'A note on a simple transmission formula').
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.display import some
+from radiotwin.errors import BadInput
+from radiotwin.scene.antennas import Antenna, Pattern
+
+if TYPE_CHECKING:
+    from radiotwin.scene import Scene
+
+MAX_EIRP_APART_DB = 0.5  # between a declared EIRP and that of power, cable and antenna
+MAX_NAMED = 6  # devices in a message
+
+
+@dataclass(frozen=True)
+class Radio:
+    """What is declared of the radio of a device.
+
+    Attributes:
+        tx_power_dbm: at the output of the transmitter [dBm]; None: not known.
+        cable_loss_db: between that and the antenna [dB].
+        antenna: None: isotropic, or a part of what is learnt of the levels.
+        frequency_hz: None: that of the scene.
+    """
+
+    tx_power_dbm: float | None = None
+    cable_loss_db: float = 0.0
+    antenna: Antenna | None = None
+    frequency_hz: float | None = None
+
+    @property
+    def fed_dbm(self) -> float:
+        """Power that reaches the antenna [dBm]; of a power that is not known, less than 0 dBm."""
+        return (self.tx_power_dbm or 0.0) - self.cable_loss_db
+
+
+def tx_power_dbm(device: str, power_dbm: float | None, eirp_dbm: float | None,
+                 cable_loss_db: float, antenna: Antenna | None) -> float | None:
+    """Return the transmit power [dBm] of a device whose power or EIRP, or both, are declared.
+
+    EIRP is the power, less the loss of the cable, and the antenna's greatest gain (ITU-R V.573-6,
+    A43).
+
+    Raises:
+        BadInput: both are declared, and contradict each other.
+    """
+    if eirp_dbm is None:
+        return power_dbm
+    peak_dbi = 0.0 if antenna is None else antenna.pattern.peak_dbi
+    by_eirp_dbm = eirp_dbm - peak_dbi + cable_loss_db
+    if power_dbm is None:
+        return by_eirp_dbm
+    if abs(by_eirp_dbm - power_dbm) > MAX_EIRP_APART_DB:
+        raise BadInput(
+            f"device {device!r}: eirp_dbm = {eirp_dbm:g} contradicts tx_power_dbm = {power_dbm:g} "
+            f"with cable_loss_db = {cable_loss_db:g} and an antenna of {peak_dbi:.1f} dBi (0 dBi "
+            f"without the column antenna), which make {power_dbm - cable_loss_db + peak_dbi:.1f} "
+            f"dBm; {MAX_EIRP_APART_DB:g} dB of difference are allowed: correct one, or leave one "
+            "empty")
+    return power_dbm
+
+
+@dataclass(frozen=True, eq=False)
+class Declared:
+    """What is declared of the radios of k devices, as it is in the levels of their links.
+
+    Attributes:
+        radios: of each device; empty: nothing is declared.
+        frequency_hz: that channel models compute at [Hz]; NaN where it is not known.
+        has_power: whether levels are received powers, with the transmit power in them.
+    """
+
+    radios: tuple[Radio, ...]
+    frequency_hz: float
+    has_power: bool
+
+    @cached_property
+    def fed_db(self) -> np.ndarray:
+        """What radios add to gains between isotropic antennas in any direction (k,) [dB]."""
+        fed_db = np.zeros(len(self.radios))
+        for number, radio in enumerate(self.radios):
+            fed_db[number] = radio.fed_dbm if self.has_power else -radio.cable_loss_db
+            if radio.frequency_hz is not None and np.isfinite(self.frequency_hz):
+                fed_db[number] -= 20 * np.log10(radio.frequency_hz / self.frequency_hz)
+        return fed_db
+
+    @property
+    def usual_db(self) -> float:
+        """The median of `fed_db` [dB]; 0 where nothing is declared."""
+        return float(np.median(self.fed_db)) if self.radios else 0.0
+
+    @cached_property
+    def antennas(self) -> list[tuple[Antenna, np.ndarray]]:
+        """Each antenna, and which devices (k,) have it."""
+        own = [radio.antenna for radio in self.radios]
+        every = {id(antenna): antenna for antenna in own if antenna is not None}
+        return [(antenna, np.array([each is antenna for each in own]))
+                for antenna in every.values()]
+
+    @property
+    def knows_powers(self) -> bool:
+        """Whether levels are received powers, and all transmit powers are known."""
+        return self.has_power and bool(self.radios) and all(
+            radio.tx_power_dbm is not None for radio in self.radios)
+
+    @cached_property
+    def adds_nothing(self) -> bool:
+        """Whether all levels are gains between isotropic antennas, as far as is declared."""
+        return not self.fed_db.any() and not self.antennas
+
+    def added_db(self, device: np.ndarray, ray_m: np.ndarray) -> np.ndarray | float:
+        """Return what the radios add to the gains of links between isotropic antennas (n,) [dB].
+
+        Args:
+            device: (n,) index of each link's device.
+            ray_m: (n, 3) from the device to the receiver [m]; NaN where the device may be anywhere.
+
+        Returns:
+            along the straight line; 0 where nothing is declared.
+        """
+        if self.adds_nothing:
+            return 0.0
+        added_db = self.fed_db[device]
+        for antenna, of_device in self.antennas:
+            rows = np.flatnonzero(of_device[device])
+            added_db[rows] += antenna.gain_dbi(ray_m[rows])
+        return added_db
+
+    def of_devices(self, index: np.ndarray) -> Declared:
+        """Return the same of other devices: those of the radios (j,) with these numbers.
+
+        Args:
+            index: (j,) of `radios`; -1: nothing is declared.
+        """
+        if self.adds_nothing:
+            return NOTHING
+        every = *self.radios, Radio()
+        return replace(self, radios=tuple(every[number] for number in index))
+
+
+NOTHING = Declared((), np.nan, False)
+
+
+def radios_of(devices: pd.DataFrame, patterns: dict[str, Pattern], scene: Scene | None
+              ) -> tuple[Radio, ...]:
+    """Return what a table of devices, and the scene, declare of each device's radio.
+
+    An antenna that the table does not name is the one that the scene declares for that device.
+
+    Args:
+        devices: k rows as of `Measurements.devices`.
+        patterns: of the antennas, by the file's name in the table.
+        scene: if there is one.
+
+    Returns:
+        of k devices; empty: nothing is declared.
+
+    Raises:
+        BadInput: powers that contradict each other.
+    """
+    of_scene: dict[str, Antenna | None] = {}
+    if scene is not None:
+        of_scene = dict(zip((each.device for each in scene.config.devices), scene.device_antennas))
+    found = []
+    for row in devices.to_dict("records"):
+        number: dict[str, float | None] = {
+            name: None if pd.isna(row.get(name)) else float(row[name])
+            for name in ("tx_power_dbm", "eirp_dbm", "cable_loss_db", "azimuth_deg", "tilt_deg",
+                         "frequency_hz")}
+        antenna = of_scene.get(row["device"])
+        name = row.get("antenna")
+        if isinstance(name, str) and name:
+            if name not in patterns:
+                raise BadInput(f"device {row['device']!r}: the content of its antenna's file "
+                               f"{name!r} is not given; give it in antenna_files of Measurements")
+            antenna = Antenna(patterns[name])
+        if antenna is not None:
+            azimuth_deg, tilt_deg = number["azimuth_deg"], number["tilt_deg"]
+            antenna = Antenna(antenna.pattern,
+                              antenna.azimuth_deg if azimuth_deg is None else azimuth_deg,
+                              antenna.tilt_deg if tilt_deg is None else tilt_deg)
+        loss_db = number["cable_loss_db"] or 0.0
+        power_dbm = tx_power_dbm(row["device"], number["tx_power_dbm"], number["eirp_dbm"],
+                                 loss_db, antenna)
+        found.append(Radio(power_dbm, loss_db, antenna, number["frequency_hz"]))
+    return tuple(found) if any(radio != Radio() for radio in found) else ()
+
+
+def complete(names: Sequence[str], radios: tuple[Radio, ...], has_power: bool,
+             scene: Scene | None) -> tuple[tuple[Radio, ...], list[str]]:
+    """Return the radios with a power each where any has one, and notes on what is assumed.
+
+    Args:
+        names: of k devices.
+        radios: of these; empty: nothing is declared.
+        has_power: whether levels are received powers.
+        scene: whose declared power is the one of devices that declare none.
+    """
+    notes: list[str] = []
+    known_dbm = [radio.tx_power_dbm for radio in radios if radio.tx_power_dbm is not None]
+    if known_dbm and not has_power:
+        notes.append("tx_power_dbm of devices is declared and levels are gains, without the power: "
+                     "it is not used to learn or to locate, and is that of the devices in coverage")
+    elif known_dbm:
+        if scene is not None and scene.config.radio.declares_power:
+            usual_dbm, whose = scene.config.radio.tx_power_dbm, "the scene's tx_power_dbm"
+        else:
+            usual_dbm, whose = float(np.median(known_dbm)), "the median of the others"
+        notes += _missing(names, radios, lambda radio: radio.tx_power_dbm is None,
+                          f"tx_power_dbm of {{}} is not declared and taken for {usual_dbm:g} dBm, "
+                          f"{whose}")
+        radios = tuple(replace(radio, tx_power_dbm=usual_dbm) if radio.tx_power_dbm is None
+                       else radio for radio in radios)
+    if any(radio.antenna for radio in radios):
+        notes += _missing(names, radios, lambda radio: radio.antenna is None,
+                          "the antenna of {} is not declared, as others' are, and taken for "
+                          "isotropic")
+    return radios, notes
+
+
+def as_learnt(names: Sequence[str], declared: Declared, learnt: Declared, scene: Scene | None
+              ) -> tuple[Declared, list[str]]:
+    """Return what is declared of devices for a law that was learnt from others, and notes.
+
+    Args:
+        names: of k devices.
+        declared: of these.
+        learnt: of the devices that the law was learnt from.
+        scene: whose declared power is the one of devices that declare none.
+    """
+    notes: list[str] = []
+    radios = declared.radios or tuple(Radio() for _ in names)
+    if learnt.knows_powers and not declared.knows_powers:
+        if scene is not None and scene.config.radio.declares_power:
+            usual_dbm, whose = scene.config.radio.tx_power_dbm, "the scene's tx_power_dbm"
+        else:
+            usual_dbm = float(np.median([radio.tx_power_dbm for radio in learnt.radios]))
+            whose = "the median of the twin's devices"
+        notes += _missing(names, radios, lambda radio: radio.tx_power_dbm is None,
+                          f"tx_power_dbm of {{}} is not declared and taken for {usual_dbm:g} dBm, "
+                          f"{whose}")
+        radios = tuple(replace(radio, tx_power_dbm=usual_dbm) for radio in radios)
+    elif declared.knows_powers and not learnt.knows_powers:
+        notes.append(f"tx_power_dbm of {some(names, MAX_NAMED)} is not used: the twin was learnt "
+                     "from received powers of devices that declared none; declare theirs in "
+                     "devices.csv and fit again")
+        radios = tuple(replace(radio, tx_power_dbm=None) for radio in radios)
+    if any(radio.antenna for radio in radios) and not learnt.antennas:
+        notes.append("the law of the twin's devices contains whatever antennas they have, and those"
+                     " of the devices to be located are added to it: unless they are isotropic "
+                     "they count twice; declare their antennas in devices.csv and fit again")
+    frequency_hz = declared.frequency_hz if np.isnan(learnt.frequency_hz) else learnt.frequency_hz
+    return Declared(radios, frequency_hz, declared.has_power), notes
+
+
+def _missing(names: Sequence[str], radios: tuple[Radio, ...], lacks: Callable[[Radio], bool],
+             text: str) -> list[str]:
+    missing = [name for name, radio in zip(names, radios, strict=True) if lacks(radio)]
+    return [text.format(some(missing, MAX_NAMED))] if missing else []

@@ -1,0 +1,228 @@
+"""What devices.csv declares of a device's radio is taken off its levels and put back.
+
+Truths are formulas of their own: free space at 1 m and an exponent, a power, a cable, a pattern that the tests write.
+"""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.coverage import CoverageSettings, predict_coverage, read_transmitters
+from radiotwin.errors import BadInput
+from radiotwin.links import link_geometry, prepare_links
+from radiotwin.links.measurements import Measurements, read_measurements
+from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin.locate import locate_devices
+from radiotwin.twin.point_gains import gains_at
+from tests.coverage.conftest import write_scene
+
+A_DB, EXPONENT, SD_DB = -40.0, 2.6, 1.5
+PLACES_M = {"a": (60.0, 60.0), "b": (330.0, 90.0), "c": (80.0, 320.0), "u": (230.0, 240.0)}
+Z_M, UP_M = 1.5, 40.0
+
+
+def sector_dbi(azimuth_deg, elevation_deg):
+    """14 dBi ahead, 12 dB less for each 50 degrees of azimuth and for each 20 of elevation, squared; 25 dB at most."""
+    off = (np.asarray(azimuth_deg) + 180) % 360 - 180
+    return 14 - np.minimum(12 * (off / 50) ** 2 + 12 * (np.asarray(elevation_deg) / 20) ** 2, 25)
+
+
+def write_sector(path):
+    rows = [f"{azimuth},{elevation},{sector_dbi(azimuth, elevation):.6f}"
+            for elevation in range(-90, 91, 2) for azimuth in range(0, 360, 2)]
+    path.write_text("azimuth_deg,elevation_deg,gain_dbi\n" + "\n".join(rows) + "\n")
+
+
+def truth_db(device_m, receiver_m, boresight_deg=None):
+    """Gain by the exponent, through a sector with that boresight if there is one."""
+    east, north, up = (np.asarray(receiver_m) - device_m).T
+    gain_db = A_DB - 10 * EXPONENT * np.log10(np.sqrt(east**2 + north**2 + up**2))
+    if boresight_deg is None:
+        return gain_db
+    return gain_db + sector_dbi(np.degrees(np.arctan2(east, north)) - boresight_deg,
+                                np.degrees(np.arctan2(up, np.hypot(east, north))))
+
+
+def campaign(folder, devices, column="rssi_dbm", boresights_deg=None, seed=0, links=250):
+    """Write measurements of devices (name -> declared columns) over the small scene, and read them."""
+    rng = np.random.default_rng(seed)
+    table = []
+    for name, declared in devices.items():
+        receiver_m = np.column_stack([rng.uniform(20, 380, (links, 2)), np.full(links, UP_M)])
+        level_db = truth_db((*PLACES_M[name], Z_M), receiver_m, (boresights_deg or {}).get(name)) \
+            + rng.normal(0, SD_DB, links) + declared.pop("adds_db")
+        table.append(pd.DataFrame({"time_s": np.arange(links), "flight": "f", "receiver": "r", "device": name, column: level_db,
+                                   **{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")}}))
+    rows = [{"device": name, "x_m": PLACES_M[name][0] if name != "u" else None, "y_m": PLACES_M[name][1] if name != "u" else None,
+             "z_m": Z_M, "role": "unknown" if name == "u" else "anchor", **declared} for name, declared in devices.items()]
+    folder.mkdir(exist_ok=True)
+    pd.concat(table).to_csv(folder / "measurements.csv", index=False)
+    pd.DataFrame(rows).to_csv(folder / "devices.csv", index=False)
+    return read_measurements(folder / "measurements.csv")
+
+
+def predicted_db(twin, scene, names, at_m):
+    row = [[each.device for each in twin.devices].index(name) for name in names]
+    return twin.predict(twin.links(np.tile(at_m, (len(row), 1)), np.array(row), scene)).mean_db
+
+
+@pytest.fixture(scope="module")
+def ground(tmp_path_factory):
+    """Open ground whose scene declares no power."""
+    return write_scene(tmp_path_factory.mktemp("open") / "scene", tx_power_dbm=0.0, noise_dbm=-102.0)
+
+
+def test_powers_of_anchors_and_of_an_unknown_device(ground, tmp_path):
+    powers = {"a": 0.0, "b": 20.0, "c": 10.0, "u": 27.0}
+    data = campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power} for name, power in powers.items()})
+    twin = fit_twin(data, ground, model="log_distance")
+    located = twin.devices[3]
+    assert np.hypot(located.x_m - 230, located.y_m - 240) < 5 and located.credible_radius_m < 10
+    at_m = np.array([[200.0, 180.0, 40.0]])
+    gains_db = np.array([truth_db((*PLACES_M[name], Z_M), at_m)[0] for name in "abcu"])
+    expected_dbm = gains_db + list(powers.values())
+    np.testing.assert_allclose(predicted_db(twin, ground, "abcu", at_m), expected_dbm, atol=0.7)
+    twin.save(tmp_path / "twin")
+    again = Twin.load(tmp_path / "twin")
+    np.testing.assert_array_equal(predicted_db(again, ground, "abcu", at_m), predicted_db(twin, ground, "abcu", at_m))
+    np.testing.assert_allclose(gains_at(again, ground, at_m, list("abcu"))[:, 0], gains_db, atol=0.7)
+    lattice = again.radio_map(ground)
+    there_m = np.array([[lattice.lattice.x_m[3], lattice.lattice.y_m[4], 1.5]])
+    np.testing.assert_allclose(lattice.gain_db[:, 0, 4, 3], [truth_db((*PLACES_M[name], Z_M), there_m)[0] for name in "abcu"],
+                               atol=1.0)
+
+
+def test_a_power_that_is_missing_is_that_of_the_scene_or_the_median(ground, tmp_path):
+    declared = {"a": {"tx_power_dbm": 0.0, "adds_db": 0.0}, "b": {"tx_power_dbm": 20.0, "adds_db": 20.0}, "c": {"adds_db": 10.0}}
+    data = campaign(tmp_path / "m", declared)
+    assert any("tx_power_dbm of c is not declared and taken for 10 dBm, the median" in note
+               for note in prepare_links(data, ground).notes)
+    with pytest.warns(UserWarning, match="tx_power_dbm of c is not declared and taken for 10 dBm"):
+        twin = fit_twin(data, ground, model="log_distance")
+    at_m = np.array([[200.0, 180.0, 40.0]])
+    expected_dbm = [truth_db((*PLACES_M[name], Z_M), at_m)[0] + power for name, power in zip("abc", (0, 20, 10))]
+    np.testing.assert_allclose(predicted_db(twin, ground, "abc", at_m), expected_dbm, atol=0.7)
+    loud = write_scene(tmp_path / "loud", tx_power_dbm=17.0)
+    assert any("tx_power_dbm of c is not declared and taken for 17 dBm, the scene's" in note
+               for note in prepare_links(data, loud).notes)
+
+
+def test_nothing_declared_changes_nothing(ground, tmp_path):
+    links = prepare_links(campaign(tmp_path / "m", {name: {"adds_db": 5.0} for name in "abc"}), ground)
+    assert links.declared.adds_nothing and not links.has_gains
+    assert links.channel_data[1] is not links.level_db and (links.channel_data[1] == links.level_db).all()
+    twin = fit_twin(read_measurements(tmp_path / "m" / "measurements.csv"), ground, model="log_distance")
+    assert "declared" not in json.loads(twin.encode()[0])
+
+
+def test_gains_do_not_hold_the_power_which_coverage_uses(ground, tmp_path):
+    data = campaign(tmp_path / "m", {name: {"tx_power_dbm": 23.0, "adds_db": 0.0} for name in "abc"}, "gain_db")
+    with pytest.warns(UserWarning, match="levels are gains, without the power"):
+        twin = fit_twin(data, ground, model="log_distance")
+    coverage = predict_coverage(twin, ground, settings=CoverageSettings(step_m=20.0))
+    assert {each["tx_power_dbm"] for each in coverage.summary["transmitters"]} == {23.0}
+
+
+@pytest.mark.parametrize(("declared", "power_dbm"), [
+    ({"eirp_dbm": 30.0, "cable_loss_db": 2.0}, 32.0), ({"eirp_dbm": 30.0, "tx_power_dbm": 30.4}, 30.4),
+    ({"eirp_dbm": 44.0, "cable_loss_db": 3.0, "antenna": "sector.csv", "tx_power_dbm": 33.0}, 33.0),
+    ({"eirp_dbm": 44.0, "antenna": "sector.csv"}, 30.0)])
+def test_eirp_is_power_less_cable_and_the_antennas_greatest_gain(ground, tmp_path, declared, power_dbm):
+    write_sector(tmp_path / "sector.csv")
+    data = campaign(tmp_path, {"a": declared | {"adds_db": 0.0}, "b": {"tx_power_dbm": 10.0, "adds_db": 0.0}})
+    radio = prepare_links(data, ground).declared.radios[0]
+    assert radio.tx_power_dbm == pytest.approx(power_dbm)
+    (tmp_path / "sites.csv").write_text(pd.DataFrame([{"device": "s", "x_m": 0, "y_m": 0, "z_m": 9} | declared]).to_csv(index=False))
+    site, = read_transmitters(tmp_path / "sites.csv", ground)
+    assert site.tx_power_dbm == pytest.approx(power_dbm)
+    assert site.fed_dbm == pytest.approx(power_dbm - declared.get("cable_loss_db", 0.0))
+
+
+@pytest.mark.parametrize(("declared", "message"), [
+    ({"eirp_dbm": 30.0, "tx_power_dbm": 20.0}, "'a': eirp_dbm = 30 contradicts tx_power_dbm = 20 .* which make 20.0 dBm"),
+    ({"cable_loss_db": -2.0}, "column cable_loss_db: .*is no loss; allowed are 0 to 100 dB"),
+    ({"antenna": "../other.csv"}, "only files in that folder may be named"),
+    ({"antenna": "none.csv"}, "none.csv")])
+def test_what_contradicts_itself_is_refused(ground, tmp_path, declared, message):
+    folder = tmp_path / "m"
+    folder.mkdir()
+    with pytest.raises(BadInput, match=message):
+        prepare_links(campaign(folder, {"a": declared | {"adds_db": 0.0}}, links=60), ground)
+
+
+def through_sectors(folder, names, column="rssi_dbm", **declared):
+    folder.mkdir()
+    write_sector(folder / "sector.csv")
+    boresights_deg = dict(zip("abcu", (45.0, 300.0, 150.0, 230.0)))
+    return campaign(folder, {name: {"adds_db": 0.0, **{key: value[name] if isinstance(value, dict) else value
+                                                        for key, value in declared.items()}, "azimuth_deg": boresights_deg[name]}
+                             for name in names}, column, boresights_deg)
+
+
+def test_antennas_of_devices_are_taken_off_and_put_back(ground, tmp_path):
+    data = through_sectors(tmp_path / "m", "abcu", antenna="sector.csv", tx_power_dbm=0.0)
+    twin = fit_twin(data, ground, model="log_distance")
+    assert twin.channel.predict(link_geometry(np.zeros((1, 3)), np.array([[100.0, 0, 0]]), np.array([0]), None))[0] \
+        == pytest.approx(A_DB - 20 * EXPONENT, abs=0.3)
+    assert np.hypot(twin.devices[3].x_m - 230, twin.devices[3].y_m - 240) < 5
+    twin.save(tmp_path / "twin")
+    at_m, again = np.array([[150.0, 210.0, 40.0]]), Twin.load(tmp_path / "twin")
+    expected_db = [truth_db((*PLACES_M[name], Z_M), at_m, boresight)[0] for name, boresight in zip("abc", (45, 300, 150))]
+    np.testing.assert_allclose(predicted_db(again, ground, "abc", at_m), expected_db, atol=0.6)
+    data.save(tmp_path / "elsewhere" / "measurements.csv")  # with the file of the pattern
+    assert len(read_measurements(tmp_path / "elsewhere" / "measurements.csv").patterns) == 1
+
+
+def test_a_new_transmitters_antenna_counts_once_where_the_devices_declare_theirs(ground, tmp_path):
+    """Gains measured through sectors; a planned one looks north."""
+    (tmp_path / "tx.csv").write_text("device,x_m,y_m,z_m,tx_power_dbm,antenna,azimuth_deg\nnew,200,100,1.5,10,m/sector.csv,0\n")
+    data = through_sectors(tmp_path / "m", "abc", "gain_db", antenna="sector.csv")
+    planned = read_transmitters(tmp_path / "tx.csv", ground)
+    settings = CoverageSettings(step_m=40.0, height_m=40.0, extent_m=(0, 400, 0, 400))
+    coverage = predict_coverage(fit_twin(data, ground, model="log_distance"), ground, planned, settings)
+    x_m, y_m = (axis.ravel() for axis in np.meshgrid(coverage.grid.x_m, coverage.grid.y_m))
+    expected_dbm = 10 + truth_db((200, 100, 1.5), np.column_stack([x_m, y_m, np.full(len(x_m), 40.0)]), 0.0)
+    error_db = coverage.dataset["received_power_dbm"].values.ravel() - expected_dbm
+    assert abs(np.median(error_db)) < 0.3 and np.abs(error_db).max() < 1.0
+    assert not any("twice" in note for note in coverage.summary["notes"])
+    undeclared = Measurements(data.table, data.devices.drop(columns=["antenna", "azimuth_deg"]))
+    told = predict_coverage(fit_twin(undeclared, ground, model="log_distance"), ground, planned, settings)
+    assert any("antenna of new is added to it: unless they are isotropic it counts twice" in note
+               for note in told.summary["notes"])
+
+
+def test_coverage_of_a_twin_of_known_powers_has_other_transmitters(ground, tmp_path):
+    data = campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power} for name, power in zip("abc", (0.0, 20.0, 10.0))})
+    twin = fit_twin(data, ground, model="log_distance")
+    (tmp_path / "tx.csv").write_text("device,x_m,y_m,z_m,tx_power_dbm\nnew,200,100,1.5,17\nlater,100,200,1.5,\na,60,60,1.5,\n")
+    planned = read_transmitters(tmp_path / "tx.csv", ground)
+    settings = CoverageSettings(step_m=40.0, height_m=40.0, extent_m=(0, 400, 0, 400), tx_power_dbm=3.0)
+    for name, place_m, power_dbm in (("new", (200, 100), 17.0), ("later", (100, 200), 3.0), ("a", (60, 60), 0.0)):
+        coverage = predict_coverage(twin, ground, planned, settings, devices=[name])
+        x_m, y_m = (axis.ravel() for axis in np.meshgrid(coverage.grid.x_m, coverage.grid.y_m))
+        expected_dbm = power_dbm + truth_db((*place_m, 1.5), np.column_stack([x_m, y_m, np.full(len(x_m), 40.0)]))
+        np.testing.assert_allclose(coverage.dataset["received_power_dbm"].values.ravel(), expected_dbm, atol=0.8)
+
+
+def test_two_carriers_are_moved_by_20_lg_f(ground, tmp_path):
+    carriers_hz = {"a": 1.8e9, "b": 2.2e9, "c": 2e9}
+    data = campaign(tmp_path / "m", {name: {"frequency_hz": hz, "adds_db": -20 * np.log10(hz / 2e9)}
+                                     for name, hz in carriers_hz.items()}, "gain_db")
+    twin = fit_twin(data, ground, model="log_distance")
+    at_m = np.array([[200.0, 180.0, 40.0]])
+    expected_db = [truth_db((*PLACES_M[name], Z_M), at_m)[0] - 20 * np.log10(hz / 2e9) for name, hz in carriers_hz.items()]
+    np.testing.assert_allclose(predicted_db(twin, ground, "abc", at_m), expected_db, atol=0.5)
+
+
+def test_a_later_file_is_located_by_its_own_powers(ground, tmp_path):
+    twin = fit_twin(campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power}
+                                              for name, power in zip("abc", (0.0, 20.0, 10.0))}), ground, model="log_distance")
+    later = campaign(tmp_path / "later", {"u": {"tx_power_dbm": 27.0, "adds_db": 27.0}}, seed=1)
+    found, _ = locate_devices(later, twin, ground)
+    assert np.hypot(found["x_m"][0] - 230, found["y_m"][0] - 240) < 8
+    silent = campaign(tmp_path / "silent", {"u": {"adds_db": 10.0}}, seed=1)
+    found, notes = locate_devices(silent, twin, ground)
+    assert any("tx_power_dbm of u is not declared and taken for 10 dBm, the median of the twin's devices" in note for note in notes)
+    assert np.hypot(found["x_m"][0] - 230, found["y_m"][0] - 240) < 8
