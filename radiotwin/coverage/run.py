@@ -36,6 +36,7 @@ from radiotwin.coverage.transmitters import (
 )
 from radiotwin.errors import BadInput
 from radiotwin.geo import origin_attributes
+from radiotwin.io.texts import percent
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
@@ -305,6 +306,12 @@ def _summary(dataset: xr.Dataset, transmitters: list[Transmitter], grid: Coverag
              bandwidth_hz: float, scene: Scene) -> dict[str, Any]:
     left_out = int(dataset["indoor"].sum()) if settings.indoor_loss_db is None else 0
     notes = gains.notes(_some_receivers(dataset, grid, scene))
+    nothing = np.isnan(dataset["received_power_dbm"].values) & (
+        ~dataset["indoor"].values if left_out else True)
+    if nothing.any():
+        notes.append(f"{percent(nothing.sum() / (nothing.size - left_out))} of the cells "
+                     f"({int(nothing.sum()):,}) receive nothing from any transmitter: no path, or "
+                     "no gain, is known there; they count as not covered")
     gaps_hz = np.diff(sorted({each.frequency_hz or 0.0 for each in transmitters}))
     if (gaps_hz < bandwidth_hz).any():
         notes.append(f"channels of {bandwidth_hz / 1e6:g} MHz whose frequencies are "

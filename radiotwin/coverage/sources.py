@@ -8,6 +8,7 @@ import numpy as np
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.display import some
 from radiotwin.errors import BadInput
+from radiotwin.io.texts import percent
 from radiotwin.links import LinkGeometry, link_geometry
 from radiotwin.links.declared import Declared, Radio
 from radiotwin.links.links import Columns, Ends, Links, World
@@ -15,8 +16,10 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import channel_named
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.published import PublishedLaw
+from radiotwin.propagation.terrain import is_far
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
+from radiotwin.scene.citymap import FAR_M
 from radiotwin.twin import Twin
 from radiotwin.twin.model.model import FittedModel
 
@@ -117,7 +120,20 @@ def _source_of_paths(scene: Scene, transmitters: Sequence[Transmitter]) -> GainS
             parts.append(np.where(np.isfinite(gain_db), gain_db, np.nan))
         return np.concatenate(parts), None
 
-    return GainSource("raytrace: paths over the 3D map, powers added", predict)
+    def notes(receiver_m: np.ndarray) -> list[str]:
+        """Return what share of the links is behind terrain, or beyond 5 km."""
+        if not len(receiver_m):
+            return []
+        some_m = np.array([each.position_m for each in transmitters[:NOTED_TRANSMITTERS]])
+        share = {
+            "are behind terrain: those that no path reaches have": np.mean(
+                [scene.city.hidden_by_ground(each_m[None], receiver_m) for each_m in some_m]),
+            f"are longer than {FAR_M / 1e3:g} km: they have, in place of paths,": np.mean(
+                [is_far(each_m, receiver_m) for each_m in some_m])}
+        return [f"{percent(value)} of the links {what} the loss along the profile of ground and "
+                "roofs (ITU-R P.526-15, Sec. 4.5)" for what, value in share.items() if value]
+
+    return GainSource("raytrace: paths over the 3D map, powers added", predict, notes)
 
 
 def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:

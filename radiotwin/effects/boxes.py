@@ -12,6 +12,7 @@ from radiotwin.effects.arrays import ends_above
 from radiotwin.effects.params import Length, Metres
 from radiotwin.inference.student import DOF
 from radiotwin.links import Links
+from radiotwin.propagation import terrain
 from radiotwin.scene.citymap import CityMap
 
 SAMPLE_M = 5.0  # between points on a link, while it is back-projected
@@ -284,7 +285,7 @@ def back_project(a_m: np.ndarray, b_m: np.ndarray,
 
 def knife_edge_db(over_m: np.ndarray, first_m: np.ndarray | float, second_m: np.ndarray | float,
                   wavelength_m: float) -> np.ndarray:
-    """Return the loss over a knife edge (ITU-R P.526-15, Eq. 26 and 31) [dB].
+    """Return the loss over a knife edge (ITU-R P.526-15, Eq. 26) [dB].
 
     Args:
         over_m: (n,) height of the edge above the straight line [m].
@@ -293,9 +294,7 @@ def knife_edge_db(over_m: np.ndarray, first_m: np.ndarray | float, second_m: np.
         wavelength_m: of the radio [m].
     """
     near, far = np.maximum(first_m, 1.0), np.maximum(second_m, 1.0)
-    nu = over_m * np.sqrt(2 * (near + far) / (wavelength_m * near * far))
-    shifted = np.maximum(nu, -0.78) - 0.1
-    return np.where(nu > -0.78, 6.9 + 20 * np.log10(np.sqrt(shifted**2 + 1) + shifted), 0.0)
+    return terrain.knife_edge_db(over_m * np.sqrt(2 * (near + far) / (wavelength_m * near * far)))
 
 
 def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray,

@@ -38,6 +38,9 @@ CHUNK = 1_000_000  # rays per call: bounds the memory of any query to about 100 
 DOWN = np.array([0.0, 0.0, -1.0])
 CONCRETE = Material("concrete", itu="concrete")  # of faces whose material is not known
 SAME_CORNER_M = 0.01  # corners closer than this are one [m]
+EARTH_RADIUS_M = 8.5e6  # 4/3 of the Earth's, for refraction (ITU-R P.526-15, Sec. 1)
+FAR_M = 5_000.0  # between ends for which the Earth is round [m]; its bulge is 0.4 m there
+BEND_M = 1_000.0  # pieces that are straight of a line of sight over the round Earth
 MIN_HEIGHT_SHARE = 0.2  # of a building's height that is left, whatever the error
 _MAX_SD_M, _MAX_AREA_M2 = 1000.0, 1e9
 
@@ -163,7 +166,8 @@ class CityMap:
     def line_of_sight(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Return whether no surface lies between points.
 
-        Two points within one solid see each other.
+        Two points within one solid see each other. Between points more than `FAR_M` apart the line
+        is bent by the curvature of the Earth, with mean refraction, and flat ground has no end.
 
         Args:
             a_m: (n, 3) or broadcastable to it [m].
@@ -182,9 +186,34 @@ class CityMap:
             way = np.ascontiguousarray(b_m[part] - a_m[part], dtype=np.float32)
             los[part] = self._scene.run(origin, way, np.ones(len(way), np.float32),
                                         query="OCCLUDED") == -1
+            far.append(start + np.flatnonzero(way[:, 0] ** 2 + way[:, 1] ** 2 > FAR_M**2))
 
+        far: list[np.ndarray] = [np.zeros(0, dtype=int)]
         in_threads(cast, range(0, len(a_m), SIGHT_CHUNK))
+        rows = np.concatenate(far)
+        if len(rows):
+            los[rows] = self._sight_over_earth(a_m[rows], b_m[rows])
         return los
+
+    def hidden_by_ground(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
+        """Return whether the terrain alone lies between points, as of `line_of_sight`."""
+        if self.terrain is None:
+            return np.zeros(np.broadcast_shapes(np.shape(a_m), np.shape(b_m))[:-1], dtype=bool)
+        return ~self.ground.line_of_sight(a_m, b_m)
+
+    def _sight_over_earth(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
+        """Return whether lines of sight (n,) over the round Earth are clear, piece by piece."""
+        offset_m = b_m - a_m
+        length_m = np.hypot(offset_m[:, 0], offset_m[:, 1])
+        share = np.linspace(0, 1, 1 + int(np.ceil(length_m.max() / BEND_M)))[:, None, None]
+        bend_m = a_m + share * offset_m
+        bend_m[..., 2] -= (share * (1 - share))[..., 0] * length_m**2 / (2 * EARTH_RADIUS_M)
+        clear = np.ones(len(a_m), bool) if self.terrain is not None else \
+            bend_m[..., 2].min(axis=0) >= np.minimum(a_m[:, 2], b_m[:, 2]).clip(None, 0)
+        for start_m, end_m in zip(bend_m, bend_m[1:]):
+            left = np.flatnonzero(clear)
+            clear[left] = self.line_of_sight(start_m[left], end_m[left])
+        return clear
 
     def first_face(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Return the (n,) first face from a to b, both (n, 3) [m]; -1 where none lies between."""
@@ -207,11 +236,12 @@ class CityMap:
         return height.reshape(x_m.shape)
 
     @cached_property
-    def _ground(self) -> CityMap:
-        """The terrain alone."""
+    def ground(self) -> CityMap:
+        """The terrain alone; there must be one."""
         assert self.terrain is not None
         used, faces = np.unique(self.faces[self.terrain], return_inverse=True)
-        return CityMap(self.vertices[used], faces.reshape(-1, 3))
+        faces = faces.reshape(-1, 3)
+        return CityMap(self.vertices[used], faces, terrain=np.ones(len(faces), dtype=bool))
 
     def ground_height_m(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> np.ndarray:
         """Return the height of the ground above the datum.
@@ -230,7 +260,7 @@ class CityMap:
 
     def _terrain_height_m(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         """Return the heights (n,) of the terrain [m]."""
-        ground = self._ground
+        ground = self.ground
         low_m, high_m = ground.vertices[:, :2].min(axis=0), ground.vertices[:, :2].max(axis=0)
         points_m = np.column_stack([x_m, y_m])
         height_m = np.full(len(points_m), np.nan)

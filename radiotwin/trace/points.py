@@ -19,7 +19,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import CityMap
 from radiotwin.trace.link_job import LinkBatch, link_job, link_pieces
-from radiotwin.trace.run import device_indices
+from radiotwin.trace.run import device_indices, warn_of_terrain
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB
 from radiotwin.trace.tiles import with_radius
@@ -109,6 +109,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
     antennas = [scene.device_antennas[device] for device in index]
     gain_db = trace_gains(scene, scene.device_m[index], points_m, settings, antennas,
                           executor)
+    warn_of_terrain(scene.city, scene.device_m[index], points_m, np.isnan(gain_db) & ~inside)
     tables = []
     for row, device in enumerate(index):
         device_m = scene.device_m[device]

@@ -17,10 +17,12 @@ from scipy.constants import speed_of_light
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.io.budgets import MAP_VALUES
 from radiotwin.io.inputs import require_within
+from radiotwin.io.texts import percent
 from radiotwin.maps.file import check_target
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
+from radiotwin.scene.citymap import FAR_M, CityMap
 from radiotwin.trace.link_job import BatchStore, solve_finer, solve_lattice
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, library_versions
@@ -199,6 +201,7 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
         check_gains(chosen(raw_db), chosen(los), chosen(distance_m), frequency_hz,
                     settings.solver, settings.combining, chosen(direct_dbi), chosen(peak_dbi)))
     limit_db = scene.config.gain_limit_db
+    warn_of_terrain(scene.city, device_m, positions_m, np.isnan(raw_db) & checked)
     gain_db, counts = _censor(raw_db, inside, impossible, limit_db)
     rows, columns, finer_db = solve_finer(scene, settings, store, index, executor)
     outside = ~inside[columns]
@@ -213,6 +216,25 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
     radio_map = radio_map.placed(scene.config.origin)
     radio_map.write(out_path)
     return radio_map
+
+
+def warn_of_terrain(city: CityMap, device_m: np.ndarray, positions_m: np.ndarray,
+                    no_path: np.ndarray) -> None:
+    """Warn of links (devices, positions) that terrain hides, or the Earth, and Sionna RT cannot."""
+    hidden = far = 0
+    for one_m, missed in zip(device_m, no_path, strict=True):
+        far += int((np.hypot(*(positions_m - one_m)[:, :2].T) > FAR_M).sum())
+        hidden += int(city.hidden_by_ground(one_m[None], positions_m[missed]).sum())
+    if hidden:
+        warnings.warn(f"behind terrain lie {percent(hidden / no_path.size)} of the links, and no "
+                      "path was found to them: Sionna RT diffracts once, so that what rounded "
+                      "hills hide comes out not detected; coverage --model raytrace has a loss "
+                      "along terrain (ITU-R P.526)", stacklevel=3)
+    if far:
+        warnings.warn(f"{percent(far / no_path.size)} of the links are longer than "
+                      f"{FAR_M / 1e3:g} km: Sionna RT's Earth is flat, so that gains beyond the "
+                      "horizon are too high; coverage --model raytrace has the round Earth",
+                      stacklevel=3)
 
 
 def _antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from radiotwin.scene.materials import itu_material
 from radiotwin.twin import Twin
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.model import FittedModel
+from tests.terrains import terrain_map
 
 FREQUENCY_HZ = 2e9
 FREE_SPACE_AT_1_M_DB = 20 * math.log10(299_792_458.0 / FREQUENCY_HZ / (4 * math.pi))
@@ -21,9 +22,12 @@ FREE_SPACE_AT_1_M_DB = 20 * math.log10(299_792_458.0 / FREQUENCY_HZ / (4 * math.
 
 def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x, y: 0.0, terrain=False,
                 ground="concrete", **radio):
-    """Write a scene of flat or tilted ground, perhaps declared as terrain, with other shapes on it, about 47.5 N, 8.7 E."""
+    """Write a scene of flat or tilted ground, or of a terrain, with other shapes on it, about 47.5 N, 8.7 E."""
     corners = [(x, y, ground_z_m(x, y)) for x, y in ((-600, -600), (600, -600), (600, 600), (-600, 600))]
     mesh = trimesh.Trimesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)
+    if terrain:
+        hills = terrain_map(ground_z_m, half_m=600.0, step_m=5.0)
+        mesh = trimesh.Trimesh(hills.vertices, hills.faces, process=False)
     folder.mkdir(parents=True)
     write_city(folder, [CityShape("ground", mesh, itu_material(ground)),
                         *(CityShape(f"house{i}", shape, itu_material("concrete")) for i, shape in enumerate(shapes))])

@@ -175,7 +175,7 @@ def test_notes_are_on_the_class_that_each_link_has(build, house):
 def test_heights_of_notes_are_above_the_ground(tmp_path, house):
     """A mast of 30 m on a plateau of 60 m, receivers at 1.5 m: COST 231's 4 to 50 m and 1 to 3 m hold."""
     scene = write_scene(tmp_path / "hill", [house(-300, -300, -280, 300, 80)], [("a", 0.0, 0.0, 90.0)],
-                        ground_z_m=lambda x, y: 60.0, terrain=True)
+                        ground_z_m=lambda x, y: 60.0 + 0 * x, terrain=True)
     notes = predict_coverage("cost231_wi", scene, settings=CoverageSettings(step_m=50.0)).summary["notes"]
     assert not any("height" in each for each in notes)
 

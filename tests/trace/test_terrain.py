@@ -1,5 +1,7 @@
 """Terrain in the ray tracer: a ridge's shadow, and reasons of points below the ground."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.readers import MapOptions, build_scene_from_map
 from radiotwin.trace import SolverSettings
 from radiotwin.trace.points import read_points, trace_points
+from radiotwin.trace.run import warn_of_terrain
 from tests.scene.readers.conftest import Map
 from tests.terrains import ridge, write_dem
 
@@ -41,6 +44,18 @@ def test_points_above_the_ground(scenes, tmp_path):
     found_m = points(tmp_path, scenes[0], [(-150, 0, 2), (0, 10, 3), (25, 0, 4)])
     datum_m = scenes[0].config.terrain.datum_m
     assert found_m[:, 2] + datum_m == pytest.approx([12, 70, 44], abs=0.6)  # pixels of 5 m cut the crest
+
+
+def test_what_terrain_hides_and_what_is_far_is_told(scenes):
+    """Two points behind the ridge, one of them without a path; one beyond 5 km."""
+    points_m = np.array([[150.0, 0, 3], [150.0, 40, 3], [-60.0, 20, 3], [6000.0, 0, 500]])
+    device_m, no_path = scenes[0].device_m, np.array([[True, False, False, False]])
+    with pytest.warns(UserWarning) as found:
+        warn_of_terrain(scenes[0].city, device_m, points_m, no_path)
+    assert len(found) == 2 and all("25%" in str(each.message) for each in found)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_terrain(scenes[1].city, device_m, points_m[:3], no_path[:, :3])
 
 
 @pytest.mark.llvm

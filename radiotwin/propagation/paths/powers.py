@@ -13,6 +13,7 @@ from radiotwin.propagation.paths.fields import path_gains
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
 from radiotwin.propagation.paths.interactions import LUEBBERS, SIONNA, Slabs, slabs_of
 from radiotwin.propagation.paths.two_edges import paths_over_two_edges, two_edge_gains
+from radiotwin.propagation.terrain import is_far, terrain_paths
 from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import CityMap
 
@@ -109,6 +110,10 @@ class PathPowers:
         reflected_diffracted: one diffraction, and reflections before or after it.
         diffracted_2: diffractions at two edges; looked for where there is no other path.
         ground: one reflection, by the ground: z = 0, or a triangle of the terrain.
+        diffracted_terrain: along the profile of the terrain, see `radiotwin.propagation.terrain`:
+            where terrain is in the way and there is no other path, and beyond the horizon. Ends
+            more than 5 km apart have this or, with line of sight, `direct` less what the ground
+            takes of it, and nothing else.
         directions: of the single paths.
     """
 
@@ -120,6 +125,7 @@ class PathPowers:
     reflected_diffracted: np.ndarray
     diffracted_2: np.ndarray
     ground: np.ndarray
+    diffracted_terrain: np.ndarray
     directions: PathDirections
 
     @property
@@ -164,7 +170,9 @@ def path_powers(
     wave_number = 2 * np.pi * frequency_hz / speed_of_light
     powers = np.zeros((len(COMPONENTS), len(receiver_m)))
     powers[0] = _direct(city, device_m, receiver_m, wave_number)
-    seen = np.flatnonzero(powers[0])
+    far = is_far(device_m, receiver_m)
+    near = np.flatnonzero(~far)
+    seen = near[powers[0, near] > 0]
     straight_m = receiver_m[seen] - device_m
     directions = [_directions(seen, powers[0, seen], straight_m, -straight_m)]
     search = candidate_search(city, depth)
@@ -172,14 +180,14 @@ def path_powers(
     slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
     candidates = search.candidates(device_m, rays)
     kind = _kinds(candidates, search.is_ground)
-    for clear, gain in clear_paths_gains(city, search, candidates, device_m, receiver_m, buffer,
-                                         wave_number, slabs, WEDGES[wedge]):
-        link, points_m = buffer.receiver[clear], buffer.points_m[clear]
+    for clear, gain in clear_paths_gains(city, search, candidates, device_m, receiver_m[near],
+                                         buffer, wave_number, slabs, WEDGES[wedge]):
+        link, points_m = near[buffer.receiver[clear]], buffer.points_m[clear]
         last, path = buffer.count[clear] - 1, np.arange(len(clear))
         np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
         directions.append(_directions(link, gain, points_m[:, 1] - points_m[:, 0],
                                       points_m[path, last - 1] - points_m[path, last]))
-    dark = np.flatnonzero(powers.sum(axis=0) == 0)
+    dark = near[powers[:, near].sum(axis=0) == 0]
     edges = np.unique(candidates.edge[(candidates.before[:, 0] < 0)])
     for first in range(0, len(dark) if depth > 1 else 0, DARK_CHUNK):
         part = dark[first:first + DARK_CHUNK]
@@ -190,6 +198,13 @@ def path_powers(
         link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)
         np.add.at(powers, (COMPONENTS.index("diffracted_2"), link), gain)
         directions.append(_directions(link, gain, legs_m[:, 0], -legs_m[:, 2]))
+    dark = near[powers[:, near].sum(axis=0) == 0]
+    rows = np.concatenate([
+        np.flatnonzero(far), dark[city.hidden_by_ground(device_m[None], receiver_m[dark])]])
+    along = terrain_paths(city, device_m, receiver_m[rows], frequency_hz)
+    kinds = np.where(powers[0, rows] > 0, 0, COMPONENTS.index("diffracted_terrain"))
+    powers[kinds, rows] = along.gain
+    directions.append(_directions(rows, along.gain, along.departure_m, along.arrival_m))
     return PathPowers(*powers, _strongest(  # type: ignore[call-arg]  # a row a kind
         PathDirections.joined(directions), len(receiver_m)))
 
@@ -198,7 +213,7 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
                       frequency_hz: float) -> PathsWithPoints:
     """Follow the paths as `path_powers` does, and return each by itself.
 
-    Without the direct ones, and those over two edges.
+    Without the direct ones, those over two edges, and those along terrain.
 
     Args:
         city: 3D map.
