@@ -343,7 +343,8 @@ def paths(
             "by more than 6 degrees; behind rounded hills there are few, and coverage --model "
             "raytrace has the loss along terrain")
     say(f"wrote {out}: {found.sizes['path']} paths of {found.sizes['link']} links"
-        + "".join(f", {count} {reason}" for reason, count in reasons.items() if reason))
+        + "".join(f", {count} {reason}" for reason, count in reasons.items() if reason)
+        + ("; gains include the antennas of scene.toml" if scene.has_antennas else ""))
 
 
 def _speeds(text: str) -> list[float]:

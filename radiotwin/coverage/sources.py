@@ -62,12 +62,18 @@ def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -
     """
     kind = channel_named(model)
     if kind is ImagePaths:
-        return _source_of_paths(scene, transmitters)
-    if issubclass(kind, PublishedLaw):
-        return _source_of_law(kind, scene, transmitters)
-    raise BadInput(f"model {model!r} is learnt from measurements, and a scene has none: fit a twin "
-                   "with it and give that, or take raytrace, or a published law, such as p1411, "
-                   "tr36777_umi, al_hourani_urban or cost231_wi")
+        source = _source_of_paths(scene, transmitters)
+    elif issubclass(kind, PublishedLaw):
+        source = _source_of_law(kind, scene, transmitters)
+    else:
+        raise BadInput(f"model {model!r} is learnt from measurements, and a scene has none: fit a "
+                       "twin with it and give that, or take raytrace, or a published law, such as "
+                       "p1411, tr36777_umi, al_hourani_urban or cost231_wi")
+    if scene.uav_antenna is None:
+        return source
+    return replace(source, notes=lambda receiver_m: [
+        *source.notes(receiver_m), "receivers are isotropic: the antenna that the scene declares "
+        "for its UAVs is not used, as it would be in a traced map"])
 
 
 def _source_of_law(kind: type[PublishedLaw], scene: Scene,

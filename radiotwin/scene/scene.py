@@ -273,6 +273,11 @@ class Scene(Summarised):
         return Antenna(self._pattern(names.pop()).heading_mean()) if names else None
 
     @property
+    def has_antennas(self) -> bool:
+        """Whether the antenna of any device or UAV is declared."""
+        return bool(self._antenna_files)
+
+    @property
     def _antenna_files(self) -> set[str]:
         ends: list[DeviceConfig | UavConfig] = [*self.config.devices, *self.config.uavs]
         return {end.antenna for end in ends if end.antenna is not None}

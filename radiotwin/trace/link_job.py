@@ -237,7 +237,7 @@ def link_job(scene: Scene, settings: SolverSettings,
         solve = SolveTiles(scene, settings) if settings.is_tiled else SolveLinks(scene, settings)
         return Job(description, solve, _resources(settings, solve.geometry_bytes), len,
                    LinkBatch.halves, lambda first, second: np.concatenate([first, second]))
-    if any(antenna is not None for antenna in (*scene.device_antennas, scene.uav_antenna)):
+    if scene.has_antennas:
         raise BadInput(f"{scene.folder / 'scene.toml'} declares antennas, which the solver 'map' "
                        "does not know; use the solver 'paths'")
     return Job(description, SolveCells(scene, settings), _resources(settings), len)

@@ -98,3 +98,10 @@ def test_antennas_at_both_ends_act_on_each_path(plain, has_map):
                  for leaving_deg, arriving_deg, _ in paths]
         expected = sum(gain * power for gain, (_, _, power) in zip(gains, paths, strict=True)) / total
         np.testing.assert_allclose(found_db[device == row], 10 * np.log10(expected)[device == row], atol=0.03)
+
+
+def test_the_antenna_of_the_uavs_is_said_not_to_be_used(plain, monkeypatch):
+    mast = Transmitter("mast", MAST_M, 0.0, frequency_hz=FREQUENCY_HZ)
+    monkeypatch.setitem(plain.__dict__, "uav_antenna", antenna_of(dipole_dbi))
+    for model in ("raytrace", "al_hourani_urban"):
+        assert "for its UAVs is not used" in " ".join(source_over(model, plain, [mast]).notes(points(1.5)))

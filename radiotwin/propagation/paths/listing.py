@@ -37,7 +37,7 @@ NO_INTERACTION, REFLECTION, DIFFRACTION = 0, 1, 2
 SCHEMA = "radiotwin.paths/1"
 _UNITS = {"db": "dB", "s": "s", "hz": "Hz", "deg": "degree", "rad": "rad", "m": "m"}
 _LONG_NAMES = {
-    "gain_db": "sum of the paths' powers (NaN: no path)",
+    "gain_db": "sum of the paths' powers, both antennas included (NaN: no path)",
     "coherent_gain_db": "power of the sum of the paths' fields (NaN: no path)",
     "rms_delay_spread_s": "power-weighted standard deviation of the delays",
     "k_factor_db": "direct over all other power (NaN: no direct path, or no other)",
