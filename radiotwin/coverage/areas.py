@@ -5,6 +5,7 @@ Receivers are in the middle of the cells, at a height above the ground.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -107,35 +108,34 @@ class CoverageGrid:
         for start in range(0, len(self.y_m), rows):
             yield slice(start, min(start + rows, len(self.y_m)))
 
-    def receivers_m(self, rows: slice, ground: CityMap | None) -> np.ndarray:
+    def receivers_m(self, rows: slice, city: CityMap) -> np.ndarray:
         """Return the positions (n, 3) of the receivers of some rows [m], see `at_height`."""
         x, y = (each.ravel() for each in np.meshgrid(self.x_m, self.y_m[rows]))
-        return self.at_height(x, y, ground)
+        return self.at_height(x, y, city)
 
-    def at_height(self, x_m: np.ndarray, y_m: np.ndarray, ground: CityMap | None) -> np.ndarray:
+    def at_height(self, x_m: np.ndarray, y_m: np.ndarray, city: CityMap) -> np.ndarray:
         """Return positions (n, 3) at the receivers' height [m].
 
         Args:
             x_m: (n,) to the east [m].
             y_m: (n,) to the north [m].
-            ground: 3D map of the ground that they stand on; None: the datum.
+            city: 3D map with the ground that they stand on, see `with_terrain`.
         """
-        bottom_m: np.ndarray | float = 0.0
-        if ground is not None and self.above_ground:
-            on = ground.height_at if ground.terrain is None else ground.ground_height_m
-            bottom_m = on(x_m, y_m)
+        bottom_m = city.ground_height_m(x_m, y_m) if self.above_ground else 0.0
         return np.column_stack([x_m, y_m, np.broadcast_to(bottom_m + self.height_m, x_m.shape)])
 
 
-def ground_of(city: CityMap) -> CityMap | None:
-    """Return the map of the ground alone; None where there is none, or it is flat at the datum."""
+@lru_cache(maxsize=2)  # a map is large
+def with_terrain(city: CityMap) -> CityMap:
+    """Return the map with its ground as the terrain, where that is not flat at the datum."""
     if city.terrain is not None:
-        return city.without(~city.terrain)
+        return city
     ground = Surfaces([(city.vertices, city.faces)]).ground_faces()
     corners_m = city.vertices[city.faces[ground]]
     if not ground.any() or np.abs(corners_m[..., 2]).max() <= GROUND_M:
-        return None
-    return city.without(~ground)
+        return city
+    return CityMap(city.vertices, city.faces, city.materials, city.material, city.vegetation,
+                   ground, city.height_sd_m)
 
 
 @dataclass(frozen=True, eq=False)

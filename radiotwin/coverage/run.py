@@ -9,7 +9,7 @@ import xarray as xr
 from scipy.special import ndtri
 
 import radiotwin
-from radiotwin.coverage.areas import Area, CoverageGrid, area_records, class_lists, ground_of
+from radiotwin.coverage.areas import Area, CoverageGrid, area_records, class_lists, with_terrain
 from radiotwin.coverage.radio import (
     Bounds,
     CoverageSettings,
@@ -234,7 +234,7 @@ def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], g
     """Predict all cells, some rows at a time; return variables (ny, nx) by name."""
     frequencies_hz = sorted({each.frequency_hz or 0.0 for each in transmitters})
     overlap = channel_overlap(np.array(frequencies_hz), bandwidth_hz, settings.aclr_db)
-    shape, ground = grid.shape, ground_of(scene.city)
+    shape, ground = grid.shape, with_terrain(scene.city)
     values = {name: np.full(shape, np.nan, np.float32) for name in (
         "received_power_dbm", "received_power_sd_db", "snr_db", "sinr_db", "rate_bps",
         "coverage_probability")}
@@ -294,7 +294,7 @@ def _some_receivers(dataset: xr.Dataset, grid: CoverageGrid, scene: Scene) -> np
     chosen = outside[::max(1, -(-len(outside) // NOTED_RECEIVERS))]
     y_m, x_m = (axis[rows] for axis, rows in zip((grid.y_m, grid.x_m),
                                                  np.unravel_index(chosen, grid.shape)))
-    return grid.at_height(x_m, y_m, ground_of(scene.city))
+    return grid.at_height(x_m, y_m, with_terrain(scene.city))
 
 
 def _known(position_m: np.ndarray) -> list[float | None]:

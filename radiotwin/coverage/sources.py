@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from radiotwin.coverage.areas import with_terrain
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.display import some
 from radiotwin.errors import BadInput
@@ -19,7 +20,7 @@ from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.propagation.terrain import is_far
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
-from radiotwin.scene.citymap import FAR_M
+from radiotwin.scene.citymap import FAR_M, CityMap
 from radiotwin.twin import Twin
 from radiotwin.twin.model.model import FittedModel
 
@@ -60,11 +61,11 @@ def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -
     Raises:
         BadInput: no such model, or one that is learnt.
     """
-    kind = channel_named(model)
+    kind, city = channel_named(model), with_terrain(scene.city)
     if kind is ImagePaths:
-        source = _source_of_paths(scene, transmitters)
+        source = _source_of_paths(city, transmitters)
     elif issubclass(kind, PublishedLaw):
-        source = _source_of_law(kind, scene, transmitters)
+        source = _source_of_law(kind, city, transmitters)
     else:
         raise BadInput(f"model {model!r} is learnt from measurements, and a scene has none: fit a "
                        "twin with it and give that, or take raytrace, or a published law, such as "
@@ -76,13 +77,13 @@ def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -
         "for its UAVs is not used, as it would be in a traced map"])
 
 
-def _source_of_law(kind: type[PublishedLaw], scene: Scene,
+def _source_of_law(kind: type[PublishedLaw], city: CityMap,
                    transmitters: Sequence[Transmitter]) -> GainSource:
     """Return a published law, and the pattern of each antenna along the straight line."""
     device_m = np.array([each.position_m for each in transmitters])
 
     def links(receiver_m: np.ndarray, frequency_hz: float | None, row: int) -> LinkGeometry:
-        return link_geometry(device_m, receiver_m, np.full(len(receiver_m), row), scene.city,
+        return link_geometry(device_m, receiver_m, np.full(len(receiver_m), row), city,
                              float(frequency_hz or np.nan))
 
     laws = {frequency_hz: kind().fit(links(np.empty((0, 3)), frequency_hz, 0), np.empty(0), None)
@@ -100,7 +101,7 @@ def _source_of_law(kind: type[PublishedLaw], scene: Scene,
             rows = [row for row, each in enumerate(transmitters)
                     if each.frequency_hz == frequency_hz][:NOTED_TRANSMITTERS]
             device = np.repeat(rows, len(receiver_m))
-            some = link_geometry(device_m, np.tile(receiver_m, (len(rows), 1)), device, scene.city,
+            some = link_geometry(device_m, np.tile(receiver_m, (len(rows), 1)), device, city,
                                  float(frequency_hz or np.nan))
             found += law.outside(some) if len(some) else []
         return list(dict.fromkeys(found))
@@ -108,7 +109,7 @@ def _source_of_law(kind: type[PublishedLaw], scene: Scene,
     return GainSource(f"{kind.name} ({kind.source})", predict, notes)
 
 
-def _source_of_paths(scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
+def _source_of_paths(city: CityMap, transmitters: Sequence[Transmitter]) -> GainSource:
     """Return the sum of the powers of all paths, each through the antenna; nothing is fitted."""
     def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
         from radiotwin.propagation.paths.powers import path_powers  # numba is large
@@ -117,7 +118,7 @@ def _source_of_paths(scene: Scene, transmitters: Sequence[Transmitter]) -> GainS
         parts = [np.empty(0)]
         for start in range(0, len(receiver_m), PATH_RECEIVERS):
             ends_m = receiver_m[start:start + PATH_RECEIVERS]
-            found = path_powers(scene.city, each.position_m, ends_m,
+            found = path_powers(city, each.position_m, ends_m,
                                 float(each.frequency_hz or np.nan))
             with np.errstate(divide="ignore"):
                 gain_db = 10 * np.log10(found.total)
@@ -133,7 +134,7 @@ def _source_of_paths(scene: Scene, transmitters: Sequence[Transmitter]) -> GainS
         some_m = np.array([each.position_m for each in transmitters[:NOTED_TRANSMITTERS]])
         share = {
             "are behind terrain: those that no path reaches have": np.mean(
-                [scene.city.hidden_by_ground(each_m[None], receiver_m) for each_m in some_m]),
+                [city.hidden_by_ground(each_m[None], receiver_m) for each_m in some_m]),
             f"are longer than {FAR_M / 1e3:g} km: they have, in place of paths,": np.mean(
                 [is_far(each_m, receiver_m) for each_m in some_m])}
         return [f"{percent(value)} of the links {what} the loss along the profile of ground and "

@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from radiotwin.coverage import CoverageSettings, Transmitter, predict_coverage
-from radiotwin.coverage.areas import Area, CoverageGrid, _covered, ground_of
+from radiotwin.coverage.areas import Area, CoverageGrid, _covered, with_terrain
 from radiotwin.errors import BadInput
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import coverage_figures
@@ -172,10 +172,11 @@ def test_notes_are_on_the_class_that_each_link_has(build, house):
     assert not any("distance" in each for each in predict_coverage("p1411", scene, settings=before).summary["notes"])
 
 
-def test_heights_of_notes_are_above_the_ground(tmp_path, house):
-    """A mast of 30 m on a plateau of 60 m, receivers at 1.5 m: COST 231's 4 to 50 m and 1 to 3 m hold."""
+@pytest.mark.parametrize("terrain", [True, False])
+def test_heights_of_notes_are_above_the_ground(tmp_path, house, terrain):
+    """A mast of 30 m on a plateau of 60 m, declared or not: COST 231's 4 to 50 m and 1 to 3 m hold, roofs are 20 m."""
     scene = write_scene(tmp_path / "hill", [house(-300, -300, -280, 300, 80)], [("a", 0.0, 0.0, 90.0)],
-                        ground_z_m=lambda x, y: 60.0 + 0 * x, terrain=True)
+                        ground_z_m=lambda x, y: 60.0 + 0 * x, terrain=terrain)
     notes = predict_coverage("cost231_wi", scene, settings=CoverageSettings(step_m=50.0)).summary["notes"]
     assert not any("height" in each for each in notes)
 
@@ -212,14 +213,14 @@ def test_paths_over_the_map_go_through_the_antenna(build, house):
 
 def test_receivers_stand_on_uneven_ground(build, twin_of):
     scene = build(devices=[("a", 0.0, 0.0, 200.0)], ground_z_m=lambda x, y: 0.1 * (x + 600.0))
-    ground = ground_of(scene.city)
     grid = CoverageGrid.over((-100, 100, -100, 100), 50.0, 1.5)
-    receiver_m = grid.receivers_m(slice(0, 4), ground)
+    receiver_m = grid.receivers_m(slice(0, 4), with_terrain(scene.city))
     np.testing.assert_allclose(receiver_m[:, 2], 0.1 * (receiver_m[:, 0] + 600.0) + 1.5, atol=1e-3)
 
 
 def test_flat_ground_is_not_looked_for(build, house):
-    assert ground_of(build(house(0, 0, 10, 10, 5)).city) is None
+    city = build(house(0, 0, 10, 10, 5)).city
+    assert with_terrain(city) is city
 
 
 def test_blocks_do_not_change_the_result(build, twin_of, house, monkeypatch):

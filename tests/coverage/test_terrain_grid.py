@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from radiotwin.coverage import CoverageSettings, Transmitter, predict_coverage
-from radiotwin.coverage.areas import CoverageGrid, ground_of
+from radiotwin.coverage.areas import CoverageGrid
 from radiotwin.scene.lattice import Lattice
 from tests.terrains import incline, terrain_map
 
@@ -16,7 +16,7 @@ MAST = [Transmitter("a", np.array([-300.0, 0, 20]), 30.0)]
 def test_receivers_stand_on_the_slope():
     height = incline(0.2, -0.1)
     grid = CoverageGrid.over((-100, 100, -50, 50), 10.0, 1.5)
-    at_m = grid.receivers_m(slice(None), ground_of(terrain_map(height)))
+    at_m = grid.receivers_m(slice(None), terrain_map(height))
     assert at_m[:, 2] == pytest.approx(height(at_m[:, 0], at_m[:, 1]) + 1.5, abs=0.01)
 
 
@@ -27,7 +27,7 @@ def test_cells_of_a_map_above_the_ground_are_above_it():
     city = terrain_map(height)
     for lattice, z_m in ((Lattice(axis_m, axis_m, np.array([30.0]), ground_m), ground_m.ravel() + 30),
                          (Lattice(axis_m, axis_m, np.array([150.0])), np.full(121, 150.0))):
-        at_m = CoverageGrid.of_map(lattice, 0).receivers_m(slice(None), ground_of(city))
+        at_m = CoverageGrid.of_map(lattice, 0).receivers_m(slice(None), city)
         assert at_m[:, 2] == pytest.approx(z_m, abs=0.01)
 
 
