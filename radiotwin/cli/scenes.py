@@ -340,8 +340,8 @@ def paths(
     reasons = found["reason"].to_series().value_counts()
     if scene.city.terrain is not None:
         say("the ground is a terrain: paths reflect off its triangles and diffract where it folds "
-            "by more than 6 degrees; behind rounded hills there are few, and coverage --model "
-            "raytrace has the loss along terrain")
+            "by more than 6 degrees; where it hides a point and there is none, the loss "
+            "along its profile is listed as one (ITU-R P.526)")
     say(f"wrote {out}: {found.sizes['path']} paths of {found.sizes['link']} links"
         + "".join(f", {count} {reason}" for reason, count in reasons.items() if reason)
         + ("; gains include the antennas of scene.toml" if scene.has_antennas else ""))

@@ -46,13 +46,11 @@ class TerrainPaths(NamedTuple):
 
     Attributes:
         gain: (n,) power gain between isotropic antennas, linear.
-        departure_m: (n, 3) from the device towards its horizon, or the receiver that it sees.
-        arrival_m: (n, 3) from the receiver towards its horizon, or the device.
+        edge_m: (n, 3) where the horizons of both ends meet, or the middle of a line of sight [m].
     """
 
     gain: np.ndarray
-    departure_m: np.ndarray
-    arrival_m: np.ndarray
+    edge_m: np.ndarray
 
 
 def is_far(device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:
@@ -63,18 +61,17 @@ def is_far(device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:
 def terrain_paths(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
                   frequency_hz: float) -> TerrainPaths:
     """Return what reaches receivers (n, 3) along the profiles from a device (3,) [m]."""
-    found = TerrainPaths(np.zeros(len(receiver_m)), *np.zeros((2, len(receiver_m), 3)))
+    found = TerrainPaths(np.zeros(len(receiver_m)), (device_m + receiver_m) / 2)
     for rows, profiles in _profiles(city, device_m, receiver_m):
         way_m = receiver_m[rows] - device_m
         free = (speed_of_light / (4 * np.pi * frequency_hz * np.linalg.norm(way_m, axis=1))) ** 2
         found.gain[rows] = free * 10 ** (-delta_bullington_db(profiles, frequency_hz) / 10)
-        up = np.column_stack(_horizons(profiles, profiles.surface_m, profiles.end_m))
-        straight = way_m[:, 2] / profiles.length_m
-        sees = up[:, 0] < straight
-        up[sees] = np.column_stack([straight, -straight])[sees]
-        for legs_m, away_m, slope in ((found.departure_m, way_m, up[:, 0]),
-                                      (found.arrival_m, -way_m, up[:, 1])):
-            legs_m[rows] = np.column_stack([away_m[:, :2], slope * profiles.length_m])
+        up, down = _horizons(profiles, profiles.surface_m, profiles.end_m)
+        beyond = up >= way_m[:, 2] / profiles.length_m
+        length_m, up, way_m = profiles.length_m[beyond], up[beyond], way_m[beyond]
+        cross_m = (way_m[:, 2] + down[beyond] * length_m) / (up + down[beyond])
+        found.edge_m[rows[beyond]] = device_m + np.column_stack([
+            way_m[:, :2] * (cross_m / length_m)[:, None], up * cross_m])
     return found
 
 

@@ -26,7 +26,7 @@ def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x
     corners = [(x, y, ground_z_m(x, y)) for x, y in ((-600, -600), (600, -600), (600, 600), (-600, 600))]
     mesh = trimesh.Trimesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], process=False)
     if terrain:
-        hills = terrain_map(ground_z_m, half_m=600.0, step_m=5.0)
+        hills = terrain_map(ground_z_m, half_m=600.0, tolerance_m=0.1)
         mesh = trimesh.Trimesh(hills.vertices, hills.faces, process=False)
     folder.mkdir(parents=True)
     write_city(folder, [CityShape("ground", mesh, itu_material(ground)),

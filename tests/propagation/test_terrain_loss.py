@@ -111,8 +111,8 @@ def test_a_ridge_of_a_map_is_its_profile_and_exchanged_ends_are_alike():
         assert -10 * np.log10(found.gain[row]) == pytest.approx(free_db + loss_db, abs=0.3)
         back = terrain_paths(city, end_m, ends_m[:1], 2e9)
         assert 10 * np.log10(back.gain[0] / found.gain[row]) == pytest.approx(0, abs=0.02)
-        np.testing.assert_allclose(back.arrival_m[0], found.departure_m[row], atol=0.5)
-    assert found.departure_m[0, 2] / np.hypot(*found.departure_m[0, :2]) == pytest.approx(50 / 301, rel=0.03)
+        np.testing.assert_allclose(back.edge_m[0], found.edge_m[row], atol=0.1)
+    assert found.edge_m == pytest.approx(np.array([[0, -10, 70], [0, 58.2, 70]]), abs=2.5)  # the crest
 
 
 def test_a_house_behind_a_hill_is_an_obstacle_too():

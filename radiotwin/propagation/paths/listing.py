@@ -26,6 +26,7 @@ from radiotwin.propagation.paths.candidates import candidate_search
 from radiotwin.propagation.paths.fields import path_amplitudes
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
 from radiotwin.propagation.paths.interactions import LUEBBERS, slabs_of
+from radiotwin.propagation.terrain import is_far, terrain_paths
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
@@ -33,7 +34,7 @@ from radiotwin.trace.run import device_indices
 
 RECEIVER_CHUNK = 500  # receivers at once
 PATH_CHUNK = 20_000  # paths at once: about 10 MB
-NO_INTERACTION, REFLECTION, DIFFRACTION = 0, 1, 2
+NO_INTERACTION, REFLECTION, DIFFRACTION, TERRAIN = 0, 1, 2, 3
 SCHEMA = "radiotwin.paths/1"
 _UNITS = {"db": "dB", "s": "s", "hz": "Hz", "deg": "degree", "rad": "rad", "m": "m"}
 _LONG_NAMES = {
@@ -89,6 +90,8 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
                 depth: int = 4) -> Iterator[tuple[Rays, int]]:
     """Follow paths of up to `depth` interactions from a device (3,) to receivers (n, 3) [m].
 
+    With those along terrain, as of `radiotwin.propagation.paths.powers.PathPowers`.
+
     Yields:
         The paths to the next receivers, whose rows are among all, and the number of these.
     """
@@ -100,12 +103,18 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
     buffer = PathBuffer.allocate(PATH_CHUNK)
     for first in range(0, len(receiver_m), RECEIVER_CHUNK):
         ends_m = np.ascontiguousarray(receiver_m[first:first + RECEIVER_CHUNK], dtype=float)
-        parts = [_direct(city, device_m, ends_m, wave_number)]
-        for rows in found_clear(city, search.surfaces, candidates, device_m, ends_m, buffer):
+        far = is_far(device_m, ends_m)
+        near = np.flatnonzero(~far)
+        parts = [_direct(city, device_m, ends_m[near], wave_number)]
+        for rows in found_clear(city, search.surfaces, candidates, device_m, ends_m[near], buffer):
             found = path_amplitudes(search.surfaces, candidates, wave_number, slabs, LUEBBERS,
                                     buffer, rows)
             parts.append(_rays(buffer, rows, kinds[buffer.candidate[rows]], *found))
         joined = _joined(parts)
+        joined = replace(joined, receiver=near[joined.receiver])
+        dark = np.setdiff1d(near, joined.receiver)
+        rows = np.append(np.flatnonzero(far), dark[city.hidden_by_ground(device_m, ends_m[dark])])
+        joined = _joined([joined, _along_terrain(city, device_m, ends_m, rows, wave_number)])
         order = np.lexsort((joined.length_m, joined.receiver))
         rays = Rays(*(getattr(joined, each.name)[order] for each in fields(Rays)))
         yield replace(rays, receiver=rays.receiver + first), len(ends_m)
@@ -119,6 +128,22 @@ def _direct(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, wave_number
     amplitude = np.exp(-1j * wave_number * length_m) / np.maximum(2 * wave_number * length_m, 1e-9)
     return Rays(seen, amplitude, length_m, np.zeros((len(seen), MAX_INTERACTIONS), dtype=np.int8),
                 np.full((len(seen), MAX_INTERACTIONS, 3), np.nan), forth, -forth)
+
+
+def _along_terrain(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, rows: np.ndarray,
+                   wave_number: float) -> Rays:
+    """Return what reaches some ends (rows) along the profile: a path by way of its edge each."""
+    ends_m = ends_m[rows]
+    along = terrain_paths(city, device_m, ends_m, wave_number * speed_of_light / (2 * np.pi))
+    legs = along.edge_m - device_m, along.edge_m - ends_m
+    lengths_m = [np.maximum(np.linalg.norm(leg, axis=1), 1e-9) for leg in legs]
+    bent = ~city.line_of_sight(device_m, ends_m)
+    kinds = np.zeros((len(rows), MAX_INTERACTIONS), dtype=np.int8)
+    points_m = np.full((len(rows), MAX_INTERACTIONS, 3), np.nan)
+    kinds[bent, 0], points_m[bent, 0] = TERRAIN, along.edge_m[bent]
+    return Rays(rows, np.sqrt(along.gain) * np.exp(-1j * wave_number * sum(lengths_m)),
+                sum(lengths_m), kinds, points_m,
+                *(leg / length_m[:, None] for leg, length_m in zip(legs, lengths_m)))
 
 
 def _rays(buffer: PathBuffer, rows: np.ndarray, kinds: np.ndarray, amplitude: np.ndarray,
@@ -153,9 +178,10 @@ def list_paths(scene: Scene, points_m: np.ndarray, out_path: Path | str | None =
                bandwidth_hz: float | None = None) -> xr.Dataset:
     """Follow the paths from a scene's devices to points, and describe each link by them.
 
-    Paths have up to 4 interactions, one of them a diffraction; both ends are vertically polarised
-    and have the scene's antennas. Azimuths are clockwise from north, elevations above the horizon;
-    angles of arrival are of the direction that the path comes from.
+    Paths have up to 4 interactions, one of them a diffraction. Where terrain is in the way and
+    there is none, and beyond 5 km, the loss along the profile is one path of its own kind. Both
+    ends are vertically polarised and have the scene's antennas. Azimuths are clockwise from north,
+    elevations above the horizon; angles of arrival are of the direction that the path comes from.
 
     Args:
         scene: 3D map, devices and radio.
@@ -299,8 +325,8 @@ def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np
         dataset[name] = "path", value
     used = max(int((kinds != NO_INTERACTION).sum(axis=1).max(initial=1)), 1)
     dataset["interactions"] = ("path", "interaction"), kinds[:, :used], {
-        "flag_values": np.array([NO_INTERACTION, REFLECTION, DIFFRACTION], dtype=np.int8),
-        "flag_meanings": "none reflection diffraction"}
+        "flag_values": np.arange(TERRAIN + 1, dtype=np.int8),
+        "flag_meanings": "none reflection diffraction terrain"}
     dataset["interaction_m"] = (
         ("path", "interaction", "axis"), rays.points_m[:, :used].astype(np.float32))
     dataset["axis"] = "axis", np.array(list("xyz"), dtype=object)

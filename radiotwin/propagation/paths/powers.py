@@ -204,7 +204,8 @@ def path_powers(
     along = terrain_paths(city, device_m, receiver_m[rows], frequency_hz)
     kinds = np.where(powers[0, rows] > 0, 0, COMPONENTS.index("diffracted_terrain"))
     powers[kinds, rows] = along.gain
-    directions.append(_directions(rows, along.gain, along.departure_m, along.arrival_m))
+    directions.append(_directions(rows, along.gain, along.edge_m - device_m,
+                                  along.edge_m - receiver_m[rows]))
     return PathPowers(*powers, _strongest(  # type: ignore[call-arg]  # a row a kind
         PathDirections.joined(directions), len(receiver_m)))
 

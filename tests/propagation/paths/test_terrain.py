@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from radiotwin.propagation.paths.listing import NO_INTERACTION, TERRAIN, follow_rays
 from radiotwin.propagation.paths.powers import COMPONENTS, path_powers
 from radiotwin.scene.citymap import CityMap
 from tests.terrains import incline, ridge, terrain_map
@@ -74,3 +75,30 @@ def test_a_wall_on_a_slope_reflects_where_the_ground_lets_it():
     ends = [-120, -30, 30], [-120, 30, 30]
     assert one_link(hidden, *ends, depth=1)["reflected_1"] == 0
     assert one_link(seen, *ends, depth=1)["reflected_1"] > 0
+
+
+def test_behind_a_rounded_hill_one_path_goes_along_it():
+    """A crest radius of 500 m, which no fold of the triangles stands for: the list and the powers agree, by way of the crest."""
+    city = terrain_map(lambda x, y: 10 + 20 * np.exp(-(x**2) / 2 / 500 / 20) + 0 * y, half_m=500.0, tolerance_m=0.1)
+    device_m, receiver_m = np.array([-300.0, 0, 20]), np.array([[300.0, 50, 12], [-200.0, 50, 30]])
+    (rays, _), = follow_rays(city, device_m, receiver_m, FREQUENCY_HZ)
+    powers = path_powers(city, device_m, receiver_m, FREQUENCY_HZ)
+    behind = np.flatnonzero(rays.receiver == 0)
+    assert rays.kinds[behind].tolist() == [[TERRAIN, *[NO_INTERACTION] * (rays.kinds.shape[1] - 1)]]
+    assert abs(rays.amplitude[behind[0]]) ** 2 == pytest.approx(powers.diffracted_terrain[0], rel=1e-9)
+    assert rays.points_m[behind[0], 0] == pytest.approx([7.6, 25.6, 30.5], abs=1) and rays.departure[behind[0], 2] > 0
+    assert powers.diffracted_terrain[1] == 0 and len(rays.receiver) - len(behind) >= 2
+    assert powers.total[0] == powers.diffracted_terrain[0]
+
+
+def test_beyond_5_km_one_path_goes_around_the_earth():
+    """Friis' equation less the first terms of P.526-15, Sec. 3.1: 31.0 dB at 20 km; nothing at 6 km, 100 m high."""
+    city = CityMap([[-9e4, -9e4, 0], [9e4, -9e4, 0], [0, 9e4, 0]], [[0, 1, 2]])
+    device_m, receiver_m = np.array([0.0, 0, 10]), np.array([[20e3, 0, 1.5], [6e3, 0, 100]])
+    powers = path_powers(city, device_m, receiver_m, FREQUENCY_HZ)
+    distance_m = np.linalg.norm(receiver_m - device_m, axis=1)
+    assert 10 * np.log10(powers.total / friis(distance_m)) == pytest.approx([-31.0, 0.0], abs=0.1)
+    assert (powers.direct > 0).tolist() == [False, True] and (powers.ground == 0).all()
+    (rays, _), = follow_rays(city, device_m, receiver_m, FREQUENCY_HZ)
+    assert rays.kinds[:, 0].tolist() == [TERRAIN, NO_INTERACTION]
+    assert np.abs(rays.amplitude) ** 2 == pytest.approx(powers.total, rel=1e-9)
