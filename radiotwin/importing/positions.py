@@ -215,8 +215,8 @@ def _read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
     `length_unit`.
 
     Returns:
-        columns of `POSITION` [degrees, m] and those of `DEVICE_OPTIONAL` that the table has; the
-        index holds the names.
+        columns of `POSITION` [degrees, m] and those of `DEVICE_OPTIONAL` and `antenna` that the
+        table has; the index holds the names.
     """
     source = read_source(path)
     DEVICES.check(len(source), path)
@@ -240,12 +240,14 @@ def _read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
                               for name, (spec, unit) in columns.items()},
                              index=names.to_numpy(dtype=object))
     others = {name: source.numbers(name, name) for name in DEVICE_OPTIONAL if name in source.table}
+    files = {"antenna": source.names("antenna", "the antennas' files")} \
+        if "antenna" in source.table else {}
     for name, numbers in others.items():
         def refuse(bad: ArrayLike, reason: str, name: str = name) -> None:
             source.refuse(name, source.table[name], bad, reason)
 
         refuse_limits(refuse, name, numbers)
-    return to_geographic(positions, settings.crs).assign(**others, **period)
+    return to_geographic(positions, settings.crs).assign(**others, **files, **period)
 
 
 def _period(source: Source, settings: Settings) -> dict[str, np.ndarray]:
@@ -406,7 +408,7 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     devices = by_device.median()
     devices["role"] = np.where(devices[["x_m", "y_m"]].notna().all(axis=1), "anchor", "unknown")
     devices.loc[devices["role"] == "unknown", ["x_m", "y_m"]] = np.nan
-    for name in DEVICE_OPTIONAL:
+    for name in (*DEVICE_OPTIONAL, "antenna"):
         if table is not None and name in table and name != "above_ground_m":
             devices[name] = table[name].reindex(devices.index)
     above_m = _above_ground_m(links, "device_", table, links["device"], device_m[:, 2])

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,13 @@ from radiotwin.importing.units import clock_notes
 from radiotwin.io.files import atomic_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
-from radiotwin.links.measurements import OPTIONAL, REQUIRED, Measurements, read_measurements
+from radiotwin.links.measurements import (
+    OPTIONAL,
+    REQUIRED,
+    Measurements,
+    read_antenna_files,
+    read_measurements,
+)
 
 SCHEMA = "radiotwin.import/2"
 UNITS = {"_m": "m", "_deg": "°", "_s": "s", "_dbm": "dBm", "_db": "dB"}
@@ -36,8 +43,9 @@ MAX_IMPOSSIBLE = 0.01  # share of levels that no receiver can have meant
 MAX_SMALLEST = 0.1  # share of levels that equal the smallest: probably a placeholder
 MIN_SAMPLE = 20  # values from which a share or a range says something
 YEARS = (1990, 2100)
+ANTENNAS = "antennas"  # folder of the patterns that the table of devices names
 FILES = {"measurements.csv", "measurements.csv.gz", "devices.csv", FRAME_FILE, "import.toml",
-         "import.json"}
+         "import.json", ANTENNAS}
 DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}
 """End of a column's name -> decimals that are written; all finer than any measurement."""
 
@@ -205,6 +213,8 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
         on_progress("averaging")
         table = average(table, settings.average_m, settings.average)
     measurements = _measurements(table, positioned.devices, logs.level_column, positioned.origin)
+    if settings.devices is not None:
+        measurements = _with_antennas(measurements, Path(settings.devices))
     report = _make_report(logs, [*logs.notes, *notes], others, kept, tally, positioned,
                          measurements, settings)
     on_progress("writing")
@@ -291,6 +301,21 @@ def _measurements(table: pd.DataFrame, devices: pd.DataFrame, level: str,
     order = ["time_s", *REQUIRED, level, *(name for name in OPTIONAL if name != "time_s")]
     table = table[[name for name in order if name in table]].reset_index(drop=True)
     return Measurements(_rounded(table), _rounded(devices), origin)
+
+
+def _with_antennas(measurements: Measurements, path: Path) -> Measurements:
+    """Return the measurements with the files that the table of devices at a path names."""
+    names = measurements.devices.get("antenna", pd.Series(dtype=str)).fillna("")
+    if not names.any():
+        return measurements
+    files = read_antenna_files(path, pd.DataFrame({"antenna": names}))
+    placed = names.map(lambda name: name and f"{ANTENNAS}/{Path(name).name}")
+    if placed.nunique() < names.nunique():
+        raise BadInput(f"{path}: two files of antennas have one name in different folders; give "
+                       "each a name of its own")
+    return replace(measurements, devices=measurements.devices.assign(antenna=placed),
+                   antenna_files={f"{ANTENNAS}/{Path(name).name}": content
+                                  for name, content in files.items()})
 
 
 def _rounded(table: pd.DataFrame) -> pd.DataFrame:

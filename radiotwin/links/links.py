@@ -397,13 +397,15 @@ class Links:
         """What is declared of the devices, in the levels (n,) [dB], see `Declared.added_db`."""
         return self.declared.added_db(self.device, self.offset_m)
 
-    @property
-    def channel_data(self) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
-        """What a channel learns from: the links, their gains and the limits of these (n,) [dB].
+    def gains(self, declared_db: np.ndarray | float | None = None
+              ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
+        """Return what a channel learns from: the links, their gains and limits of these (n,) [dB].
 
-        Gains between isotropic antennas, as far as powers and antennas are declared.
+        Args:
+            declared_db: (n,) what of the levels is declared [dB]; None: `declared_db`.
         """
-        return self.geometry, self.level_db - self.declared_db, self.limit_db - self.declared_db
+        taken_db = self.declared_db if declared_db is None else declared_db
+        return self.geometry, self.level_db - taken_db, self.limit_db - taken_db
 
     @cached_property
     def receiver_limits_db(self) -> np.ndarray:

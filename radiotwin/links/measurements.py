@@ -516,9 +516,9 @@ def read_antenna_files(path: Path, devices: pd.DataFrame) -> dict[str, bytes]:
         BadInput: a file that is missing, elsewhere, or no pattern.
     """
     files = {}
-    for row, name in enumerate(devices.get("antenna", ())):
+    for name in devices.get("antenna", ()):
         if name and name not in files:
-            file = require_within(path.parent, path.parent / name, f"{path}, row {row + 2}")
+            file = require_within(path.parent, path.parent / name, f"{path}, column antenna")
             files[name] = read_bytes(file, "pattern of an antenna", DOCUMENT_BYTES)
             parse_pattern(file, files[name])
     return files

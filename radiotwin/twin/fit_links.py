@@ -69,7 +69,7 @@ def fit_known(links: Links, channel: type[ChannelModel], seed: int) -> Twin:
     Raises:
         BadInput: links that no channel can be learnt from.
     """
-    geometry, gain_db, limit_db = links.channel_data
+    geometry, gain_db, limit_db = links.gains()
     check_fit_data(geometry, gain_db, needs_los=channel.uses_map and links.city is not None)
     fitted = fit_once(channel, geometry, gain_db, limit_db, seed)
     devices = [TwinDevice.anchor(name, *position_m)

@@ -11,6 +11,7 @@ from scipy.stats import f
 from radiotwin.links import Links
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import drop_uninformative
+from radiotwin.propagation.laws.followed_paths import device_antenna_db
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.map_error import (
@@ -136,7 +137,9 @@ def _image_paths(links: Links, law: Twin, device_m: np.ndarray) -> ImagePaths:
     """Return the channel, its diffuse power fitted to links of devices that have a position."""
     channel = ImagePaths(law.channel)
     located = links.located(device_m)
-    return channel.fit_diffuse(*located.channel_data)
+    declared, antenna_db = located.declared, device_antenna_db(located)
+    fed_db = 0.0 if declared.adds_nothing else declared.fed_db[located.device]
+    return channel.fit_diffuse(*located.gains(fed_db), antenna_db)
 
 
 def fit_over_wrong_map(links: Links, scene: Scene, seed: int, start: Twin | None,
@@ -184,7 +187,7 @@ def _shift(links: Links, seed: int) -> Shift:
     known = links.located(links.device_m)
     if not len(known):
         return NO_SHIFT
-    informative = drop_uninformative(*known.channel_data)
+    informative = drop_uninformative(*known.gains())
     return estimate_shift(*informative, seed)
 
 
@@ -234,7 +237,7 @@ def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:
 def _found(links: Links, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
     """Return the errors of a map that is not shifted any more, from devices that are not lost."""
     known = links.located(reliable_m(devices, LOST_M))
-    informative = drop_uninformative(*known.channel_data)
+    informative = drop_uninformative(*known.gains())
     error, diffuse = estimate_other_errors(*informative, seed)
     return replace(error, shift_m=shift_m), diffuse
 
@@ -243,7 +246,7 @@ def _channel(links: Links, devices: list[TwinDevice], found: Found, seed: int) -
     """Fit the channel to all devices that are located; kriging alone to those that are lost."""
     lost = tuple(np.flatnonzero(~np.isfinite(reliable_m(devices, LOST_M)).all(axis=1)).tolist())
     known = links.located(reliable_m(devices))
-    data = *known.channel_data, seed
+    data = *known.gains(PathKriging(found).declared_db(known)), seed
     inputs = PathKriging, *data, str(found[0].state()), found[1], lost
     return kept("channel", inputs, lambda: PathKriging(found, lost).fit(*data), PathKriging.state,
                 PathKriging.from_state)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.importing import parse_columns, read_settings
+from radiotwin.importing import import_measurements, parse_columns, read_settings
+from radiotwin.links.declared import radios_of
 
 HEAD = "device,x,y,level\n"
 
@@ -239,3 +240,19 @@ def test_options_overrule_the_file_and_tables_lie_beside_it(tmp_path):
             read_settings(tmp_path / "m.toml", {})
     with pytest.raises(BadInput, match="none.toml does not exist"):
         read_settings(tmp_path / "none.toml", {})
+
+
+def test_a_site_table_declares_the_radios_and_brings_the_files_of_antennas(tmp_path):
+    (tmp_path / "patterns").mkdir()
+    (tmp_path / "patterns" / "flat.csv").write_text("azimuth_deg,elevation_deg,gain_dbi\n0,-90,7\n0,90,7\n")
+    (tmp_path / "sites.csv").write_text("device,x,y,z,eirp_dbm,cable_loss_db,antenna,azimuth_deg,tilt_deg\n"
+                                        "a,0,0,20,45,2,patterns/flat.csv,30,-4\nb,50,0,20,,,,,\n")
+    (tmp_path / "log.csv").write_text("x,y,h,cell,rsrp\n" + "".join(f"{10 + i},5,1.5,{cell},-80\n" for i in range(3) for cell in "ab"))
+    columns = {"receiver": "always r", "x": "x", "y": "y", "height": "h", "device": "cell", "level": "rsrp"}
+    for _ in range(2):  # over an earlier import, too
+        found = import_measurements(tmp_path / "log.csv", tmp_path / "out", columns, devices=tmp_path / "sites.csv",
+                                    level_unit="dBm", length_unit="m")
+    assert found.devices["antenna"].tolist() == ["antennas/flat.csv", ""]
+    first, second = radios_of(found.devices, found.patterns, None)
+    assert (first.tx_power_dbm, first.cable_loss_db) == (40.0, 2.0)  # 45 - 7 + 2
+    assert (first.antenna.azimuth_deg, first.antenna.tilt_deg) == (30.0, -4.0) and second.antenna is None

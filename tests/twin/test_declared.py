@@ -12,7 +12,12 @@ import pytest
 from radiotwin.coverage import CoverageSettings, predict_coverage, read_transmitters
 from radiotwin.errors import BadInput
 from radiotwin.links import link_geometry, prepare_links
+from radiotwin.links.declared import Declared, Radio
+from radiotwin.links.links import Columns, Ends, Links, World
 from radiotwin.links.measurements import Measurements, read_measurements
+from radiotwin.propagation.laws.followed_paths import path_gains
+from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.scene.antennas import Antenna, read_pattern
 from radiotwin.twin import Twin, fit_twin
 from radiotwin.twin.locate import locate_devices
 from radiotwin.twin.point_gains import gains_at
@@ -112,7 +117,7 @@ def test_a_power_that_is_missing_is_that_of_the_scene_or_the_median(ground, tmp_
 def test_nothing_declared_changes_nothing(ground, tmp_path):
     links = prepare_links(campaign(tmp_path / "m", {name: {"adds_db": 5.0} for name in "abc"}), ground)
     assert links.declared.adds_nothing and not links.has_gains
-    assert links.channel_data[1] is not links.level_db and (links.channel_data[1] == links.level_db).all()
+    assert links.gains()[1] is not links.level_db and (links.gains()[1] == links.level_db).all()
     twin = fit_twin(read_measurements(tmp_path / "m" / "measurements.csv"), ground, model="log_distance")
     assert "declared" not in json.loads(twin.encode()[0])
 
@@ -226,3 +231,29 @@ def test_a_later_file_is_located_by_its_own_powers(ground, tmp_path):
     found, notes = locate_devices(silent, twin, ground)
     assert any("tx_power_dbm of u is not declared and taken for 10 dBm, the median of the twin's devices" in note for note in notes)
     assert np.hypot(found["x_m"][0] - 230, found["y_m"][0] - 240) < 8
+
+
+def test_antennas_act_along_each_path_where_paths_are_followed(ground, tmp_path):
+    """A mast that looks down: the bounce leaves within the beam, the straight line above it (Fresnel, P.2040 concrete)."""
+    write_sector(tmp_path / "sector.csv")
+    antenna, hz = Antenna(read_pattern(tmp_path / "sector.csv"), 90.0, -12.0), 2e9
+    device_m = np.array([[0.0, 0.0, 20.0]])
+    receiver_m = np.column_stack([np.array([250.0, 330.0, 410.0]), np.zeros(3), np.full(3, 30.0)])
+    across, wave = receiver_m[:, 0], 299_792_458 / hz
+    eta = 5.24 - 1j * 0.0462 * (hz / 1e9) ** 0.7822 / (2 * np.pi * hz * 8.8541878128e-12)
+    power = []
+    for up, is_bounce in ((10.0, False), (-50.0, True)):
+        length = np.hypot(across, up)
+        sine = np.abs(up) / length
+        root = np.sqrt(eta - 1 + sine**2)
+        reflected = (eta * sine - root) / (eta * sine + root) if is_bounce else 1.0
+        power.append((wave / (4 * np.pi * length)) ** 2 * np.abs(reflected) ** 2)
+        power.append(10 ** (sector_dbi(0.0, np.degrees(np.arctan2(up, across)) + 12) / 10))
+    direct, into_direct, bounce, into_bounce = power
+    ends = Ends(device_names=["m"], device_m=device_m, anchors=frozenset([0]),
+                declared=Declared((Radio(tx_power_dbm=13.0, cable_loss_db=2.0, antenna=antenna),), hz, True))
+    links = Links(columns=Columns.unmeasured(receiver_m, np.zeros(3, int)), ends=ends,
+                  world=World(frequency_hz=hz, city=ground.city, is_gain=False))
+    channel = ImagePaths()
+    level_db = channel.level_db(path_gains(links.geometry), links.geometry) + channel.declared_db(links)
+    np.testing.assert_allclose(level_db, 11 + 10 * np.log10(direct * into_direct + bounce * into_bounce), atol=0.1)

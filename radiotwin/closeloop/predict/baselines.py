@@ -132,7 +132,7 @@ def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,
         train: (n,) bool or rows, to learn from.
         like: kriging whose correlation is taken; None: it is fitted.
     """
-    geometry, gain_db, limit_db = links.select(train).channel_data
+    geometry, gain_db, limit_db = links.select(train).gains()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of classes with few links
         if like is not None and kind is RegressionKriging:
@@ -196,7 +196,7 @@ def published_laws(links: Links) -> list[PublishedLaw]:
     """
     if not links.has_gains or np.isnan(links.frequency_hz):
         return []
-    laws, data = [], links.channel_data
+    laws, data = [], links.gains()
     for kind in BUILT_IN:
         if not issubclass(kind, PublishedLaw):
             continue

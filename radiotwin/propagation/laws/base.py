@@ -86,7 +86,14 @@ class ChannelModel(ABC):
     def level_at(self, links: Links, exact: bool = False) -> np.ndarray:
         """Return the mean level (n,) [dB] of measured links, of `quick` unless it must be exact."""
         channel = self if exact else self.quick
-        return channel.predict(links.geometry)[0] + links.declared_db
+        return channel.predict(links.geometry)[0] + channel.declared_db(links)
+
+    def declared_db(self, links: Links) -> np.ndarray | float:
+        """Return what is declared of the devices, in the levels of links (n,) [dB].
+
+        Antennas act along the straight line, unless a model knows better.
+        """
+        return links.declared_db
 
     def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Return what of the channel is fitted again together with effects.

@@ -108,6 +108,13 @@ def antenna_gain_db(geometry: LinkGeometry, device_antennas: Sequence[Antenna | 
     return gain_db
 
 
+def device_antenna_db(links: Links) -> np.ndarray | float:
+    """Return what the declared antennas of devices add to the followed power of links (n,) [dB]."""
+    if not links.declared.antennas:
+        return 0.0
+    return antenna_gain_db(links.geometry, [radio.antenna for radio in links.declared.radios])
+
+
 def free_space(geometry: LinkGeometry) -> np.ndarray:
     """Return the power gain (n,) along the straight line if nothing were in the way (ITU-R P.525).
 

@@ -16,14 +16,19 @@ from typing_extensions import override
 from radiotwin.inference import student
 from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.inference.student import DOF
-from radiotwin.links import LinkGeometry, design_effect
+from radiotwin.links import LinkGeometry, Links, design_effect
 from radiotwin.propagation.laws.base import (
     ANY_LEVEL_SD_DB,
     ChannelModel,
     require_names,
     require_number,
 )
-from radiotwin.propagation.laws.followed_paths import free_space, interaction_gains, path_gains
+from radiotwin.propagation.laws.followed_paths import (
+    device_antenna_db,
+    free_space,
+    interaction_gains,
+    path_gains,
+)
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.published import free_space_db
 
@@ -149,9 +154,16 @@ class ImagePaths(ChannelModel):
         self.law.fit(links, level_db, limit_db, seed)
         return self.fit_diffuse(links, level_db, limit_db)
 
-    def fit_diffuse(self, links: LinkGeometry, level_db: np.ndarray,
-                    limit_db: Limit) -> Self:
-        """Fit the diffuse power to links without line of sight, as of `fit`, beside their level."""
+    def fit_diffuse(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+                    antenna_db: np.ndarray | float = 0.0) -> Self:
+        """Fit the diffuse power to links without line of sight, as of `fit`, beside their level.
+
+        Args:
+            links: n links.
+            level_db: (n,) as of `fit`.
+            limit_db: as of `fit`.
+            antenna_db: (n,) what antennas add to the power of the followed paths [dB].
+        """
         nlos = links.select(~links.los)
         level_db = level_db[~links.los]
         blank = np.isnan(level_db)
@@ -163,6 +175,7 @@ class ImagePaths(ChannelModel):
             self.diffuse = DIFFUSE_DEFAULT
             return self
         power = path_gains(nlos)
+        power = power * 10 ** (np.broadcast_to(antenna_db, len(links))[~links.los] / 10)
         near_m = min(float(np.quantile(links.distance_m, NEAR_QUANTILE)), 100.0)
 
         def loss(numbers: np.ndarray) -> float:
@@ -187,6 +200,16 @@ class ImagePaths(ChannelModel):
     def level_db(self, power: np.ndarray, links: LinkGeometry) -> np.ndarray:
         """Return the mean level (n,) [dB] of links whose paths carry these powers (n,)."""
         return _with_diffuse_db(power, links.distance_m, *self.diffuse)
+
+    @override
+    def declared_db(self, links: Links) -> np.ndarray | float:
+        """Return the same with antennas along each path; diffuse power has their mean, 0 dBi."""
+        if not links.declared.antennas:
+            return links.declared_db
+        geometry, power = links.geometry, _seen_gains(links.geometry)
+        through = power * 10 ** (device_antenna_db(links) / 10)
+        return links.declared.fed_db[links.device] + self.level_db(through, geometry) \
+            - self.level_db(power, geometry)
 
     @property
     @override

@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from radiotwin.inference.gaussian import Limit, standardised
 from radiotwin.inference.student import DOF
-from radiotwin.links import LinkGeometry
+from radiotwin.links import LinkGeometry, Links
 from radiotwin.propagation.laws.base import (
     MAX_DB,
     MAX_SD_DB,
@@ -20,6 +20,7 @@ from radiotwin.propagation.laws.base import (
     require_names,
     require_number,
 )
+from radiotwin.propagation.laws.followed_paths import device_antenna_db
 from radiotwin.propagation.laws.image_paths import (
     DIFFUSE_DEFAULT,
     fit_class,
@@ -109,6 +110,13 @@ class PathKriging(ChannelModel):
         share = self.weight[followed.los.astype(int)]
         mean_db[sure], sd_db[sure] = _mixture(share, by_paths, (mean_db[sure], sd_db[sure]))
         return mean_db, sd_db
+
+    @override
+    def declared_db(self, links: Links) -> np.ndarray | float:
+        """Return the same with antennas along each path."""
+        if not links.declared.antennas:
+            return links.declared_db
+        return links.declared.fed_db[links.device] + device_antenna_db(links)
 
     @property
     @override

@@ -94,7 +94,7 @@ class Model:
             links = links.with_devices(np.where(np.isfinite(device_m), device_m, 0.0))
         geometry = links.geometry
         if channel_db is None:
-            channel_db = channel.predict(geometry)[0] + links.declared_db
+            channel_db = channel.predict(geometry)[0] + channel.declared_db(links)
         columns, prior_sd_db = channel.level_columns(geometry)
         return cls(links, usable if train is None else train & usable, usable, channel, channel_db,
                    columns, prior_sd_db, channel.error_group(geometry),
@@ -467,7 +467,7 @@ class FittedModel:
         """Return the levels that are expected of links, see `Prediction`."""
         if self.is_channel_alone:
             mean_db, sd_db = self.channel.predict(links.geometry)
-            mean_db = mean_db + links.declared_db
+            mean_db = mean_db + self.channel.declared_db(links)
             detected = gaussian.detection_probability(mean_db, sd_db, links.limit_db)
             return Prediction(mean_db, sd_db, detected)
         fit = self.on_links(links)
