@@ -121,9 +121,10 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
     Args:
         scene: its UAVs, radio, batteries and data; the buildings keep UAVs out.
         radio_map: over the scene's lattice. A device that it lacks is never heard, and nothing
-            below the scene's sensitivity is. Its `sigma_db`, if any, is the standard deviation of
-            shadowing that is drawn in every slot; with the attributes `shadowing_share` and
-            `shadowing_length_m` (see `radiotwin.twin.shadowing`) a part of it stays for a flight.
+            below the scene's sensitivity is. A transmit power that it does not know is the scene's.
+            Its `sigma_db`, if any, is the standard deviation of shadowing that is drawn in every
+            slot; with the attributes `shadowing_share` and `shadowing_length_m` (see
+            `radiotwin.twin.shadowing`) a part of it stays for a flight.
         known: positions that the agents see.
         assignment: `matching` or `max-rate`.
 
@@ -135,6 +136,7 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
     config, lattice = scene.config, scene.lattice
     levels = [int(np.abs(lattice.z_m - uav.altitude_m).argmin()) for uav in config.uavs]
     to_snr_db = config.radio.tx_power_dbm - config.radio.noise_dbm
+    powers_dbm = radio_map.tx_power_dbm
     shape = (len(config.uavs), len(config.devices), *lattice.shape[1:])
     MAP_VALUES.check(math.prod(shape), f"{scene.folder / 'scene.toml'}: the mission's map")
     snr_db, sigma_db = np.full(shape, -np.inf, np.float32), np.zeros(shape, np.float32)
@@ -144,7 +146,9 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
         row = radio_map.devices.index(device.device)
         gain_db = radio_map.gain_db[row, levels]
         _check_values(device.device, "gain_db", gain_db, -MAX_GAIN_DB, MAX_GAIN_DB)
-        snr_db[:, k] = np.where(np.isnan(gain_db), -np.inf, gain_db + to_snr_db)
+        power_dbm = powers_dbm.get(device.device, config.radio.tx_power_dbm)
+        snr_db[:, k] = np.where(np.isnan(gain_db), -np.inf,
+                                gain_db + (power_dbm - config.radio.noise_dbm))
         if "sigma_db" in radio_map.dataset:
             own_db = radio_map.dataset["sigma_db"].values[row, levels]
             _check_values(device.device, "sigma_db", own_db, 0.0, MAX_SIGMA_DB)

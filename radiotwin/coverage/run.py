@@ -138,6 +138,9 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
         # Where a device of the map is does not matter, and may not be declared.
         found = [by_name.get(name, Transmitter(name, np.full(3, np.nan)))
                  for name in source.devices]
+    if isinstance(source, RadioMap):
+        found = [replace(each, tx_power_dbm=source.tx_power_dbm.get(each.name))
+                 if each.tx_power_dbm is None else each for each in found]
     if not found:
         raise BadInput(f"there is no transmitter: {scene.folder / 'scene.toml'} declares no "
                        "[[devices]]; add some, or give a table with --transmitters")

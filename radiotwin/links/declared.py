@@ -140,6 +140,24 @@ class Declared:
             added_db[rows] += antenna.gain_dbi(ray_m[rows])
         return added_db
 
+    def anew(self, radios: dict[int, Radio]) -> Declared:
+        """Return the same where some devices, by their numbers, declare something else by now.
+
+        Args:
+            radios: what they do not declare is as it was, and so are powers that were not known.
+        """
+        if not self.radios:
+            return self
+        now = list(self.radios)
+        for number, radio in radios.items():
+            old = now[number]
+            now[number] = Radio(
+                old.tx_power_dbm if None in (old.tx_power_dbm, radio.tx_power_dbm)
+                else radio.tx_power_dbm,
+                radio.cable_loss_db or old.cable_loss_db, radio.antenna or old.antenna,
+                radio.frequency_hz or old.frequency_hz)
+        return replace(self, radios=tuple(now))
+
     def of_devices(self, index: np.ndarray) -> Declared:
         """Return the same of other devices: those of the radios (j,) with these numbers.
 

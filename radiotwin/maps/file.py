@@ -22,6 +22,7 @@ from radiotwin.io.budgets import DEVICES, MAP_AXIS, MAP_STREAM_VALUES, MAP_VALUE
 from radiotwin.io.files import atomic_folder, require_writable
 from radiotwin.io.forms import MAX_NAME, MAX_POSITION_M
 from radiotwin.io.inputs import open_input
+from radiotwin.links.measurements import MAX_LEVEL_DB
 from radiotwin.maps.form import (
     ATTRIBUTES,
     BLOCK_VALUES,
@@ -30,6 +31,7 @@ from radiotwin.maps.form import (
     GRID_MAPPING,
     GROUND,
     MAX_SIGMA_DB,
+    POWERS,
     VARIABLES,
     MapBlock,
     is_zarr,
@@ -73,6 +75,11 @@ def form_problem(dataset: xr.Dataset) -> str | None:
         value = dataset.attrs.get(name, 0.0)
         if not isinstance(value, int | float | np.number) or not math.isfinite(value):
             return f"the attribute {name} is {str(value)[:60]!r}, not a finite number"
+    powers = np.atleast_1d(dataset.attrs.get(POWERS, np.zeros(dataset.sizes["device"])))
+    if powers.dtype.kind not in "iuf" or powers.shape != (dataset.sizes["device"],) \
+            or not (np.abs(powers) <= MAX_LEVEL_DB).all():
+        return (f"the attribute {POWERS} is {str(powers)[:60]!r}, not a power of each device "
+                f"within {MAX_LEVEL_DB:g} dBm")
     for name, most in (("latitude", 90), ("longitude", 180)):
         if abs(dataset.attrs.get(f"origin_{name}_deg", 0.0)) > most:
             return f"the attribute origin_{name}_deg is not within {most} degrees of 0"

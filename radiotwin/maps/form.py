@@ -119,6 +119,10 @@ def _check_values(device: str, values: dict[str, np.ndarray]) -> None:
                            f"is {low:g} to {high:g}: fit it again")
 
 
+POWERS = "device_tx_power_dbm"
+"""Attribute: declared transmit power of each device [dBm]; gains are without it."""
+
+
 def header(devices: list[str], lattice: Lattice, attributes: dict[str, Any] | None) -> xr.Dataset:
     """Return the coordinates and attributes of a radio map."""
     dataset = xr.Dataset(coords={"device": np.array(devices, dtype=object),

@@ -43,6 +43,7 @@ from radiotwin.maps.form import (
     ATTRIBUTES,
     DIMS,
     GROUND,
+    POWERS,
     VARIABLES,
     MapBlock,
     MapStream,
@@ -95,6 +96,12 @@ class OverDevices(Summarised):
     def devices(self) -> list[str]:
         """Names of the devices."""
         return [str(name) for name in self.dataset["device"].values]
+
+    @property
+    def tx_power_dbm(self) -> dict[str, float]:
+        """Declared transmit powers by device [dBm]; empty: the map does not know them."""
+        powers_dbm = np.atleast_1d(self.dataset.attrs.get(POWERS, []))
+        return dict(zip(self.devices, powers_dbm.tolist()))
 
     @property
     def attributes(self) -> dict[str, Any]:

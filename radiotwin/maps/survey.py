@@ -88,7 +88,7 @@ NLOS_LAW = LogDistanceLine(-35.0, -3.04, 5**0.5)
 
 
 def segmented_truth(scene: Scene) -> RadioMap:
-    """Return the mean gain and the shadowing of the segmented law over a scene's lattice.
+    """Return mean gain and shadowing of the segmented law over a lattice, through the antennas.
 
     The mean is given below sensitivity, too: a survey draws the shadowing before it decides what is
     detected.
@@ -101,12 +101,15 @@ def segmented_truth(scene: Scene) -> RadioMap:
     """
     receiver_m = scene.lattice.positions_m
     gain_db, sigma_db, los = [], [], []
-    for device_m in scene.device_m:
+    for device_m, antenna in zip(scene.device_m, scene.device_antennas):
         seen = scene.city.line_of_sight(receiver_m, device_m[None])
         distance_m = np.sqrt(((receiver_m - device_m) ** 2).sum(axis=1))
         log_distance = np.log10(np.maximum(distance_m, 1.0))  # the law begins at 1 m
-        gain_db.append(np.where(seen, LOS_LAW.mean_db(log_distance),
-                                NLOS_LAW.mean_db(log_distance)))
+        mean_db = np.where(seen, LOS_LAW.mean_db(log_distance), NLOS_LAW.mean_db(log_distance))
+        for end, way_m in ((antenna, receiver_m - device_m),
+                           (scene.uav_antenna, device_m - receiver_m)):
+            mean_db = mean_db if end is None else mean_db + end.gain_dbi(way_m)
+        gain_db.append(mean_db)
         sigma_db.append(np.where(seen, LOS_LAW.sd_db, NLOS_LAW.sd_db))
         los.append(seen)
     return RadioMap.build(

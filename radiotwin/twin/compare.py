@@ -9,6 +9,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import mean_if_detected
+from radiotwin.links.declared import radios_of
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import channel_named
@@ -263,6 +264,9 @@ def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
     predicted_db = np.full(len(row), np.nan)
     if (row >= 0).any():
         links = twin.links(measurements.receiver_m[row >= 0], row[row >= 0], scene)
+        radios = radios_of(measurements.devices, measurements.patterns, scene)
+        links = links.with_ends(declared=twin.declared.anew(
+            {row: radio for row, radio in zip(row_of_device, radios) if row >= 0}))
         found = twin.predict(links)
         limit_db = -np.inf if twin.limit_db is None else twin.limit_db
         predicted_db[row >= 0] = mean_if_detected(found.mean_db, found.sd_db, limit_db)

@@ -31,7 +31,7 @@ from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import read_bytes, read_text, require_within
 from radiotwin.links.declared import NOTHING, Declared
 from radiotwin.links.links import Columns, Ends, Links, Prediction, World
-from radiotwin.maps.form import MapStream
+from radiotwin.maps.form import POWERS, MapStream
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.kriging import RegressionKriging, ResidualField
@@ -236,6 +236,9 @@ class Twin(Summarised):
                       "radiotwin_version": radiotwin.__version__}
         if self.level == "rssi_dbm" and not np.ptp(power_dbm):
             attributes["tx_power_dbm"] = float(power_dbm[0])
+        radios = [self.declared.radios[i] for i in known] if self.declared.radios else []
+        if radios and all(radio.tx_power_dbm is not None for radio in radios):
+            attributes[POWERS] = [float(radio.tx_power_dbm or 0.0) for radio in radios]
         return MapStream(list(rows), scene.lattice, attributes, ("gain_db", "los", "sigma_db"),
                          make).placed(scene.config.origin)
 

@@ -28,6 +28,18 @@ def test_the_snr_is_power_plus_gain_minus_noise_at_the_uavs_altitude(small_scene
                                        at_altitude["sigma_db"].sel(device=device.device).values)
 
 
+def test_a_maps_own_powers_of_devices_come_before_the_scenes(small_scene, city_mission):
+    truth = segmented_truth(small_scene)
+    names = [device.device for device in small_scene.config.devices]
+    powers_dbm = 10.0 + np.arange(len(names))
+    loud = RadioMap(truth.dataset.assign_attrs(device_tx_power_dbm=powers_dbm.tolist()))
+    order = [truth.devices.index(name) for name in names]
+    rise_db = make_mission(small_scene, loud, Known.truth(small_scene)).snr_db - city_mission.snr_db
+    expected_db = (powers_dbm[order] - small_scene.config.radio.tx_power_dbm)[None, :, None, None]
+    np.testing.assert_allclose(rise_db[np.isfinite(rise_db)], np.broadcast_to(expected_db, rise_db.shape)[np.isfinite(rise_db)],
+                               atol=1e-3)
+
+
 def test_a_link_without_gain_has_no_snr(small_scene):
     truth = segmented_truth(small_scene)
     dataset = truth.dataset.copy(deep=True)

@@ -15,10 +15,15 @@ from radiotwin.links import link_geometry, prepare_links
 from radiotwin.links.declared import Declared, Radio
 from radiotwin.links.links import Columns, Ends, Links, World
 from radiotwin.links.measurements import Measurements, read_measurements
+from radiotwin.maps.file import form_problem
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.propagation.laws.followed_paths import path_gains
 from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna, read_pattern
 from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin.compare import predict
 from radiotwin.twin.locate import locate_devices
 from radiotwin.twin.point_gains import gains_at
 from tests.coverage.conftest import write_scene
@@ -257,3 +262,48 @@ def test_antennas_act_along_each_path_where_paths_are_followed(ground, tmp_path)
     channel = ImagePaths()
     level_db = channel.level_db(path_gains(links.geometry), links.geometry) + channel.declared_db(links)
     np.testing.assert_allclose(level_db, 11 + 10 * np.log10(direct * into_direct + bounce * into_bounce), atol=0.1)
+
+
+def test_a_survey_through_antennas_of_the_scene_is_learnt_without_them(tmp_path):
+    """The truth is the segmented law, in line of sight everywhere, through the sector of one device."""
+    scene = write_scene(tmp_path / "scene", devices=[(name, *PLACES_M[name], Z_M) for name in "abc"], half_m=400.0, tx_power_dbm=0.0,
+                        noise_dbm=-102.0)
+    write_sector(scene.folder / "sector.csv")
+    text = (scene.folder / "scene.toml").read_text().replace('role = "unknown"', 'role = "anchor"')
+    text = text.replace('device = "a"\n', 'device = "a"\nantenna = "sector.csv"\nazimuth_deg = 45\n')
+    text += '[[uavs]]\nuav = "u"\naltitude_m = 1.5\nstart_x_m = 0\nstart_y_m = 0\nterminal_x_m = 0\nterminal_y_m = 0\nbattery = 900\n'
+    (scene.folder / "scene.toml").write_text(text)
+    scene = Scene.load(scene.folder)
+    truth = segmented_truth(scene)
+    x_m, y_m = np.meshgrid(truth.lattice.x_m, truth.lattice.y_m)
+    away_m = np.column_stack([x_m.ravel() - 60, y_m.ravel() - 60])
+    expected_db = -30 - 25 * np.log10(np.hypot(*away_m.T)) + sector_dbi(np.degrees(np.arctan2(*away_m.T)) - 45, 0.0)
+    np.testing.assert_allclose(truth.gain_db[0, 0].ravel(), expected_db, atol=0.02)
+    data = fly_survey(scene, truth, flights=2, pattern="random-waypoint", seed=0)
+    with pytest.warns(UserWarning, match="the antenna of b, c is not declared, as others' are, and taken for isotropic"):
+        twin = fit_twin(data, scene, model="log_distance")
+    error_db = twin.radio_map(scene).gain_db - truth.gain_db
+    assert np.abs(error_db).max() < 1.0
+
+
+def test_a_twins_map_tells_coverage_the_powers(ground, tmp_path):
+    powers = {"a": 0.0, "b": 20.0, "c": 10.0}
+    data = campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power} for name, power in powers.items()})
+    radio_map = fit_twin(data, ground, model="log_distance").radio_map(ground)
+    radio_map.save(tmp_path / "map.nc")
+    again = RadioMap.load(tmp_path / "map.nc")
+    assert again.tx_power_dbm == powers
+    coverage = predict_coverage(again, ground)
+    assert [each["tx_power_dbm"] for each in coverage.summary["transmitters"]] == [0.0, 20.0, 10.0]
+    strongest_dbm = (again.gain_db[:, 0] + np.array([0.0, 20.0, 10.0])[:, None, None]).max(axis=0)
+    np.testing.assert_allclose(coverage.dataset["received_power_dbm"], strongest_dbm, atol=1e-3)
+    again.dataset.attrs["device_tx_power_dbm"] = [0.0, 1e9, 0.0]
+    assert "not a power of each device" in form_problem(again.dataset)
+
+
+def test_a_comparison_takes_powers_as_they_are_declared_by_then(ground, tmp_path):
+    twin = fit_twin(campaign(tmp_path / "m", {name: {"tx_power_dbm": 20.0, "adds_db": 20.0} for name in "abc"}), ground,
+                    model="log_distance")
+    later = campaign(tmp_path / "later", {"a": {"tx_power_dbm": 5.0, "adds_db": 5.0}}, seed=3)
+    error_db = predict(twin, ground, later) - later.level_db
+    assert abs(error_db.mean()) < 0.5 and error_db.std() < 2
