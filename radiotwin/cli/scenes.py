@@ -248,6 +248,10 @@ def trace(
     if "noise_floor_db" in facts:
         say(f"numerical noise: {facts['noise_floor_db']:.2f} dB RMS against ten times the rays; "
             f"nine links in ten are within {facts['noise_floor_p90_db']:.2f} dB")
+    if "exchanged_nlos_db" in facts:
+        say(f"ends exchanged, on {facts['exchanged_links']} links: {facts['exchanged_los_db']:.2f} "
+            f"dB RMS in line of sight, {facts['exchanged_nlos_db']:.2f} dB without; without it "
+            f"{100 * facts['exchanged_nlos_doubtful_share']:.0f} % differ by more than 6 dB")
 
 
 def _print_plan(scene: "Scene", settings: "SolverSettings", devices: list[str] | None) -> None:

@@ -27,6 +27,7 @@ from radiotwin.trace.settings import FINER, SolverSettings
 from radiotwin.trace.solver import Antennas, CellGains, PathGains
 from radiotwin.trace.tiles import PackedCity, Tile, batches_by_place, longest_path_m, tile_of
 
+MAX_EXCHANGED = 50  # calls of the solver, for the estimate of what an exchange of ends changes
 GEOMETRY_COPIES = 3  # of a packed city in a worker: as received, unpacked, and a tile of it
 
 
@@ -283,14 +284,60 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
     """
     total = len(scene.lattice.positions_m)
     if settings.solver == "paths":
-        count = min(total, max(8, round(0.01 * total)))
         rng = np.random.default_rng(settings.seed)
-        columns = np.sort(rng.choice(total, size=count, replace=False))
+        columns = np.sort(rng.choice(total, size=sampled(scene), replace=False))
         rows = slice(0, len(index))
     else:
         columns, rows = np.arange(_plane(scene)), slice(0, 1)
     return rows, columns, solve_lattice(scene, settings.finer(FINER), store, index[rows], executor,
                                         columns, "finer", "numerical noise")
+
+
+def sampled(scene: Scene) -> int:
+    """Return how many positions `solve_finer` takes."""
+    total = len(scene.lattice.positions_m)
+    return min(total, max(8, round(0.01 * total)))
+
+
+def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
+                    executor: Executor, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Solve links with their ends exchanged: rays start at receivers; see `solve_lattice`.
+
+    Args:
+        scene: City, devices, antennas and lattice.
+        settings: With the solver `paths`.
+        store: Of the map.
+        index: Devices.
+        executor: Where it runs.
+        columns: Positions of receivers to choose from, at most `MAX_EXCHANGED` calls of the solver.
+
+    Returns:
+        Columns that were solved, and their gains (devices, columns) [dB].
+    """
+    of_antenna: dict[int, list[int]] = {}  # a call has one antenna for all its points
+    for device in index:
+        of_antenna.setdefault(id(scene.device_antennas[device]), []).append(device)
+    size = settings.batch_receivers
+    groups = [devices[start:start + size] for devices in of_antenna.values()
+              for start in range(0, len(devices), size)]
+    columns = columns[::max(1, -(-len(columns) * len(groups) // MAX_EXCHANGED))]
+    longest_m = longest_path_m(scene) if settings.is_tiled else 0.0
+    pieces = []
+    for column in columns:
+        point_m = scene.lattice.positions_m[column]
+        for devices in groups:
+            digest = hashlib.sha256(str(devices).encode()).hexdigest()[:12]
+            ends_m, tile = scene.device_m[devices], None
+            if settings.radius_m is not None and settings.is_tiled:
+                tile = tile_of(point_m, ends_m, settings.radius_m, longest_m)
+            pieces.append(LinkBatch(f"exchanged-{column:07d}-{digest}", point_m, ends_m,
+                                    (scene.uav_antenna, scene.device_antennas[devices[0]]),
+                                    settings.batch_receivers, tile))
+    solved = executor.run(link_job(scene, settings, "exchanged ends"), pieces, store)
+    gain_db = np.empty((len(index), len(columns)))
+    rows = [index.index(device) for devices in groups for device in devices]
+    gain_db[rows] = np.concatenate([np.zeros(0), *solved]).reshape(len(columns), len(index)).T
+    return columns, gain_db
 
 
 def _plane(scene: Scene) -> int:

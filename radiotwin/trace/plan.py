@@ -17,7 +17,13 @@ from radiotwin.runtime.execution.job import peak_bytes
 from radiotwin.runtime.execution.local import LocalPool
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
-from radiotwin.trace.link_job import LinkBatch, lattice_pieces, link_job
+from radiotwin.trace.link_job import (
+    MAX_EXCHANGED,
+    LinkBatch,
+    lattice_pieces,
+    link_job,
+    sampled,
+)
 from radiotwin.trace.run import device_indices, noise_figures, open_store
 from radiotwin.trace.settings import FINER, QUALITIES, SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, PathGains
@@ -46,6 +52,7 @@ class TracePlan:
         peak_bytes: Memory that a worker took.
         memory_bytes: Most that a worker may take.
         workers: As many as this machine has cores and memory for.
+        exchanged: Batches more, of links whose ends are exchanged.
     """
 
     links: int
@@ -58,13 +65,14 @@ class TracePlan:
     peak_bytes: int
     memory_bytes: int
     workers: int
+    exchanged: int = 0
 
     def seconds(self, workers: int) -> float:
         """Return the time that so many workers take, each on a core of this machine's kind [s]."""
         left = self.batches - self.finished
         if not left:
             return 0.0
-        rounds = math.ceil((1 + NOISE_SHARE) * left / workers)
+        rounds = math.ceil(((1 + NOISE_SHARE) * left + self.exchanged) / workers)
         return self.start_s + rounds * self.batch_s
 
     def rows(self) -> list[tuple[int, float, float]]:
@@ -132,7 +140,8 @@ def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None
         batch_p90_s=float(np.quantile(seconds, 0.9)),
         busy=busy,
         peak_bytes=max((each[3] for each in found), default=0),
-        memory_bytes=job.resources.memory_bytes, workers=workers)
+        memory_bytes=job.resources.memory_bytes, workers=workers,
+        exchanged=min(MAX_EXCHANGED, sampled(scene)) if settings.solver == "paths" else 0)
 
 
 @dataclass(frozen=True)

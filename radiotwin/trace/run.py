@@ -1,7 +1,7 @@
 """The truth map: every lattice position, every device, resumable and checked.
 
 A map is kept if its gains are possible by physics. Its numerical noise is the change of its gains
-when ten times the rays are sent.
+when ten times the rays are sent, and when the ends of links are exchanged.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import FAR_M, CityMap
-from radiotwin.trace.link_job import BatchStore, solve_finer, solve_lattice
+from radiotwin.trace.link_job import BatchStore, solve_exchanged, solve_finer, solve_lattice
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, library_versions
 from radiotwin.trace.tiles import with_radius
@@ -40,6 +40,7 @@ MIN_EXCESS_DB = -0.5  # of a link that the tracer sees in LoS
 # Where a ray grazes an edge, the tracer and the map's own ray test may differ in LoS: such a share
 # of LoS links may lie below, and as many however small the map.
 MAX_DARK_SHARE, MAX_DARK_LINKS = 0.005, 3
+DOUBT_DB = 6.0  # a link whose two ends differ by more is doubtful
 MAX_STEM = 100  # characters of a file's name
 
 
@@ -116,6 +117,29 @@ def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float 
         "noise_floor_method": "a sample of the links solved again with ten times the rays; "
                               "RMS difference over links detected in both",
     }
+
+
+def exchange_figures(gain_db: np.ndarray, exchanged_db: np.ndarray, los: np.ndarray
+                     ) -> dict[str, float]:
+    """Compare links with the same from their other ends, (n,) gains [dB], NaN where not detected.
+
+    Gains do not depend on which end sends (reciprocity). What differs is the truth's own error:
+    paths that the rays of one end miss, and a wedge that is not reciprocal.
+
+    Returns:
+        Attributes: RMS of the difference over links detected in both, of links in line of sight
+        (`los`, (n,) bool) and without; of the latter the 90th percentile and the share that
+        differs by more than `DOUBT_DB`. NaN of a class without links.
+    """
+    both = np.isfinite(gain_db) & np.isfinite(exchanged_db)
+    of_class = [np.abs(gain_db - exchanged_db)[both & each] for each in (los, ~los)]
+    with_sight_db, without_db = (each if len(each) else np.array([np.nan]) for each in of_class)
+    return {
+        "exchanged_links": int(both.sum()),
+        "exchanged_los_db": float(np.sqrt(np.mean(with_sight_db**2))),
+        "exchanged_nlos_db": float(np.sqrt(np.mean(without_db**2))),
+        "exchanged_nlos_p90_db": float(np.quantile(without_db, 0.9)),
+        "exchanged_nlos_doubtful_share": float(np.mean(without_db > DOUBT_DB))}
 
 
 def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
@@ -208,6 +232,11 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
     finer_db[(finer_db < limit_db) | (finer_db == IMPOSSIBLE_DB)] = np.nan
     figures |= noise_figures(gain_db[rows, columns][:, outside].ravel(),
                              finer_db[:, outside].ravel())
+    if settings.solver == "paths":
+        turned, exchanged_db = solve_exchanged(scene, settings, store, index, executor,
+                                               columns[outside])
+        exchanged_db[(exchanged_db < limit_db) | (exchanged_db == IMPOSSIBLE_DB)] = np.nan
+        figures |= exchange_figures(gain_db[:, turned], exchanged_db, los[:, turned])
     attributes = {"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
                   "scene": scene.config.name, "scene_hash": scene.content_hash(),
                   "trace_hash": store.hash, **settings.attributes(), **counts, **figures,
