@@ -162,6 +162,11 @@ def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray,
     return -np.minimum(horizontal_db + vertical_db, max_db)
 
 
+def linear(gain_db: np.ndarray) -> np.ndarray:
+    """Return gains [dB] as ratios of power; in single precision faster than a power of 10."""
+    return np.exp(gain_db * (math.log(10) / 10))
+
+
 class Departures(NamedTuple):
     """Directions in which links leave their device.
 
@@ -184,14 +189,10 @@ class Departures(NamedTuple):
 
     def offset_db(self, pattern: SectorPattern) -> np.ndarray:
         """Return (n,) what a pattern adds to each link [dB]."""
-        gain = _linear(sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern))
+        gain = linear(sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern))
         at_tilt = np.full(len(AROUND_DEG), pattern.tilt_deg)
-        mean_gain = np.mean(_linear(sector_pattern_db(AROUND_DEG, at_tilt, pattern)))
+        mean_gain = np.mean(linear(sector_pattern_db(AROUND_DEG, at_tilt, pattern)))
         return self.rays.through_antenna_db(gain, pattern.scattered_db, float(mean_gain))
-
-
-def _linear(gain_db: np.ndarray) -> np.ndarray:
-    return np.exp(gain_db * (math.log(10) / 10))
 
 
 class SectorEffect(GainEffect):

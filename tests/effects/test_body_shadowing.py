@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from radiotwin.effects.catalogue.body_shadowing import Body, BodyShadowing
 from radiotwin.effects.params import Estimate
+from radiotwin.scene.citymap import CityMap
 
 
 @pytest.fixture
@@ -100,3 +102,19 @@ def test_a_body_is_found_in_a_flight(open_ground, loop):
     assert found.names[0] == "body_shadowing"
     assert found.first["body_depth_db[r1]"].value == pytest.approx(9, abs=1.5)
     assert abs(found.first["body_azimuth_deg[r1]"].value - 180) < 12
+
+
+def test_over_a_map_each_path_has_the_loss_of_its_own_direction(make_links):
+    """A screen hides the device in the north; the wall east of both, 99 m away, is what is heard, from ahead and abeam."""
+    walls = [trimesh.creation.box(extents=extents) for extents in ([60, 2, 80], [2, 800, 80])]
+    for wall, middle in zip(walls, ([0, 50, 40], [100, 0, 40])):
+        wall.apply_translation(middle)
+    mesh = trimesh.util.concatenate(walls)
+    links = make_links([[0.0, 100, 10]], [[0.0, 0, 10]], city=CityMap(mesh.vertices, mesh.faces), heading_deg=np.zeros(1))
+    wall_deg = np.degrees(np.arctan2(198, 100))
+    for azimuth_deg in (0.0, wall_deg, 180.0):
+        body = Body(depth_db=10.0, azimuth_deg=azimuth_deg, width_deg=60.0)
+        gain_db = BodyShadowing().with_params(BodyShadowing.Params(receivers={0: body})).gain_db(links)
+        off = np.radians(azimuth_deg - wall_deg)
+        exponent = np.log(0.5) / np.log((1 + np.cos(np.radians(30))) / 2)
+        assert gain_db[0] == pytest.approx(-10 * ((1 + np.cos(off)) / 2) ** exponent, abs=0.5)

@@ -5,13 +5,18 @@ depth ((1 + cos angle) / 2)^k, with the angle between the arrival and the body, 
 elevation together. Its width is where half of the depth is left: k = 1, the first harmonic, is 180°
 wide, and a large k is a normal curve. Airframe shadowing is described by Khawaja et al., 'A survey
 of air-to-ground propagation channel modeling for unmanned aerial vehicles', IEEE COMST 21(3), 2019.
+With a 3D map each path has the loss of the direction from which it comes; a link that no path
+reaches has that of the straight line.
 """
+
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import BodyFrameEffect, report_patterns
+from radiotwin.effects.antennas import BodyFrameEffect, linear, report_patterns
 from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import (
@@ -24,6 +29,7 @@ from radiotwin.effects.params import (
 )
 from radiotwin.effects.patterns import Pattern
 from radiotwin.links import Links
+from radiotwin.propagation.laws.followed_paths import Rays
 
 MIN_LINKS = 100  # of a receiver, detected and with a heading
 MIN_NATS = 4.0  # that a body must gain to be proposed
@@ -89,7 +95,8 @@ class BodyShadowing(BodyFrameEffect):
         gain_db = np.zeros(len(links))
         for receiver, body in self.params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
-            gain_db[rows] = -body.loss_db(_arrivals(links.select(rows)))
+            arrivals = self.of_links.get(links, receiver, partial(_Arrivals.of, links, rows))
+            gain_db[rows] = arrivals.gain_db(body)
         return gain_db
 
     @override
@@ -107,10 +114,41 @@ class BodyShadowing(BodyFrameEffect):
                                prefix="body_")
 
 
-def _arrivals(links: Links) -> np.ndarray:
+class _Arrivals(NamedTuple):
+    """Directions from which links arrive at their receiver.
+
+    Attributes:
+        rays: of the paths.
+        direction: (p, 3) of the rays along right, nose and top of the receiver.
+        straight: (n, 3) of the straight lines, likewise.
+    """
+
+    rays: Rays
+    direction: np.ndarray
+    straight: np.ndarray
+
+    @classmethod
+    def of(cls, links: Links, rows: np.ndarray) -> "_Arrivals":
+        """Return those of some links, which are followed over the map."""
+        links = links.select(rows)
+        rays = Rays.of(links, of_device=False)
+        return cls(rays, _in_body(links, rays), _straight(links))
+
+    def gain_db(self, body: Body) -> np.ndarray:
+        """Return (n,) what the body adds to each link [dB]."""
+        along_db = self.rays.through_antenna_db(linear(-body.loss_db(self.direction)))
+        return np.where(np.isnan(along_db), -body.loss_db(self.straight), along_db)
+
+
+def _straight(links: Links) -> np.ndarray:
     """Return unit vectors (n, 3) towards the devices, along right, nose and top of the receiver."""
-    length_m = np.maximum(np.linalg.norm(links.offset_m, axis=1), 1e-9)
-    return np.einsum("nij,nj->ni", links.receiver_axes, -links.offset_m / length_m[:, None])
+    return _in_body(links, Rays.of(links, of_device=False, straight=True))
+
+
+def _in_body(links: Links, rays: Rays) -> np.ndarray:
+    """Return directions of rays (p, 3) along right, nose and top of the receiver."""
+    axes = links.receiver_axes.astype(rays.direction.dtype)
+    return np.einsum("pij,pj->pi", axes[rays.link], rays.direction)
 
 
 def _directions(azimuth_deg: np.ndarray | float, elevation_deg: np.ndarray | float) -> np.ndarray:
@@ -135,7 +173,7 @@ def _best_body(view: ResidualView, rows: np.ndarray) -> Body | None:
     azimuth_deg, elevation_deg = (each.ravel() for each in np.meshgrid(
         np.arange(0.0, 360.0, SEARCH_STEP_DEG),
         np.arange(-90.0 + SEARCH_STEP_DEG, 90.0, SEARCH_STEP_DEG)))
-    cosine = _arrivals(view.links.select(few)) @ _directions(azimuth_deg, elevation_deg).T
+    cosine = _straight(view.links.select(few)) @ _directions(azimuth_deg, elevation_deg).T
     best, most_nats = None, MIN_NATS
     for width_deg in SEARCHED_WIDTHS_DEG:
         share = _share(cosine, width_deg)

@@ -171,9 +171,9 @@ class Rays:
         sums[reached] = np.add.reduceat(power, first, dtype=float)  # a third of bincount's time
         return sums
 
-    def through_antenna_db(self, gain: np.ndarray, scattered_db: float,
-                           mean_gain: float) -> np.ndarray:
-        """Return what an antenna adds to the links (n,) [dB].
+    def through_antenna_db(self, gain: np.ndarray, scattered_db: float = -np.inf,
+                           mean_gain: float = 1.0) -> np.ndarray:
+        """Return what an antenna adds to the links (n,) [dB]; NaN where there is no power.
 
         Args:
             gain: (p,) of the antenna in the directions of the rays, linear.
@@ -182,7 +182,8 @@ class Rays:
         """
         scattered = self.free * 10 ** (scattered_db / 10)
         received = self._sums(self.power * gain) + scattered * mean_gain
-        return 10 * np.log10(received / (self._isotropic + scattered))
+        with np.errstate(invalid="ignore"):
+            return 10 * np.log10(received / (self._isotropic + scattered))
 
 
 class _Followed(NamedTuple):
