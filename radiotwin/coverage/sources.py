@@ -187,7 +187,9 @@ def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]
     def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
         each, device = transmitters[row], np.full(len(receiver_m), rows[row])
         if has_power:
-            levels = twin.predict(twin.links(receiver_m, device, scene))
+            isotropic = replace(twin.declared, receiver_antenna=None)
+            levels = twin.predict(twin.links(receiver_m, device, scene).with_ends(
+                declared=isotropic))
             return levels.mean_db, levels.sd_db
         radios = [Radio()] * (known + 1)
         radios[rows[row]] = Radio(antenna=each.antenna, frequency_hz=each.frequency_hz)

@@ -82,11 +82,13 @@ class Declared:
         radios: of each device; empty: nothing is declared.
         frequency_hz: that channel models compute at [Hz]; NaN where it is not known.
         has_power: whether levels are received powers, with the transmit power in them.
+        receiver_antenna: of all receivers; None: isotropic, or a part of what is learnt.
     """
 
     radios: tuple[Radio, ...]
     frequency_hz: float
     has_power: bool
+    receiver_antenna: Antenna | None = None
 
     @cached_property
     def fed_db(self) -> np.ndarray:
@@ -112,6 +114,11 @@ class Declared:
                 for antenna in every.values()]
 
     @property
+    def has_antennas(self) -> bool:
+        """Whether any antenna is declared, at either end."""
+        return bool(self.antennas) or self.receiver_antenna is not None
+
+    @property
     def knows_powers(self) -> bool:
         """Whether levels are received powers, and all transmit powers are known."""
         return self.has_power and bool(self.radios) and all(
@@ -120,7 +127,7 @@ class Declared:
     @cached_property
     def adds_nothing(self) -> bool:
         """Whether all levels are gains between isotropic antennas, as far as is declared."""
-        return not self.fed_db.any() and not self.antennas
+        return not self.fed_db.any() and not self.has_antennas
 
     def added_db(self, device: np.ndarray, ray_m: np.ndarray) -> np.ndarray | float:
         """Return what the radios add to the gains of links between isotropic antennas (n,) [dB].
@@ -138,6 +145,8 @@ class Declared:
         for antenna, of_device in self.antennas:
             rows = np.flatnonzero(of_device[device])
             added_db[rows] += antenna.gain_dbi(ray_m[rows])
+        if self.receiver_antenna is not None:
+            added_db += self.receiver_antenna.gain_dbi(-ray_m)
         return added_db
 
     def anew(self, radios: dict[int, Radio]) -> Declared:
@@ -250,6 +259,23 @@ def complete(names: Sequence[str], radios: tuple[Radio, ...], has_power: bool,
     return radios, notes
 
 
+def antenna_of_uavs(scene: Scene | None, receivers: Sequence[str]
+                    ) -> tuple[Antenna | None, list[str]]:
+    """Return the antenna that a scene declares for its UAVs if they are the receivers, and notes.
+
+    Args:
+        scene: if there is one.
+        receivers: names.
+    """
+    if scene is None or scene.uav_antenna is None:
+        return None, []
+    others = sorted(set(receivers) - {each.uav for each in scene.config.uavs})
+    if not others:
+        return scene.uav_antenna, []
+    return None, ["the antenna that the scene declares for its UAVs is not used, and is a part of "
+                  f"what is learnt: receivers {some(others, MAX_NAMED)} are none of its UAVs"]
+
+
 def as_learnt(names: Sequence[str], declared: Declared, learnt: Declared, scene: Scene | None
               ) -> tuple[Declared, list[str]]:
     """Return what is declared of devices for a law that was learnt from others, and notes.
@@ -282,7 +308,8 @@ def as_learnt(names: Sequence[str], declared: Declared, learnt: Declared, scene:
                      " of the devices to be located are added to it: unless they are isotropic "
                      "they count twice; declare their antennas in devices.csv and fit again")
     frequency_hz = declared.frequency_hz if np.isnan(learnt.frequency_hz) else learnt.frequency_hz
-    return Declared(radios, frequency_hz, declared.has_power), notes
+    return Declared(radios, frequency_hz, declared.has_power,
+                    None if learnt.receiver_antenna is None else declared.receiver_antenna), notes
 
 
 def _missing(names: Sequence[str], radios: tuple[Radio, ...], lacks: Callable[[Radio], bool],

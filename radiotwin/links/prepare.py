@@ -22,7 +22,7 @@ from radiotwin.links.checks import (
     unmapped_ends,
     useless_receivers,
 )
-from radiotwin.links.declared import Declared, complete, radios_of
+from radiotwin.links.declared import Declared, Radio, antenna_of_uavs, complete, radios_of
 from radiotwin.links.limits import estimate_limits
 from radiotwin.links.links import RESTART_NOTE, Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements
@@ -181,7 +181,10 @@ def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
     notes += _other_frequencies(_column(devices, "frequency_hz"), frequency_hz)
     radios, assumed = complete(list(devices["device"]), radios_of(
         devices, measurements.patterns, scene), not is_gain, scene)
-    notes += assumed
+    receiver_antenna, unused = antenna_of_uavs(scene, list(receiver_names))
+    notes += [*assumed, *unused]
+    if receiver_antenna is not None and not radios:
+        radios = (Radio(),) * len(devices)
     columns = Columns(
         level_db=level_db, limit_db=np.full(len(level_db), -np.inf), receiver_m=receiver_m,
         device=device, receiver=receiver, flight=flight, time_s=_column(table, "time_s"),
@@ -195,7 +198,8 @@ def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
         anchors=frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist()),
         boresight_deg=np.where(of_sector, _column(devices, "azimuth_deg"), np.nan),
         tilt_deg=np.where(of_sector, _column(devices, "tilt_deg"), np.nan),
-        declared=Declared(radios, frequency_hz, not is_gain), flown=Flown.of(columns))
+        declared=Declared(radios, frequency_hz, not is_gain, receiver_antenna),
+        flown=Flown.of(columns))
     city = scene.city if scene is not None else None
     links = Links(columns=columns, ends=ends, notes=tuple(notes),
                   world=World(frequency_hz=frequency_hz, city=city, is_gain=is_gain))

@@ -9,7 +9,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import mean_if_detected
-from radiotwin.links.declared import radios_of
+from radiotwin.links.declared import antenna_of_uavs, radios_of
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import channel_named
@@ -265,8 +265,11 @@ def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
     if (row >= 0).any():
         links = twin.links(measurements.receiver_m[row >= 0], row[row >= 0], scene)
         radios = radios_of(measurements.devices, measurements.patterns, scene)
-        links = links.with_ends(declared=twin.declared.anew(
-            {row: radio for row, radio in zip(row_of_device, radios) if row >= 0}))
+        declared = twin.declared.anew(
+            {row: radio for row, radio in zip(row_of_device, radios) if row >= 0})
+        if antenna_of_uavs(scene, list(measurements.table["receiver"]))[0] is None:
+            declared = replace(declared, receiver_antenna=None)
+        links = links.with_ends(declared=declared)
         found = twin.predict(links)
         limit_db = -np.inf if twin.limit_db is None else twin.limit_db
         predicted_db[row >= 0] = mean_if_detected(found.mean_db, found.sd_db, limit_db)

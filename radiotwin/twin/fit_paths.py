@@ -11,7 +11,7 @@ from scipy.stats import f
 from radiotwin.links import Links
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import drop_uninformative
-from radiotwin.propagation.laws.followed_paths import device_antenna_db
+from radiotwin.propagation.laws.followed_paths import declared_antenna_db
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.map_error import (
@@ -137,7 +137,7 @@ def _image_paths(links: Links, law: Twin, device_m: np.ndarray) -> ImagePaths:
     """Return the channel, its diffuse power fitted to links of devices that have a position."""
     channel = ImagePaths(law.channel)
     located = links.located(device_m)
-    declared, antenna_db = located.declared, device_antenna_db(located)
+    declared, antenna_db = located.declared, declared_antenna_db(located)
     fed_db = 0.0 if declared.adds_nothing else declared.fed_db[located.device]
     return channel.fit_diffuse(*located.gains(fed_db), antenna_db)
 

@@ -100,7 +100,7 @@ class FittedRecord(_Strict):
 
 
 class AntennaRecord(_Strict):
-    """Antenna of a device; its pattern is beside the channel."""
+    """Antenna of a device, or of the receivers; its pattern is beside the channel."""
 
     pattern: Annotated[int, Field(ge=0)]
     azimuth_deg: Annotated[float, Field(ge=-MAX_ANGLE_DEG, le=MAX_ANGLE_DEG)]
@@ -120,6 +120,7 @@ class DeclaredRecord(_Strict):
     """What is declared of each device's radio, and the frequency that the channel computes at."""
 
     radios: list[RadioRecord]
+    receiver_antenna: AntennaRecord | None = None
     frequency_hz: Annotated[float, Field(ge=FREQUENCIES_HZ[0], le=FREQUENCIES_HZ[1])] | None
 
 
@@ -229,18 +230,20 @@ def _declared_record(declared: Declared) -> tuple[dict[str, Any] | None, dict[st
     if not declared.radios:
         return None, {}
     patterns: dict[int, Pattern] = {}
-    radios = []
-    for radio in declared.radios:
-        antenna = None
-        if radio.antenna is not None:
-            patterns[id(radio.antenna.pattern)] = radio.antenna.pattern
-            antenna = {"pattern": list(patterns).index(id(radio.antenna.pattern)),
-                       "azimuth_deg": radio.antenna.azimuth_deg,
-                       "tilt_deg": radio.antenna.tilt_deg}
-        radios.append({"tx_power_dbm": radio.tx_power_dbm, "cable_loss_db": radio.cable_loss_db,
-                       "antenna": antenna, "frequency_hz": radio.frequency_hz})
+
+    def record(antenna: Antenna | None) -> dict[str, Any] | None:
+        if antenna is None:
+            return None
+        patterns[id(antenna.pattern)] = antenna.pattern
+        return {"pattern": list(patterns).index(id(antenna.pattern)),
+                "azimuth_deg": antenna.azimuth_deg, "tilt_deg": antenna.tilt_deg}
+
+    radios = [{"tx_power_dbm": radio.tx_power_dbm, "cable_loss_db": radio.cable_loss_db,
+               "antenna": record(radio.antenna), "frequency_hz": radio.frequency_hz}
+              for radio in declared.radios]
     known_hz = None if np.isnan(declared.frequency_hz) else declared.frequency_hz
-    return {"radios": radios, "frequency_hz": known_hz}, {
+    return {"radios": radios, "receiver_antenna": record(declared.receiver_antenna),
+            "frequency_hz": known_hz}, {
         f"{PATTERN}{number}/{each.name}": getattr(pattern, each.name)
         for number, pattern in enumerate(patterns.values()) for each in fields(pattern)}
 
@@ -265,12 +268,15 @@ def _declared(content: TwinRecord, arrays: dict[str, np.ndarray]) -> Declared:
             raise ValueError("angles of a pattern are not in order")
         patterns.append(Pattern(azimuth_deg, elevation_deg, require_array(
             own, "gain_dbi", (len(elevation_deg), len(azimuth_deg)), -MAX_DB, MAX_GAIN_DBI)))
-    return Declared(tuple(
-        Radio(radio.tx_power_dbm, radio.cable_loss_db, None if radio.antenna is None else Antenna(
-            patterns[radio.antenna.pattern], radio.antenna.azimuth_deg, radio.antenna.tilt_deg),
-            radio.frequency_hz)
-        for radio in record.radios), np.nan if record.frequency_hz is None else record.frequency_hz,
-        content.level == "rssi_dbm")
+
+    def antenna(of_end: AntennaRecord | None) -> Antenna | None:
+        return None if of_end is None else Antenna(patterns[of_end.pattern], of_end.azimuth_deg,
+                                                   of_end.tilt_deg)
+
+    radios = tuple(Radio(radio.tx_power_dbm, radio.cable_loss_db, antenna(radio.antenna),
+                         radio.frequency_hz) for radio in record.radios)
+    return Declared(radios, np.nan if record.frequency_hz is None else record.frequency_hz,
+                    content.level == "rssi_dbm", antenna(record.receiver_antenna))
 
 
 def _fitted_record(fitted: FittedModel) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def test_plausible_or_unknown_heights_are_not_mentioned(points_m):
 def test_a_device_whose_height_is_not_given_is_held_above_the_ground():
     """One of unknown position above most of the ground that was flown over, and not below it."""
     city = terrain_map(lambda x_m, y_m: np.where(x_m > 300.0, 160.0, 100.0) + 0 * y_m)
-    world = SimpleNamespace(city=city, device_antennas=[], config=SimpleNamespace(origin=None, devices=[], gain_limit_db=-150.0,
+    world = SimpleNamespace(city=city, device_antennas=[], uav_antenna=None, config=SimpleNamespace(origin=None, devices=[], gain_limit_db=-150.0,
                                                               radio=SimpleNamespace(frequency_hz=2e9, sensitivity_dbm=-120.0)))
     rng, count = np.random.default_rng(0), 200
     receiver_m = np.column_stack([rng.uniform(-400, 400, (count, 2)), np.full(count, 190.0)])

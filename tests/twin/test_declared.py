@@ -10,6 +10,8 @@ import pandas as pd
 import pytest
 
 from radiotwin.coverage import CoverageSettings, predict_coverage, read_transmitters
+from radiotwin.coverage.sources import source_of_twin
+from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
 from radiotwin.links import link_geometry, prepare_links
 from radiotwin.links.declared import Declared, Radio
@@ -307,3 +309,38 @@ def test_a_comparison_takes_powers_as_they_are_declared_by_then(ground, tmp_path
     later = campaign(tmp_path / "later", {"a": {"tx_power_dbm": 5.0, "adds_db": 5.0}}, seed=3)
     error_db = predict(twin, ground, later) - later.level_db
     assert abs(error_db.mean()) < 0.5 and error_db.std() < 2
+
+
+def lobe_dbi(elevation_deg):
+    """A receiver's antenna: 6 dBi at the horizon, 1 dB less for each 5 degrees up or down."""
+    return 6 - np.abs(elevation_deg) / 5
+
+
+def test_the_antenna_of_the_uavs_is_taken_off_and_put_back_where_uavs_receive(ground, tmp_path):
+    """It would bend the law: devices are seen from 6 to 80 degrees. Receivers of coverage are isotropic; others are no UAVs."""
+    scene = write_scene(tmp_path / "scene", tx_power_dbm=0.0, noise_dbm=-102.0)
+    (scene.folder / "antennas").mkdir()
+    rows = [f"{azimuth},{elevation},{lobe_dbi(elevation):.6f}" for elevation in range(-90, 91, 5) for azimuth in (0, 120, 240)]
+    (scene.folder / "antennas" / "lobe.csv").write_text("azimuth_deg,elevation_deg,gain_dbi\n" + "\n".join(rows) + "\n")
+    with (scene.folder / "scene.toml").open("a") as file:
+        file.write('\n[[uavs]]\nuav = "r"\naltitude_m = 1.5\nstart_x_m = 0.0\nstart_y_m = 0.0\nterminal_x_m = 0.0\n'
+                   'terminal_y_m = 0.0\nbattery = 60.0\nantenna = "antennas/lobe.csv"\n')
+    scene = Scene.load(scene.folder)
+    data = campaign(tmp_path / "m", {name: {"adds_db": 0.0} for name in "abc"}, "gain_db")
+    device_m = data.device_m[data.device_index]
+    up = data.receiver_m[:, 2] - device_m[:, 2]
+    down_deg = -np.degrees(np.arctan2(up, np.hypot(*(data.receiver_m - device_m)[:, :2].T)))
+    data.table["gain_db"] += lobe_dbi(down_deg)
+    twin = fit_twin(data, scene, model="log_distance")
+    twin.save(tmp_path / "twin")
+    at_m = np.array([[75.0, 60.0, 40.0]])  # nearly above the first device
+    steep_db = truth_db((*PLACES_M["a"], Z_M), at_m)[0]
+    heard_db = steep_db + lobe_dbi(np.degrees(np.arctan2(38.5, 15.0)))
+    assert predicted_db(Twin.load(tmp_path / "twin"), scene, "a", at_m)[0] == pytest.approx(heard_db, abs=0.7)
+    source = source_of_twin(twin, scene, [Transmitter("a", np.array([*PLACES_M["a"], Z_M]))])
+    assert source.predict(0, at_m, np.zeros(1, dtype=int))[0][0] == pytest.approx(steep_db, abs=0.7)
+    assert np.abs(predict(twin, scene, data) - data.level_db).mean() < 1.5
+    data.table["receiver"] = "phone"
+    assert (predict(twin, scene, data) - data.level_db + lobe_dbi(down_deg)).std() < 2  # as if isotropic
+    links = prepare_links(data, scene)
+    assert links.declared.adds_nothing and any("receivers phone are none of its UAVs" in note for note in links.notes)

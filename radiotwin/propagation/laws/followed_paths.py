@@ -108,11 +108,12 @@ def antenna_gain_db(geometry: LinkGeometry, device_antennas: Sequence[Antenna | 
     return gain_db
 
 
-def device_antenna_db(links: Links) -> np.ndarray | float:
-    """Return what the declared antennas of devices add to the followed power of links (n,) [dB]."""
-    if not links.declared.antennas:
+def declared_antenna_db(links: Links) -> np.ndarray | float:
+    """Return what the declared antennas add to the followed power of links (n,) [dB]."""
+    if not links.declared.has_antennas:
         return 0.0
-    return antenna_gain_db(links.geometry, [radio.antenna for radio in links.declared.radios])
+    return antenna_gain_db(links.geometry, [radio.antenna for radio in links.declared.radios],
+                           links.declared.receiver_antenna)
 
 
 def free_space(geometry: LinkGeometry) -> np.ndarray:

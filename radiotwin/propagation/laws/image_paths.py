@@ -24,7 +24,7 @@ from radiotwin.propagation.laws.base import (
     require_number,
 )
 from radiotwin.propagation.laws.followed_paths import (
-    device_antenna_db,
+    declared_antenna_db,
     free_space,
     interaction_gains,
     path_gains,
@@ -204,10 +204,10 @@ class ImagePaths(ChannelModel):
     @override
     def declared_db(self, links: Links) -> np.ndarray | float:
         """Return the same with antennas along each path; diffuse power has their mean, 0 dBi."""
-        if not links.declared.antennas:
+        if not links.declared.has_antennas:
             return links.declared_db
         geometry, power = links.geometry, _seen_gains(links.geometry)
-        through = power * 10 ** (device_antenna_db(links) / 10)
+        through = power * 10 ** (declared_antenna_db(links) / 10)
         return links.declared.fed_db[links.device] + self.level_db(through, geometry) \
             - self.level_db(power, geometry)
 

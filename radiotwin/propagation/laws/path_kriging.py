@@ -20,7 +20,7 @@ from radiotwin.propagation.laws.base import (
     require_names,
     require_number,
 )
-from radiotwin.propagation.laws.followed_paths import device_antenna_db
+from radiotwin.propagation.laws.followed_paths import declared_antenna_db
 from radiotwin.propagation.laws.image_paths import (
     DIFFUSE_DEFAULT,
     fit_class,
@@ -114,9 +114,9 @@ class PathKriging(ChannelModel):
     @override
     def declared_db(self, links: Links) -> np.ndarray | float:
         """Return the same with antennas along each path."""
-        if not links.declared.antennas:
+        if not links.declared.has_antennas:
             return links.declared_db
-        return links.declared.fed_db[links.device] + device_antenna_db(links)
+        return links.declared.fed_db[links.device] + declared_antenna_db(links)
 
     @property
     @override
