@@ -1,5 +1,6 @@
 """Coverage of a network, block by block: best server, SINR, rate and location probability."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -139,6 +140,9 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
         found = [by_name.get(name, Transmitter(name, np.full(3, np.nan)))
                  for name in source.devices]
     if isinstance(source, RadioMap):
+        if given is not None and any(each.antenna for each in found):
+            warnings.warn("antennas of the transmitters' table are not used: a radio map has those "
+                          "that it was made with", stacklevel=3)
         found = [replace(each, tx_power_dbm=source.tx_power_dbm.get(each.name))
                  if each.tx_power_dbm is None else each for each in found]
     if not found:

@@ -14,16 +14,14 @@ from radiotwin.geo import between_frames, is_same_frame, read_frame, to_local
 from radiotwin.io.budgets import DEVICES
 from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import name_fault
-from radiotwin.io.inputs import require_within
-from radiotwin.links.declared import tx_power_dbm as declared_power_dbm
-from radiotwin.links.measurements import RADIO, refuse_limits
+from radiotwin.links.declared import Radio, radios_of
+from radiotwin.links.measurements import RADIO, read_antenna_files, refuse_limits
 from radiotwin.scene import Scene
-from radiotwin.scene.antennas import Antenna, read_pattern
+from radiotwin.scene.antennas import Antenna, parse_pattern
 
 _LOCAL, _GLOBAL = ("x_m", "y_m"), ("latitude_deg", "longitude_deg")
 _OPTIONAL = (*RADIO, "load")
 _NAMED = 10  # transmitters in a message
-MAX_TILT_DEG = 90.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,19 +94,20 @@ def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
     if "load" in columns:
         refuse(path, "load", table["load"], (columns["load"] < 0) | (columns["load"] > 1),
                "is no load; allowed are 0 to 1")
-    if "tilt_deg" in columns:
-        refuse(path, "tilt_deg", table["tilt_deg"], np.abs(columns["tilt_deg"]) > MAX_TILT_DEG,
-               f"is no tilt; allowed are -{MAX_TILT_DEG:g} to {MAX_TILT_DEG:g}")
-    antennas = _antennas(path, table, columns)
-    values = {name: [None if np.isnan(value) else float(value) for value in columns[name]]
-              if name in columns else [None] * len(table) for name in _OPTIONAL}
-    powers_dbm = [declared_power_dbm(name, power_dbm, eirp_dbm, loss_db or 0.0, antenna)
-                  for name, power_dbm, eirp_dbm, loss_db, antenna in zip(
-                      names, values["tx_power_dbm"], values["eirp_dbm"], values["cable_loss_db"],
-                      antennas)]
-    return [Transmitter(*row) for row in zip(
-        names, position_m, powers_dbm, antennas, values["load"], values["frequency_hz"],
-        values["cable_loss_db"])]
+    if "antenna" not in table and any(np.nan_to_num(columns.get(name, 0.0)).any()
+                                      for name in ("azimuth_deg", "tilt_deg")):
+        warnings.warn(f"{path}: azimuth_deg and tilt_deg are not used, as no column antenna names "
+                      "the file of a pattern", stacklevel=3)
+    files = table.get("antenna", pd.Series("", table.index)).fillna("").astype(str).str.strip()
+    patterns = {name: parse_pattern(Path(name), content)
+                for name, content in read_antenna_files(path, files).items()}
+    load = columns.pop("load", np.full(len(table), np.nan))
+    radios = radios_of(pd.DataFrame({"device": names, "antenna": files, **columns}), patterns, None)
+    return [Transmitter(name, place_m, radio.tx_power_dbm, radio.antenna,
+                        None if np.isnan(share) else float(share), radio.frequency_hz,
+                        radio.cable_loss_db or None)
+            for name, place_m, share, radio in zip(names, position_m, load,
+                                                   radios or [Radio()] * len(table))]
 
 
 def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Transmitter]:
@@ -190,21 +189,3 @@ def _column(path: Path, table: pd.DataFrame, name: str, may_be_empty: bool = Fal
     refuse_limits(partial(refuse, path, name, text), name, numbers)
     return numbers
 
-
-def _antennas(path: Path, table: pd.DataFrame,
-              columns: dict[str, np.ndarray]) -> list[Antenna | None]:
-    if "antenna" not in table:
-        if any(np.nan_to_num(columns.get(name, 0.0)).any() for name in ("azimuth_deg", "tilt_deg")):
-            warnings.warn(f"{path}: azimuth_deg and tilt_deg are not used, as no column antenna "
-                          "names the file of a pattern", stacklevel=4)
-        return [None] * len(table)
-    patterns, found = {}, []
-    angles = [np.nan_to_num(columns.get(name, np.zeros(len(table))))
-              for name in ("azimuth_deg", "tilt_deg")]
-    for row, text in enumerate(table["antenna"].fillna("").astype(str).str.strip()):
-        if text and text not in patterns:
-            file = require_within(path.parent, path.parent / text, f"{path}, row {row + 2}")
-            patterns[text] = read_pattern(file)
-        found.append(Antenna(patterns[text], *(float(each[row]) for each in angles))
-                     if text else None)
-    return found

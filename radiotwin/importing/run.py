@@ -308,7 +308,7 @@ def _with_antennas(measurements: Measurements, path: Path) -> Measurements:
     names = measurements.devices.get("antenna", pd.Series(dtype=str)).fillna("")
     if not names.any():
         return measurements
-    files = read_antenna_files(path, pd.DataFrame({"antenna": names}))
+    files = read_antenna_files(path, names, are_rows=False)
     placed = names.map(lambda name: name and f"{ANTENNAS}/{Path(name).name}")
     if placed.nunique() < names.nunique():
         raise BadInput(f"{path}: two files of antennas have one name in different folders; give "

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from radiotwin.display import some
+from radiotwin.display import count, some
 from radiotwin.errors import BadInput
 from radiotwin.scene.antennas import Antenna, Pattern
 
@@ -99,6 +99,16 @@ class Declared:
             if radio.frequency_hz is not None and np.isfinite(self.frequency_hz):
                 fed_db[number] -= 20 * np.log10(radio.frequency_hz / self.frequency_hz)
         return fed_db
+
+    @property
+    def description(self) -> str:
+        """What of it is declared, in a few words."""
+        known = [radio.tx_power_dbm for radio in self.radios if radio.tx_power_dbm is not None]
+        parts = [f"tx_power_dbm {min(known):g} to {max(known):g}"] if known else []
+        for name, empty in (("cable_loss_db", 0.0), ("antenna", None), ("frequency_hz", None)):
+            having = sum(getattr(radio, name) != empty for radio in self.radios)
+            parts += [f"{name} of {count(having, 'device')}"] if having else []
+        return ", ".join(parts) or "nothing"
 
     @property
     def usual_db(self) -> float:

@@ -472,7 +472,8 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
         devices = moved_positions(devices, _DEVICE_POSITION,
                                   lambda position_m: between_frames(position_m, of_devices, origin))
     _check_spread(path, table, devices_path, devices)
-    return Measurements(table, devices, origin, read_antenna_files(devices_path, devices))
+    return Measurements(table, devices, origin, read_antenna_files(
+        devices_path, devices.get("antenna", ())))
 
 
 def read_devices(path: Path | str) -> pd.DataFrame:
@@ -505,20 +506,23 @@ def read_devices(path: Path | str) -> pd.DataFrame:
     return devices
 
 
-def read_antenna_files(path: Path, devices: pd.DataFrame) -> dict[str, bytes]:
+def read_antenna_files(path: Path, names: Iterable[str], are_rows: bool = True
+                       ) -> dict[str, bytes]:
     """Read the antenna files below a table's folder that its column `antenna` names, by that name.
 
     Args:
         path: of the table.
-        devices: its rows.
+        names: in the column; empty where a device has none.
+        are_rows: whether they are in the order of its rows.
 
     Raises:
         BadInput: a file that is missing, elsewhere, or no pattern.
     """
     files = {}
-    for name in devices.get("antenna", ()):
+    for row, name in enumerate(names):
         if name and name not in files:
-            file = require_within(path.parent, path.parent / name, f"{path}, column antenna")
+            where = f"row {row + 2}" if are_rows else "column antenna"
+            file = require_within(path.parent, path.parent / name, f"{path}, {where}")
             files[name] = read_bytes(file, "pattern of an antenna", DOCUMENT_BYTES)
             parse_pattern(file, files[name])
     return files

@@ -80,6 +80,9 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     refuse_misplaced_anchors(links, scene)
     for note in links.notes:
         warnings.warn(note, stacklevel=2)
+    if links.has_boresights:
+        warnings.warn("azimuth_deg and tilt_deg are used by close-loop alone where no column "
+                      "antenna names the file of a pattern", stacklevel=2)
     if along_paths:
         fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
         twin = fit(links, scene, seed, start, executor)

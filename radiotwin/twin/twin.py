@@ -316,7 +316,8 @@ class Twin(Summarised):
             ("channel", self.channel.name),
             ("effects", some(each.name for each in self.effects) or "none"),
             ("devices", some(each.device for each in self.devices)), ("unknown devices", found),
-            ("level", self.level), ("limit of detection", limit),
+            ("level", self.level), ("declared of devices", self.declared.description),
+            ("limit of detection", limit),
             ("scene", str(self.provenance.get("scene", "none")))))
 
     def encode(self) -> tuple[str, bytes]:
