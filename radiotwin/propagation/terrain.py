@@ -66,12 +66,10 @@ def terrain_paths(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
         way_m = receiver_m[rows] - device_m
         free = (speed_of_light / (4 * np.pi * frequency_hz * np.linalg.norm(way_m, axis=1))) ** 2
         found.gain[rows] = free * 10 ** (-delta_bullington_db(profiles, frequency_hz) / 10)
-        up, down = _horizons(profiles, profiles.surface_m, profiles.end_m)
-        beyond = up >= way_m[:, 2] / profiles.length_m
-        length_m, up, way_m = profiles.length_m[beyond], up[beyond], way_m[beyond]
-        cross_m = (way_m[:, 2] + down[beyond] * length_m) / (up + down[beyond])
-        found.edge_m[rows[beyond]] = device_m + np.column_stack([
-            way_m[:, :2] * (cross_m / length_m)[:, None], up * cross_m])
+        beyond, cross_m, height_m = _edges(profiles, profiles.surface_m, profiles.end_m)
+        share = (cross_m / profiles.length_m[beyond])[:, None]
+        found.edge_m[rows[beyond]] = np.column_stack([
+            device_m[:2] + share * way_m[beyond, :2], height_m])
     return found
 
 
@@ -115,32 +113,38 @@ def knife_edge_db(nu: np.ndarray) -> np.ndarray:
     return np.where(nu > -0.78, 6.9 + 20 * np.log10(np.sqrt(shifted**2 + 1) + shifted), 0.0)
 
 
-def _horizons(profiles: Profiles, height_m: np.ndarray,
-              end_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greatest slopes (n,) up from either end to the points of a profile (n, p)."""
+def _edges(profiles: Profiles, height_m: np.ndarray,
+           end_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which links (n,) have no sight, and where the horizons of their ends meet (m,) [m].
+
+    Of profiles (n, p) and ends (n, 2): distances from the first end, and heights.
+    """
     at_m, back_m = profiles.at_m, profiles.length_m[:, None] - profiles.at_m
     curved_m = height_m + at_m * back_m / (2 * EARTH_RADIUS_M)
-    return (((curved_m - end_m[:, :1]) / at_m).max(axis=1),
-            ((curved_m - end_m[:, 1:]) / back_m).max(axis=1))
+    up, down = (((curved_m - each[:, None]) / way_m).max(axis=1)
+                for each, way_m in zip(end_m.T, (at_m, back_m)))
+    rise_m = end_m[:, 1] - end_m[:, 0]
+    beyond = up >= rise_m / profiles.length_m
+    cross_m = (rise_m + down * profiles.length_m)[beyond] / (up + down)[beyond]
+    return beyond, cross_m, end_m[beyond, 0] + up[beyond] * cross_m
 
 
 def _bullington_db(profiles: Profiles, height_m: np.ndarray, end_m: np.ndarray,
                    wavelength_m: float) -> np.ndarray:
     """Return the loss (n,) over a profile (n, p) between ends (n, 2) [dB] ([1], section 4.5.1)."""
-    length_m, at_m = profiles.length_m, profiles.at_m
-    first, second = end_m.T
-    up, down = _horizons(profiles, height_m, end_m)
+    length_m = profiles.length_m[:, None]
+
+    def parameter(rows: np.ndarray, at_m: np.ndarray, over_datum_m: np.ndarray) -> np.ndarray:
+        back_m = length_m[rows] - at_m
+        line_m = (end_m[rows, :1] * back_m + end_m[rows, 1:] * at_m) / length_m[rows]
+        return (over_datum_m - line_m) * np.sqrt(
+            2 * length_m[rows] / (wavelength_m * at_m * back_m))
+
     # With line of sight the most obstructed point, else where the horizons cross
-    back_m = length_m[:, None] - at_m
-    over_m = (height_m + at_m * back_m / (2 * EARTH_RADIUS_M)
-              - (first[:, None] * back_m + second[:, None] * at_m) / length_m[:, None])
-    nu = (over_m * np.sqrt(2 * length_m[:, None] / (wavelength_m * at_m * back_m))).max(axis=1)
-    beyond = up >= (second - first) / length_m
-    cross_m = (second - first + down * length_m)[beyond] / (up + down)[beyond]
-    length_m, first, second = length_m[beyond], first[beyond], second[beyond]
-    left_m = length_m - cross_m
-    nu[beyond] = (first + up[beyond] * cross_m - (first * left_m + second * cross_m) / length_m) \
-        * np.sqrt(2 * length_m / (wavelength_m * cross_m * left_m))
+    bulge_m = profiles.at_m * (length_m - profiles.at_m) / (2 * EARTH_RADIUS_M)
+    nu = parameter(np.ones(len(end_m), bool), profiles.at_m, height_m + bulge_m).max(axis=1)
+    beyond, cross_m, top_m = _edges(profiles, height_m, end_m)
+    nu[beyond] = parameter(beyond, cross_m[:, None], top_m[:, None])[:, 0]
     edge_db = knife_edge_db(nu)
     return edge_db + (1 - np.exp(-edge_db / 6)) * (10 + 0.02 * profiles.length_m / 1e3)
 
