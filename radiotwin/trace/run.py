@@ -128,18 +128,19 @@ def exchange_figures(gain_db: np.ndarray, exchanged_db: np.ndarray, los: np.ndar
 
     Returns:
         Attributes: RMS of the difference over links detected in both, of links in line of sight
-        (`los`, (n,) bool) and without; of the latter the 90th percentile and the share that
-        differs by more than `DOUBT_DB`. NaN of a class without links.
+        (`los`, (n,) bool) and without; of the latter also the mean of the exchanged minus the
+        map's gain, and the share that differs by more than `DOUBT_DB`. NaN of a class without
+        links.
     """
     both = np.isfinite(gain_db) & np.isfinite(exchanged_db)
-    of_class = [np.abs(gain_db - exchanged_db)[both & each] for each in (los, ~los)]
+    of_class = [(exchanged_db - gain_db)[both & each] for each in (los, ~los)]
     with_sight_db, without_db = (each if len(each) else np.array([np.nan]) for each in of_class)
     return {
         "exchanged_links": int(both.sum()),
         "exchanged_los_db": float(np.sqrt(np.mean(with_sight_db**2))),
         "exchanged_nlos_db": float(np.sqrt(np.mean(without_db**2))),
-        "exchanged_nlos_p90_db": float(np.quantile(without_db, 0.9)),
-        "exchanged_nlos_doubtful_share": float(np.mean(without_db > DOUBT_DB))}
+        "exchanged_nlos_bias_db": float(np.mean(without_db)),
+        "exchanged_nlos_doubtful_share": float(np.mean(np.abs(without_db) > DOUBT_DB))}
 
 
 def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:

@@ -34,6 +34,7 @@ def test_exchanged_ends_are_compared_by_class():
     assert figures["exchanged_links"] == 6
     assert figures["exchanged_los_db"] == pytest.approx(np.sqrt((9 + 16) / 2))
     assert figures["exchanged_nlos_db"] == pytest.approx(np.sqrt((0 + 4 + 49 + 1) / 4))
+    assert figures["exchanged_nlos_bias_db"] == pytest.approx((0 + 2 - 7 + 1) / 4)
     assert figures["exchanged_nlos_doubtful_share"] == 1 / 4
     assert np.isnan(exchange_figures(forward_db, backward_db, np.ones(8, dtype=bool))["exchanged_nlos_db"])
 
