@@ -7,8 +7,10 @@ from scipy.constants import epsilon_0, speed_of_light
 from radiotwin.coverage.sources import source_over
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.links import link_geometry
+from radiotwin.links.declared import Declared, Radio
 from radiotwin.propagation.laws.followed_paths import antenna_gain_db
 from radiotwin.scene.antennas import Antenna, Pattern
+from radiotwin.twin.localize.along_paths import Relocation
 
 FREQUENCY_HZ = 2e9
 MAST_M = np.array([5.0, -3.0, 10.0])
@@ -98,6 +100,19 @@ def test_antennas_at_both_ends_act_on_each_path(plain, has_map):
                  for leaving_deg, arriving_deg, _ in paths]
         expected = sum(gain * power for gain, (_, _, power) in zip(gains, paths, strict=True)) / total
         np.testing.assert_allclose(found_db[device == row], 10 * np.log10(expected)[device == row], atol=0.03)
+
+
+def test_positions_that_are_tried_are_heard_through_both_antennas(plain):
+    """Two devices at one place, of which one has an antenna; receivers have one, too."""
+    receiver_m = points(60.0)
+    azimuth_deg, paths = rays_by_hand(receiver_m)
+    declared = Declared((Radio(antenna=antenna_of(downtilted_sector_dbi)), Radio()), FREQUENCY_HZ, False, antenna_of(dipole_dbi))
+    relocation = Relocation((-600, 600, -600, 600), 100.0)
+    for device, of_device in enumerate((downtilted_sector_dbi, lambda azimuth_deg, elevation_deg: 0.0)):
+        expected = sum(power * 10 ** ((of_device(azimuth_deg - BORESIGHT_DEG, leaving_deg) + dipole_dbi(0.0, arriving_deg)) / 10)
+                       for leaving_deg, arriving_deg, power in paths)
+        power = relocation.follow(plain.city, tuple(MAST_M), receiver_m, FREQUENCY_HZ, declared, device)
+        np.testing.assert_allclose(10 * np.log10(power), 10 * np.log10(expected), atol=0.03)
 
 
 def test_the_antenna_of_the_uavs_is_said_not_to_be_used(plain, monkeypatch):

@@ -22,6 +22,7 @@ from radiotwin.effects.base import ResidualView
 from radiotwin.inference.censored_regression import CensoredRegression
 from radiotwin.inference.student import DOF
 from radiotwin.links import Links
+from radiotwin.links.declared import Declared
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.execution import Executor, Job, Resources
@@ -32,7 +33,7 @@ from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.model.model import Fit, Model
 
 Followed = dict[tuple[float, ...], dict[int, float]]
-"""Position -> hash of the other end's position -> power."""
+"""Position -> hash of the other end's position and of the antenna -> power."""
 LINKS = 150  # of a device, about
 MIN_HEARD = 30  # of these; what is not heard says little, and fits many positions
 MAX_DEVICES = 30  # of unknown position; each takes some ten seconds
@@ -84,7 +85,7 @@ class Relocation:
             parts of the links use the same ones.
         positions: where each device was found before, which is worth trying with other links, too.
         history: hash of all searches so far, which decide what is remembered.
-        powers: map -> position -> hash of the other end's position -> power.
+        powers: map -> position -> hash of the other end's position and the antenna -> power.
         executor: where devices are searched for side by side, inside `keep_pieces`.
     """
 
@@ -185,17 +186,26 @@ class Relocation:
         return rows[hashes >= self.thresholds[name]]
 
     def follow(self, city: CityMap, position_m: tuple[float, ...], ends_m: np.ndarray,
-               frequency_hz: float) -> np.ndarray:
-        """Return the power (n,) from a position to ends (n, 3)."""
+               frequency_hz: float, declared: Declared, device: int) -> np.ndarray:
+        """Return the power (n,) from a position to ends (n, 3), through what antennas a device has.
+
+        Receivers have the antenna that is declared of them.
+        """
         from radiotwin.propagation.paths import path_powers  # late: numba is large
 
         known = self.powers.setdefault(city, {}).setdefault(position_m, {})
-        hashes = _hashes(ends_m).tolist()
+        antenna = declared.radios[device].antenna if declared.radios else None
+        number = [None, *(each for each, _ in declared.antennas)].index(antenna)
+        hashes = (_hashes(ends_m) + np.uint64(number)).tolist()  # devices may be tried at one place
         missing = {key: row for row, key in enumerate(hashes) if key not in known}
         if missing:
             new_m = ends_m[list(missing.values())]
             followed = path_powers(city, np.array(position_m), new_m, frequency_hz, rays=RAYS)
-            known.update(zip(missing, followed.total.tolist(), strict=True))
+            power = followed.total
+            if declared.has_antennas:
+                power = power * np.nan_to_num(10 ** (followed.directions.antenna_gain_db(
+                    len(new_m), antenna, declared.receiver_antenna) / 10))
+            known.update(zip(missing, power.tolist(), strict=True))
         return np.array([known[key] for key in hashes])
 
 
@@ -328,13 +338,15 @@ class _Search:
         return self.by_law.nll(links, self.by_law.fit.model.level_at(links))
 
     def _paths_db(self, links: Links) -> np.ndarray:
-        position_m = tuple(map(float, links.device_m[self.by_paths.device]))
+        device, declared = self.by_paths.device, links.declared
+        position_m = tuple(map(float, links.device_m[device]))
         assert links.city is not None
         power = self.relocation.follow(links.city, position_m, links.receiver_m,
-                                       links.frequency_hz)
+                                       links.frequency_hz, declared, device)
         channel = self.by_paths.fit.channel
         assert isinstance(channel, ImagePaths)
-        return channel.level_db(power, links.geometry) + links.declared_db
+        fed_db = 0.0 if declared.adds_nothing else declared.fed_db[device]
+        return channel.level_db(power, links.geometry) + fed_db
 
     def _try(self, positions_m: Iterable[np.ndarray]) -> list[float]:
         """Return the negative log-likelihood by paths of each position (2,) [nats]."""
