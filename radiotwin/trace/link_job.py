@@ -27,7 +27,8 @@ from radiotwin.trace.settings import FINER, SolverSettings
 from radiotwin.trace.solver import Antennas, CellGains, PathGains
 from radiotwin.trace.tiles import PackedCity, Tile, batches_by_place, longest_path_m, tile_of
 
-MAX_EXCHANGED = 50  # calls of the solver, for the estimate of what an exchange of ends changes
+# Calls of the solver for the estimate of what an exchange of ends changes: a tenth of the map's
+MIN_EXCHANGED, MAX_EXCHANGED = 8, 50
 GEOMETRY_COPIES = 3  # of a packed city in a worker: as received, unpacked, and a tile of it
 
 
@@ -299,6 +300,12 @@ def sampled(scene: Scene) -> int:
     return min(total, max(8, round(0.01 * total)))
 
 
+def exchanged_calls(scene: Scene, settings: SolverSettings, devices: int) -> int:
+    """Return the most calls of the solver that `solve_exchanged` makes, of one antenna."""
+    batches = devices * -(-len(scene.lattice.positions_m) // settings.batch_receivers)
+    return min(sampled(scene), max(MIN_EXCHANGED, min(MAX_EXCHANGED, batches // 10)))
+
+
 def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
                     executor: Executor, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Solve links with their ends exchanged: rays start at receivers; see `solve_lattice`.
@@ -309,7 +316,7 @@ def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, i
         store: Of the map.
         index: Devices.
         executor: Where it runs.
-        columns: Positions of receivers to choose from, at most `MAX_EXCHANGED` calls of the solver.
+        columns: Positions of receivers to choose from, see `exchanged_calls`.
 
     Returns:
         Columns that were solved, and their gains (devices, columns) [dB].
@@ -320,7 +327,8 @@ def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, i
     size = settings.batch_receivers
     groups = [devices[start:start + size] for devices in of_antenna.values()
               for start in range(0, len(devices), size)]
-    columns = columns[::max(1, -(-len(columns) * len(groups) // MAX_EXCHANGED))]
+    most = exchanged_calls(scene, settings, len(index))
+    columns = columns[::max(1, -(-len(columns) * len(groups) // most))]
     longest_m = longest_path_m(scene) if settings.is_tiled else 0.0
     pieces = []
     for column in columns:

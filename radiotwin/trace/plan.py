@@ -17,13 +17,7 @@ from radiotwin.runtime.execution.job import peak_bytes
 from radiotwin.runtime.execution.local import LocalPool
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
-from radiotwin.trace.link_job import (
-    MAX_EXCHANGED,
-    LinkBatch,
-    lattice_pieces,
-    link_job,
-    sampled,
-)
+from radiotwin.trace.link_job import LinkBatch, exchanged_calls, lattice_pieces, link_job
 from radiotwin.trace.run import device_indices, noise_figures, open_store
 from radiotwin.trace.settings import FINER, QUALITIES, SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, PathGains
@@ -141,7 +135,8 @@ def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None
         busy=busy,
         peak_bytes=max((each[3] for each in found), default=0),
         memory_bytes=job.resources.memory_bytes, workers=workers,
-        exchanged=min(MAX_EXCHANGED, sampled(scene)) if settings.solver == "paths" else 0)
+        exchanged=exchanged_calls(scene, settings, len(index)) if settings.solver == "paths"
+        else 0)
 
 
 @dataclass(frozen=True)
