@@ -17,6 +17,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import channel_named
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.published import PublishedLaw
+from radiotwin.propagation.paths import path_powers
 from radiotwin.propagation.terrain import is_far
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna
@@ -92,7 +93,9 @@ def _source_of_law(kind: type[PublishedLaw], city: CityMap,
     def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
         each = transmitters[row]
         mean_db, sd_db = laws[each.frequency_hz].predict(links(receiver_m, each.frequency_hz, row))
-        return mean_db + antenna_gain_db(each, receiver_m), sd_db
+        if each.antenna is not None:
+            mean_db = mean_db + each.antenna.gain_dbi(receiver_m - each.position_m)
+        return mean_db, sd_db
 
     def notes(receiver_m: np.ndarray) -> list[str]:
         """Return where links lie outside what the law was published for."""
@@ -112,8 +115,6 @@ def _source_of_law(kind: type[PublishedLaw], city: CityMap,
 def _source_of_paths(city: CityMap, transmitters: Sequence[Transmitter]) -> GainSource:
     """Return the sum of the powers of all paths, each through the antenna; nothing is fitted."""
     def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
-        from radiotwin.propagation.paths.powers import path_powers  # numba is large
-
         each = transmitters[row]
         parts = [np.empty(0)]
         for start in range(0, len(receiver_m), PATH_RECEIVERS):
@@ -297,13 +298,6 @@ def completed(twin: Twin, transmitters: Sequence[Transmitter]) -> list[Transmitt
     return [replace(each, **{name: getattr(radio_of[each.name], name) for name in (
         "tx_power_dbm", "cable_loss_db", "antenna", "frequency_hz") if getattr(each, name) is None})
         if each.name in radio_of else each for each in transmitters]
-
-
-def antenna_gain_db(transmitter: Transmitter, receiver_m: np.ndarray) -> np.ndarray | float:
-    """Return what an antenna adds along the straight line (n,) [dB]; 0 for an isotropic one."""
-    if transmitter.antenna is None:
-        return 0.0
-    return transmitter.antenna.gain_dbi(receiver_m - transmitter.position_m)
 
 
 def altitude_row(radio_map: RadioMap, height_m: float | None) -> int:

@@ -6,9 +6,9 @@ from scipy.constants import epsilon_0, speed_of_light
 
 from radiotwin.coverage.sources import source_over
 from radiotwin.coverage.transmitters import Transmitter
-from radiotwin.links import link_geometry
 from radiotwin.links.declared import Declared, Radio
-from radiotwin.propagation.laws.followed_paths import antenna_gain_db
+from radiotwin.links.links import Columns, Ends, Links, World
+from radiotwin.propagation.laws.followed_paths import declared_antenna_db
 from radiotwin.scene.antennas import Antenna, Pattern
 from radiotwin.twin.localize.along_paths import Relocation
 
@@ -93,8 +93,10 @@ def test_antennas_at_both_ends_act_on_each_path(plain, has_map):
     paths = paths if has_map else paths[:1]
     total = sum(power for _, _, power in paths)
     device = np.arange(POINTS) % 2
-    links = link_geometry(np.array([MAST_M, MAST_M]), receiver_m, device, plain.city if has_map else None, FREQUENCY_HZ)
-    found_db = antenna_gain_db(links, [antenna_of(downtilted_sector_dbi), None], antenna_of(dipole_dbi))
+    declared = Declared((Radio(antenna=antenna_of(downtilted_sector_dbi)), Radio()), FREQUENCY_HZ, False, antenna_of(dipole_dbi))
+    ends = Ends(device_names=["mast", "other"], device_m=np.array([MAST_M, MAST_M]), anchors=frozenset([0, 1]), declared=declared)
+    world = World(frequency_hz=FREQUENCY_HZ, city=plain.city if has_map else None, is_gain=True)
+    found_db = declared_antenna_db(Links(columns=Columns.unmeasured(receiver_m, device), ends=ends, world=world))
     for row, of_device in enumerate((downtilted_sector_dbi, lambda azimuth_deg, elevation_deg: 0.0)):
         gains = [10 ** ((of_device(azimuth_deg - BORESIGHT_DEG, leaving_deg) + dipole_dbi(0.0, arriving_deg)) / 10)
                  for leaving_deg, arriving_deg, _ in paths]

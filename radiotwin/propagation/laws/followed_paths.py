@@ -7,7 +7,7 @@ straight line only, as those of knife edges, which the caller adds.
 
 import time
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -28,7 +28,6 @@ from radiotwin.runtime.compiled import njit
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.pieces import KeptParts, Piece
 from radiotwin.runtime.processes import in_threads
-from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import CityMap
 
 GRID_M = 0.5  # estimated positions of devices are rounded to it, and share their paths
@@ -79,41 +78,24 @@ def paths_of(geometry: LinkGeometry) -> PathDirections:
     return joined._replace(departure=joined.departure * scale, arrival=joined.arrival * scale)
 
 
-def antenna_gain_db(geometry: LinkGeometry, device_antennas: Sequence[Antenna | None],
-                    receiver_antenna: Antenna | None = None) -> np.ndarray:
-    """Return what declared antennas add to links (n,) [dB].
+def declared_antenna_db(links: Links) -> np.ndarray | float:
+    """Return what declared antennas add to the followed power of links (n,) [dB].
 
     Each path has the gains of the directions in which it leaves and arrives. Without a map, or
     where there is no path, they are those of the straight line.
-
-    Args:
-        geometry: of the links.
-        device_antennas: of each device by its row; None: isotropic.
-        receiver_antenna: of all receivers; None: isotropic.
     """
-    gain_db = np.zeros(len(geometry))
-    for device in np.unique(geometry.device).tolist():
-        antenna = device_antennas[device]
-        if antenna is None and receiver_antenna is None:
-            continue
-        rows = np.flatnonzero(geometry.device == device)
-        links = geometry.select(rows)
-        straight_m = links.receiver_m - links.device_m
-        for end, way_m in ((antenna, straight_m), (receiver_antenna, -straight_m)):
-            if end is not None:
-                gain_db[rows] += end.gain_dbi(way_m)
-        if geometry.city is not None:
-            along_db = paths_of(links).antenna_gain_db(len(rows), antenna, receiver_antenna)
-            gain_db[rows] = np.where(np.isfinite(along_db), along_db, gain_db[rows])
-    return gain_db
-
-
-def declared_antenna_db(links: Links) -> np.ndarray | float:
-    """Return what the declared antennas add to the followed power of links (n,) [dB]."""
-    if not links.declared.has_antennas:
+    declared = links.declared
+    if not declared.has_antennas:
         return 0.0
-    return antenna_gain_db(links.geometry, [radio.antenna for radio in links.declared.radios],
-                           links.declared.receiver_antenna)
+    straight_db = links.declared_db - declared.fed_db[links.device]
+    if links.city is None:
+        return straight_db
+    along_db = np.full(len(links), np.nan)
+    for device in np.unique(links.device).tolist():
+        rows = np.flatnonzero(links.device == device)
+        along_db[rows] = paths_of(links.geometry.select(rows)).antenna_gain_db(
+            len(rows), declared.radios[device].antenna, declared.receiver_antenna)
+    return np.where(np.isnan(along_db), straight_db, along_db)
 
 
 def free_space(geometry: LinkGeometry) -> np.ndarray:

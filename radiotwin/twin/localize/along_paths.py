@@ -24,6 +24,7 @@ from radiotwin.inference.student import DOF
 from radiotwin.links import Links
 from radiotwin.links.declared import Declared
 from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.propagation.paths import path_powers
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept_with_name
@@ -191,8 +192,6 @@ class Relocation:
 
         Receivers have the antenna that is declared of them.
         """
-        from radiotwin.propagation.paths import path_powers  # late: numba is large
-
         known = self.powers.setdefault(city, {}).setdefault(position_m, {})
         antenna = declared.radios[device].antenna if declared.radios else None
         number = [None, *(each for each, _ in declared.antennas)].index(antenna)
