@@ -35,7 +35,7 @@ from radiotwin.propagation.paths.images import (
     source_images,
 )
 from radiotwin.propagation.paths.interactions import around_edge
-from radiotwin.propagation.paths.pruning import cone_misses, lit_part
+from radiotwin.propagation.paths.pruning import lit_part, narrow, open_window
 from radiotwin.propagation.paths.surfaces import (
     ALONG,
     LENGTH,
@@ -161,26 +161,35 @@ def _sample(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _with_facets_after(
     surfaces: Surfaces, ways: Ways, first: np.ndarray, end: np.ndarray, after: np.ndarray,
-    depth: int,
+    parent: np.ndarray, depth: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Combine each way to an edge with the sequences of facets after it that rays can reach.
 
-    Those of edge e are the rows `first[e]` to `end[e]` of `after` (m, b). Returns the row of the
+    Those of edge e are the rows `first[e]` to `end[e]` of `after` (m, b), the empty one first, each
+    after its `parent` (m,), the row of the sequence without the last facet. Returns the row of the
     way (c,), and that of `after` (c,).
     """
-    total = 0
+    most = total = 0
     for way in range(len(ways.edge)):
-        total += end[ways.edge[way]] - first[ways.edge[way]]
+        rows = end[ways.edge[way]] - first[ways.edge[way]]
+        most, total = max(most, rows), total + rows
     of_way, of_after = np.empty(total, dtype=np.int64), np.empty(total, dtype=np.int64)
+    window, is_open = np.empty((most, 4)), np.empty(most, dtype=np.bool_)
     count = 0
     for way in range(len(ways.edge)):
         edge = ways.edge[way]
         room = depth - 1 - sequence_length(ways.before, way)
         for row in range(first[edge], end[edge]):
-            length = sequence_length(after, row)
-            if length <= room and not cone_misses(
-                    surfaces.planes, surfaces.edges, edge, after[row, :length], ways.lit_m[way],
-                    ways.source_m[way]):
+            at, length = row - first[edge], sequence_length(after, row)
+            if length == 0:
+                open_window(surfaces.edges, edge, ways.lit_m[way], window[at])
+                is_open[at] = True
+            else:
+                window[at] = window[parent[row] - first[edge]]
+                is_open[at] = length <= room and is_open[parent[row] - first[edge]] and narrow(
+                    surfaces.planes, surfaces.edges, edge, after[row], length - 1,
+                    ways.source_m[way], window[at])
+            if is_open[at]:
                 of_way[count], of_after[count] = way, row
                 count += 1
     return of_way[:count], of_after[:count]
@@ -194,12 +203,14 @@ class FacetSequences:
         source: (c,) row of the source.
         facets: (c, depth) rows of `Surfaces`, then -1.
         order: (c,) number of facets.
+        parent: (c,) row of the sequence without its last facet; of an empty one its own.
         next_facets: (m, 2) a sequence, and a facet that rays hit after it.
     """
 
     source: np.ndarray
     facets: np.ndarray
     order: np.ndarray
+    parent: np.ndarray
     next_facets: np.ndarray
 
 
@@ -245,6 +256,7 @@ def _shoot(
     normal = facets.surfaces.planes[:, NORMAL:NORMAL + 3]
     row = source  # of each ray: the sequence that it has visited
     sequences, of_source = [np.empty((sources, 0), dtype=int)], [np.arange(sources)]
+    parents = [np.arange(sources)]
     first = [0]
     seen = []
     count = sources
@@ -262,6 +274,7 @@ def _shoot(
             break
         sequences.append(np.column_stack([sequences[-1][parent - first[-1]], last]))
         of_source.append(of_source[-1][parent - first[-1]])
+        parents.append(parent)
         first.append(count)
         row = count + inverse
         count += len(pairs)
@@ -272,7 +285,7 @@ def _shoot(
               for part in sequences]
     order = np.repeat(np.arange(len(sequences)), [len(part) for part in sequences])
     return FacetSequences(np.concatenate(of_source), np.concatenate(padded), order,
-                          np.concatenate(seen))
+                          np.concatenate(parents), np.concatenate(seen))
 
 
 def _first_facets(
@@ -321,6 +334,7 @@ class CandidateSearch:
             self.is_ground[self.facets.of_face[city.terrain]] = True
         self._city, self._depth = city, depth
         self._after = np.empty((0, depth - 1), dtype=int)
+        self._parent_after = np.empty(0, dtype=int)
         edges = len(self.surfaces.edges)
         self._first_after, self._end_after = np.full((2, edges), -1)
         self._remembered: OrderedDict[tuple[bytes, int], Candidates] = OrderedDict()
@@ -362,9 +376,9 @@ class CandidateSearch:
         ways = _open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
         with self._one_at_a_time:
             self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
-            after = self._after  # others replace it, its rows stay
+            after, parent = self._after, self._parent_after  # others replace them, rows stay
         way, row = _with_facets_after(self.surfaces, ways, self._first_after, self._end_after,
-                                     after, self._depth)
+                                     after, parent, self._depth)
         none = np.full((len(reflections), self._depth), -1)
         return Candidates(np.concatenate([reflections, ways.before[way]]),
                           np.concatenate([none[:, 0], ways.edge[way]]),
@@ -393,4 +407,8 @@ class CandidateSearch:
             bounds = np.searchsorted(found.source[order], np.arange(len(part) + 1))
             self._first_after[part] = len(self._after) + bounds[:-1]
             self._end_after[part] = len(self._after) + bounds[1:]
+            new_row = np.empty_like(order)
+            new_row[order] = len(self._after) + np.arange(len(order))
+            self._parent_after = np.concatenate([self._parent_after,
+                                                 new_row[found.parent[order]]])
             self._after = np.concatenate([self._after, found.facets[order]])

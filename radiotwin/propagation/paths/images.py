@@ -13,7 +13,15 @@ from typing import NamedTuple
 import numpy as np
 
 from radiotwin.propagation.paths.interactions import around_edge
-from radiotwin.propagation.paths.pruning import lit_part, over_edge, through_facet
+from radiotwin.propagation.paths.pruning import (
+    GROUP,
+    lit_part,
+    narrow,
+    open_window,
+    over_edge,
+    spheres_around,
+    through_facet,
+)
 from radiotwin.propagation.paths.surfaces import (
     ALONG,
     LENGTH,
@@ -93,7 +101,8 @@ def find_paths(
     planes, uv_m, edges = surfaces.planes, surfaces.triangle_uv_m, surfaces.edges
     n = len(receiver_m)
     image, mirror = np.empty((MAX_INTERACTIONS + 1, 3)), np.empty((MAX_INTERACTIONS + 1, 3))
-    possible = np.empty(n, dtype=np.int64)
+    possible, spheres = np.empty(n, dtype=np.int64), spheres_around(receiver_m)
+    lit_m, source_m, window = np.empty(2), np.empty(2), np.empty(4)
     found = 0
     for row in range(cursor // n, len(candidates.edge)):
         before = sequence_length(candidates.before, row)
@@ -104,17 +113,23 @@ def find_paths(
         edge = candidates.edge[row]
         along_m = across_m = 0.0
         if edge < 0:
-            count = through_facet(planes, facets_before[-1], image[before], receiver_m, possible)
+            count = through_facet(planes, facets_before[-1], image[before], receiver_m, spheres,
+                                  possible)
         else:
             is_open, along_m, across_m = \
                 around_edge(edges, edge, image[before, 0], image[before, 1], image[before, 2])
             if not is_open:
                 continue
-            low_m, high_m = lit_part(planes, edges, edge, facets_before, image)
+            lit_m[0], lit_m[1] = lit_part(planes, edges, edge, facets_before, image)
+            source_m[0], source_m[1] = along_m, across_m
+            open_window(edges, edge, lit_m, window)
+            is_open = lit_m[0] < lit_m[1]
+            for k in range(after):
+                is_open = is_open and narrow(planes, edges, edge, facets_after, k, source_m, window)
             count = 0
-            if low_m < high_m:
-                count = over_edge(planes, edges, edge, facets_after, low_m, high_m, along_m,
-                                  across_m, receiver_m, possible)
+            if is_open:
+                count = over_edge(planes, edges, edge, facets_after, window, source_m, receiver_m,
+                                  spheres, possible)
         for i in range(count):
             at = possible[i]
             if row * n + at < cursor:
@@ -237,10 +252,29 @@ def found_clear(
     Yields:
         (m,) rows of the buffer, ascending; the next paths take their places.
     """
+    order = _neighbours_together(receiver_m)
+    sorted_m = np.ascontiguousarray(receiver_m[order])
     cursor = 0
     while cursor < len(candidates.edge) * len(receiver_m):
-        found, cursor = find_paths(surfaces, candidates, device_m, receiver_m, cursor, buffer)
+        found, cursor = find_paths(surfaces, candidates, device_m, sorted_m, cursor, buffer)
+        buffer.receiver[:found] = order[buffer.receiver[:found]]
         yield clear_paths(city, surfaces, candidates, buffer, found)
+
+
+def _neighbours_together(points_m: np.ndarray) -> np.ndarray:
+    """Return an order (n,) in which each `GROUP` of points (n, 3) [m] are neighbours."""
+    order = np.arange(len(points_m))
+    parts = [(0, len(points_m))]
+    while parts:
+        first, end = parts.pop()
+        if end - first <= GROUP:
+            continue
+        rows = order[first:end]
+        axis = np.ptp(points_m[rows], axis=0).argmax()
+        half = GROUP * (-(-(end - first) // GROUP) // 2)
+        order[first:end] = rows[np.argpartition(points_m[rows, axis], half)]
+        parts += [(first, first + half), (first + half, end)]
+    return order
 
 
 def clear_paths(

@@ -9,6 +9,7 @@ from radiotwin.propagation.paths.surfaces import (
     ALONG,
     AXIS_U,
     AXIS_V,
+    EXTERIOR,
     LENGTH,
     NORMAL,
     NORMAL_0,
@@ -18,12 +19,31 @@ from radiotwin.propagation.paths.surfaces import (
     ORIGIN,
     SIZE,
     START,
+    TANGENT,
     height,
     mirrored,
 )
+from radiotwin.propagation.paths.vectors import dot
 from radiotwin.runtime.compiled import njit
 
 ROUNDING_M = 1e-6  # [m], slack of the tests for rounding in double precision
+ROUNDING_RAD = 1e-6  # [rad], the same
+GROUP = 16  # receivers that are tested together first
+
+
+@njit(cache=True, error_model="numpy")
+def spheres_around(receiver_m: np.ndarray) -> np.ndarray:
+    """Return (g, 4) centres and radii [m] of spheres around each `GROUP` receivers of (n, 3)."""
+    spheres = np.empty((-(-len(receiver_m) // GROUP), 4))
+    for group in range(len(spheres)):
+        points_m = receiver_m[group * GROUP:(group + 1) * GROUP]
+        radius2 = 0.0
+        for axis in range(3):
+            spheres[group, axis] = (points_m[:, axis].min() + points_m[:, axis].max()) / 2.0
+        for i in range(len(points_m)):
+            radius2 = max(radius2, ((points_m[i] - spheres[group, :3]) ** 2).sum())
+        spheres[group, 3] = np.sqrt(radius2) + ROUNDING_M
+    return spheres
 
 
 @njit(cache=True, error_model="numpy")
@@ -82,67 +102,93 @@ def lit_part(
 
 
 @njit(cache=True, error_model="numpy")
-def cone_misses(
-    planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, lit_m: np.ndarray,
-    source_m: np.ndarray,
+def open_window(edges: np.ndarray, edge: int, lit_m: np.ndarray, window: np.ndarray) -> None:
+    """Write the window (4,) of all rays that the lit part (2,) [m] of an edge diffracts.
+
+    A window is start and end along the edge [m], and smallest and largest angle from face 0 around
+    it [rad]. Facets after an edge are unfolded: mirrored so that rays to them stay straight.
+    """
+    window[0], window[1] = lit_m[0], lit_m[1]
+    window[2], window[3] = -ROUNDING_RAD, edges[edge, EXTERIOR] + ROUNDING_RAD
+
+
+@njit(cache=True, error_model="numpy")
+def narrow(
+    planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, k: int,
+    source_m: np.ndarray, window: np.ndarray,
 ) -> bool:
-    """Return whether diffracted rays from the lit part of an edge miss one of the facets after it.
+    """Narrow a window to diffracted rays that go through facet k of those after an edge.
 
     A ray to a point at q along the edge and r from its line leaves the edge at t, where
     (q - s) d = (t - s) (d + r), with the source at s along the edge and d from its line. So t is
     above a bound where (q - s) d > (bound - s) (d + r). For all points of a facet that holds if it
     holds at the corners of its rectangle: r is convex, and where that is the wrong way round, a
-    lower bound of r that is linear takes its place.
+    lower bound of r that is linear takes its place. The angle around the edge stays the same.
 
     Args:
         planes: of `Surfaces`.
         edges: of `Surfaces`.
         edge: row of `edges`.
         after: (b,) facets after the edge.
-        lit_m: (2,) start and end of the lit part [m].
+        k: which of them.
         source_m: (2,) position of the source along the edge, and distance from its line [m].
+        window: (4,) of `open_window`, narrowed to the facets before k; changed in place.
 
     Returns:
-        Whether none of the rays goes through all facets; False may be wrong, True never is.
+        Whether the window is still open; True may be wrong, False never is.
     """
-    start, along = edges[edge, START:START + 3], edges[edge, ALONG:ALONG + 3]
-    corner, centre = np.empty((4, 3)), np.empty(3)
-    for k in range(len(after)):
-        facet = after[k]
-        if facet == len(planes) - 1:
-            continue
-        for i in range(4):
-            for axis in range(3):
-                corner[i, axis] = planes[facet, ORIGIN + axis] \
-                    + (i % 2) * planes[facet, SIZE] * planes[facet, AXIS_U + axis] \
-                    + (i // 2) * planes[facet, SIZE + 1] * planes[facet, AXIS_V + axis]
-            for j in range(k - 1, -1, -1):
-                corner[i, 0], corner[i, 1], corner[i, 2] = mirrored(
-                    planes, after[j], corner[i, 0], corner[i, 1], corner[i, 2])
-            for axis in range(3):
-                corner[i, axis] -= start[axis]
+    facet = after[k]
+    if facet == len(planes) - 1:
+        return True
+    row = edges[edge]
+    corner, x, y = np.empty(3), np.empty(4), np.empty(4)
+    at_m, across_m, least_m = np.empty(4), np.empty(4), np.empty(4)
+    for i in range(4):
         for axis in range(3):
-            centre[axis] = corner[:, axis].sum()
-        centre_along = centre[0] * along[0] + centre[1] * along[1] + centre[2] * along[2]
+            corner[axis] = planes[facet, ORIGIN + axis] \
+                + (i % 2) * planes[facet, SIZE] * planes[facet, AXIS_U + axis] \
+                + (i // 2) * planes[facet, SIZE + 1] * planes[facet, AXIS_V + axis]
+        for j in range(k - 1, -1, -1):
+            corner[0], corner[1], corner[2] = mirrored(planes, after[j], corner[0], corner[1],
+                                                       corner[2])
         for axis in range(3):
-            centre[axis] -= centre_along * along[axis]
-        size = np.sqrt((centre ** 2).sum())
-        below = above = True
-        low_m, high_m = lit_m[0] - source_m[0], lit_m[1] - source_m[0]
-        for i in range(4):
-            at_m = corner[i, 0] * along[0] + corner[i, 1] * along[1] + corner[i, 2] * along[2]
-            across2 = (corner[i] ** 2).sum() - at_m * at_m
-            across_m = source_m[1] + np.sqrt(max(across2, 0.0))
-            least_m = source_m[1]
-            if size > 0.0:
-                least_m += (corner[i, 0] * centre[0] + corner[i, 1] * centre[1]
-                            + corner[i, 2] * centre[2]) / size
-            leans_m = (at_m - source_m[0]) * source_m[1]
-            below = below and leans_m < low_m * (least_m if low_m > 0.0 else across_m)
-            above = above and leans_m > high_m * (across_m if high_m > 0.0 else least_m)
-        if below or above:
-            return True
-    return False
+            corner[axis] -= row[START + axis]
+        at_m[i] = dot(corner, row[ALONG:ALONG + 3]) - source_m[0]
+        x[i] = dot(corner, row[TANGENT:TANGENT + 3])
+        y[i] = dot(corner, row[NORMAL_0:NORMAL_0 + 3])
+        across_m[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
+    centre_x, centre_y = x.sum(), y.sum()
+    size = np.sqrt(centre_x * centre_x + centre_y * centre_y)
+    for i in range(4):
+        least_m[i] = (centre_x * x[i] + centre_y * y[i]) / size if size > 0.0 else 0.0
+    if source_m[1] + least_m.min() <= ROUNDING_M:
+        least_m[:] = 0.0
+    low_m, high_m = np.inf, -np.inf
+    for i in range(4):
+        to_nearest_m = at_m[i] * source_m[1] / (source_m[1] + least_m[i])
+        to_corner_m = at_m[i] * source_m[1] / (source_m[1] + across_m[i])
+        low_m = min(low_m, to_corner_m if at_m[i] > 0.0 else to_nearest_m)
+        high_m = max(high_m, to_nearest_m if at_m[i] > 0.0 else to_corner_m)
+    window[0] = max(window[0], source_m[0] + low_m - ROUNDING_M)
+    window[1] = min(window[1], source_m[0] + high_m + ROUNDING_M)
+    if window[0] >= window[1]:
+        return False
+    least_rad, most_rad = np.inf, -np.inf  # from the facet's middle
+    for i in range(4):
+        aside_rad = np.arctan2(centre_x * y[i] - centre_y * x[i], centre_x * x[i] + centre_y * y[i])
+        least_rad, most_rad = min(least_rad, aside_rad), max(most_rad, aside_rad)
+    if size == 0.0 or most_rad - least_rad >= np.pi - ROUNDING_RAD:  # the edge's line goes through
+        return True
+    middle_rad = np.arctan2(centre_y, centre_x)
+    parts, low_rad, high_rad = 0, 0.0, 0.0
+    for turn in range(-1, 2):
+        from_rad = max(window[2], middle_rad + least_rad + 2.0 * np.pi * turn - ROUNDING_RAD)
+        to_rad = min(window[3], middle_rad + most_rad + 2.0 * np.pi * turn + ROUNDING_RAD)
+        if from_rad < to_rad:
+            parts, low_rad, high_rad = parts + 1, from_rad, to_rad
+    if parts == 1:
+        window[2], window[3] = low_rad, high_rad
+    return parts > 0
 
 
 @njit(cache=True, error_model="numpy")
@@ -168,7 +214,8 @@ def _positive(
 
 @njit(cache=True, error_model="numpy")
 def through_facet(
-    planes: np.ndarray, facet: int, image: np.ndarray, receiver_m: np.ndarray, possible: np.ndarray
+    planes: np.ndarray, facet: int, image: np.ndarray, receiver_m: np.ndarray, spheres: np.ndarray,
+    possible: np.ndarray,
 ) -> int:
     """Find the receivers that see an image through a facet's bounding rectangle.
 
@@ -179,6 +226,7 @@ def through_facet(
         facet: row of `planes`.
         image: (3,) image of the device in the facet [m].
         receiver_m: (n, 3) positions [m].
+        spheres: of `spheres_around` these.
         possible: (n,) output: rows of the receivers.
 
     Returns:
@@ -195,27 +243,49 @@ def through_facet(
     behind_m = offset_m - (nx * ix + ny * iy + nz * iz)
     image_u = (ix - ox) * ux + (iy - oy) * uy + (iz - oz) * uz
     image_v = (ix - ox) * vx + (iy - oy) * vy + (iz - oz) * vz
+    # Planes through the image and the rectangle's sides: a u + b h > 0 within, and so on, with h the
+    # height above the image's level; a sphere is outside where it is below one by its radius
+    low_u, high_u = np.sqrt(image_u ** 2 + behind_m ** 2), \
+        np.sqrt((size_u - image_u) ** 2 + behind_m ** 2)
+    low_v, high_v = np.sqrt(image_v ** 2 + behind_m ** 2), \
+        np.sqrt((size_v - image_v) ** 2 + behind_m ** 2)
     count = 0
-    for i in range(len(receiver_m)):
-        x, y, z = receiver_m[i, 0], receiver_m[i, 1], receiver_m[i, 2]
-        before_m = nx * x + ny * y + nz * z - offset_m
-        if before_m < ON_PLANE_M:
+    for group in range(len(spheres)):
+        x, y, z = spheres[group, 0], spheres[group, 1], spheres[group, 2]
+        reach_m = spheres[group, 3]
+        height_m = nx * x + ny * y + nz * z - offset_m
+        if height_m < -reach_m:
             continue
-        x, y, z = x - ox, y - oy, z - oz
-        share = behind_m / (before_m + behind_m)
-        u = image_u + share * (x * ux + y * uy + z * uz - image_u)
-        v = image_v + share * (x * vx + y * vy + z * vz - image_v)
-        if endless or (-ROUNDING_M < u < size_u + ROUNDING_M
-                       and -ROUNDING_M < v < size_v + ROUNDING_M):
-            possible[count] = i
-            count += 1
+        if not endless:
+            x, y, z = x - ox, y - oy, z - oz
+            u = x * ux + y * uy + z * uz - image_u
+            v = x * vx + y * vy + z * vz - image_v
+            height_m += behind_m
+            if u * behind_m + image_u * height_m < -reach_m * low_u \
+                    or (size_u - image_u) * height_m - u * behind_m < -reach_m * high_u \
+                    or v * behind_m + image_v * height_m < -reach_m * low_v \
+                    or (size_v - image_v) * height_m - v * behind_m < -reach_m * high_v:
+                continue
+        for i in range(group * GROUP, min((group + 1) * GROUP, len(receiver_m))):
+            x, y, z = receiver_m[i, 0], receiver_m[i, 1], receiver_m[i, 2]
+            before_m = nx * x + ny * y + nz * z - offset_m
+            if before_m < ON_PLANE_M:
+                continue
+            x, y, z = x - ox, y - oy, z - oz
+            share = behind_m / (before_m + behind_m)
+            u = image_u + share * (x * ux + y * uy + z * uz - image_u)
+            v = image_v + share * (x * vx + y * vy + z * vz - image_v)
+            if endless or (-ROUNDING_M < u < size_u + ROUNDING_M
+                           and -ROUNDING_M < v < size_v + ROUNDING_M):
+                possible[count] = i
+                count += 1
     return count
 
 
 @njit(cache=True, error_model="numpy")
 def over_edge(
-    planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, low_m: float,
-    high_m: float, along_m: float, across_m: float, receiver_m: np.ndarray, possible: np.ndarray,
+    planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, window: np.ndarray,
+    source_m: np.ndarray, receiver_m: np.ndarray, spheres: np.ndarray, possible: np.ndarray,
 ) -> int:
     """Find the receivers that a ray over the lit part of an edge may reach.
 
@@ -224,11 +294,10 @@ def over_edge(
         edges: of `Surfaces`.
         edge: row of `edges`.
         after: facets after the edge.
-        low_m: start of the lit part along the edge [m].
-        high_m: end of the lit part [m].
-        along_m: position of the source along the edge [m].
-        across_m: distance of the source from the edge's line [m].
+        window: (4,) of `open_window`, narrowed to all facets.
+        source_m: (2,) position of the source along the edge, and distance from its line [m].
         receiver_m: (n, 3) positions [m].
+        spheres: of `spheres_around` these.
         possible: (n,) output: rows of the receivers.
 
     Returns:
@@ -258,33 +327,58 @@ def over_edge(
     ux, uy, uz = planes[facet, AXIS_U:AXIS_U + 3]
     vx, vy, vz = planes[facet, AXIS_V:AXIS_V + 3]
     size_u, size_v = planes[facet, SIZE:SIZE + 2]
+    low_m, high_m = window[0], window[1]
+    along_m, across_m = source_m
+    # Half planes at the window's angles; receivers are between them
+    tangent, normal = edges[edge, TANGENT:TANGENT + 3], edges[edge, NORMAL_0:NORMAL_0 + 3]
+    narrow_angle = window[3] - window[2] < np.pi
+    lx, ly, lz = np.cos(window[2]) * normal - np.sin(window[2]) * tangent
+    hx, hy, hz = np.sin(window[3]) * tangent - np.cos(window[3]) * normal
     count = 0
-    for i in range(len(receiver_m)):
-        rx, ry, rz = receiver_m[i, 0], receiver_m[i, 1], receiver_m[i, 2]
+    for group in range(len(spheres)):
+        rx, ry, rz = spheres[group, 0], spheres[group, 1], spheres[group, 2]
+        reach_m = spheres[group, 3]
         x = xx * rx + xy * ry + xz * rz + x0
         y = yx * rx + yy * ry + yz * rz + y0
         z = zx * rx + zy * ry + zz * rz + z0
+        if narrow_angle:
+            if lx * x + ly * y + lz * z < -reach_m or hx * x + hy * y + hz * z < -reach_m:
+                continue
+        elif x * nx + y * ny + z * nz < -reach_m and x * mx + y * my + z * mz < -reach_m:
+            continue
         to_along_m = x * ax + y * ay + z * az
-        to_across_m = np.sqrt(max(x * x + y * y + z * z - to_along_m * to_along_m, 1e-12))
-        at_m = along_m + (to_along_m - along_m) * across_m / (across_m + to_across_m)
-        if not low_m < at_m < high_m:
+        to_across_m = np.sqrt(max(x * x + y * y + z * z - to_along_m * to_along_m, 0.0))
+        near_m, far_m = across_m + max(to_across_m - reach_m, 0.0), across_m + to_across_m + reach_m
+        most_m, least_m = to_along_m - along_m + reach_m, to_along_m - along_m - reach_m
+        if along_m + most_m * across_m / (near_m if most_m > 0.0 else far_m) < low_m \
+                or along_m + least_m * across_m / (far_m if least_m > 0.0 else near_m) > high_m:
             continue
-        if x * nx + y * ny + z * nz < -ROUNDING_M and x * mx + y * my + z * mz < -ROUNDING_M:
-            continue
-        if sided:
-            qx, qy, qz = at_m * ax - ox, at_m * ay - oy, at_m * az - oz
-            x, y, z = x - ox, y - oy, z - oz
-            before_m, behind_m = qx * fx + qy * fy + qz * fz, -(x * fx + y * fy + z * fz)
-            if before_m < 0.0 or behind_m < 0.0:
+        for i in range(group * GROUP, min((group + 1) * GROUP, len(receiver_m))):
+            rx, ry, rz = receiver_m[i, 0], receiver_m[i, 1], receiver_m[i, 2]
+            x = xx * rx + xy * ry + xz * rz + x0
+            y = yx * rx + yy * ry + yz * rz + y0
+            z = zx * rx + zy * ry + zz * rz + z0
+            to_along_m = x * ax + y * ay + z * az
+            to_across_m = np.sqrt(max(x * x + y * y + z * z - to_along_m * to_along_m, 1e-12))
+            at_m = along_m + (to_along_m - along_m) * across_m / (across_m + to_across_m)
+            if not low_m < at_m < high_m:
                 continue
-            share = before_m / max(before_m + behind_m, ON_PLANE_M)
-            x, y, z = qx + share * (x - qx), qy + share * (y - qy), qz + share * (z - qz)
-            u, v = x * ux + y * uy + z * uz, x * vx + y * vy + z * vz
-            if not (-ROUNDING_M < u < size_u + ROUNDING_M
-                    and -ROUNDING_M < v < size_v + ROUNDING_M):
+            if x * nx + y * ny + z * nz < -ROUNDING_M and x * mx + y * my + z * mz < -ROUNDING_M:
                 continue
-        possible[count] = i
-        count += 1
+            if sided:
+                qx, qy, qz = at_m * ax - ox, at_m * ay - oy, at_m * az - oz
+                x, y, z = x - ox, y - oy, z - oz
+                before_m, behind_m = qx * fx + qy * fy + qz * fz, -(x * fx + y * fy + z * fz)
+                if before_m < 0.0 or behind_m < 0.0:
+                    continue
+                share = before_m / max(before_m + behind_m, ON_PLANE_M)
+                x, y, z = qx + share * (x - qx), qy + share * (y - qy), qz + share * (z - qz)
+                u, v = x * ux + y * uy + z * uz, x * vx + y * vy + z * vz
+                if not (-ROUNDING_M < u < size_u + ROUNDING_M
+                        and -ROUNDING_M < v < size_v + ROUNDING_M):
+                    continue
+            possible[count] = i
+            count += 1
     return count
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from radiotwin.propagation.paths.candidates import CandidateSearch, _open_ways
-from radiotwin.propagation.paths.pruning import cone_misses
+from radiotwin.propagation.paths.pruning import narrow, open_window
 
 
 def test_a_facet_that_a_diffracted_ray_hits_is_never_missed(town):
@@ -16,7 +16,9 @@ def test_a_facet_that_a_diffracted_ray_hits_is_never_missed(town):
         edge, after = rng.integers(len(edges)), rng.integers(len(planes) - 1, size=rng.integers(1, 4))
         source_m = np.array([rng.uniform(-30, 60), rng.uniform(0.1, 80)])
         low_m, high_m = np.sort(rng.uniform(0, edges[edge, 6], 2))
-        misses = cone_misses(planes, edges, edge, after, np.array([low_m, high_m]), source_m)
+        window = np.empty(4)
+        open_window(edges, edge, np.array([low_m, high_m]), window)
+        misses = not all(narrow(planes, edges, edge, after, k, source_m, window) for k in range(len(after)))
         missed += misses
         for k, facet in enumerate(after):
             if not misses:
