@@ -377,8 +377,8 @@ class CandidateSearch:
         facing = np.flatnonzero(planes[:, NORMAL:NORMAL + 3] @ device_m > planes[:, OFFSET])
         single = np.full((len(facing), self._depth), -1)
         single[:, 0] = facing
-        reflections = np.unique(np.concatenate([sequences.facets[sequences.order > 0], single]),
-                                axis=0)
+        reflections = np.unique(np.concatenate(
+            [sequences.facets[sequences.order > 0], single, self._corner_sequences(facing)]), axis=0)
         ways = _open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
         with self._one_at_a_time:
             self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
@@ -389,6 +389,18 @@ class CandidateSearch:
         return Candidates(np.concatenate([reflections, ways.before[way]]),
                           np.concatenate([none[:, 0], ways.edge[way]]),
                           np.concatenate([none[:, 1:], after[row]]))
+
+    def _corner_sequences(self, facing: np.ndarray) -> np.ndarray:
+        """Return sequences (n, depth) of two facets that meet at a reentrant corner.
+
+        Of which the device is before the first (f,). Such corners send rays back where they come
+        from; from far away the strips that do so are too narrow for the rays that are shot.
+        """
+        corners = self.facets.corners
+        found = corners[np.isin(corners[:, 0], facing)] if self._depth > 1 else corners[:0]
+        out = np.full((len(found), self._depth), -1)
+        out[:, :2] = found[:, :self._depth]
+        return out
 
     def _to_edges(
         self, sequences: FacetSequences, facing: np.ndarray

@@ -27,12 +27,13 @@ from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.surfaces import GROUND_MATERIAL, MATERIAL, NORMAL, Surfaces
 from radiotwin.propagation.paths.vectors import cross, dot
 from radiotwin.runtime.compiled import njit
-from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.citymap import GROUND_M, CityMap
 
 WELD_M = 0.002  # [m], well above the single precision of PLY files: 0.06 mm at 1 km
 QUERY_CHUNK = 2_000  # sides per query of the tree: bounds the memory
 COPLANAR_M = 0.005  # [m], maximum distance of a neighbour's corner from the plane
 MAX_TRIANGLES_AT_SEGMENT = 12  # triangles that may meet at one segment
+FLAT_RAD = 0.1  # flatter folds approximate curved surfaces and diffract too little to count
 TRIED_SIDES = 16  # of a facet's triangles, to lay its bounding rectangle along
 
 
@@ -161,12 +162,15 @@ class CityFacets(NamedTuple):
         of_face: (city faces,) facet of each face of the city; -1: a sliver, or on flat ground.
         edge_ends_m: (e, 2, 3) starts and ends of the edges [m].
         edge_facets: (e, 2) face 0 and face n of the edges.
+        corners: (c, 2) a facet, and one that it forms a reentrant corner with, such as the ground;
+            each pair in both orders.
     """
 
     surfaces: Surfaces
     of_face: np.ndarray
     edge_ends_m: np.ndarray
     edge_facets: np.ndarray
+    corners: np.ndarray
 
 
 def extract_facets(city: CityMap) -> CityFacets:
@@ -186,7 +190,23 @@ def extract_facets(city: CityMap) -> CityFacets:
     ground = [0, 0, 1, 0.0 if city.terrain is None else np.inf, 0, 0, 0, 1, 0, 0, 0, 1, 0, np.inf,
               np.inf, 1, 0, 0, GROUND_MATERIAL]
     surfaces = Surfaces(np.concatenate([planes, [ground]]), triangle_uv_m, edges)
-    return CityFacets(surfaces, of_face, ends_m, facet)
+    return CityFacets(surfaces, of_face, ends_m, facet, _corners(city, planes, of_face, topology))
+
+
+def _corners(city: CityMap, planes: np.ndarray, of_face: np.ndarray, topology: Topology
+             ) -> np.ndarray:
+    """Return pairs of facets (c, 2) that meet at less than 180 degrees, in both orders."""
+    facet = of_face[topology.source]
+    pairs = [np.empty((0, 2), dtype=int)]
+    if len(planes):
+        pairs.append(facet[_wedges(topology, FLAT_RAD, np.pi - FLAT_RAD)[:, 1:]])
+    if city.terrain is None:
+        low_m = np.full(len(planes), np.inf)
+        np.minimum.at(low_m, facet, topology.vertices_m[topology.triangles, 2].min(axis=1))
+        stands = np.flatnonzero((low_m < GROUND_M) & (np.abs(planes[:, NORMAL + 2]) < 0.9))
+        pairs.append(np.column_stack([stands, np.full(len(stands), len(planes))]))
+    found = np.concatenate(pairs)
+    return np.unique(np.concatenate([found, found[:, ::-1]]), axis=0)
 
 
 def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -288,9 +308,7 @@ def _edges(planes: np.ndarray, of_face: np.ndarray, topology: Topology
     if not len(planes):
         return np.empty((0, 19)), np.empty((0, 2, 3)), np.empty((0, 2), dtype=int)
     normal, material = planes[:, NORMAL:NORMAL + 3], planes[:, MATERIAL]
-    # Folds flatter than 0.1 rad approximate curved surfaces and diffract too little to count
-    found = _wedges(topology.vertices_m, topology.triangles, topology.normal, topology.segments,
-                    topology.owner, topology.group, np.pi + 0.1)
+    found = _wedges(topology, np.pi + FLAT_RAD, 2 * np.pi - 1e-3)
     segment = topology.segments[found[:, 0]]
     pair = np.sort(of_face[topology.source[found[:, 1:]]], axis=1)
     keep = (pair[:, 0] != pair[:, 1]) & (material[pair[:, 0]] == material[pair[:, 1]])
@@ -354,12 +372,17 @@ def _joined(ends_m: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return out_m[:count], row[:count]
 
 
+def _wedges(topology: Topology, min_rad: float, max_rad: float) -> np.ndarray:
+    """Return (w, 3) row of `segments` and the two triangles of each open sector of such angles."""
+    return _open_sectors(topology.vertices_m, topology.triangles, topology.normal,
+                         topology.segments, topology.owner, topology.group, min_rad, max_rad)
+
+
 @njit(cache=True)
-def _wedges(
+def _open_sectors(
     vertices_m: np.ndarray, triangles: np.ndarray, normal: np.ndarray, segments: np.ndarray,
-    owner: np.ndarray, group: np.ndarray, min_rad: float,
+    owner: np.ndarray, group: np.ndarray, min_rad: float, max_rad: float,
 ) -> np.ndarray:
-    """Return (w, 3) row of `segments` and the two triangles of each open sector over `min_rad`."""
     found = []
     for g in range(len(group) - 1):
         a, n = group[g], group[g + 1] - group[g]
@@ -386,7 +409,7 @@ def _wedges(
         for k in range(n):
             i, j = order[k], order[(k + 1) % n]
             width = (angle[j] - angle[i]) % (2 * np.pi)
-            if opens[i] > 0 and opens[j] < 0 and min_rad < width < 2 * np.pi - 1e-3:
+            if opens[i] > 0 and opens[j] < 0 and min_rad < width < max_rad:
                 found.append((a, owner[a + i], owner[a + j]))
     out = np.empty((len(found), 3), dtype=np.int64)
     for k in range(len(found)):
