@@ -27,7 +27,7 @@ from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.surfaces import GROUND_MATERIAL, MATERIAL, NORMAL, Surfaces
 from radiotwin.propagation.paths.vectors import cross, dot
 from radiotwin.runtime.compiled import njit
-from radiotwin.scene.citymap import GROUND_M, CityMap
+from radiotwin.scene.citymap import CityMap
 
 WELD_M = 0.002  # [m], well above the single precision of PLY files: 0.06 mm at 1 km
 QUERY_CHUNK = 2_000  # sides per query of the tree: bounds the memory
@@ -162,8 +162,7 @@ class CityFacets(NamedTuple):
         of_face: (city faces,) facet of each face of the city; -1: a sliver, or on flat ground.
         edge_ends_m: (e, 2, 3) starts and ends of the edges [m].
         edge_facets: (e, 2) face 0 and face n of the edges.
-        corners: (c, 2) a facet, and one that it forms a reentrant corner with, such as the ground;
-            each pair in both orders.
+        corners: (c, 2) facets that meet in a reentrant corner; each pair in both orders.
     """
 
     surfaces: Surfaces
@@ -190,23 +189,11 @@ def extract_facets(city: CityMap) -> CityFacets:
     ground = [0, 0, 1, 0.0 if city.terrain is None else np.inf, 0, 0, 0, 1, 0, 0, 0, 1, 0, np.inf,
               np.inf, 1, 0, 0, GROUND_MATERIAL]
     surfaces = Surfaces(np.concatenate([planes, [ground]]), triangle_uv_m, edges)
-    return CityFacets(surfaces, of_face, ends_m, facet, _corners(city, planes, of_face, topology))
-
-
-def _corners(city: CityMap, planes: np.ndarray, of_face: np.ndarray, topology: Topology
-             ) -> np.ndarray:
-    """Return pairs of facets (c, 2) that meet at less than 180 degrees, in both orders."""
-    facet = of_face[topology.source]
-    pairs = [np.empty((0, 2), dtype=int)]
+    corners = np.empty((0, 2), dtype=int)
     if len(planes):
-        pairs.append(facet[_wedges(topology, FLAT_RAD, np.pi - FLAT_RAD)[:, 1:]])
-    if city.terrain is None:
-        low_m = np.full(len(planes), np.inf)
-        np.minimum.at(low_m, facet, topology.vertices_m[topology.triangles, 2].min(axis=1))
-        stands = np.flatnonzero((low_m < GROUND_M) & (np.abs(planes[:, NORMAL + 2]) < 0.9))
-        pairs.append(np.column_stack([stands, np.full(len(stands), len(planes))]))
-    found = np.concatenate(pairs)
-    return np.unique(np.concatenate([found, found[:, ::-1]]), axis=0)
+        meeting = of_face[topology.source[_wedges(topology, FLAT_RAD, np.pi - FLAT_RAD)[:, 1:]]]
+        corners = np.unique(np.concatenate([meeting, meeting[:, ::-1]]), axis=0)
+    return CityFacets(surfaces, of_face, ends_m, facet, corners)
 
 
 def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
