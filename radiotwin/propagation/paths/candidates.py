@@ -251,14 +251,14 @@ def _edge_sequences(
     at, ray = np.nonzero(is_open[source])
     of_edge, share = source[at], (within[at] + aside[ray]) / starts[source[at]]
     start_m = ends_m[of_edge, 0] + share[:, None] * offset_m[of_edge] + SKIN_M * outward[of_edge]
-    return _shoot(city, facets, start_m, direction[ray], of_edge, len(rows), depth)
+    return _shoot(city, facets, start_m, direction[ray], of_edge, len(rows), depth, False)
 
 
 def _shoot(
     city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray,
-    source: np.ndarray, sources: int, depth: int,
+    source: np.ndarray, sources: int, depth: int, beyond: bool = True,
 ) -> FacetSequences:
-    """Follow rays (n, 3) of sources (n,) through `depth` reflections, and to the facet after."""
+    """Follow rays (n, 3) of sources (n,) through `depth` reflections, and to the facet beyond."""
     normal = facets.surfaces.planes[:, NORMAL:NORMAL + 3]
     row = source  # of each ray: the sequence that it has visited
     sequences, of_source = [np.empty((sources, 0), dtype=int)], [np.arange(sources)]
@@ -266,7 +266,7 @@ def _shoot(
     first = [0]
     seen = []
     count = sources
-    for level in range(depth + 1):
+    for level in range(depth + beyond):
         distance_m, facet = np.concatenate(
             [_first_facets(city, facets, start_m[a:a + RAY_CHUNK], direction[a:a + RAY_CHUNK])
              for a in range(0, len(start_m), RAY_CHUNK)] or [np.empty((2, 0))], axis=1)
@@ -291,7 +291,8 @@ def _shoot(
               for part in sequences]
     order = np.repeat(np.arange(len(sequences)), [len(part) for part in sequences])
     return FacetSequences(np.concatenate(of_source), np.concatenate(padded), order,
-                          np.concatenate(parents), np.concatenate(seen))
+                          np.concatenate(parents),
+                          np.concatenate(seen or [np.empty((0, 2), dtype=int)]))
 
 
 def _first_facets(
