@@ -8,7 +8,7 @@ from scipy.constants import speed_of_light
 
 from radiotwin.propagation.paths.candidates import candidate_search
 from radiotwin.propagation.paths.images import PathBuffer
-from radiotwin.propagation.paths.interactions import slabs_of
+from radiotwin.propagation.paths.interactions import city_slabs
 from radiotwin.propagation.paths.powers import PATH_CHUNK, WEDGES, clear_paths_gains
 from radiotwin.scene import Scene
 from radiotwin.trace.settings import SolverSettings
@@ -40,8 +40,7 @@ def engine_paths(
     """Return the engine's paths from one device to receivers (n, 3) without line of sight."""
     city, frequency_hz = scene.city, scene.config.radio.frequency_hz
     search, buffer = candidate_search(city, DEPTH), PathBuffer.allocate(PATH_CHUNK)
-    candidates, slabs = search.candidates(device_m), slabs_of(
-        (*city.materials, city.ground_material), frequency_hz)
+    candidates, slabs = search.candidates(device_m), city_slabs(city, frequency_hz)
     out: list[list[FoundPath]] = [[] for _ in receiver_m]
     for clear, gain in clear_paths_gains(
             city, search, candidates, device_m, receiver_m, buffer,

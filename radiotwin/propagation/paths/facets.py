@@ -199,6 +199,8 @@ def extract_facets(city: CityMap) -> CityFacets:
 def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return planes (f, 19), triangles (t, 6) and facets of faces, in order of first triangles."""
     material = city.material[topology.source]
+    if city.terrain is not None:
+        material = np.where(city.terrain[topology.source], GROUND_MATERIAL, material)
     label = _coplanar_groups(topology, material)
     count = int(label.max()) + 1 if len(label) else 0
     order = np.argsort(label, kind="stable")

@@ -1,7 +1,7 @@
 """A ray at a surface and at an edge: coefficients, position of the interaction, and field after it.
 
 A surface is a slab of one dielectric, of the thickness that its material declares [1]: behind a
-thin wall is air again, which reflects, too. What a rough surface scatters is missing from its
+thin wall is air again, which reflects, too. The ground is a half space. What a rough surface scatters is missing from its
 reflection: with the scattering coefficient S the field is sqrt(1 - S²) times as strong [5].
 
 An edge is a wedge in the uniform theory of diffraction [2]. By Keller's law the angle between ray
@@ -52,6 +52,7 @@ from radiotwin.propagation.paths.surfaces import (
 )
 from radiotwin.propagation.paths.vectors import cross, dot
 from radiotwin.runtime.compiled import njit
+from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import Material, constants
 
 VACUUM_PERMITTIVITY_F_M = 8.8541878128e-12  # [F/m], CODATA 2018
@@ -65,7 +66,7 @@ class Slabs(NamedTuple):
 
     Attributes:
         permittivity: (m,) complex relative permittivities, for fields that vary as exp(+j ω t).
-        phase_rad: (m,) thickness times wave number in vacuum [rad].
+        phase_rad: (m,) thickness times wave number in vacuum [rad]; infinite: a half space.
         specular: (m,) field that is left to the reflection over that of a smooth surface.
     """
 
@@ -74,12 +75,15 @@ class Slabs(NamedTuple):
     specular: np.ndarray
 
 
-def slabs_of(materials: Sequence[Material], frequency_hz: float) -> Slabs:
-    """Return materials at a frequency; outside ITU's ranges as `materials.constants` says.
+def city_slabs(city: CityMap, frequency_hz: float) -> Slabs:
+    """Return a city's materials at a frequency [Hz], and last that of its ground, a half space."""
+    slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
+    slabs.phase_rad[-1] = np.inf
+    return slabs
 
-    Args:
-        materials: m materials; of a city that of the ground last, see `CityMap.ground_material`.
-        frequency_hz: frequency [Hz].
+
+def slabs_of(materials: Sequence[Material], frequency_hz: float) -> Slabs:
+    """Return m materials at a frequency [Hz]; outside ITU's ranges as `materials.constants` says.
     """
     angular = 2 * np.pi * frequency_hz
     real, conductivity_s_m, _ = np.array([constants(each, frequency_hz) for each in materials]).T
@@ -108,7 +112,7 @@ def fresnel(sine: float, permittivity: complex) -> tuple[complex, complex]:
 
 @njit(cache=True)
 def reflection(sine: float, slabs: Slabs, row: int) -> tuple[complex, complex]:
-    """Return the reflection coefficients of a slab in air [1, eq. 43a and 44].
+    """Return the reflection coefficients of a slab in air [1, eq. 43a and 44], or a half space.
 
     Args:
         sine: sine of the angle between ray and surface.
@@ -122,6 +126,8 @@ def reflection(sine: float, slabs: Slabs, row: int) -> tuple[complex, complex]:
     sine = max(sine, MIN_SINE)
     permittivity = slabs.permittivity[row]
     te, tm = fresnel(sine, permittivity)
+    if np.isinf(slabs.phase_rad[row]):
+        return te * slabs.specular[row], tm * slabs.specular[row]
     root = np.sqrt(permittivity - (1.0 - sine * sine) + 0j)
     there_and_back = np.exp(-2j * slabs.phase_rad[row] * root)
     rest = slabs.specular[row] * (1.0 - there_and_back)

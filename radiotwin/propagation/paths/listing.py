@@ -25,7 +25,7 @@ from radiotwin.maps.form import CONVENTIONS
 from radiotwin.propagation.paths.candidates import candidate_search
 from radiotwin.propagation.paths.fields import path_amplitudes
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
-from radiotwin.propagation.paths.interactions import LUEBBERS, slabs_of
+from radiotwin.propagation.paths.interactions import LUEBBERS, city_slabs
 from radiotwin.propagation.terrain import is_far, terrain_paths
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
@@ -99,7 +99,7 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
     candidates = search.candidates(device_m)
     kinds = _kinds(candidates)
     wave_number = 2 * np.pi * frequency_hz / speed_of_light
-    slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
+    slabs = city_slabs(city, frequency_hz)
     buffer = PathBuffer.allocate(PATH_CHUNK)
     for first in range(0, len(receiver_m), RECEIVER_CHUNK):
         ends_m = np.ascontiguousarray(receiver_m[first:first + RECEIVER_CHUNK], dtype=float)

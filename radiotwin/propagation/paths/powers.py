@@ -11,7 +11,7 @@ from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.candidates import DEVICE_RAYS, CandidateSearch, candidate_search
 from radiotwin.propagation.paths.fields import path_gains
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
-from radiotwin.propagation.paths.interactions import LUEBBERS, SIONNA, Slabs, slabs_of
+from radiotwin.propagation.paths.interactions import LUEBBERS, SIONNA, Slabs, city_slabs
 from radiotwin.propagation.paths.two_edges import paths_over_two_edges, two_edge_gains
 from radiotwin.propagation.terrain import is_far, terrain_paths
 from radiotwin.scene.antennas import Antenna
@@ -143,7 +143,8 @@ def path_powers(
 ) -> PathPowers:
     """Follow the paths from a device to receivers and add up their powers.
 
-    Surfaces are slabs of the map's materials, and flat ground is one of `city.ground_material`.
+    Surfaces are slabs of the map's materials, and the ground is a half space of
+    `city.ground_material`.
     Ends inside buildings are accepted, but their results mean little.
 
     Args:
@@ -177,7 +178,7 @@ def path_powers(
     directions = [_directions(seen, powers[0, seen], straight_m, -straight_m)]
     search = candidate_search(city, depth)
     buffer = PathBuffer.allocate(PATH_CHUNK)
-    slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
+    slabs = city_slabs(city, frequency_hz)
     candidates = search.candidates(device_m, rays)
     kind = _kinds(candidates, search.is_ground)
     for clear, gain in clear_paths_gains(city, search, candidates, device_m, receiver_m[near],
@@ -224,7 +225,7 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
     """
     search = candidate_search(city, DEPTH)
     buffer = PathBuffer.allocate(PATH_CHUNK)
-    slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
+    slabs = city_slabs(city, frequency_hz)
     no_points = np.zeros((0, *buffer.points_m.shape[1:]), dtype=np.float32)
     no_rows = np.zeros(0, dtype=int)
     parts = [PathsWithPoints(no_rows, np.zeros(0), no_points, no_rows)]

@@ -10,7 +10,7 @@ import numpy as np
 from radiotwin.runtime.compiled import njit
 
 ON_PLANE_M = 1e-4  # [m], a point this close to a plane is on neither side of it
-GROUND_MATERIAL = -1  # last row of `Slabs`
+GROUND_MATERIAL = -1  # last row of `Slabs`; of flat ground, and of the triangles of a terrain
 
 # First columns of what is in `Surfaces.planes` and `Surfaces.edges`. Numba counts references to
 # each array that a function is given; with an array for each field, that would take longer than

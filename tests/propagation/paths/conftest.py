@@ -15,7 +15,7 @@ def _turn(points_m, angle_rad):
 
 @pytest.fixture(scope="session")
 def line_of_slab():
-    """Reflection (TE, TM) of a slab as a transmission line that ends in free space.
+    """Reflection (TE, TM) of a slab as a transmission line that ends in free space; an endless one is a half space.
 
     Collin, "Field Theory of Guided Waves", 2nd ed., section 3.4: wave impedances of the two polarisations, and the
     input impedance of a line. The constants are those of ITU-R P.2040's table.
@@ -24,7 +24,7 @@ def line_of_slab():
         angular = 2 * np.pi * frequency_hz
         permittivity = real - 1j * conductivity_s_m / (angular * 8.8541878128e-12)
         root = np.sqrt(permittivity - 1 + sine**2)
-        turn = np.tan(angular / 299_792_458.0 * thickness_m * root)
+        turn = -1j if np.isinf(thickness_m) else np.tan(angular / 299_792_458.0 * thickness_m * root)
         coefficients = []
         for outside, inside in ((1 / sine, 1 / root), (sine, root / permittivity)):  # over that of vacuum
             line = inside * (outside + 1j * inside * turn) / (inside + 1j * outside * turn)

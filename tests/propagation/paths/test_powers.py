@@ -71,7 +71,7 @@ def test_directions_of_some_links():
 def test_only_the_ground(line_of_slab):
     plane = CityMap([[-500, -500, 0], [500, -500, 0], [500, 500, 0], [-500, 500, 0]], [[0, 1, 2], [0, 2, 3]])
     got = one_link(plane, [0, 0, 2], [30, 0, 38])
-    assert got["ground"] == pytest.approx(friis(50) * abs(line_of_slab(0.8)[1]) ** 2, rel=1e-9)
+    assert got["ground"] == pytest.approx(friis(50) * abs(line_of_slab(0.8, thickness_m=np.inf)[1]) ** 2, rel=1e-9)
     assert sum(got.values()) == got["ground"] + got["direct"]
 
 
@@ -87,7 +87,7 @@ def test_each_wall_and_the_ground_reflect_with_their_own_material(box_mesh, line
     glass = line_of_slab(np.sqrt(0.5), 6.31, 0.0036 * 2.4**1.3394, 0.03)
     assert got["reflected_1"] == pytest.approx(
         friis(np.hypot(20, 20)) * (abs(glass[0]) ** 2 + 1), rel=1e-3)
-    asphalt = line_of_slab(2 / np.sqrt(5), 4.83, 0.0108 * 2.4**1.3969)
+    asphalt = line_of_slab(2 / np.sqrt(5), 4.83, 0.0108 * 2.4**1.3969, np.inf)
     assert got["ground"] == pytest.approx(0.64 * friis(np.hypot(20, 40)) * abs(asphalt[1]) ** 2, rel=1e-9)
 
 

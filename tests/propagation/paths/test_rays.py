@@ -19,18 +19,18 @@ def rays_of(city, device_m, receiver_m, **settings):
 
 
 def test_two_rays_over_the_ground_fade_as_the_exact_sum(line_of_slab):
-    """A vertical dipole's far field in the plane of incidence: TM, over a slab of concrete."""
+    """A vertical dipole's far field in the plane of incidence: TM, over a half space of concrete."""
     plane = CityMap([[-500, -500, 0], [500, -500, 0], [500, 500, 0], [-500, 500, 0]], [[0, 1, 2], [0, 2, 3]])
     distance_m = np.linspace(20, 300, 200)
     rays, = rays_of(plane, [0, 0, 2], np.column_stack([distance_m, np.zeros(200), np.full(200, 40.0)]))
     assert (np.bincount(rays.receiver) == 2).all()
     direct_m, bounced_m = np.hypot(distance_m, 38), np.hypot(distance_m, 42)
     assert np.allclose(rays.delay_s.reshape(-1, 2) * speed_of_light, np.column_stack([direct_m, bounced_m]), rtol=1e-12)
-    bounce = np.array([line_of_slab(42 / length_m)[1] for length_m in bounced_m])
+    bounce = np.array([line_of_slab(42 / length_m, thickness_m=np.inf)[1] for length_m in bounced_m])
     exact = np.exp(-1j * WAVE_NUMBER * direct_m) / direct_m + bounce * np.exp(-1j * WAVE_NUMBER * bounced_m) / bounced_m
     assert np.allclose(rays.amplitude.reshape(-1, 2).sum(axis=1), exact / (2 * WAVE_NUMBER), rtol=1e-8)
     level_db = 20 * np.log10(np.abs(exact * direct_m))
-    assert np.ptp(level_db) > 8  # it does fade
+    assert np.ptp(level_db) > 7  # it does fade
     on_ground = rays.points_m[1::2, 0]
     assert np.allclose(on_ground, np.column_stack([distance_m * 2 / 42, np.zeros(200), np.zeros(200)]))
     assert (rays.kinds[1::2, 0] == REFLECTION).all() and not rays.kinds[::2].any() and not rays.kinds[:, 1:].any()

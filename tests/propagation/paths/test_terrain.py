@@ -29,7 +29,7 @@ def one_link(city, device_m, receiver_m, **more):
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.2, 0.0), (-0.15, 0.3)])
 def test_an_inclined_plane_reflects_as_a_tilted_mirror(slope, line_of_slab):
-    """The image of the device across the plane; the coefficient of a slab at the angle to that plane."""
+    """The image of the device across the plane; the coefficient of a half space at the angle to that plane."""
     height = incline(*slope)
     normal = np.array([-slope[0], -slope[1], 1.0]) / np.sqrt(1 + slope[0] ** 2 + slope[1] ** 2)
     device_m = np.array([-40.0, 10.0, height(-40, 10) + 8])
@@ -37,7 +37,7 @@ def test_an_inclined_plane_reflects_as_a_tilted_mirror(slope, line_of_slab):
     above_m = (device_m - [0, 0, height(0, 0)]) @ normal, (receiver_m - [0, 0, height(0, 0)]) @ normal
     image_m = device_m - 2 * above_m[0] * normal
     length_m = np.linalg.norm(receiver_m - image_m)
-    te, tm = line_of_slab((above_m[0] + above_m[1]) / length_m)
+    te, tm = line_of_slab((above_m[0] + above_m[1]) / length_m, thickness_m=np.inf)
     away = (receiver_m - image_m) / length_m
     towards = away - 2 * (away @ normal) * normal
     across = np.cross(towards, normal) / np.linalg.norm(np.cross(towards, normal))
