@@ -74,7 +74,7 @@ class PathBuffer(NamedTuple):
     def allocate(cls, capacity: int) -> "PathBuffer":
         """Return an empty buffer for `capacity` paths."""
         receiver, candidate, count = np.empty((3, capacity), dtype=np.int64)
-        return cls(receiver, candidate, np.empty((capacity, MAX_INTERACTIONS + 2, 3)), count)
+        return cls(receiver, candidate, np.zeros((capacity, MAX_INTERACTIONS + 2, 3)), count)
 
 
 @njit(cache=True, error_model="numpy")
