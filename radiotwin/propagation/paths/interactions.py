@@ -1,8 +1,9 @@
 """A ray at a surface and at an edge: coefficients, position of the interaction, and field after it.
 
 A surface is a slab of one dielectric, of the thickness that its material declares [1]: behind a
-thin wall is air again, which reflects, too. The ground is a half space. What a rough surface scatters is missing from its
-reflection: with the scattering coefficient S the field is sqrt(1 - S²) times as strong [5].
+thin wall is air again, which reflects, too. The ground is a half space. What a rough surface
+scatters is missing from its reflection: with the scattering coefficient S the field is
+sqrt(1 - S²) times as strong [5].
 
 An edge is a wedge in the uniform theory of diffraction [2]. By Keller's law the angle between ray
 and edge stays the same: the ray is straight once the half planes before and after the edge are
@@ -83,8 +84,7 @@ def city_slabs(city: CityMap, frequency_hz: float) -> Slabs:
 
 
 def slabs_of(materials: Sequence[Material], frequency_hz: float) -> Slabs:
-    """Return m materials at a frequency [Hz]; outside ITU's ranges as `materials.constants` says.
-    """
+    """Return m materials at a frequency [Hz], outside ITU's ranges as `materials.constants`."""
     angular = 2 * np.pi * frequency_hz
     real, conductivity_s_m, _ = np.array([constants(each, frequency_hz) for each in materials]).T
     thickness_m, scattering = np.array([(each.thickness_m, each.scattering_coefficient)
@@ -112,7 +112,7 @@ def fresnel(sine: float, permittivity: complex) -> tuple[complex, complex]:
 
 @njit(cache=True)
 def reflection(sine: float, slabs: Slabs, row: int) -> tuple[complex, complex]:
-    """Return the reflection coefficients of a slab in air [1, eq. 43a and 44], or a half space.
+    """Return the reflection coefficients of a slab in air [1, eq. 43a, 44] or of a half space.
 
     Args:
         sine: sine of the angle between ray and surface.

@@ -243,8 +243,8 @@ def through_facet(
     behind_m = offset_m - (nx * ix + ny * iy + nz * iz)
     image_u = (ix - ox) * ux + (iy - oy) * uy + (iz - oz) * uz
     image_v = (ix - ox) * vx + (iy - oy) * vy + (iz - oz) * vz
-    # Planes through the image and the rectangle's sides: a u + b h > 0 within, and so on, with h the
-    # height above the image's level; a sphere is outside where it is below one by its radius
+    # Planes through the image and the rectangle's sides; a sphere is outside where its centre lies
+    # below one of them by more than its radius
     low_u, high_u = np.sqrt(image_u ** 2 + behind_m ** 2), \
         np.sqrt((size_u - image_u) ** 2 + behind_m ** 2)
     low_v, high_v = np.sqrt(image_v ** 2 + behind_m ** 2), \
