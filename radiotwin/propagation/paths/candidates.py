@@ -378,8 +378,9 @@ class CandidateSearch:
         facing = np.flatnonzero(planes[:, NORMAL:NORMAL + 3] @ device_m > planes[:, OFFSET])
         single = np.full((len(facing), self._depth), -1)
         single[:, 0] = facing
+        reflected = sequences.facets[sequences.order > 0]
         reflections = np.unique(np.concatenate(
-            [sequences.facets[sequences.order > 0], single, self._corner_sequences(facing)]), axis=0)
+            [reflected, single, self._corner_sequences(facing)]), axis=0)
         ways = _open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
         with self._one_at_a_time:
             self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
