@@ -253,15 +253,7 @@ def complete(names: Sequence[str], radios: tuple[Radio, ...], has_power: bool,
         notes.append("tx_power_dbm of devices is declared and levels are gains, without the power: "
                      "it is not used to learn or to locate, and is that of the devices in coverage")
     elif known_dbm:
-        if scene is not None and scene.config.radio.declares_power:
-            usual_dbm, whose = scene.config.radio.tx_power_dbm, "the scene's tx_power_dbm"
-        else:
-            usual_dbm, whose = float(np.median(known_dbm)), "the median of the others"
-        notes += _missing(names, radios, lambda radio: radio.tx_power_dbm is None,
-                          f"tx_power_dbm of {{}} is not declared and taken for {usual_dbm:g} dBm, "
-                          f"{whose}")
-        radios = tuple(replace(radio, tx_power_dbm=usual_dbm) if radio.tx_power_dbm is None
-                       else radio for radio in radios)
+        radios, notes = _with_powers(names, radios, known_dbm, "the median of the others", scene)
     if any(radio.antenna for radio in radios):
         notes += _missing(names, radios, lambda radio: radio.antenna is None,
                           "the antenna of {} is not declared, as others' are, and taken for "
@@ -298,17 +290,11 @@ def as_learnt(names: Sequence[str], declared: Declared, learnt: Declared, scene:
     """
     notes: list[str] = []
     radios = declared.radios or tuple(Radio() for _ in names)
-    if learnt.knows_powers and not declared.knows_powers:
-        if scene is not None and scene.config.radio.declares_power:
-            usual_dbm, whose = scene.config.radio.tx_power_dbm, "the scene's tx_power_dbm"
-        else:
-            usual_dbm = float(np.median([radio.tx_power_dbm for radio in learnt.radios]))
-            whose = "the median of the twin's devices"
-        notes += _missing(names, radios, lambda radio: radio.tx_power_dbm is None,
-                          f"tx_power_dbm of {{}} is not declared and taken for {usual_dbm:g} dBm, "
-                          f"{whose}")
-        radios = tuple(replace(radio, tx_power_dbm=usual_dbm) for radio in radios)
-    elif declared.knows_powers and not learnt.knows_powers:
+    if learnt.knows_powers:
+        radios, notes = _with_powers(
+            names, radios, [radio.tx_power_dbm or 0.0 for radio in learnt.radios],
+            "the median of the twin's devices", scene)
+    elif declared.knows_powers:
         notes.append(f"tx_power_dbm of {some(names, MAX_NAMED)} is not used: the twin was learnt "
                      "from received powers of devices that declared none; declare theirs in "
                      "devices.csv and fit again")
@@ -320,6 +306,26 @@ def as_learnt(names: Sequence[str], declared: Declared, learnt: Declared, scene:
     frequency_hz = declared.frequency_hz if np.isnan(learnt.frequency_hz) else learnt.frequency_hz
     return Declared(radios, frequency_hz, declared.has_power,
                     None if learnt.receiver_antenna is None else declared.receiver_antenna), notes
+
+
+def _with_powers(names: Sequence[str], radios: tuple[Radio, ...], known_dbm: list[float],
+                 whose: str, scene: Scene | None) -> tuple[tuple[Radio, ...], list[str]]:
+    """Return radios with a power each, and a note on what is assumed where none is declared.
+
+    Args:
+        names: of the devices.
+        radios: of these.
+        known_dbm: powers whose median is assumed, unless the scene declares one [dBm].
+        whose: that median is, in words.
+        scene: if there is one.
+    """
+    usual_dbm = float(np.median(known_dbm))
+    if scene is not None and scene.config.radio.declares_power:
+        usual_dbm, whose = scene.config.radio.tx_power_dbm, "the scene's tx_power_dbm"
+    notes = _missing(names, radios, lambda radio: radio.tx_power_dbm is None, "tx_power_dbm of {} "
+                     f"is not declared and taken for {usual_dbm:g} dBm, {whose}")
+    return tuple(replace(radio, tx_power_dbm=usual_dbm) if radio.tx_power_dbm is None else radio
+                 for radio in radios), notes
 
 
 def _missing(names: Sequence[str], radios: tuple[Radio, ...], lacks: Callable[[Radio], bool],

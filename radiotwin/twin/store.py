@@ -30,7 +30,7 @@ from radiotwin.links.measurements import (
     MAX_TILT_DEG,
 )
 from radiotwin.propagation.laws import ChannelModel
-from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB, require_array
+from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB, require_array, require_names
 from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_channel
 from radiotwin.scene.antennas import MAX_GAIN_DBI, Antenna, Pattern
 from radiotwin.twin.localize.estimate import Name, TwinDevice
@@ -258,8 +258,11 @@ def _declared(content: TwinRecord, arrays: dict[str, np.ndarray]) -> Declared:
     if len(record.radios) != len(content.devices):
         raise ValueError(f"{len(record.radios)} radios are declared of {len(content.devices)} "
                          "devices")
-    patterns = []
-    for number in range(len(arrays) // len(fields(Pattern))):
+    patterns, names = [], [each.name for each in fields(Pattern)]
+    count = len(arrays) // len(names)
+    require_names("patterns", arrays, [f"{PATTERN}{number}/{name}" for number in range(count)
+                                       for name in names])
+    for number in range(count):
         own = {name.removeprefix(f"{PATTERN}{number}/"): array for name, array in arrays.items()}
         azimuth_deg = require_array(own, "azimuth_deg", (None,), 0, 360)
         elevation_deg = require_array(own, "elevation_deg", (None,), -90, 90)
