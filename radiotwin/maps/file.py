@@ -21,7 +21,7 @@ from radiotwin.io.array_stores import METADATA, check_hdf5, check_zarr
 from radiotwin.io.budgets import DEVICES, MAP_AXIS, MAP_STREAM_VALUES, MAP_VALUES
 from radiotwin.io.files import atomic_folder, require_writable
 from radiotwin.io.forms import MAX_NAME, MAX_POSITION_M
-from radiotwin.io.inputs import open_input
+from radiotwin.io.inputs import open_input, parse_json
 from radiotwin.links.measurements import MAX_LEVEL_DB
 from radiotwin.maps.form import (
     ATTRIBUTES,
@@ -75,15 +75,23 @@ def form_problem(dataset: xr.Dataset) -> str | None:
         value = dataset.attrs.get(name, 0.0)
         if not isinstance(value, int | float | np.number) or not math.isfinite(value):
             return f"the attribute {name} is {str(value)[:60]!r}, not a finite number"
-    powers = np.atleast_1d(dataset.attrs.get(POWERS, np.zeros(dataset.sizes["device"])))
-    if powers.dtype.kind not in "iuf" or powers.shape != (dataset.sizes["device"],) \
-            or not (np.abs(powers) <= MAX_LEVEL_DB).all():
-        return (f"the attribute {POWERS} is {str(powers)[:60]!r}, not a power of each device "
-                f"within {MAX_LEVEL_DB:g} dBm")
+    if not _are_powers(dataset.attrs.get(POWERS, "{}")):
+        return (f"the attribute {POWERS} is {str(dataset.attrs[POWERS])[:60]!r}, not powers of "
+                f"devices within {MAX_LEVEL_DB:g} dBm, such as {{\"d0\": 20.0}}")
     for name, most in (("latitude", 90), ("longitude", 180)):
         if abs(dataset.attrs.get(f"origin_{name}_deg", 0.0)) > most:
             return f"the attribute origin_{name}_deg is not within {most} degrees of 0"
     return None
+
+
+def _are_powers(text: object) -> bool:
+    """Return whether an attribute holds powers [dBm] by name, as JSON."""
+    try:
+        powers_dbm = parse_json(str(text), POWERS)
+    except BadInput:
+        return False
+    return isinstance(powers_dbm, dict) and all(
+        type(each) in (int, float) and abs(each) <= MAX_LEVEL_DB for each in powers_dbm.values())
 
 
 def axis_problem(dataset: xr.Dataset) -> str | None:

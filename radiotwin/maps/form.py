@@ -120,7 +120,7 @@ def _check_values(device: str, values: dict[str, np.ndarray]) -> None:
 
 
 POWERS = "device_tx_power_dbm"
-"""Attribute: declared transmit power of each device [dBm]; gains are without it."""
+"""Attribute: declared transmit powers by device [dBm], as JSON; gains are without them."""
 
 
 def header(devices: list[str], lattice: Lattice, attributes: dict[str, Any] | None) -> xr.Dataset:

@@ -5,6 +5,7 @@ Both draw themselves into any axes, and give themselves to GIS programs as rows.
 
 from __future__ import annotations
 
+import json
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -100,8 +101,8 @@ class OverDevices(Summarised):
     @property
     def tx_power_dbm(self) -> dict[str, float]:
         """Declared transmit powers by device [dBm]; empty: the map does not know them."""
-        powers_dbm = np.atleast_1d(self.dataset.attrs.get(POWERS, []))
-        return dict(zip(self.devices, powers_dbm.tolist()))
+        powers_dbm = json.loads(self.dataset.attrs.get(POWERS, "{}"))
+        return {name: float(powers_dbm[name]) for name in self.devices if name in powers_dbm}
 
     @property
     def attributes(self) -> dict[str, Any]:

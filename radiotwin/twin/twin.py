@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -236,9 +237,11 @@ class Twin(Summarised):
                       "radiotwin_version": radiotwin.__version__}
         if self.level == "rssi_dbm" and not np.ptp(power_dbm):
             attributes["tx_power_dbm"] = float(power_dbm[0])
-        radios = [self.declared.radios[i] for i in known] if self.declared.radios else []
-        if radios and all(radio.tx_power_dbm is not None for radio in radios):
-            attributes[POWERS] = [float(radio.tx_power_dbm or 0.0) for radio in radios]
+        powers_dbm = {name: self.declared.radios[row].tx_power_dbm for name, row in rows.items()
+                      if self.declared.radios
+                      and self.declared.radios[row].tx_power_dbm is not None}
+        if powers_dbm:
+            attributes[POWERS] = json.dumps(powers_dbm)
         return MapStream(list(rows), scene.lattice, attributes, ("gain_db", "los", "sigma_db"),
                          make).placed(scene.config.origin)
 

@@ -1,5 +1,6 @@
 """A scene and a radio map become a mission."""
 
+import json
 import re
 
 import numpy as np
@@ -32,10 +33,9 @@ def test_a_maps_own_powers_of_devices_come_before_the_scenes(small_scene, city_m
     truth = segmented_truth(small_scene)
     names = [device.device for device in small_scene.config.devices]
     powers_dbm = 10.0 + np.arange(len(names))
-    loud = RadioMap(truth.dataset.assign_attrs(device_tx_power_dbm=powers_dbm.tolist()))
-    order = [truth.devices.index(name) for name in names]
+    loud = RadioMap(truth.dataset.assign_attrs(device_tx_power_dbm=json.dumps(dict(zip(names, powers_dbm)))))
     rise_db = make_mission(small_scene, loud, Known.truth(small_scene)).snr_db - city_mission.snr_db
-    expected_db = (powers_dbm[order] - small_scene.config.radio.tx_power_dbm)[None, :, None, None]
+    expected_db = (powers_dbm - small_scene.config.radio.tx_power_dbm)[None, :, None, None]
     np.testing.assert_allclose(rise_db[np.isfinite(rise_db)], np.broadcast_to(expected_db, rise_db.shape)[np.isfinite(rise_db)],
                                atol=1e-3)
 

@@ -299,8 +299,9 @@ def test_a_twins_map_tells_coverage_the_powers(ground, tmp_path):
     assert [each["tx_power_dbm"] for each in coverage.summary["transmitters"]] == [0.0, 20.0, 10.0]
     strongest_dbm = (again.gain_db[:, 0] + np.array([0.0, 20.0, 10.0])[:, None, None]).max(axis=0)
     np.testing.assert_allclose(coverage.dataset["received_power_dbm"], strongest_dbm, atol=1e-3)
-    again.dataset.attrs["device_tx_power_dbm"] = [0.0, 1e9, 0.0]
-    assert "not a power of each device" in form_problem(again.dataset)
+    for wrong in ('{"a": 1e9}', '["a"]', "{", "7"):
+        again.dataset.attrs["device_tx_power_dbm"] = wrong
+        assert "not powers of devices" in form_problem(again.dataset)
 
 
 def test_a_comparison_takes_powers_as_they_are_declared_by_then(ground, tmp_path):
