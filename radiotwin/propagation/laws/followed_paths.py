@@ -33,7 +33,8 @@ from radiotwin.scene.citymap import CityMap
 GRID_M = 0.5  # estimated positions of devices are rounded to it, and share their paths
 MAX_REMEMBERED_BYTES = 3 * 10**8  # of paths: of 250,000 links in a city
 MIN_REMEMBERED = 2  # devices, however many links they have
-BATCH_LINKS = 50_000  # of devices that are followed side by side: 30 MB
+BATCH_LINKS = 50_000  # of devices that are followed side by side: 60 MB
+ENDS_CHUNK = 10_000  # of one device, whose directions are held at once: 70 MB
 LINK_CHUNK = 1000  # whose paths are held before the weakest go: tens of megabytes
 UNIT_STEPS = 2**15 - 1  # of a component of a direction that is remembered: 0.002 degrees
 WEAKEST = 1e-3  # of a link's strongest path: most are weaker, and together they carry little
@@ -268,9 +269,14 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
         return []
     def follow(number: int) -> _NewPaths:
         position_m, ends_m = asked[number]
-        found = path_powers(city, np.array(position_m), ends_m, frequency_hz)
-        return np.column_stack([getattr(found, name) for name in COMPONENTS]), \
-            _packed(found.directions)
+        powers, paths = [], []
+        for first in range(0, len(ends_m), ENDS_CHUNK):
+            found = path_powers(city, np.array(position_m), ends_m[first:first + ENDS_CHUNK],
+                                frequency_hz)
+            powers.append(np.column_stack([getattr(found, name) for name in COMPONENTS]))
+            link = found.directions.link + np.int32(first)
+            paths.append(_packed(found.directions._replace(link=link)))
+        return np.concatenate(powers), PathDirections.joined(paths)
 
     def write(found: _NewPaths) -> Piece:
         return {"powers": found[0], **found[1]._asdict()}, None

@@ -6,7 +6,7 @@ import trimesh
 
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws import followed_paths
-from radiotwin.propagation.laws.followed_paths import path_gains
+from radiotwin.propagation.laws.followed_paths import path_gains, paths_of
 from radiotwin.runtime.pieces import keep_pieces
 from radiotwin.scene.citymap import CityMap
 
@@ -45,6 +45,15 @@ def test_several_devices_are_followed_as_each_by_itself(geometry, monkeypatch, t
             followed_paths._remembered.clear()
             np.testing.assert_array_equal(path_gains(geometry), alone)
             assert store.made == made
+
+
+def test_parts_of_a_devices_links_change_nothing(geometry, monkeypatch):
+    whole = path_gains(geometry), paths_of(geometry)
+    followed_paths._remembered.clear()
+    monkeypatch.setattr(followed_paths, "ENDS_CHUNK", 5)
+    np.testing.assert_array_equal(path_gains(geometry), whole[0])
+    for each, other in zip(paths_of(geometry), whole[1], strict=True):
+        np.testing.assert_array_equal(each, other)
 
 
 def test_what_is_remembered_is_bounded(geometry, monkeypatch):
