@@ -46,7 +46,7 @@ from radiotwin.propagation.paths.surfaces import (
     START,
     Surfaces,
 )
-from radiotwin.propagation.paths.two_edges import FacetEdges
+from radiotwin.propagation.paths.two_edges import EdgePairsToTry
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
@@ -197,6 +197,23 @@ def _with_facets_after(
     return of_way[:count], of_after[:count]
 
 
+class FacetEdges(NamedTuple):
+    """The edges of each facet.
+
+    Attributes:
+        edge: (m,) edges, facet after facet.
+        first: (f + 2,) first row in `edge` of each facet, and of the ground, which has none.
+    """
+
+    edge: np.ndarray
+    first: np.ndarray
+
+    def of(self, facet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the edges (m,) of facets (n,), and the row of the facet (m,) of each."""
+        row, within = expand(self.first[facet + 1] - self.first[facet])
+        return self.edge[self.first[facet[row]] + within], row
+
+
 @dataclass(frozen=True, eq=False)
 class FacetSequences:
     """Sequences of facets that rays from sources visit; the first row of each source is empty.
@@ -236,12 +253,12 @@ def _edge_sequences(
 ) -> FacetSequences:
     """Find the sequences of up to `depth` facets that rays from some edges (n,) visit.
 
-    As many start from each 20 m of an edge, spread along it.
+    As many start from each 20 m of an edge up to 200 m, spread along it.
     """
     edges, ends_m = facets.surfaces.edges[rows], facets.edge_ends_m[rows]
     normal_0, normal_n = edges[:, NORMAL_0:NORMAL_0 + 3], edges[:, NORMAL_N:NORMAL_N + 3]
     offset_m = ends_m[:, 1] - ends_m[:, 0]
-    starts = np.maximum(np.ceil(np.linalg.norm(offset_m, axis=1) / 20.0).astype(int), 1)
+    starts = np.clip(np.ceil(np.linalg.norm(offset_m, axis=1) / 20.0).astype(int), 1, 10)
     source, within = expand(starts)
     outward = normal_0 + normal_n
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -329,7 +346,6 @@ class CandidateSearch:
         facets: of the city, and its edges.
         surfaces: of `facets`.
         is_ground: (f + 1,) bool, rows of the ground in `surfaces.planes`.
-        facet_edges: edges at each facet.
     """
 
     def __init__(self, city: CityMap, depth: int) -> None:
@@ -348,7 +364,7 @@ class CandidateSearch:
         self._one_at_a_time = Lock()
         facet, edge = self.facets.edge_facets.ravel(), np.repeat(np.arange(edges), 2)
         order = np.lexsort((edge, facet))
-        self.facet_edges = FacetEdges(self.facets.of_face, edge[order], np.searchsorted(
+        self._facet_edges = FacetEdges(edge[order], np.searchsorted(
             facet[order], np.arange(len(self.is_ground) + 1)))
 
     def candidates(self, device_m: np.ndarray, rays: int = DEVICE_RAYS) -> Candidates:
@@ -369,6 +385,19 @@ class CandidateSearch:
                     for each in of_device) > MAX_REMEMBERED_BYTES:
                 self._remembered.popitem(last=False)
         return found
+
+    def pairs_of_edges(self, edges: np.ndarray) -> EdgePairsToTry:
+        """Return what to try as the second edge after edges (s,) of a device's candidates."""
+        with self._one_at_a_time:
+            after, first = self._after, self._first_after[edges]
+            row, within = expand(self._end_after[edges] - first)
+        rows = first[row] + within
+        single = (after[rows] >= 0).sum(axis=1) == 1
+        second, of_facet = self._facet_edges.of(after[rows[single], 0])
+        pairs = np.unique(np.column_stack([row[single][of_facet], second]), axis=0)
+        pairs = pairs[edges[pairs[:, 0]] != pairs[:, 1]]
+        return EdgePairsToTry(edges, pairs[:, 1],
+                              np.searchsorted(pairs[:, 0], np.arange(len(edges) + 1)))
 
     def _find(self, device_m: np.ndarray, rays: int) -> Candidates:
         planes = self.surfaces.planes
@@ -412,9 +441,7 @@ class CandidateSearch:
         reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]
         pairs = np.concatenate([direct, reflected])
         pairs = pairs[sequences.order[pairs[:, 0]] < self._depth]
-        first = self.facet_edges.first[pairs[:, 1]]
-        row, within = expand(self.facet_edges.first[pairs[:, 1] + 1] - first)
-        edge = self.facet_edges.edge[first[row] + within]
+        edge, row = self._facet_edges.of(pairs[:, 1])
         both = np.unique(np.column_stack([pairs[row, 0], edge]), axis=0)
         return sequences.facets[both[:, 0]], both[:, 1]
 

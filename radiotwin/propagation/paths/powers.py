@@ -189,11 +189,12 @@ def path_powers(
         directions.append(_directions(link, gain, points_m[:, 1] - points_m[:, 0],
                                       points_m[path, last - 1] - points_m[path, last]))
     dark = near[powers[:, near].sum(axis=0) == 0]
-    edges = np.unique(candidates.edge[(candidates.before[:, 0] < 0)])
+    if len(dark) and depth > 1:
+        seen_edges = candidates.edge[(candidates.before[:, 0] < 0) & (candidates.edge >= 0)]
+        to_try = search.pairs_of_edges(np.unique(seen_edges))
     for first in range(0, len(dark) if depth > 1 else 0, DARK_CHUNK):
         part = dark[first:first + DARK_CHUNK]
-        pairs = paths_over_two_edges(city, search.surfaces, search.facet_edges, edges, device_m,
-                                     receiver_m[part])
+        pairs = paths_over_two_edges(city, search.surfaces, to_try, device_m, receiver_m[part])
         gain = two_edge_gains(search.surfaces, wave_number, slabs, WEDGES[wedge], pairs.edge,
                               pairs.points_m)
         link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)

@@ -1,8 +1,7 @@
 """Diffraction at two edges, one after the other: over two roofs, or round a corner and over a roof.
 
-It is for links that no other path reaches. The first edge is one that the device sees. The second
-is looked for where the way from the first to the receiver is blocked: on the facets that such a
-straight line hits first, from either end.
+It is for links that no other path reaches. The first edge is one that the device sees; the second
+is at a facet that rays from the first one hit, so that it is found from either end.
 
 The field is that of two wedges in sequence. For parallel edges the distances in the coefficients
 and the spreading are those of Kouyoumjian and Pathak's theory with an edge as the second source,
@@ -15,9 +14,7 @@ of one flat roof, along which the field vanishes, nothing is found.
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 
-from radiotwin.propagation.paths.facets import expand
 from radiotwin.propagation.paths.fields import vertical
 from radiotwin.propagation.paths.interactions import Slabs, around_edge, diffract
 from radiotwin.propagation.paths.surfaces import ALONG, LENGTH, NORMAL_0, NORMAL_N, START, Surfaces
@@ -43,43 +40,26 @@ class EdgePairs(NamedTuple):
     points_m: np.ndarray
 
 
-class FacetEdges(NamedTuple):
-    """The edges of each facet.
+class EdgePairsToTry(NamedTuple):
+    """Edges that a device sees, and those that may come after each.
 
     Attributes:
-        of_face: (city faces,) as in `Facets`.
-        edge: (m,) edges, facet after facet.
-        first: (f + 2,) first row in `edge` of each facet, and of the ground, which has none.
+        edge: (s,) rows of the edges.
+        second: (m,) edges after them, those of the first one first.
+        first: (s + 1,) first row in `second` of each edge.
     """
 
-    of_face: np.ndarray
     edge: np.ndarray
+    second: np.ndarray
     first: np.ndarray
 
 
 def paths_over_two_edges(
-    city: CityMap, surfaces: Surfaces, facet_edges: FacetEdges, seen: np.ndarray,
-    device_m: np.ndarray, receiver_m: np.ndarray,
+    city: CityMap, surfaces: Surfaces, to_try: EdgePairsToTry, device_m: np.ndarray,
+    receiver_m: np.ndarray,
 ) -> EdgePairs:
-    """Find the paths from a device (3,) to receivers (n, 3) [m] over two edges.
-
-    The first one is of those that the device sees, (s,).
-    """
-    bend_m = _bends(surfaces.edges, seen, device_m, receiver_m).reshape(-1, 3)
-    receiver, first = np.repeat(np.arange(len(receiver_m)), len(seen)), np.tile(
-        seen, len(receiver_m))
-    end_m = receiver_m[receiver]
-    face = np.concatenate([city.first_face(bend_m, end_m), city.first_face(end_m, bend_m)])
-    blocked = np.flatnonzero(face >= 0)
-    facet = facet_edges.of_face[face[blocked]]
-    start = facet_edges.first[facet]  # of a facet -1 the last one, behind which nothing is
-    row, within = expand(np.where(facet >= 0, facet_edges.first[facet + 1] - start, 0))
-    way = blocked[row] % max(len(bend_m), 1)
-    second, edges = facet_edges.edge[start[row] + within], len(surfaces.edges)
-    # As one number each, and hashed: thirty times faster than `np.unique` of rows.
-    key = (receiver[way] * edges + first[way]) * edges + second
-    pair, second = np.divmod(np.sort(pd.unique(key[first[way] != second])), max(edges, 1))
-    tried = np.column_stack([*np.divmod(pair, max(edges, 1)), second])
+    """Find the paths from a device (3,) to receivers (n, 3) [m] over two edges."""
+    tried = _possible(surfaces.edges, to_try, device_m, receiver_m)
     points_m, possible = _solve(surfaces.edges, tried, device_m, receiver_m)
     tried, points_m = tried[possible], points_m[possible]
     faces = surfaces.edges[tried[:, 1:]]
@@ -92,24 +72,57 @@ def paths_over_two_edges(
     return EdgePairs(tried[clear, 0], tried[clear, 1:], points_m[clear])
 
 
-@njit(cache=True, error_model="numpy")
-def _bends(
-    edges: np.ndarray, seen: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray
+@njit(cache=True, nogil=True, error_model="numpy")
+def _possible(
+    edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray, receiver_m: np.ndarray
 ) -> np.ndarray:
-    """Return where a ray from the device to a receiver bends on an edge, (n, s, 3) just off it."""
-    out = np.empty((len(receiver_m), len(seen), 3))
-    for j in range(len(seen)):
-        row = edges[seen[j]]
-        outward = row[NORMAL_0:NORMAL_0 + 3] + row[NORMAL_N:NORMAL_N + 3]
-        outward = SKIN_M * outward / np.sqrt(dot(outward, outward))
-        _, from_m, off_m = around_edge(edges, seen[j], device_m[0], device_m[1], device_m[2])
-        for i in range(len(receiver_m)):
-            _, to_m, to_off_m = around_edge(edges, seen[j], receiver_m[i, 0], receiver_m[i, 1],
-                                            receiver_m[i, 2])
-            at_m = from_m + (to_m - from_m) * off_m / (off_m + to_off_m)
-            at_m = min(max(at_m, 0.0), row[LENGTH])
-            out[i, j] = row[START:START + 3] + at_m * row[ALONG:ALONG + 3] + outward
-    return out
+    """Return the receivers and pairs of edges, (t, 3), that Keller's cones do not rule out."""
+    n, seen = len(receiver_m), len(to_try.edge)
+    end_m = np.empty((len(edges), 2, 3))
+    for k in range(len(edges)):
+        end_m[k, 0] = edges[k, START:START + 3]
+        end_m[k, 1] = end_m[k, 0] + edges[k, LENGTH] * edges[k, ALONG:ALONG + 3]
+    # Whether rays from the device over a first edge meet a second one does not depend on receivers
+    meets = np.empty(len(to_try.second), dtype=np.bool_)
+    for j in range(seen):
+        for row in range(to_try.first[j], to_try.first[j + 1]):
+            meets[row] = _cone_meets(edges, to_try.edge[j], device_m, end_m[to_try.second[row]])
+    out = np.empty((1024, 3), dtype=np.int64)
+    count = 0
+    is_open = np.empty(len(edges), dtype=np.bool_)
+    for i in range(n):
+        for k in range(len(edges)):
+            is_open[k] = around_edge(edges, k, receiver_m[i, 0], receiver_m[i, 1],
+                                     receiver_m[i, 2])[0]
+        for j in range(seen):
+            for row in range(to_try.first[j], to_try.first[j + 1]):
+                second = to_try.second[row]
+                if meets[row] and is_open[second] and _cone_meets(
+                        edges, second, receiver_m[i], end_m[to_try.edge[j]]):
+                    if count == len(out):
+                        out = np.concatenate((out, np.empty_like(out)))
+                    out[count, 0], out[count, 1], out[count, 2] = i, to_try.edge[j], second
+                    count += 1
+    return out[:count]
+
+
+@njit(cache=True, error_model="numpy")
+def _cone_meets(edges: np.ndarray, edge: int, from_m: np.ndarray, end_m: np.ndarray) -> bool:
+    """Return whether rays from a point over an edge may meet a segment (2, 3) [m].
+
+    They leave the edge where (q - s) d = (t - s) (d + r), as of `pruning.narrow`; True may be
+    wrong, False never is.
+    """
+    _, s, d = around_edge(edges, edge, from_m[0], from_m[1], from_m[2])
+    low_m, high_m, most_m = np.inf, -np.inf, 0.0
+    for end in range(2):
+        _, q, r = around_edge(edges, edge, end_m[end, 0], end_m[end, 1], end_m[end, 2])
+        low_m, high_m, most_m = min(low_m, q), max(high_m, q), max(most_m, r)
+    if low_m > s:  # r is at most that of an end, and at least 0
+        low_m = s + (low_m - s) * d / (d + most_m)
+    if high_m < s:
+        high_m = s + (high_m - s) * d / (d + most_m)
+    return low_m < edges[edge, LENGTH] and high_m > 0.0
 
 
 @njit(cache=True, error_model="numpy")
