@@ -165,27 +165,34 @@ def shortest(
         which the edges meet.
     """
     a, b = one[ALONG:ALONG + 3], other[ALONG:ALONG + 3]
+    apart = other[START:START + 3] - one[START:START + 3]
+    # Lengths and slopes follow from these and the positions alone
+    cosine, apart2, apart_a, apart_b = dot(a, b), dot(apart, apart), dot(apart, a), dot(apart, b)
+    start, end = from_m - one[START:START + 3], to_m - other[START:START + 3]
+    start_at, end_at = dot(start, a), dot(end, b)
+    start_off2, end_off2 = dot(start, start) - start_at ** 2, dot(end, end) - end_at ** 2
     s, t = 0.5 * one[LENGTH], 0.5 * other[LENGTH]
-    cosine = dot(a, b)
     length_m = np.inf
     step_s = step_t = 0.0
     for _ in range(STEPS):
-        p = one[START:START + 3] + s * a
-        q = other[START:START + 3] + t * b
-        legs_m = np.array([np.sqrt(((p - from_m) ** 2).sum()), np.sqrt(((q - p) ** 2).sum()),
-                           np.sqrt(((to_m - q) ** 2).sum())])
-        if legs_m.min() < PRECISION_M:
+        near_m = np.sqrt(max(start_off2 + (s - start_at) ** 2, 0.0))
+        between_m = np.sqrt(max(apart2 + s * s + t * t + 2.0 * (t * apart_b - s * apart_a
+                                                                - s * t * cosine), 0.0))
+        far_m = np.sqrt(max(end_off2 + (t - end_at) ** 2, 0.0))
+        if min(near_m, between_m, far_m) < PRECISION_M:
             return -1.0, -1.0
-        if legs_m.sum() > length_m + PRECISION_M:  # too far: go back by half
+        if near_m + between_m + far_m > length_m + PRECISION_M:  # too far: go back by half
             step_s, step_t = 0.5 * step_s, 0.5 * step_t
             s, t = s - step_s, t - step_t
             continue
-        length_m = legs_m.sum()
-        first, second, third = (p - from_m) / legs_m[0], (q - p) / legs_m[1], (to_m - q) / legs_m[2]
-        slope_s, slope_t = dot(first, a) - dot(second, a), dot(second, b) - dot(third, b)
-        ss = (1.0 - dot(first, a) ** 2) / legs_m[0] + (1.0 - dot(second, a) ** 2) / legs_m[1]
-        tt = (1.0 - dot(second, b) ** 2) / legs_m[1] + (1.0 - dot(third, b) ** 2) / legs_m[2]
-        st = -(cosine - dot(second, a) * dot(second, b)) / legs_m[1]
+        length_m = near_m + between_m + far_m
+        first_a, third_b = (s - start_at) / near_m, (end_at - t) / far_m
+        second_a = (apart_a + t * cosine - s) / between_m
+        second_b = (apart_b + t - s * cosine) / between_m
+        slope_s, slope_t = first_a - second_a, second_b - third_b
+        ss = (1.0 - first_a ** 2) / near_m + (1.0 - second_a ** 2) / between_m
+        tt = (1.0 - second_b ** 2) / between_m + (1.0 - third_b ** 2) / far_m
+        st = -(cosine - second_a * second_b) / between_m
         scale = ss * tt - st * st
         if not scale > 0.0:
             return -1.0, -1.0
