@@ -40,8 +40,9 @@ def coverage(
              "takes far longer [p1411].")] = None,
     transmitters: Annotated[Path | None, typer.Option(
         metavar="TABLE", help="Transmitters in place of the twin's or the scene's devices: device, "
-                              "x_m, y_m (or latitude_deg, longitude_deg), z_m, tx_power_dbm, load, "
-                              "antenna, azimuth_deg, tilt_deg.")] = None,
+                              "x_m, y_m (or latitude_deg, longitude_deg), z_m, tx_power_dbm, "
+                              "eirp_dbm, cable_loss_db, frequency_hz, load, antenna, azimuth_deg, "
+                              "tilt_deg.")] = None,
     devices: OnlyDevices = None,
     tx_power_dbm: Annotated[float | None, typer.Option(
         help="Power of transmitters that declare none [tx_power_dbm of the scene].")] = None,

@@ -175,8 +175,10 @@ def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]
                        "powers: what another transmitter would send is not known; declare "
                        "tx_power_dbm in devices.csv and fit again, or leave it out with --devices")
     found = _notes_of_twin(twin, transmitters, rows, has_power)
-    if any(each.frequency_hz not in (None, scene.config.radio.frequency_hz)
-           for each in transmitters):
+    measured_hz = [radio.frequency_hz for radio in twin.declared.radios] or [None] * known
+    if any(each.frequency_hz not in (None, scene.config.radio.frequency_hz,
+                                     *measured_hz[row:row + 1])
+           for each, row in zip(transmitters, rows)):
         found.append("transmitters of other frequencies get the twin's law, moved by 20 lg f as in "
                      f"free space: it was learnt at {scene.config.radio.frequency_hz / 1e9:g} GHz")
     frequency_hz = scene.config.radio.frequency_hz if np.isnan(twin.declared.frequency_hz) \

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
 from radiotwin.coverage import CoverageSettings, predict_coverage, read_transmitters
 from radiotwin.coverage.sources import source_of_twin
 from radiotwin.coverage.transmitters import Transmitter
@@ -345,3 +346,17 @@ def test_the_antenna_of_the_uavs_is_taken_off_and_put_back_where_uavs_receive(gr
     assert (predict(twin, scene, data) - data.level_db + lobe_dbi(down_deg)).std() < 2  # as if isotropic
     links = prepare_links(data, scene)
     assert links.declared.adds_nothing and any("receivers phone are none of its UAVs" in note for note in links.notes)
+
+
+def test_held_out_errors_of_a_close_loop_are_those_of_the_gains(ground, tmp_path):
+    powers = {"a": 0.0, "b": 20.0, "c": 10.0}
+    data = campaign(tmp_path / "m", {name: {"tx_power_dbm": power, "adds_db": power} for name, power in powers.items()})
+    gains = data.table.assign(gain_db=data.table["rssi_dbm"] - data.table["device"].map(powers)).drop(columns="rssi_dbm")
+    errors_db = []
+    for each in (data, Measurements(gains, data.devices.drop(columns="tx_power_dbm"))):
+        links = prepare_links(each, ground)
+        folds = make_folds(links, 0, "block")
+        model = cross_validate(links, make_bases(ground, 0)["log-distance"], folds, training_parts(links, folds))
+        errors_db.append(links.level_db - model.held_out_mean_db)
+    np.testing.assert_allclose(*errors_db, atol=1e-4)
+    assert np.nanstd(errors_db[0]) == pytest.approx(SD_DB, abs=0.15)
