@@ -1,12 +1,20 @@
-"""numba's compiler, imported so that a folder named `coverage` does it no harm.
+"""numba's compiler, without two of its traps.
 
 numba imports the package `coverage` where there is one, takes a folder of that name on the path for
 it, and fails. The output of `radiotwin coverage` may be such a folder, in the working directory.
+
+numba compiles a function again when its own file has changed, and not when a function that it calls
+has changed in another file: after an update the old code would go on, with other arguments. So what
+is kept of a file of this package also belongs to the compiled functions in the files beside it.
 """
 
 import os
 import sys
+from functools import lru_cache
+from hashlib import sha256
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 __all__ = ["njit"]
 
@@ -24,5 +32,25 @@ _whole_path = sys.path[:]
 sys.path[:] = _path_without_folder("coverage")
 try:
     from numba import njit
+    from numba.core.caching import _SourceFileBackedLocatorMixin as _Locator
 finally:
     sys.path[:] = _whole_path
+
+_stamp_of_file = _Locator.get_source_stamp
+
+
+@lru_cache
+def _compiled_files_hash(folder: Path) -> str | None:
+    """Return the hash of the files of a folder with compiled functions; None: there are none."""
+    contents = [path.read_bytes() for path in sorted(folder.glob("*.py"))]
+    compiled = [content for content in contents if __name__.encode() in content]
+    return sha256(b"".join(compiled)).hexdigest() if compiled else None
+
+
+def _stamp(self: Any) -> Any:
+    """Return what kept code must have been compiled from to be used."""
+    others = _compiled_files_hash(Path(self._py_file).parent)
+    return _stamp_of_file(self) if others is None else (_stamp_of_file(self), others)
+
+
+_Locator.get_source_stamp = _stamp
