@@ -155,4 +155,4 @@ class SolverSettings:
         if self.compute_device == "cpu":
             del own["compute_device"]
         return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY,
-                      "paths_counted": "once"}
+                      "paths_counted": "once", "ground": "half space"}

@@ -14,6 +14,7 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from radiotwin.runtime import llvm
 from radiotwin.runtime.cuda import Device
 from radiotwin.runtime.processes import allowed_cores
 from radiotwin.scene.antennas import Antenna
+from radiotwin.scene.citymap import GROUND_M
 from radiotwin.scene.folder import CityShape, read_city, write_city
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.materials import permittivity, ranges_text
@@ -37,6 +39,7 @@ from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE, Solver
 log = logging.getLogger(__name__)
 City = Path | str | Sequence[CityShape] | None
 """`city.xml` of a scene folder, or what `read_city` returns; None for free space."""
+GROUND_DEPTH_M = 1000.0  # of the ground: a half space, as its materials are lossy
 _VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 # Delays are single precision, with a unit roundoff of 6e-8, and sums of up to five segments.
 _LENGTH_TOLERANCE = 1e-6  # relative
@@ -123,7 +126,7 @@ def load_city(city: City, frequency_hz: float, device: Device = "cpu") -> Any:
 def _load_copy(rt: Any, city: Path | str | Sequence[CityShape]) -> Any:
     shapes = read_city(city) if isinstance(city, Path | str) else city
     with scratch_folder() as folder:
-        write_city(folder, shapes)
+        write_city(folder, [_deep(shape) if _is_flat_ground(shape) else shape for shape in shapes])
         try:
             return rt.load_scene(str(folder / "city.xml"))
         except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OSError,
@@ -132,6 +135,17 @@ def _load_copy(rt: Any, city: Path | str | Sequence[CityShape]) -> Any:
             raise BadInput(f"{name}: Sionna RT cannot read it "
                            f"({str(error).strip()}); `radiotwin build-scene --check` lists what is "
                            "wrong with it") from None
+
+
+def _is_flat_ground(shape: CityShape) -> bool:
+    return bool((np.abs(shape.mesh.vertices[:, 2]) < GROUND_M).all())
+
+
+def _deep(ground: CityShape) -> CityShape:
+    """Return a ground from whose far side nothing comes back: a half space, and not a slab."""
+    material = replace(ground.material, name=f"{ground.material.name}-ground",
+                       thickness_m=GROUND_DEPTH_M)
+    return replace(ground, material=material)
 
 
 def _hold_in_range(material: Any, frequency_hz: float) -> None:

@@ -39,7 +39,7 @@ def test_free_space_is_friis():
 
 # Ground of half-space: so thick and lossy that nothing comes back from its lower side.
 PERMITTIVITY, CONDUCTIVITY = 15.0, 0.2
-GROUND = Material("ground", relative_permittivity=PERMITTIVITY, conductivity_s_per_m=CONDUCTIVITY, thickness_m=5.0)
+GROUND = Material("ground", relative_permittivity=PERMITTIVITY, conductivity_s_per_m=CONDUCTIVITY, thickness_m=0.1)
 DEVICE_M = np.array([0.0, 0.0, 1.5])
 
 

@@ -54,10 +54,10 @@ SAMPLE_M, SAMPLE_RAD = 0.3, 0.002  # [m], [rad] seen from the device: step of po
 SAMPLE_CHUNK = 100_000  # points at once: about 50 MB
 RAY_CHUNK = 200_000  # rays at once: about 60 MB
 DEVICE_RAYS = 100_000  # about half a degree apart
-EDGE_RAYS = 4_000  # from each 20 m of an edge, about 3 degrees apart, 2 at the horizon
+EDGE_RAYS = 2_000  # from each 20 m of an edge, about 5 degrees apart, 3 at the horizon
 PLASTIC = 0.7548776662466927  # spreads rays along an edge evenly (Roberts' sequence)
 LEVEL_SINE = 0.1  # of the elevation up to which rays are dense
-EDGE_CHUNK = 50  # edges at once whose surroundings are searched: about 100 MB
+EDGE_CHUNK = 100  # edges at once whose surroundings are searched: about 100 MB
 MAX_REMEMBERED_BYTES = 2**25  # of one search, so 400 MB of all that `candidate_search` keeps
 
 
