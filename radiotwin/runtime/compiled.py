@@ -53,4 +53,4 @@ def _stamp(self: Any) -> Any:
     return _stamp_of_file(self) if others is None else (_stamp_of_file(self), others)
 
 
-_Locator.get_source_stamp = _stamp
+_Locator.get_source_stamp = _stamp  # type: ignore[method-assign]

@@ -56,10 +56,10 @@ def test_the_limit_is_that_of_the_readings_and_leaves_no_bias(small_scene):
     assert abs(held_out(claimed)["bias_db"]) > 2.0
 
 
-def test_an_anchor_inside_a_building_is_refused_where_lines_of_sight_count(small_scene):
-    """Both are in one; the log-distance law asks for no line of sight."""
+def test_an_anchor_on_a_roofs_plane_is_refused_where_lines_of_sight_count(small_scene):
+    """Both are on one; the log-distance law asks for no line of sight."""
     measured = walked(0, small_scene)
     assert small_scene.city.inside(np.array(DEVICE_M)).any()
     for base in ("twin", "raytrace", "auto"):
-        with pytest.raises(BadInput, match="devices, row 2: anchor 'd0' .*inside a building"):
+        with pytest.raises(BadInput, match="devices, row 2: anchor 'd0' .*on a surface"):
             close_loop(measured, small_scene, base)
