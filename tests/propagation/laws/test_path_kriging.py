@@ -54,17 +54,20 @@ def levels(city, receiver_m, device, seed, noise_db=1.0):
 @pytest.mark.slow
 @pytest.mark.parametrize(("move_m", "rise_m"), [(0.0, 0.0), (2.0, 0.0), (0.0, 4.0)])
 def test_the_size_of_a_maps_errors_is_found(move_m, rise_m):
-    """Rationale: the same paths over another map; only how the map was made wrong is not shared."""
+    """Rationale: the same paths over three other maps; only how the map was made wrong is not shared."""
     receiver_m, device = flight(300, 3)
-    level_db = levels(houses(), receiver_m, device, 5)
-    wrong = links_over(houses(move_m, rise_m, seed=11), receiver_m, device)
-    found, _ = estimate_map_error(wrong, level_db, None, 0)
-    for (size_m, low_m, high_m), true_m in ((found.wall_m, move_m), (found.height_m, rise_m)):
-        assert low_m <= size_m <= high_m
-        if not found.is_shifted:  # of nine houses the mean error is large enough to be called a shift
-            assert low_m - 1.0 <= true_m <= high_m + 1.0  # the true errors of nine houses are few draws
-    assert (found.is_seen or found.is_shifted) == bool(move_m or rise_m), "a map is blamed if it is wrong"
-    assert found.is_seen or not rise_m, "heights show at most links"
+    level_db, blamed, outside = levels(houses(), receiver_m, device, 5), 0, 0
+    seeds = (11, 12, 13) if move_m or rise_m else (11,)
+    for seed in seeds:
+        wrong = links_over(houses(move_m, rise_m, seed=seed), receiver_m, device)
+        found, _ = estimate_map_error(wrong, level_db, None, 0)
+        for (size_m, low_m, high_m), true_m in ((found.wall_m, move_m), (found.height_m, rise_m)):
+            assert low_m <= size_m <= high_m
+            if not found.is_shifted:  # of nine houses the mean error is large enough to be called a shift
+                outside += not low_m - 1.0 <= true_m <= high_m + 1.0  # nine houses are few draws
+        blamed += found.is_seen or found.is_shifted
+    assert blamed >= 2 if move_m or rise_m else not blamed, "a map is blamed if it is wrong"
+    assert outside <= len(seeds) // 2, "an interval of 90 % misses one map in three at most"
 
 
 def test_few_links_say_nothing_of_a_map():
