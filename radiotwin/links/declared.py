@@ -1,4 +1,4 @@
-"""What is declared of each device's radio: power, cable, antenna and carrier, and what that adds.
+"""Declared radios of devices: power, cable loss, antenna and carrier, and their share of a level.
 
 A channel model knows gains between isotropic antennas at one frequency. The level of a link is that
 gain, and the power that its device feeds to its antenna, the antenna's gain in the direction of the
@@ -28,7 +28,7 @@ MAX_NAMED = 6  # devices in a message
 
 @dataclass(frozen=True)
 class Radio:
-    """What is declared of the radio of a device.
+    """Declared radio of one device.
 
     Attributes:
         tx_power_dbm: at the output of the transmitter [dBm]; None: not known.
@@ -44,7 +44,7 @@ class Radio:
 
     @property
     def fed_dbm(self) -> float:
-        """Power that reaches the antenna [dBm]; of a power that is not known, less than 0 dBm."""
+        """Power at the antenna's input [dBm]; of 0 dBm if the transmit power is not known."""
         return (self.tx_power_dbm or 0.0) - self.cable_loss_db
 
 
@@ -76,7 +76,7 @@ def tx_power_dbm(device: str, power_dbm: float | None, eirp_dbm: float | None,
 
 @dataclass(frozen=True, eq=False)
 class Declared:
-    """What is declared of the radios of k devices, as it is in the levels of their links.
+    """Declared radios of k devices, as they are in the levels of their links.
 
     Attributes:
         radios: of each device; empty: nothing is declared.
@@ -92,7 +92,7 @@ class Declared:
 
     @cached_property
     def fed_db(self) -> np.ndarray:
-        """What radios add to gains between isotropic antennas in any direction (k,) [dB]."""
+        """Share of a level that is the same in all directions (k,) [dB]: power, cable, carrier."""
         fed_db = np.zeros(len(self.radios))
         for number, radio in enumerate(self.radios):
             fed_db[number] = radio.fed_dbm if self.has_power else -radio.cable_loss_db
@@ -102,7 +102,7 @@ class Declared:
 
     @property
     def description(self) -> str:
-        """What of it is declared, in a few words."""
+        """Summary of the declared values, in a few words."""
         known = [radio.tx_power_dbm for radio in self.radios if radio.tx_power_dbm is not None]
         parts = [f"tx_power_dbm {min(known):g} to {max(known):g}"] if known else []
         for name, empty in (("cable_loss_db", 0.0), ("antenna", None), ("frequency_hz", None)):

@@ -108,7 +108,7 @@ class AntennaRecord(_Strict):
 
 
 class RadioRecord(_Strict):
-    """What is declared of the radio of a device."""
+    """Declared radio of a device."""
 
     tx_power_dbm: Annotated[float, Field(ge=-2 * MAX_POWER_DBM, le=2 * MAX_POWER_DBM)] | None
     cable_loss_db: Annotated[float, Field(ge=0, le=MAX_CABLE_LOSS_DB)]
@@ -117,7 +117,7 @@ class RadioRecord(_Strict):
 
 
 class DeclaredRecord(_Strict):
-    """What is declared of each device's radio, and the frequency that the channel computes at."""
+    """Declared radio of each device, and the frequency that the channel computes at."""
 
     radios: list[RadioRecord]
     receiver_antenna: AntennaRecord | None = None

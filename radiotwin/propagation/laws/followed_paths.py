@@ -265,8 +265,9 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
 def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
                frequency_hz: float) -> list[_NewPaths]:
     """Return powers and paths as of `_Followed` from positions to ends (n, 3)."""
-    if not asked:  # as most often: no bar, and no numba, for what is remembered
+    if not asked:  # usually all paths are remembered, and no progress bar is needed
         return []
+
     def follow(number: int) -> _NewPaths:
         position_m, ends_m = asked[number]
         powers, paths = [], []

@@ -192,14 +192,14 @@ def path_powers(
     if len(dark) and depth > 1:
         seen_edges = candidates.edge[(candidates.before[:, 0] < 0) & (candidates.edge >= 0)]
         to_try = search.pairs_of_edges(np.unique(seen_edges))
-    for first in range(0, len(dark) if depth > 1 else 0, DARK_CHUNK):
-        part = dark[first:first + DARK_CHUNK]
-        pairs = paths_over_two_edges(city, search.surfaces, to_try, device_m, receiver_m[part])
-        gain = two_edge_gains(search.surfaces, wave_number, slabs, WEDGES[wedge], pairs.edge,
-                              pairs.points_m)
-        link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)
-        np.add.at(powers, (COMPONENTS.index("diffracted_2"), link), gain)
-        directions.append(_directions(link, gain, legs_m[:, 0], -legs_m[:, 2]))
+        for first in range(0, len(dark), DARK_CHUNK):
+            part = dark[first:first + DARK_CHUNK]
+            pairs = paths_over_two_edges(city, search.surfaces, to_try, device_m, receiver_m[part])
+            gain = two_edge_gains(search.surfaces, wave_number, slabs, WEDGES[wedge], pairs.edge,
+                                  pairs.points_m)
+            link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)
+            np.add.at(powers, (COMPONENTS.index("diffracted_2"), link), gain)
+            directions.append(_directions(link, gain, legs_m[:, 0], -legs_m[:, 2]))
     dark = near[powers[:, near].sum(axis=0) == 0]
     rows = np.concatenate([
         np.flatnonzero(far), dark[city.hidden_by_ground(device_m[None], receiver_m[dark])]])
