@@ -20,13 +20,14 @@ from radiotwin.closeloop.crossfit import (
     training_parts,
 )
 from radiotwin.closeloop.predict.predictor import CombinedPrediction, combined_prediction
+from radiotwin.closeloop.scan import Anomaly, scan
 from radiotwin.closeloop.search.causes import add_causes
 from radiotwin.closeloop.search.declared import add_declared
 from radiotwin.closeloop.search.faults import add_changes, add_faults, drop_idle_faults
 from radiotwin.closeloop.search.relocate import relocate_devices
 from radiotwin.closeloop.search.rest import add_shadowing, add_trends
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState, search
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.criteria import MIN_SURE, SelectionCriteria
 from radiotwin.closeloop.verdict.intervals import effect_parameters, effect_size_db
 from radiotwin.closeloop.verdict.posterior import verdict_without_effect
 from radiotwin.closeloop.verdict.residual_tests import (
@@ -62,6 +63,7 @@ class Loop(Summarised):
         explained: base and named effects, without trends and interpolation of the rest.
         found: base and effects, and the log of all trials.
         criteria: thresholds that decided.
+        anomalies: groups of links that stand out in the held-out residual of `before`.
         dependences_before, dependences_after: of the held-out residual.
         seed: of the folds, and of the draws in `prediction`.
         noise_floor_db: from links measured twice at one position; NaN where there are none.
@@ -75,6 +77,7 @@ class Loop(Summarised):
     explained: CrossFit
     found: SearchState
     criteria: SelectionCriteria
+    anomalies: list[Anomaly]
     dependences_before: list[ResidualDependence]
     dependences_after: list[ResidualDependence]
     seed: int
@@ -106,9 +109,17 @@ class Loop(Summarised):
 
     @property
     def verdict(self) -> str:
-        """`effect` where a cause was named; else `none`, `unexplained` or `undecided`."""
-        named = any(each.is_cause and not each.is_declared for each in self.after.whole.effects)
-        return "effect" if named else verdict_without_effect(self.found.steps, self.criteria)
+        """`effect`, `located`, `none` or `undecided`.
+
+        It is `effect` where a cause was named, `located` where a group of links surely stands out
+        and its cause is open. It is never `none` while a group probably stands out.
+        """
+        if any(each.is_cause and not each.is_declared for each in self.after.whole.effects):
+            return "effect"
+        if any(each.probability >= MIN_SURE for each in self.anomalies):
+            return "located"
+        verdict = verdict_without_effect(self.found.steps, self.criteria)
+        return "undecided" if self.anomalies else verdict
 
     @property
     def _summary(self) -> Summary:
@@ -195,6 +206,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
                           executor or Executor(), on_progress)
     declared = search(SearchState(models[best]), [add_declared], inputs)
     on_progress("looking at the residual")
+    anomalies = scan(declared.model)
     before = after = dependences(declared.model, seed)
     found = search(declared, [add_faults, add_changes, add_causes, drop_idle_faults], inputs)
     on_progress("unknown devices again, beside the effects")
@@ -206,5 +218,5 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     left = [each.variable for each in significant(after, criteria)]
     found = search(replace(found, model=explained),
                    [partial(add_trends, variables=left), add_shadowing] if left else [], inputs)
-    return Loop(best, links, folds, declared.model, explained, found, criteria, before, after, seed,
-                noise_floor_db(all_links, criteria), measurements.origin)
+    return Loop(best, links, folds, declared.model, explained, found, criteria, anomalies, before,
+                after, seed, noise_floor_db(all_links, criteria), measurements.origin)

@@ -15,8 +15,8 @@ HALF = 0.5  # more probable than not
 NOT_LOOKED_FOR, LACKING = "not looked for: ", "there is no "  # a reason, and how it goes on
 LIKELY = 0.05  # a cause that is less probable is not worth a word
 DATES_S = 1e9, 4e9  # times from 2001 to 2096; no other number of seconds is as large
-BADGES = {"effect": "found: ", "none": "no cause found", "unexplained": "unexplained",
-          "undecided": "undecided"}
+BADGES = {"effect": "found: ", "located": "located, cause open",
+          "none": "no cause found", "undecided": "undecided"}
 
 
 def closeloop_summary(report: dict) -> str:
@@ -25,7 +25,7 @@ def closeloop_summary(report: dict) -> str:
     Args:
         report: content of `closeloop.json`.
     """
-    text = {"effect": _effect, "none": _none, "unexplained": _unexplained,
+    text = {"effect": _effect, "located": _undecided, "none": _none,
             "undecided": _undecided}[report["verdict"]](report)
     text += next((f" {_side_by_side(each)}." for each in _largest_first(report)
                   if _differ(each["difference_db"])), "")
@@ -277,6 +277,9 @@ def _undecided(report: dict) -> str:
     text = "Undecided: these measurements do not tell."
     if step is None:
         return text
+    first = next(iter(step["probabilities"]), {"name": ""})
+    if first["name"] == OTHER or (step["rest_db"] or 0.0) > _criteria(report)["max_rest_db"]:
+        return _unexplained(report)
     text += f" Likeliest: {_likely(step['probabilities'])}."
     likely = [each["name"] for each in step["probabilities"]
               if (each["probability"] or 0) >= LIKELY]

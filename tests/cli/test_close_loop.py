@@ -34,7 +34,7 @@ def test_a_file_and_a_table_of_devices_are_enough(run, tmp_path):
     assert done.returncode == 0, done.stderr
     assert "receiver_gain_offset" in done.stdout and "closeloop.html" in done.stdout
     report = json.loads((tmp_path / "result" / "closeloop.json").read_text())
-    assert report["schema"] == "radiotwin.closeloop/2" and report["verdict"] == "effect"
+    assert report["schema"] == "radiotwin.closeloop/3" and report["verdict"] == "effect"
     assert report["effects"][0]["name"] == "receiver_gain_offset"
     assert report["error"]["after"]["rmse_db"] < 0.8 * report["error"]["before"]["rmse_db"]
     links = pd.read_csv(tmp_path / "result" / "residuals.csv.gz")

@@ -35,7 +35,8 @@ def report(verdict="effect", **changes):
     after = SCORES | {"rmse_db": 2.0, "std_db": 2.0} if found else SCORES
     drivers = [{"variable": "time_in_flight_s", "p_value": 0.0004, "effect_db": 1.5}]
     return {
-        "schema": "radiotwin.closeloop/2", "radiotwin_version": "0", "base": "twin", "verdict": verdict,
+        "schema": "radiotwin.closeloop/3", "radiotwin_version": "0", "base": "twin",
+        "verdict": "undecided" if verdict == "unexplained" else verdict,
         "effects": [DRIFT | {"probability": 0.95}] if found else [],
         "candidates": [{"name": "receiver_drift", "step": 1, "heldout_rmse_db": 2.0, "heldout_nll_gain": 210.0,
                         "p_value": 1e-9, "kept": found, "reason": "" if found else "gains nothing"},
@@ -72,7 +73,7 @@ def page(content, folder):
      "Unexplained: about 3.50 dB of what the base misses belong to places, and beyond 3 dB it is not said that nothing is "
      "missing. Correlated shadowing does this, too. Likeliest: nothing is missing (0.70) and antenna pattern (0.29). About "
      "1.25 dB belong to single readings. The residual is 3.00 dB RMSE and depends on time in flight.",
-     "unexplained")])
+     "undecided")])
 def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
     text = page(report(verdict), tmp_path)
     assert sentence in text and f"<b>{badge}</b>" in text

@@ -174,7 +174,7 @@ def test_maps_have_a_budget(run_folder, tmp_path, monkeypatch):
 
 
 def test_a_close_loop_without_its_entries_is_bad_input(tmp_path):
-    (tmp_path / "closeloop.json").write_text('{"schema": "radiotwin.closeloop/2"}')
+    (tmp_path / "closeloop.json").write_text('{"schema": "radiotwin.closeloop/3"}')
     with pytest.raises(BadInput, match="closeloop.json is damaged"):
         write_report(read_run(tmp_path), tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()

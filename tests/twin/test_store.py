@@ -66,7 +66,7 @@ def test_a_curve_that_only_describes_is_drawn_on_the_maps_of_a_stored_twin(open_
     world.gain_db += 5.0 * np.sin(np.radians(3 * azimuth_deg))  # no effect of the catalogue does so at all devices
     measurements = open_ground.measured(world).select(world.slot % 2 == 0)
     loop = close_loop(measurements, base="log-distance")
-    assert loop.verdict == "unexplained"
+    assert loop.verdict in ("located", "undecided")
     corrected_twin(loop, None).save(tmp_path / "twin")
     twin = Twin.load(tmp_path / "twin")
     assert [each.variant for each in twin.effects] == ["over azimuth_deg"]

@@ -13,6 +13,7 @@ from radiotwin.closeloop.crossfit import CrossFit, without_quality
 from radiotwin.closeloop.output.result_schema import ReportRecord
 from radiotwin.closeloop.predict.blending import held_out_coverage
 from radiotwin.closeloop.run import Loop
+from radiotwin.closeloop.scan import Anomaly
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.posterior import Step
 from radiotwin.effects.params import Parameter
@@ -28,7 +29,7 @@ AS_GOOD = 1.02  # ratio of errors up to which one model is as good as another
 _WORDS = {"log_distance": "the log-distance law", "segmented_log_distance": "the segmented law",
           "regression_kriging": "kriging", "extra_trees": "a tree ensemble (ExtraTrees)",
           "hist_gradient_boosting": "gradient boosting (HistGradientBoosting)"}
-SCHEMA = "radiotwin.closeloop/2"
+SCHEMA = "radiotwin.closeloop/3"
 REMEDY = "run `radiotwin close-loop` again"
 MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
 # Parts that a report need not have.
@@ -116,6 +117,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
     return _for_json({
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
+        "anomalies": [_anomaly(each) for each in loop.anomalies],
         "posterior": [_step(each) for each in loop.found.steps],
         "detectable": [vars(each) for each in loop.detectable],
         "receivers_compared": [_difference(each, links) for each in receiver_differences(links)],
@@ -203,6 +205,16 @@ def _step(step: Step) -> dict[str, Any]:
     return {"step": step.number + 1, "unnamed_nats": step.unnamed_nats, "rest_db": step.rest_db,
             "noise_db": step.noise_db,
             "probabilities": [{"name": name, "probability": each} for name, each in ordered]}
+
+
+def _anomaly(found: Anomaly) -> dict[str, Any]:
+    return {"family": found.family, "members": {key: list(names) for key, names in
+                                                found.members.items()},
+            "ranges": {key: list(ends) for key, ends in found.ranges.items()},
+            "sight": found.sight, "statistic": found.statistic, "size": found.size.record(),
+            "probability": found.probability, "links": int(found.rows.sum()),
+            "causes": [{"name": name, "probability": probability}
+                       for name, probability in found.causes.items()]}
 
 
 def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Schema of `closeloop.json`, by which it is read: it may come from somebody else."""
 
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -155,6 +155,28 @@ class StepRecord(Record):
     noise_db: Real | None
 
 
+class CauseRecord(Record):
+    """What may be the cause of an anomaly; `another` = none of the catalogue."""
+
+    name: str
+    probability: Real
+
+
+class AnomalyRecord(Record):
+    """A group of links that reads otherwise than its peers."""
+
+    family: str
+    members: dict[Literal["device", "receiver", "flight"], list[str]]
+    ranges: dict[str, Annotated[list[Real], Field(min_length=2, max_length=2)]] = Field(
+        default_factory=dict)
+    sight: Literal["los", "nlos", "all"] = "all"
+    statistic: Literal["level", "scatter", "blanks", "slope"]
+    size: KnownParameterRecord
+    probability: Real
+    links: Whole
+    causes: list[CauseRecord] = Field(default_factory=list)
+
+
 class DetectableRecord(Record):
     """How large an effect would have had to be, to be named; no size where none would do."""
 
@@ -192,12 +214,13 @@ class InputsRecord(Record):
 class ReportRecord(Record):
     """Content of `closeloop.json`."""
 
-    schema_: Literal["radiotwin.closeloop/2"] = Field(alias="schema")
+    schema_: Literal["radiotwin.closeloop/3"] = Field(alias="schema")
     radiotwin_version: str = ""
     base: str
-    verdict: Literal["effect", "none", "unexplained", "undecided"]
+    verdict: Literal["effect", "located", "none", "undecided"]
     effects: list[EffectRecord]
     candidates: list[CandidateRecord]
+    anomalies: list[AnomalyRecord] = Field(default_factory=list)
     posterior: list[StepRecord] = Field(default_factory=list)
     detectable: list[DetectableRecord] = Field(default_factory=list)
     receivers_compared: list[ReceiverDifferenceRecord] = Field(default_factory=list)

@@ -24,6 +24,7 @@ LEVELS_DB = 120.0  # span of changes of a level that can be at all, where no bou
 MIN_FOLDS = 0.5  # share of the folds that must have found a parameter, too
 MIN_CLUSTERS = 3  # effective ones, of which a spread can be told
 # Of probabilities (`radiotwin.closeloop.verdict.posterior`); the weights are in calibration.json.
+MIN_SURE = 0.9  # probability of a group that stands out, for the verdict to be `located`
 LEAST_RATIO = 0.2  # of what belongs to places to noise; less is none
 NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
 EXPLAINED = 0.3  # of what a pattern explains, for a search to have found it; it is refined later

@@ -91,11 +91,10 @@ def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
 
 
 def verdict_without_effect(steps: Sequence[Step], criteria: SelectionCriteria) -> str:
-    """Return `none`, `unexplained` or `undecided`, where no cause was named.
+    """Return `none` or `undecided`, where no cause was named.
 
-    It is `unexplained` where a cause without a name is the likeliest, or more than `max_rest_db`
-    belongs to places; `none` where it is probable that nothing is hidden. The first step decides:
-    descriptions of the rest have no part in it.
+    It is `none` where it is probable that nothing is hidden and no more than `max_rest_db` belongs
+    to places. The first step decides: descriptions of the rest have no part in it.
 
     Args:
         steps: what the residual says; none where no cause was looked for.
@@ -106,7 +105,7 @@ def verdict_without_effect(steps: Sequence[Step], criteria: SelectionCriteria) -
     first = steps[0]
     likeliest = max(first.probabilities, key=lambda name: first.probabilities[name])
     if likeliest == OTHER or first.rest_db > criteria.max_rest_db:
-        return "unexplained"
+        return "undecided"
     return "none" if first.probabilities[NONE] >= criteria.min_probability else "undecided"
 
 

@@ -1,0 +1,309 @@
+"""Groups of values that stand out from their peers.
+
+A group is any set of values, and groups may overlap. Each has a statistic with a standard error, in
+which values of one unit (neighbours, which err alike) count as one. Its peers are the other groups
+of the same kind. Their own spread is estimated robustly, and with few peers it is shrunk to a
+prior. Whether a group is one of its peers is judged by two hypotheses (Efron 2008,
+'Microarrays, empirical Bayes and the two-groups model', Statist. Sci. 23): it is as far from them
+as Student's t with that spread allows, or it may be anywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student_t
+
+MIN_VALUES, MIN_UNITS = 12, 4  # of a group, to be judged
+HUBER = 1.345  # scales, beyond which a value pulls no further (95 % efficient for normal errors)
+MAX_SCALES = 8.0  # a single value counts as this far away at most
+LEAVE_OUT = 64  # groups up to which each is left out of its own peers
+PEER_WEIGHT = 4.0  # peers that the prior spread counts as
+PRIOR_DOF = 8.0  # of that prior
+MIN_ALIKE = 3  # values of a unit, to tell how much units differ
+OUTLIER_DOF = 2.0  # of sizes of what stands out: heavy tails
+POLISH_ROUNDS = 3
+TINY = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Members of groups, which may overlap.
+
+    Attributes:
+        row: (m,) value of each membership.
+        group: (m,) group of each membership.
+        count: number of groups k.
+    """
+
+    row: np.ndarray
+    group: np.ndarray
+    count: int
+
+    @classmethod
+    def of_labels(cls, label: np.ndarray) -> Groups:
+        """Return the groups of equal labels (n,); negative labels are in none."""
+        row = np.flatnonzero(label >= 0)
+        return cls(row, label[row], int(label.max(initial=-1)) + 1)
+
+    def among(self, rows: np.ndarray) -> Groups:
+        """Return the groups with members from a mask (n,) only."""
+        kept = rows[self.row]
+        return Groups(self.row[kept], self.group[kept], self.count)
+
+    def members(self, group: int, n: int) -> np.ndarray:
+        """Return the mask (n,) of a group's members."""
+        rows = np.zeros(n, dtype=bool)
+        rows[self.row[self.group == group]] = True
+        return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Units:
+    """Which of n values err alike.
+
+    Attributes:
+        passing: unit (n,) of values whose errors are alike at one time.
+        lasting: unit (n,) of values whose errors are alike at all times; there are few large ones.
+    """
+
+    passing: np.ndarray
+    lasting: np.ndarray
+
+    def spread(self, values: np.ndarray, rows: np.ndarray) -> float:
+        """Return the standard deviation of lasting units' means, of values (n,) in a mask (n,).
+
+        Not a robust one: how heavy its tails are is what makes a small group stand out by chance.
+        """
+        label = np.unique(self.lasting[rows], return_inverse=True)[1].ravel()
+        number = np.bincount(label)
+        mean = np.bincount(label, values[rows]) / number
+        several = number >= MIN_ALIKE
+        if several.sum() < MIN_UNITS:
+            return float(np.std(values[rows]))
+        return float(np.std(mean[several]))
+
+
+@dataclass(frozen=True, eq=False)
+class Statistic:
+    """A statistic of each of k groups; NaN where a group is too small.
+
+    Attributes:
+        value: (k,).
+        error: (k,) its standard error, units counted once.
+        units: (k,) effective number of lasting units.
+    """
+
+    value: np.ndarray
+    error: np.ndarray
+    units: np.ndarray
+
+
+def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    """Return the median (count,) of the values (m,) of each group (m,); NaN of an empty one."""
+    order = np.lexsort((values, group))
+    ordered, begin = values[order], np.searchsorted(group[order], np.arange(count + 1))
+    size = np.diff(begin)
+    found = np.full(count, np.nan)
+    some = size > 0
+    low, high = begin[:-1] + (size - 1) // 2, begin[:-1] + size // 2
+    found[some] = 0.5 * (ordered[low[some]] + ordered[high[some]])
+    return found
+
+
+def levels(values: np.ndarray, groups: Groups, units: Units, lasting_sd: float,
+           least_scale: float) -> Statistic:
+    """Return the level of each group: Huber's estimate, one step from the median.
+
+    Args:
+        values: (n,) without NaN among the members.
+        groups: of them.
+        units: of the values.
+        lasting_sd: standard deviation of lasting units' means.
+        least_scale: of a group's values, such as the step that they are rounded to.
+    """
+    x, group, count = values[groups.row], groups.group, groups.count
+    middle = medians(x, group, count)
+    scale = np.maximum(1.4826 * medians(np.abs(x - middle[group]), group, count), least_scale)
+    deviation = (x - middle[group]) / scale[group]
+    inside = np.maximum(np.bincount(group, np.abs(deviation) < HUBER, count), 1.0)
+    value = middle + scale * np.bincount(group, np.clip(deviation, -HUBER, HUBER), count) / inside
+    pull = np.clip((x - value[group]) / scale[group], -HUBER, HUBER)
+    return _judged(value, scale / inside, pull, groups, units, lasting_sd)
+
+
+def log_scatters(values: np.ndarray, groups: Groups, units: Units, lasting_sd: float,
+                 scale: np.ndarray) -> Statistic:
+    """Return the logarithm of each group's mean absolute deviation from its own median.
+
+    Args:
+        values: (n,) without NaN among the members.
+        groups: of them.
+        units: as of `levels`.
+        lasting_sd: of the logarithm's lasting units' means.
+        scale: (n,) usual scale of each value, of which one counts `MAX_SCALES` at most.
+    """
+    x, group, count = values[groups.row], groups.group, groups.count
+    middle = medians(x, group, count)
+    size = np.minimum(np.abs(x - middle[group]) / scale[groups.row], MAX_SCALES)
+    number = np.maximum(np.bincount(group, minlength=count), 1)
+    mean = np.maximum(np.bincount(group, size, count) / number, 1e-3)
+    return _judged(np.log(mean), 1 / (number * mean), size - mean[group], groups, units, lasting_sd)
+
+
+def means(values: np.ndarray, groups: Groups, units: Units, lasting_sd: float) -> Statistic:
+    """Return the mean of each group, such as a share; arguments as of `levels`."""
+    x, group, count = values[groups.row], groups.group, groups.count
+    number = np.maximum(np.bincount(group, minlength=count), 1)
+    mean = np.bincount(group, x, count) / number
+    return _judged(mean, 1 / number, x - mean[group], groups, units, lasting_sd)
+
+
+def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Groups,
+            units: Units, lasting_sd: float) -> Statistic:
+    """Return a statistic with the larger of two errors.
+
+    They are the sandwich over passing units, whose influences are `pull` (m,) times `step`, and
+    what the lasting units leave.
+    """
+    group, count = groups.group, groups.count
+    pair, of_pair = _pairs(group, units.passing[groups.row])
+    several = np.bincount(of_pair, minlength=count)
+    squares = np.bincount(of_pair, np.bincount(pair, pull) ** 2, count)
+    sandwich = step * np.sqrt(squares * several / np.maximum(several - 1, 1))
+    pair, of_pair = _pairs(group, units.lasting[groups.row])
+    share = np.bincount(pair)
+    number = np.bincount(group, minlength=count)
+    lasting = number**2 / np.maximum(np.bincount(of_pair, share.astype(float) ** 2, count), 1)
+    error = np.maximum(sandwich, lasting_sd / np.sqrt(np.maximum(lasting, 1.0)))
+    enough = (number >= MIN_VALUES) & (several >= MIN_UNITS)
+    return Statistic(*(np.where(enough, each, np.nan) for each in (value, error, lasting)))
+
+
+def _pairs(group: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pair (m,) of each group (m,) and unit (m,), and the group of each pair."""
+    size = np.int64(unit.max(initial=0) + 1)
+    pairs, pair = np.unique(group * size + unit, return_inverse=True)
+    return pair.ravel(), pairs // size
+
+
+@dataclass(frozen=True, eq=False)
+class Apart:
+    """How far k groups are from their peers.
+
+    Attributes:
+        size: (k,) distance from the peers' centre; NaN where a group is not judged.
+        error: (k,) its standard error, the centre's included.
+        spread: (k,) standard deviation of the peers themselves.
+        dof: (k,) degrees of freedom of the spread.
+    """
+
+    size: np.ndarray
+    error: np.ndarray
+    spread: np.ndarray
+    dof: np.ndarray
+
+    @property
+    def score(self) -> np.ndarray:
+        """(k,) distance over error and spread together."""
+        return self.size / np.hypot(self.error, self.spread)
+
+    def log_odds(self, outlier_sd: float, prior_odds: float) -> np.ndarray:
+        """Return the log odds (k,) that a group is not one of its peers; NaN = not judged.
+
+        Args:
+            outlier_sd: scale of the sizes of what stands out, Student's t around 0.
+            prior_odds: that one group of all k stands out, shared among those that are judged.
+        """
+        total, judged = np.hypot(self.error, self.spread), np.isfinite(self.size)
+        like_peers = student_t.logpdf(self.size, self.dof, scale=total)
+        anywhere = student_t.logpdf(self.size, OUTLIER_DOF, scale=np.hypot(total, outlier_sd))
+        return anywhere - like_peers + np.log(prior_odds / max(judged.sum(), 1))
+
+
+def apart(found: Statistic, prior_spread: float) -> Apart:
+    """Return how far each group is from its peers, whose spread is shrunk to a prior."""
+    value, error = found.value, found.error
+    size, total = np.full(len(value), np.nan), np.full(len(value), np.nan)
+    spread, dof = total.copy(), total.copy()
+    judged = np.flatnonzero(np.isfinite(value))
+    if len(judged) < 2:
+        return Apart(size, total, spread, dof)
+    own, squares = value[judged], error[judged] ** 2
+    if len(judged) <= LEAVE_OUT:
+        others = ~np.eye(len(judged), dtype=bool)
+        own_peers = np.broadcast_to(own, others.shape)[others].reshape(len(judged), -1)
+        of_peers = np.broadcast_to(squares, others.shape)[others].reshape(len(judged), -1)
+    else:
+        own_peers, of_peers = own[None], squares[None]
+    peers = own_peers.shape[1]
+    centre = np.median(own_peers, axis=1)
+    noise = np.maximum(np.median(of_peers, axis=1), TINY)
+    seen = (1.4826 * np.median(np.abs(own_peers - centre[:, None]), axis=1)) ** 2
+    # Peers may be closer together than their errors say, which are of the worst case.
+    weight = peers - 1.0
+    usual = (weight * seen + PEER_WEIGHT * (prior_spread**2 + noise)) / (weight + PEER_WEIGHT)
+    size[judged] = own - centre
+    total[judged] = np.sqrt(squares * np.minimum(usual / noise, 1.0) + 1.57 / peers * usual)
+    spread[judged] = np.sqrt(np.maximum(usual - noise, 0.0))
+    # A mean of few units has the tails of one unit.
+    dof[judged] = 1 / (1 / (weight + PRIOR_DOF) + 0.5 / found.units[judged])
+    return Apart(size, total, spread, dof)
+
+
+def together(parts: list[Apart]) -> Apart:
+    """Return distances of the same groups in several parts of the data, weighted by precision."""
+    if len(parts) == 1:
+        return parts[0]
+    sizes = np.array([each.size for each in parts])
+    known = np.isfinite(sizes)
+    variance = np.array([each.error**2 + each.spread**2 for each in parts])
+    weight = np.where(known, 1 / np.where(known, variance, 1.0), 0.0)
+    total = weight.sum(axis=0)
+    share = weight / np.where(total > 0, total, 1.0)
+    missing = ~known.any(axis=0)
+
+    def joined(values: list[np.ndarray], power: int) -> np.ndarray:
+        filled = np.where(known, np.array(values), 0.0)
+        summed = np.sum(share**power * filled**power, axis=0) ** (1 / power)
+        return np.where(missing, np.nan, summed)
+
+    size = np.where(missing, np.nan, np.sum(share * np.where(known, sizes, 0.0), axis=0))
+    return Apart(size, joined([each.error for each in parts], 2),
+                 joined([each.spread for each in parts], 2),
+                 joined([each.dof for each in parts], 1))
+
+
+def polished(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
+    """Return values (n,) less the medians of each label's groups in turn: a median polish."""
+    left = values.copy()
+    for _ in range(POLISH_ROUNDS):
+        for label in labels:
+            left = left - medians(left, label, int(label.max(initial=0)) + 1)[label]
+    return left
+
+
+def without_shared(values: np.ndarray, label: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Return values (n,) less what several groups share in a unit.
+
+    A unit that several groups have been to shows how far they differ where all else is equal. Its
+    own error is estimated beside the groups' levels, by medians in turn, and shrunk to 0.
+
+    Args:
+        values: n values.
+        label: group (n,) of each.
+        unit: (n,) within which errors last.
+    """
+    cell_of, of_group = _pairs(label, unit)
+    size = np.int64(unit.max(initial=0) + 1)
+    cell = np.unique(label * size + unit)
+    of_unit = np.unique(cell % size, return_inverse=True)[1].ravel()
+    middle = medians(values, cell_of, len(cell))
+    visits = np.bincount(of_unit)
+    shrink = np.where(visits > 1, visits / (visits + 1.0), 0.0)
+    shared = np.zeros(len(visits))
+    for _ in range(POLISH_ROUNDS):
+        level = medians(middle - shared[of_unit], of_group, int(of_group.max(initial=0)) + 1)
+        shared = shrink * medians(middle - level[of_group], of_unit, len(visits))
+    return values - shared[of_unit[cell_of]]
