@@ -43,7 +43,7 @@ from radiotwin.effects.registry import catalogue
 from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, prepare_links
-from radiotwin.links.checks import refuse_misplaced_anchors
+from radiotwin.links.checks import stand_anchors
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.links.measurements import Measurements
 from radiotwin.links.thinning import thin_links
@@ -187,8 +187,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
                        "base log-distance")
     criteria = criteria or SelectionCriteria()
     all_links = prepare_links(measurements, scene)
-    if scene is not None and base != LogDistanceBase.name:  # which needs no line of sight
-        refuse_misplaced_anchors(all_links, scene)
+    if scene is not None:  # the log-distance law needs no line of sight
+        all_links = stand_anchors(all_links, scene, refuse=base != LogDistanceBase.name)
     links = limits_to_explain(thin_links(all_links, seed))
     folds = make_folds(links, seed, hold_out)
     names = [base]

@@ -41,6 +41,7 @@ from radiotwin.io.texts import percent
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
+from radiotwin.scene.footing import footing
 from radiotwin.twin import Twin
 
 SCHEMA = "radiotwin.coverage/1"
@@ -157,7 +158,7 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
                                "other transmitters than it was made for; leave it out with "
                                "--devices, or give a twin or a scene")
     if given is not None:
-        _check_outdoors(found, scene)
+        found = _outdoors(found, scene)
     tx_power_dbm = settings.tx_power_dbm
     if isinstance(source, Twin) and not source.has_gains:
         if tx_power_dbm is not None:
@@ -170,18 +171,33 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
     return with_defaults(found, scene, tx_power_dbm, settings.load)
 
 
-def _check_outdoors(transmitters: list[Transmitter], scene: Scene) -> None:
-    """Raise BadInput about a transmitter inside a building; a scene's own are checked before."""
+def _outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Transmitter]:
+    """Return transmitters outside buildings; a scene's own are checked before.
+
+    Warns:
+        One is inside by no more than a map is off, and is moved.
+
+    Raises:
+        BadInput: one is inside by more.
+    """
+    found = []
     for each in transmitters:
         x_m, y_m, z_m = each.position_m
         where = str(scene.city.misplaced(each.position_m)[0])
-        if where:
+        outside = footing(scene.city, each.position_m) if where else None
+        if outside is not None:
+            warnings.warn(f"transmitter {each.name} would be inside a building of the map or below "
+                          f"its ground, by no more than a map is off: moved {outside.move}",
+                          stacklevel=4)
+            each = replace(each, position_m=outside.point_m)
+        elif where:
             top_m = float(scene.city.height_at(x_m, y_m))
             raise BadInput(f"transmitter {each.name!r} at ({x_m:g}, {y_m:g}, {z_m:g}) m is {where}"
-                           + (f" {top_m:.1f} m high; move it, or put it on the roof (z_m > "
-                              f"{top_m:.1f})" if where == "inside a building" else
-                              "; z_m counts from the datum: raise it" if where == "below the ground"
-                              else " of the city; move it 0.01 m or more off it"))
+                           + ("; z_m counts from the datum: raise it" if where == "below the ground"
+                              else f" {top_m:.1f} m high; move it, or put it on the roof (z_m > "
+                                   f"{top_m:.1f})"))
+        found.append(each)
+    return found
 
 
 def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Transmitter],

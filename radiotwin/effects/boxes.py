@@ -13,7 +13,7 @@ from radiotwin.effects.params import Length, Metres
 from radiotwin.inference.student import DOF
 from radiotwin.links import Links
 from radiotwin.propagation import terrain
-from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.citymap import HEIGHT_SD_M, CityMap
 
 SAMPLE_M = 5.0  # between points on a link, while it is back-projected
 CELL_M = 12.5  # side of a cell of the back-projection
@@ -27,9 +27,6 @@ SAME_PLACE_M = 10.0  # devices of one mast
 BESIDE_UNKNOWN = ("only links of devices whose positions are estimated pass it: they may be "
                   "elsewhere")
 WELD_M = 0.05  # vertices closer together belong to one building
-# Standard deviation of a height: the default, and a lower bound. With less, other shadows beside a
-# roof are fitted by small errors of its height.
-HEIGHT_SD_M = 3.0  # one storey
 
 
 class Box(NamedTuple):
@@ -385,4 +382,5 @@ def building_height_sds_m(city: CityMap) -> np.ndarray:
     known = np.isfinite(city.height_sd_m)
     faces = np.bincount(label[known], minlength=len(centres_m))
     sums = np.bincount(label[known], weights=city.height_sd_m[known], minlength=len(centres_m))
+    # With less, other shadows beside a roof are fitted by small errors of its height.
     return np.maximum(sums / np.maximum(faces, 1), HEIGHT_SD_M)

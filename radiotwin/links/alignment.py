@@ -1,6 +1,7 @@
 """Measurements in the frame of a scene: converted where both are known, checked where not."""
 
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -11,14 +12,17 @@ from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.checks import map_corners_m, outside_map
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
+from radiotwin.scene.footing import MAX_SDS, WALL_SD_M
 
 MAX_MISPLACED = 0.05  # share of the links inside buildings, or outside the map, that may be right
 SEARCHED_M, COARSE_M, FINE_M = 500.0, 10.0, 2.0  # translations that are tried, along each axis
 MAX_POINTS = 4_000  # receiver positions that are tried
 MAX_CELLS = 4_000_000  # of the grid of what is built; bounds the memory
 AROUND_M = 30.0  # standard deviation of the surroundings that a position is compared with
+AGREE_M = MAX_SDS * WALL_SD_M  # a translation that errors of a map and of positions explain
 MAX_OUTSIDE = 0.5  # share of the receivers off the map, after a translation that the user gives
 MIN_CONTRAST = 5.0  # standard deviations, from which a translation is proposed
+CLEAR = 2.0  # from which receivers keep clear of buildings
 
 
 def in_scene_frame(measurements: Measurements, scene: Scene,
@@ -27,7 +31,7 @@ def in_scene_frame(measurements: Measurements, scene: Scene,
 
     Where both say where on the earth they lie, what differs is converted exactly. Where one does
     not, the frames are taken for the same if the receivers fit: few inside buildings, few outside
-    the map.
+    the map, or no translation fits better than one within the errors of a map and of positions.
 
     Args:
         measurements: with or without an origin.
@@ -35,7 +39,8 @@ def in_scene_frame(measurements: Measurements, scene: Scene,
         shift_m: to add to x and y after that [m]; (0, 0) says that the frames are the same.
 
     Warns:
-        Positions were converted, with how far they moved.
+        Positions were converted, with how far they moved; or many receivers are inside buildings,
+        and no translation fits clearly better than none.
 
     Raises:
         BadInput: the frames cannot be related and the receivers do not fit; with the translation
@@ -93,7 +98,7 @@ def _refuse_off_map(measurements: Measurements, scene: Scene,
 
 
 def _require_fit(measurements: Measurements, scene: Scene) -> None:
-    """Raise BadInput where receivers do not fit into the scene, with what would make them fit."""
+    """Warn where receivers fit badly; raise BadInput where a translation would make them fit."""
     receiver_m = measurements.receiver_m
     receiver_m = receiver_m[np.isfinite(receiver_m).all(axis=1)]
     if not len(receiver_m):
@@ -105,20 +110,57 @@ def _require_fit(measurements: Measurements, scene: Scene) -> None:
     outside = outside_map(receiver_m, scene).mean()
     if inside <= MAX_MISPLACED and outside <= MAX_MISPLACED:
         return
+    ground = "" if scene.city.terrain is None else " or below the ground"
+    odd = (f"{inside:.1%} of the receivers are inside buildings{ground} and {outside:.1%} outside "
+           "the 3D map")
+    search = _search(scene, receiver_m)
+    if search is not None and search.agrees:
+        warnings.warn(f"{odd}. Measurements and scene are taken to be in one frame: receivers keep "
+                      "clear of the buildings, and no translation fits clearly better than none",
+                      stacklevel=3)
+        return
+    proposed = None if search is None else search.proposed
     unknown = [what for what, origin in (("the measurements", measurements.origin),
                                          ("the scene", scene.config.origin)) if origin is None]
-    proposed = best_shift(scene, receiver_m)
     remedy = f"no translation within {SEARCHED_M:g} m makes them fit (feet and degrees are not " \
              "converted)" \
         if proposed is None else \
         f"--shift={proposed[0]:g},{proposed[1]:g} would make them fit best"
-    ground = "" if scene.city.terrain is None else " or below the ground"
     raise BadInput(
-        f"measurements and scene are not in one frame: {inside:.1%} of the receivers are inside "
-        f"buildings{ground} and {outside:.1%} outside the 3D map, and where on the earth x = y = 0 "
+        f"measurements and scene are not in one frame: {odd}, and where on the earth x = y = 0 "
         f"lies is not known of {' and of '.join(unknown)}. {remedy}. Better: import with --origin, "
         "and build the scene from a map or with --origin; then positions are converted. If the "
         "frames are the same and receivers are indoors: --shift=0,0")
+
+
+@dataclass(frozen=True)
+class Search:
+    """Translations of receivers over a map, by how they keep clear of the buildings.
+
+    A contrast is the number of receivers in buildings less what the density of buildings around
+    each of them lets expect, in standard deviations.
+
+    Attributes:
+        best_m: x and y of the translation with the least contrast [m].
+        best: its contrast.
+        near: the least contrast within `AGREE_M` of no translation.
+        tried: number of translations.
+    """
+
+    best_m: tuple[float, float]
+    best: float
+    near: float
+    tried: int
+
+    @property
+    def proposed(self) -> tuple[float, float] | None:
+        """The best translation; None where it does not stand out."""
+        return self.best_m if self.best <= -MIN_CONTRAST else None
+
+    @property
+    def agrees(self) -> bool:
+        """Whether receivers keep clear as they are, and the best of many tried does by chance."""
+        return self.near <= -CLEAR and (self.best**2 - self.near**2) / 2 < np.log(self.tried)
 
 
 def best_shift(scene: Scene, receiver_m: np.ndarray) -> tuple[float, float] | None:
@@ -137,6 +179,12 @@ def best_shift(scene: Scene, receiver_m: np.ndarray) -> tuple[float, float] | No
     Returns:
         x, y to add [m]; None where no translation stands out.
     """
+    search = _search(scene, receiver_m)
+    return None if search is None else search.proposed
+
+
+def _search(scene: Scene, receiver_m: np.ndarray) -> Search | None:
+    """Compare translations of receivers (n, 3) [m]; None where none takes them onto the map."""
     (low_m, high_m), reach_m = map_corners_m(scene), SEARCHED_M + 2 * COARSE_M
     low_m = np.maximum(low_m, receiver_m[:, :2].min(axis=0) - reach_m)
     high_m = np.minimum(high_m, receiver_m[:, :2].max(axis=0) + reach_m)
@@ -159,10 +207,14 @@ def best_shift(scene: Scene, receiver_m: np.ndarray) -> tuple[float, float] | No
         excess = built[cells].sum() - density.sum() + (~on_map).sum()
         return float(excess / np.sqrt((density * (1 - density)).sum() + 1.0))
 
-    best = (0.0, 0.0)
-    for around_m, step_m in ((SEARCHED_M, COARSE_M), (2 * COARSE_M, FINE_M)):
+    def least(centre_m: tuple[float, float], around_m: float, step_m: float
+              ) -> tuple[float, tuple[float, float]]:
         steps_m = np.arange(-around_m, around_m + step_m, step_m).tolist()
-        best = min(((best[0] + east_m, best[1] + north_m)
-                    for east_m in steps_m for north_m in steps_m),
-                   key=lambda shift_m: contrast(*shift_m))
-    return best if contrast(*best) <= -MIN_CONTRAST else None
+        shifts = [(centre_m[0] + east_m, centre_m[1] + north_m)
+                  for east_m in steps_m for north_m in steps_m]
+        return min((contrast(*shift_m), shift_m) for shift_m in shifts)
+
+    near, _ = least((0.0, 0.0), AGREE_M, FINE_M)
+    _, coarse_m = least((0.0, 0.0), SEARCHED_M, COARSE_M)
+    best, best_m = least(coarse_m, 2 * COARSE_M, FINE_M)
+    return Search(best_m, best, near, int(2 * SEARCHED_M / COARSE_M + 1) ** 2)

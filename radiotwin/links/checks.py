@@ -17,6 +17,7 @@ from radiotwin.links.links import Links
 from radiotwin.links.measurements import MAX_APART_M, Measurements
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.footing import MAX_SDS, WALL_SD_M, footing
 
 MAX_FLOWN_M = 500.0  # above the ground: more than three times what UAVs may (120 m, EU 2019/947)
 HIGH_M = 200.0  # above the ground, from which altitudes above the sea are suspected
@@ -244,11 +245,19 @@ def receiver_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
             if odd.any()] + height_notes(receiver_m, scene)
 
 
-def refuse_misplaced_anchors(links: Links, scene: Scene) -> None:
-    """Check that anchors are where a device can be.
+def stand_anchors(links: Links, scene: Scene, refuse: bool = True) -> Links:
+    """Return links with anchors outside the buildings and above the ground of the map.
+
+    One that is inside by no more than roofs, walls and the ground of a map are off is moved to
+    where it can stand, with a note; see `radiotwin.scene.footing`.
+
+    Args:
+        links: over the map of the scene.
+        scene: the 3D map.
+        refuse: whether one that no error of a map explains is bad input; else it stays inside.
 
     Raises:
-        BadInput: one is far from the receivers, inside a building, or below the ground.
+        BadInput: an anchor is far from the receivers, or no error of a map explains where it is.
     """
     anchors = np.array(sorted(links.anchors), dtype=int)
     anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
@@ -257,12 +266,28 @@ def refuse_misplaced_anchors(links: Links, scene: Scene) -> None:
         raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} is more "
                        f"than {MAX_APART_M / 1000:g} km from the middle of the receivers; both "
                        "need one frame, in metres")
-    misplaced = scene.city.misplaced(links.device_m[anchors])
+    device_m = links.device_m.copy()
+    moved: dict[str, list[str]] = {}  # by what was done: sectors of a mast move together
+    misplaced = scene.city.misplaced(device_m[anchors])
     for index, where in zip(anchors[misplaced != ""], misplaced[misplaced != ""]):
-        x_m, y_m, z_m = links.device_m[index]
-        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} at "
-                       f"({x_m:g}, {y_m:g}, {z_m:g}) m is {where} of the scene; correct "
-                       "its position, or the scene's frame")
+        name, (x_m, y_m, z_m) = links.device_names[index], device_m[index]
+        found = footing(scene.city, device_m[index])
+        if found is not None:
+            device_m[index] = found.point_m
+            moved.setdefault(found.move, []).append(name)
+        elif refuse:
+            top_m = float(scene.city.height_at(x_m, y_m))
+            raise BadInput(
+                f"devices, row {index + 2}: anchor {name!r} at ({x_m:g}, {y_m:g}, {z_m:g}) m is "
+                f"{where} of the scene, {top_m - z_m:.1f} m below what is highest there, and more "
+                f"than {MAX_SDS * WALL_SD_M:g} m from the outside: more than {MAX_SDS:g} standard "
+                "deviations of a map's errors. Correct its position, or the scene's frame; or set "
+                "its role to unknown, and it is located")
+    if not moved:
+        return links
+    return links.with_devices(device_m).with_notes(*(
+        f"{_named('device', names)} would be inside a building of the map or below its ground, by "
+        f"no more than a map is off: moved {move}" for move, names in moved.items()))
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,

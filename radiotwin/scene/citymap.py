@@ -41,6 +41,7 @@ SAME_CORNER_M = 0.01  # corners closer than this are one [m]
 EARTH_RADIUS_M = 8.5e6  # 4/3 of the Earth's, for refraction (ITU-R P.526-15, Sec. 1)
 FAR_M = 5_000.0  # between ends for which the Earth is round [m]; its bulge is 0.4 m there
 BEND_M = 1_000.0  # pieces that are straight of a line of sight over the round Earth
+HEIGHT_SD_M = 3.0  # of a roof of which nothing is said: one storey
 MIN_HEIGHT_SHARE = 0.2  # of a building's height that is left, whatever the error
 _MAX_SD_M, _MAX_AREA_M2 = 1000.0, 1e9
 

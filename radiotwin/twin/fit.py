@@ -12,7 +12,7 @@ from radiotwin.links.checks import (
     COPIED,
     copied_rows,
     refuse_empty_levels,
-    refuse_misplaced_anchors,
+    stand_anchors,
 )
 from radiotwin.links.measurements import Measurements
 from radiotwin.propagation.laws import channel_named
@@ -77,7 +77,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     if not along_paths:
         _check_heights(measurements)
     links = (prepare_links if along_paths else join_links)(measurements, scene)
-    refuse_misplaced_anchors(links, scene)
+    links = stand_anchors(links, scene)
     for note in links.notes:
         warnings.warn(note, stacklevel=2)
     if links.has_boresights:

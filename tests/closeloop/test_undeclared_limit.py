@@ -7,8 +7,6 @@ import pytest
 
 from radiotwin.closeloop.crossfit import LogDistanceBase, cross_validate, make_folds, training_parts
 from radiotwin.closeloop.output.result_file import errors
-from radiotwin.closeloop.run import close_loop
-from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.links.measurements import Measurements
@@ -54,12 +52,3 @@ def test_the_limit_is_that_of_the_readings_and_leaves_no_bias(small_scene):
     assert abs(held_out(links)["bias_db"]) <= 0.5
     claimed = links.with_columns(limit_db=np.full(len(links), DEFAULT_DBM))
     assert abs(held_out(claimed)["bias_db"]) > 2.0
-
-
-def test_an_anchor_on_a_roofs_plane_is_refused_where_lines_of_sight_count(small_scene):
-    """Both are on one; the log-distance law asks for no line of sight."""
-    measured = walked(0, small_scene)
-    assert small_scene.city.inside(np.array(DEVICE_M)).any()
-    for base in ("twin", "raytrace", "auto"):
-        with pytest.raises(BadInput, match="devices, row 2: anchor 'd0' .*on a surface"):
-            close_loop(measured, small_scene, base)

@@ -103,3 +103,17 @@ def test_known_frames_are_converted_and_told(rbm):
 def test_known_frames_let_receivers_be_indoors(rbm):
     inside = measured(walked(rbm, 2, indoors=1.0), THERE)
     assert in_scene_frame(inside, placed(rbm, THERE)) is inside
+
+
+def test_a_ride_with_gps_errors_is_in_the_frame(rbm):
+    """Positions 5 m off and one phone 12 m: many are inside buildings, and a note says so; moved by 60 m they are refused."""
+    rng = np.random.default_rng(4)
+    receiver_m = walked(rbm, 4, 600, indoors=0.0)
+    receiver_m[:, :2] += rng.normal(0, 5.0, (600, 2))
+    receiver_m[:150, 0] += 12.0
+    assert rbm.city.inside(receiver_m).mean() > 0.07
+    with pytest.warns(UserWarning, match="receivers are inside buildings .* no translation fits clearly better"):
+        ride = in_scene_frame(measured(receiver_m), rbm)
+    np.testing.assert_array_equal(ride.receiver_m, receiver_m)
+    with pytest.raises(BadInput, match="not in one frame"):
+        in_scene_frame(measured(receiver_m + [60.0, 0.0, 0.0]), rbm)

@@ -1,5 +1,7 @@
 """Fitting a twin: what it is learnt from, and what is refused or warned of."""
 
+import warnings
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -70,6 +72,25 @@ def test_an_anchor_inside_a_building_is_bad_input(small_scene, flown):
     devices.loc[0, ["x_m", "y_m"]] = 130.0, 170.0
     with pytest.raises(BadInput, match="devices, row 2: anchor 'd0' .*inside a building"):
         fit_twin(Measurements(flown.table, devices), small_scene, model="segmented_log_distance", seed=0)
+
+
+def test_an_anchor_just_below_a_roof_of_the_map_stands_on_it(small_scene, flown):
+    """Its links are those of a device just above the roof, and a note says how far it was moved."""
+    devices = flown.devices.copy()
+    devices.loc[0, ["x_m", "y_m"]] = 130.0, 170.0
+    roof_m = float(small_scene.city.height_at(130.0, 170.0))
+    fits = {}
+    for above_m in (-0.4, 0.5):
+        devices.loc[0, "z_m"] = roof_m + above_m
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            fits[above_m] = fit_twin(Measurements(flown.table, devices), small_scene, model="segmented_log_distance")
+        moved = [str(each.message) for each in said if "device d0 would be inside" in str(each.message)]
+        assert [text.split("moved ")[1][:40] for text in moved] == (
+            ["0.9 m up, to 0.5 m above the roof, which"] if above_m < 0 else [])
+    np.testing.assert_allclose(fits[-0.4].device_m, fits[0.5].device_m, atol=1e-3)
+    below_db, above_db = (each.radio_map(small_scene).gain_db for each in fits.values())
+    np.testing.assert_allclose(below_db, above_db, atol=0.02)
 
 
 def test_receivers_off_the_map_are_mentioned(small_scene, flown):

@@ -1,0 +1,99 @@
+"""Where a device stands whose place the map has inside a building or below the ground.
+
+Roofs, walls and the ground of a map are off. A mast on a roof that is mapped too high is inside
+the building, and so is a lamp at a wall that is mapped too far out. Such a device is moved to where
+the smallest of these errors, in its standard deviations, would put the surface: to just above the
+roof or the ground, or to just outside the wall.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from radiotwin.scene.citymap import DOWN, HEIGHT_SD_M, CityMap
+
+CLEARANCE_M = 0.5  # of a device from the surface that it is moved out of
+WALL_SD_M = 2.0
+"""Of a wall, across it: outlines of OpenStreetMap lie 4 m from those of a survey on average, most
+of it in common with their neighbours, and surveyed ones decimetres (Fan, Zipf, Fu and Neis 2014,
+'Quality assessment for building footprints data on OpenStreetMap', IJGIS 28)."""
+GROUND_SD_M = 2.4  # Copernicus DEM: within 4 m at 90 %
+MAX_SDS = 3.0  # errors beyond are not a map's
+STEP_M, DIRECTIONS = 0.1, 72  # of the search for the nearest wall
+
+
+@dataclass(frozen=True, eq=False)
+class Footing:
+    """The nearest place outside.
+
+    Attributes:
+        point_m: (3,) x, y, z [m].
+        sds: error of the map that explains it, in its standard deviations.
+        move: what was done, in words.
+    """
+
+    point_m: np.ndarray
+    sds: float
+    move: str
+
+
+def footing(city: CityMap, point_m: np.ndarray) -> Footing | None:
+    """Return where a device (3,) [m] inside a building or below the ground stands.
+
+    Returns:
+        the place that the smallest error of the map explains, at most `MAX_SDS` standard
+        deviations; None where there is none.
+    """
+    found = [each for each in (_above(city, point_m, to_ground=True),
+                               _above(city, point_m, to_ground=False), _beside(city, point_m))
+             if each is not None and each.sds <= MAX_SDS]
+    return min(found, key=lambda each: each.sds, default=None)
+
+
+def _above(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | None:
+    """Return the place just above the ground, or above the roof; None inside a building."""
+    x_m, y_m, z_m = point_m.tolist()
+    ground_m = float(city.ground_height_m(x_m, y_m))
+    surface_m, sd_m, what = ground_m, GROUND_SD_M, "the ground"
+    if not to_ground:
+        surface_m, sd_m, what = *_roof_m(city, x_m, y_m), "the roof"
+    there_m = np.array([x_m, y_m, surface_m + CLEARANCE_M])
+    if surface_m < z_m or (not to_ground and surface_m <= ground_m) or city.inside(there_m)[0]:
+        return None
+    return Footing(there_m, (surface_m - z_m) / sd_m,
+                   f"{there_m[2] - z_m:.1f} m up, to {CLEARANCE_M:g} m above {what}, which the map "
+                   f"has {surface_m - z_m:.1f} m too high (standard deviation {sd_m:.1f} m)")
+
+
+def _roof_m(city: CityMap, x_m: float, y_m: float) -> tuple[float, float]:
+    """Return the height of the roof at a place, and its standard deviation [m]."""
+    above_m = np.array([[x_m, y_m, city.vertices[:, 2].max() + 1.0]])
+    distance_m, face, _ = city.first_hits_towards(above_m, DOWN)
+    if face[0] < 0:
+        return -np.inf, HEIGHT_SD_M
+    sd_m = np.nan if city.height_sd_m is None else float(city.height_sd_m[face[0]])
+    return float(above_m[0, 2] - distance_m[0]), HEIGHT_SD_M if np.isnan(sd_m) else sd_m
+
+
+def _beside(city: CityMap, point_m: np.ndarray) -> Footing | None:
+    """Return the place just outside the nearest wall; None where it is too far."""
+    steps_m = np.arange(0.0, MAX_SDS * WALL_SD_M, STEP_M) + STEP_M
+    angle_rad = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    towards = np.column_stack([np.sin(angle_rad), np.cos(angle_rad), np.zeros(DIRECTIONS)])
+    free = np.ones((len(steps_m), DIRECTIONS), dtype=bool)
+    for beyond_m in (0.0, CLEARANCE_M):  # the next building may be close
+        places_m = point_m + (steps_m + beyond_m)[:, None, None] * towards
+        free &= ~city.inside(places_m.reshape(-1, 3)).reshape(free.shape)
+    if not free.any():
+        return None
+    nearest = int(free.any(axis=1).argmax())
+    wall_m, ways = float(steps_m[nearest]), towards[free[nearest]]
+    across = ways.sum(axis=0) / max(np.linalg.norm(ways.sum(axis=0)), 1e-9)
+    for direction in (across, ways[0]):  # between two walls their mean is no way out
+        there_m = point_m + (wall_m + CLEARANCE_M) * direction
+        if not city.inside(there_m)[0]:
+            break
+    return Footing(there_m, wall_m / WALL_SD_M,
+                   f"{wall_m + CLEARANCE_M:.1f} m sideways, to {CLEARANCE_M:g} m outside the wall, "
+                   f"which the map has {wall_m:.1f} m too far out (standard deviation "
+                   f"{WALL_SD_M:g} m)")
