@@ -269,15 +269,23 @@ def close_loop(
 
 
 def _print(report: dict[str, Any]) -> None:
+    from radiotwin.report import anomaly_words
     from radiotwin.report.labels import name_label
 
     for note in report["notes"]:
         say(f"note: {note}")
+    anomalies = anomaly_words.rows(report)
+    if anomalies:
+        print_rows("What stands out", dict(zip(
+            anomaly_words.COLUMNS, ("left", "left", "right", "right", "right", "right", "left"),
+            strict=True)), anomalies)
     error = report["error"]
     groups = [(name, both) for name, both in (("all", error), *error["by_los"].items())
               if both["before"]["n"]]
-    rows = [[name, when, *(_number(both[when][key]) for key in ("rmse_db", "mae_db", "bias_db"))]
-            for name, both in groups for when in ("before", "after")]
+    scores = ("rmse_db", "mae_db", "bias_db")
+    rows = [[name, name_label(when), *(_number(both[when][key]) for key in scores)]
+            for name, both in groups
+            for when in ("before", "after", "after_with_quality") if both.get(when)]
     rows += [[name_label(name), "", value["rmse_db"], float("nan"), float("nan")]
              for name, value in report["baselines"].items()]
     print_rows(
@@ -298,7 +306,9 @@ def _estimate(estimate: dict[str, Any]) -> list[float | str]:
     if is_reference(estimate):
         return ["reference", float("nan"), float("nan")]
     value, low, high = (_number(estimate[key]) for key in ("value", "low", "high"))
-    return [value if estimate.get("determined", True) else "not determined", low, high]
+    if not estimate.get("determined", True):
+        return ["not determined", float("nan"), float("nan")]
+    return [value, low, high]
 
 
 def _number(value: float | None) -> float:

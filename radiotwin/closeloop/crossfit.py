@@ -16,6 +16,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.special import logsumexp
 from typing_extensions import override
 
 from radiotwin.errors import BadInput
@@ -39,6 +40,7 @@ MIN_BLOCKS = 10
 MIN_CLUSTERS = 6  # places that are held out one by one
 STRETCHES = 4  # of each fold, where nothing moves
 MAX_ENDS = 500  # more are positions of one end that moves, and need not return
+QUALITIES = 16  # quantiles of the column `quality` that a map's prediction is averaged over
 MAX_RADIUS_M = 100.0  # of a device's circle by the law, for paths to be followed to locate it
 
 
@@ -312,6 +314,26 @@ class CrossFit:
             fold.usable, mean_if_detected(*reading, fold.model.limit_db, fold.model.dof,
                                           fold.model.losses), np.nan))
 
+    @property
+    def reads_quality(self) -> bool:
+        """Whether an effect reads the links' own quality, which no map has."""
+        return self.links.quality is not None and any(
+            "quality" in each.uses for each in self.whole.effects)
+
+    @cached_property
+    def on_map(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) held-out mean [dB] and (n,) negative log-likelihood [nats], as a map has them.
+
+        A map does not know a link's own quality: the prediction is averaged over that of the
+        training links.
+        """
+        if not self.reads_quality:
+            return self.held_out_mean_db, self.held_out_nll
+        shares = (np.arange(QUALITIES) + 0.5) / QUALITIES
+        each = [_with_quality(self, share) for share in shares.tolist()]
+        return (np.mean([model.held_out_mean_db for model in each], axis=0),
+                np.log(QUALITIES) - logsumexp([-model.held_out_nll for model in each], axis=0))
+
     @cached_property
     def unforeseen(self) -> np.ndarray:
         """(n,) bool, links on which a fault acts that was not there when their fold learnt.
@@ -328,9 +350,11 @@ class CrossFit:
 
     def rmse_db(self, rows: np.ndarray | None = None) -> float:
         """Return the held-out RMSE of the detected links of a mask (n,), or of all [dB]."""
-        error = self.links.level_db - self.held_out_mean_db
-        error = error if rows is None else error[rows]
-        return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
+        return _rms(self.links.level_db - self.held_out_mean_db, rows)
+
+    def rmse_on_map_db(self) -> float:
+        """Return the held-out RMSE of all detected links, as a map has it [dB]."""
+        return _rms(self.links.level_db - self.on_map[0])
 
     @cached_property
     def held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
@@ -376,20 +400,22 @@ def _on_the_same_links(whole: Fit, fold: Fit, of_whole: list[int],
             if as_many or shared[row, column] > 1e-9]
 
 
-def without_quality(model: CrossFit) -> CrossFit:
-    """Return a model whose links do not know their own quality, as no map does.
+def _rms(error: np.ndarray, rows: np.ndarray | None = None) -> float:
+    error = error if rows is None else error[rows]
+    return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
 
-    Each has the median of its fold's training links instead; nothing is fitted again.
+
+def _with_quality(model: CrossFit, share: float) -> CrossFit:
+    """Return a model whose held-out links all have one quality, a quantile of the training links'.
+
+    Nothing is fitted again.
     """
-    if model.links.quality is None:
-        return model
-
     def blind(each: Fit) -> Fit:
-        quality = each.links.quality
-        assert quality is not None
-        known = quality[each.train & np.isfinite(quality)]
-        usual = float(np.median(known)) if len(known) else np.nan
-        links = each.links.with_columns(quality=np.full(len(quality), usual))
+        own = each.links.quality
+        assert own is not None
+        known = own[each.train & np.isfinite(own)]
+        usual = float(np.quantile(known, share)) if len(known) else np.nan
+        links = each.links.with_columns(quality=np.where(each.train, own, usual))
         terms = tuple(term if "quality" not in effect.uses
                       else effect.term(links, each.model.level_at)
                       for effect, term in zip(each.effects, each.model.terms, strict=True))

@@ -69,13 +69,6 @@ def vary_patterns(effect: Effect, end: str) -> Variation:
                      list(np.arange(values.size).reshape(members, -1)))
 
 
-def allowed_of(name: str, field: dict[str, Any]) -> Allowed:
-    """Return the allowed values of a field of `quantities`; azimuths repeat."""
-    if name.endswith("azimuth_deg"):
-        return Allowed(period=360.0)
-    return Allowed(field["low"], field["high"])
-
-
 def report_patterns(patterns: Mapping[int, EffectParams], params_sd: np.ndarray,
                     names: Sequence[str], prefix: str = "",
                     with_scattered: bool = True) -> dict[str, Parameter]:
@@ -92,10 +85,8 @@ def report_patterns(patterns: Mapping[int, EffectParams], params_sd: np.ndarray,
     for (member, pattern), sd in zip(patterns.items(), np.reshape(params_sd, (len(patterns), -1)),
                                      strict=True):
         for (field, each), field_sd in zip(quantities(pattern).items(), sd, strict=True):
-            value = getattr(pattern, field)
-            value = value % 360 if field.endswith("azimuth_deg") else value
             reported[f"{prefix}{field}[{names[member]}]"] = Parameter.normal(
-                value, field_sd, each["unit"], allowed_of(field, each))
+                getattr(pattern, field), field_sd, each["unit"], Allowed.of(each))
         if not with_scattered:
             reported.popitem()
     return reported
@@ -199,6 +190,7 @@ class SectorEffect(GainEffect):
     """Devices with sector antennas."""
 
     name = "antenna_pattern"
+    in_words = "directions of the device's antenna"
     figure = "pattern"
     of_device = True
     confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle", "foliage")

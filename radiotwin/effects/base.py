@@ -121,6 +121,7 @@ class Effect(ABC):
     Attributes:
         name: as in `closeloop.json`.
         variant: which of several physical forms of that name.
+        in_words: what is said to be the cause where it is one; "" = its name.
         stage: where in the chain it acts, see the module.
         Params: its parameters, a subclass of `EffectParams`.
         figure: key of the figure that shows it (`radiotwin.report`); "" = residual against the
@@ -154,6 +155,7 @@ class Effect(ABC):
 
     name: ClassVar[str]
     variant: ClassVar[str] = ""
+    in_words: ClassVar[str] = ""
     stage: ClassVar[str]
     Params: ClassVar[type[EffectParams]] = EffectParams
     figure: ClassVar[str] = ""
@@ -331,7 +333,7 @@ class Effect(ABC):
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         """Return what was found, by name; by default every parameter made with `quantity`."""
         return {name: Parameter.normal(getattr(self.params, name), sd, each["unit"],
-                                       Allowed(each["low"], each["high"]))
+                                       Allowed.of(each))
                 for (name, each), sd in zip(quantities(self.Params).items(), estimate.params_sd,
                                             strict=True)}
 

@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from radiotwin.effects.arrays import ends_above
-from radiotwin.effects.params import Length, Metres
+from radiotwin.effects.params import Allowed, Length, Metres
 from radiotwin.inference.student import DOF
 from radiotwin.links import Links
 from radiotwin.propagation import terrain
@@ -44,6 +44,11 @@ class Box(NamedTuple):
     width_m: Length
     height_m: Length
     turn_deg: Annotated[float, Field(ge=-3600, le=3600)]
+
+    @staticmethod
+    def allowed(field: str, low: float, high: float) -> Allowed:
+        """Return the values that a field may have within bounds; half a turn changes nothing."""
+        return Allowed(period=180.0) if field == "turn_deg" else Allowed(low, high)
 
     def straightened(self) -> "Box":
         """Return the same box with a turn of at most 45° to each side."""

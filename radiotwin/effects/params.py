@@ -8,6 +8,11 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
 
 QUANTILE_90 = 1.645  # standard deviations to each side of a normal distribution's 90 % interval
+CIRCLE_DEG = 360.0
+# Spans of priors without bounds: 90 % of a level's, whose standard deviation is 20 dB, and of a
+# positive number's, a factor of 100.
+LEVELS_DB, RATIOS = 66.0, float(np.log(100.0))
+MAX_SHARE = 0.5  # of a prior's span, which an interval may have: more is less than one bit learnt
 NEAR_SHARE = 0.5  # of a step: grid on which folds search where each value follows paths
 
 
@@ -81,6 +86,26 @@ class Allowed:
     period: float = np.inf
     is_log: bool = False
 
+    @classmethod
+    def of(cls, field: dict[str, Any]) -> "Allowed":
+        """Return the values of a field of `quantities`; angles that may turn around repeat."""
+        low, high = field["low"], field["high"]
+        if field["unit"] == "deg" and high - low > CIRCLE_DEG:
+            return cls(period=CIRCLE_DEG)
+        return cls(low, high)
+
+    def span(self, unit: str) -> float:
+        """Return how wide a prior over these values is, of the logarithm where ratios count.
+
+        Args:
+            unit: of the values; levels without bounds have the span of `LEVELS_DB`.
+        """
+        if self.is_log:
+            return float(np.log(self.high / self.low)) if 0 < self.low and np.isfinite(self.high) \
+                else RATIOS
+        levels = LEVELS_DB if unit in ("dB", "dBm") else np.inf
+        return float(min(self.high - self.low, self.period, levels))
+
 
 ANY_VALUE, POSITIVE = Allowed(), Allowed(low=0.0, is_log=True)
 
@@ -119,9 +144,27 @@ class Parameter:
         low, high = value * np.exp([-QUANTILE_90 * log_sd, QUANTILE_90 * log_sd])
         return cls(float(value), float(low), float(high), unit, allowed=allowed)
 
+    @property
+    def is_narrow(self) -> bool:
+        """Whether the interval is at most `MAX_SHARE` of what was to be expected before."""
+        ends = np.array([self.low, self.high])
+        if self.allowed.is_log:
+            with np.errstate(divide="ignore"):
+                ends = np.log(ends)
+        return bool(np.ptp(ends) <= MAX_SHARE * self.allowed.span(self.unit))
+
     def record(self) -> dict[str, Any]:
-        """Return what `closeloop.json` has of it."""
-        return {"value": self.value, "low": self.low, "high": self.high, "unit": self.unit,
+        """Return what `closeloop.json` has of it.
+
+        An angle is within one period, and its interval the arc from `low` up to `high`, which may
+        pass 0; an angle that is not determined has none.
+        """
+        value, low, high, period = self.value, self.low, self.high, self.allowed.period
+        if np.isfinite(period):
+            value, low, high = value % period, low % period, high % period
+            if not self.determined:
+                low = high = np.nan
+        return {"value": value, "low": low, "high": high, "unit": self.unit,
                 "determined": self.determined}
 
 

@@ -133,7 +133,7 @@ class LoopData:
         links: measured links, with the devices where the final model has them.
         base: name of the base model.
         before_db: (n,) held-out prediction of the base alone [dB]; NaN: none.
-        after_db: (n,) the same with all effects [dB].
+        after_db: (n,) the same with all effects, as a map has them [dB].
         changed: whether anything was added to the base.
         kept: names of the candidates that were kept, in order, without what belongs to the base.
         drivers: variables that the residual depends on, those before the effects first.
@@ -163,7 +163,7 @@ def collect(loop: Loop) -> LoopData:
     if model.whole.shadowing:
         interpolated_db = model.held_out_shadowing[0] * model.held_out_scales[0]
     return LoopData(
-        links, loop.base, loop.before.held_out_mean_db, model.held_out_mean_db,
+        links, loop.base, loop.before.held_out_mean_db, model.on_map[0],
         model is not loop.before,
         [trial.name for trial in loop.found.log.kept][in_base:],
         [each.variable for each in dependences or before[:3]], _effects(loop, links),

@@ -24,6 +24,7 @@ from radiotwin.report.closeloop_data import (
     bin_means,
     collect,
 )
+from radiotwin.report.group_figures import groups_figure
 from radiotwin.report.labels import (
     AFTER,
     BEFORE,
@@ -270,13 +271,15 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
         loop: result of the close-loop.
         scene: whose buildings are drawn; None: no 3D map.
         report: content of `closeloop.json`.
-        folder: for `waterfall.png`, `residual_map.png`, `level_map.png`, `drivers.png`, and
-            `effect_RANK_NAME.png` for each effect; those of an earlier run are removed.
+        folder: for `groups.png`, `waterfall.png`, `residual_map.png`, `level_map.png`,
+            `drivers.png`, and `effect_RANK_NAME.png` for each effect; those of an earlier run
+            are removed.
     """
     folder, data = Path(folder), collect(loop)
     background = MapBackground(data.links, scene)
     for old in [*folder.glob("effect_*.png"), folder / "level_map.png"]:
         old.unlink(missing_ok=True)
+    save(groups_figure(data, report), folder / "groups.png")
     save(waterfall_figure(report), folder / "waterfall.png")
     save(residual_map_figure(data, background), folder / "residual_map.png")
     level_map = level_map_figure(data, background)
@@ -305,7 +308,8 @@ def waterfall_figure(report: dict) -> Figure:
     steps = [(name_label(name), name in without_cause) for name, _ in kept]
     if kept and abs(levels[-1] - after) > MIN_STEP_DB:
         levels.append(after)
-        steps.append(("joint refit", False))
+        known = report["error"].get("after_with_quality")
+        steps.append(("on a map: quality not known" if known else "joint refit", False))
     figure = new_figure(max(1.15 * (len(steps) + 2) + 2.6, 6.5), 4.6)
     ax = figure.add_subplot()
     _draw_bar(ax, 0, 0.0, before, BEFORE, f"{before:.2f} dB")

@@ -6,19 +6,28 @@ from typing import Any
 
 from radiotwin.closeloop.output.result_file import check_report
 from radiotwin.display import count
+from radiotwin.report import anomaly_words
 from radiotwin.report import closeloop_words as words
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (
+    about,
     effect_picture,
     interpolations,
     join_names,
     name_label,
+    number,
     parameter_label,
     parameter_labels,
+    probability,
+    quantity,
     variable_label,
 )
 
 FIGURES = (
+    ("groups.png", "Where the residual stands out",
+     "Median of the held-out residual of the base (measured minus predicted; red: less was "
+     "measured) and its scatter, by device, receiver and flight. Framed: the groups that stand "
+     "out."),
     ("waterfall.png", "Error step by step",
      "RMSE on held-out links, which were used neither to choose nor to fit the model: the base "
      "alone, the change by each effect, and the result. Horizontal lines: other models, held out "
@@ -72,14 +81,11 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         BadInput: a damaged figure.
     """
     candidates = report["candidates"]
-    verdict = words.BADGES[report["verdict"]]
-    if report["verdict"] == "effect":
-        verdict = verdict if words.is_sure(report) else "probable: "
-        verdict += join_names(words.cause_names(report))
     pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
     return {
         "lead": words.closeloop_summary(report), "rivals": words.rivals(report),
-        "verdict": verdict, "cards": _cards(report),
+        "verdict": words.verdict(report), "cards": _cards(report),
+        "anomalies": Table(anomaly_words.COLUMNS, anomaly_words.rows(report), "", 2),
         "figures": [picture for picture in pictures if picture],
         "effects": _effects(report, folder),
         "more_effects": max(len(report["effects"]) - MAX_EFFECTS, 0),
@@ -87,7 +93,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
         "detectable": Table(
             ("effect", "would have been named from", "what its size is"),
-            [[name_label(each["name"]), f"{words.about(each['size'])} {each['unit']}",
+            [[name_label(each["name"]), f"{about(each['size'])} {each['unit']}",
               each["pattern"]] for each in report["detectable"] if each["size"] is not None]),
         "undetectable": words.undetectable(report),
         "side_by_side": words.side_by_side(report),
@@ -96,7 +102,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "candidates": _candidate_table(candidates),
         "remaining": Table(
             ("variable", "standard deviation of the mean residual over it [dB]", "p, corrected"),
-            [[variable_label(driver["variable"])[0], words.number(driver.get("effect_db")),
+            [[variable_label(driver["variable"])[0], number(driver.get("effect_db")),
               _p_value(driver["p_value"])] for driver in report["remaining"]["drivers"]]),
         "notes": report["notes"]}
 
@@ -106,14 +112,18 @@ def _cards(report: dict) -> list[tuple[str, str]]:
     prediction = report.get("prediction")
     if prediction:
         cards.append(("all that was learnt together, RMSE",
-                      f"{words.number(prediction['combined_rmse_db'])} dB"))
+                      f"{number(prediction['combined_rmse_db'])} dB"))
         inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
         if inside is not None:
             cards.append(("held-out readings in its 90 % intervals", f"{100 * inside:.0f} %"))
         cards.append((f"{name_label(prediction['best_baseline'])} alone",
-                      f"{words.number(prediction['best_baseline_rmse_db'])} dB"))
+                      f"{number(prediction['best_baseline_rmse_db'])} dB"))
+    known = report["error"].get("after_with_quality")
+    if known:
+        cards.append(("RMSE if each reading's quality is known, as on no map",
+                      f"{number(known['rmse_db'])} dB"))
     for key, label, unit in CARDS:
-        before, after = (words.number(report["error"][when].get(key))
+        before, after = (number(report["error"][when].get(key))
                          for when in ("before", "after"))
         unchanged = before == after and not report["effects"]
         cards.append((label, (before if unchanged else f"{before} → {after}") + unit))
@@ -144,12 +154,14 @@ def _evidence(effect: dict) -> str:
     text = f"{effect['variant'].capitalize()}. " if effect.get("variant") else ""
     evidence = effect["evidence"]
     if effect.get("probability") is not None:
-        text += f"Probability that it is there: {words.probability(effect['probability'])}. "
+        text += f"Probability that it is there: {probability(effect['probability'])}. "
     size = effect.get("size_db")
     if size is not None and size["value"] is None:
         text += "It changes no level, only which links are blank. "
+    elif size is not None and not size.get("determined", True):
+        text += "By how much it changes the links that it acts on is not determined. "
     elif size is not None:
-        text += f"It changes the links that it acts on by {words.number(size['value'])} dB (RMS"
+        text += f"It changes the links that it acts on by {number(size['value'])} dB (RMS"
         text += f"; 90 % interval {_interval(size)}). " if _interval(size) != "–" else "). "
     if evidence["p_value"] is not None:
         text += f"That held-out links gain by chance: p {_p_value(evidence['p_value'])}."
@@ -173,12 +185,16 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
         groups += [(GROUPS.get(name, KINDS[kind] + name), both) for name, both in group.items()
                    if len(group) <= MAX_ROWS and both["before"]["n"]
                    and (kind != "los" or both["before"]["n"] < report["error"]["before"]["n"])]
-    for number, (label, both) in enumerate(groups):
+    for place, (label, both) in enumerate(groups):
         rows += [[label if when == "before" else "", when,
-                  *(words.number(both[when].get(key)) for key in columns)]
+                  *(number(both[when].get(key)) for key in columns)]
                  for when in ("before", "after")]
-        if number == 0:
-            rows += [["", name_label(name), *(words.number(scores.get(key)) for key in columns)]
+        known = both.get("after_with_quality")
+        if known:
+            rows.append(["", "after, with each reading's own quality",
+                         *(number(known.get(key)) for key in columns)])
+        if place == 0:
+            rows += [["", name_label(name), *(number(scores.get(key)) for key in columns)]
                      for name, scores in others.items()]
     heldout = report["heldout"]
     headings = [COLUMNS.get(key, key.replace("_", " ")) for key in columns]
@@ -188,12 +204,12 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
 
 def _candidate_table(candidates: list[dict]) -> Table:
     rows = [[c["step"], _with_variant(c), "kept" if c["kept"] else c["reason"],
-             words.probability(c.get("probability")), words.number(c["heldout_rmse_db"]),
-             words.number(c.get("evidence_nats")), words.number(c["heldout_nll_gain"])]
+             probability(c.get("probability")), number(c["heldout_rmse_db"]),
+             number(c.get("evidence_nats")), number(c["heldout_nll_gain"])]
             for c in candidates]
     return Table(("step", "effect", "kept, or why not", "probability by itself",
                   "held-out RMSE [dB]", "evidence [nats]", "held-out gain [nats]"), rows, "", 3,
-                 {number for number, c in enumerate(candidates) if c["kept"]})
+                 {row for row, c in enumerate(candidates) if c["kept"]})
 
 
 def _with_variant(candidate: dict) -> str:
@@ -215,14 +231,14 @@ def _value(parameter: dict) -> str:
     if words.is_reference(parameter):
         return "0 (reference)"
     known = parameter.get("determined", True)
-    return words.quantity(parameter["value"], parameter["unit"]) if known else "not determined"
+    return quantity(parameter["value"], parameter["unit"]) if known else "not determined"
 
 
 def _interval(parameter: dict) -> str:
     low, high = parameter["low"], parameter["high"]
-    unknown = None in (low, high) or low == high
+    unknown = None in (low, high) or low == high or not parameter.get("determined", True)
     unit = parameter["unit"]
-    return "–" if unknown else f"{words.quantity(low, unit)} to {words.quantity(high, unit)}"
+    return "–" if unknown else f"{quantity(low, unit)} to {quantity(high, unit)}"
 
 
 def _p_value(value: float | None) -> str:

@@ -1,40 +1,55 @@
 """Say in sentences what a close-loop found, how probable it is and what would have been seen."""
 
 from collections import Counter
+from math import hypot
 
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.criteria import LIKELY, SelectionCriteria
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER
 from radiotwin.effects.registry import effects_named
-from radiotwin.io.texts import moment
-from radiotwin.report.labels import interpolations, join_names, name_label, variable_label
+from radiotwin.report.anomaly_words import MAX_NAMED, SURE, group, some_names, where
+from radiotwin.report.labels import (
+    interpolations,
+    join_names,
+    name_label,
+    number,
+    probability,
+    variable_label,
+)
 
-MAX_NAMED = 4  # variables or effects in a sentence
 MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance
-SURE = 0.9  # a cause that is less probable is said to be probable only
 HALF = 0.5  # more probable than not
 NOT_LOOKED_FOR, LACKING = "not looked for: ", "there is no "  # a reason, and how it goes on
-LIKELY = 0.05  # a cause that is less probable is not worth a word
-DATES_S = 1e9, 4e9  # times from 2001 to 2096; no other number of seconds is as large
-BADGES = {"effect": "found: ", "located": "located, cause open",
-          "none": "no cause found", "undecided": "undecided"}
 
 
 def closeloop_summary(report: dict) -> str:
-    """Summarise the result of a close-loop in a few sentences.
+    """Summarise the result of a close-loop in a few sentences: where, why, and the error.
 
     Args:
         report: content of `closeloop.json`.
     """
-    text = {"effect": _effect, "located": _undecided, "none": _none,
-            "undecided": _undecided}[report["verdict"]](report)
+    why = {"effect": _effect, "located": _located, "none": _none,
+           "undecided": _undecided}[report["verdict"]](report)
+    text = " ".join(filter(None, [where(report), why]))
     text += next((f" {_side_by_side(each)}." for each in _largest_first(report)
                   if _differ(each["difference_db"])), "")
     interpolated = _has_interpolation(report)
     if interpolated:
         text += (" Interpolation of what remains, which explains nothing, brings the RMSE to "
                  f"{number(report['error']['after']['rmse_db'])} dB.")
+    text += with_quality(report)
     advice = (report.get("prediction") or {}).get("advice")
     return f"{text} {advice}" if advice else text
+
+
+def verdict(report: dict) -> str:
+    """Return the verdict in a few words, with the names that it is about."""
+    if report["verdict"] == "effect":
+        start = "found" if is_sure(report) else "probable"
+        return f"{start}: {join_names(cause_names(report))}"
+    if report["verdict"] == "located":
+        groups = [group(each)[0] for each in report["anomalies"]]
+        return f"located: {some_names(groups)}; cause open"
+    return {"none": "nothing stands out"}.get(report["verdict"], report["verdict"])
 
 
 def cause_names(report: dict) -> list[str]:
@@ -65,7 +80,8 @@ def rivals(report: dict) -> str:
         return text
     named = {each["name"] for each in report["effects"]}
     others = {each["name"]: each["probability"] or 0.0 for each in step["probabilities"]
-              if each["name"] not in named}
+              if each["name"] not in named
+              and not (each["name"] == NONE and report.get("anomalies"))}
     left = 1.0 - report["effects"][first - 1]["probability"]
     share = min(1.0, left / max(sum(others.values()), 1e-9))
     same = report["effects"][first - 1].get("indistinguishable_from", [])
@@ -79,7 +95,17 @@ def rivals(report: dict) -> str:
 def undetectable(report: dict) -> str:
     """Say which effects would not have been named at any size that they may have; else empty."""
     names = [name_label(each["name"]) for each in report["detectable"] if each["size"] is None]
-    return f"Not to be seen at any size that they may have: {join_names(names)}." if names else ""
+    return (f"Not to be seen in a typical form, at any size that they may have: "
+            f"{join_names(names)}.") if names else ""
+
+
+def with_quality(report: dict) -> str:
+    """Say the error where each reading's own quality is known, which no map has; else empty."""
+    known = report["error"].get("after_with_quality")
+    if not known:
+        return ""
+    return (f" Where the quality of each reading is known, as on no map, it is "
+            f"{number(known['rmse_db'])} dB.")
 
 
 def side_by_side(report: dict) -> list[str]:
@@ -101,45 +127,6 @@ def is_reference(parameter: dict) -> bool:
     """
     known = parameter["value"] == parameter["low"] == parameter["high"] == 0
     return known and parameter.get("unit") == "dB"
-
-
-def number(value: float | None) -> str:
-    """Return a number as a page shows it."""
-    if value is None:
-        return "–"
-    if isinstance(value, int):
-        text = f"{value:,}"
-    elif 0.005 <= abs(value) < 0.1:
-        text = f"{value:.2g}"
-    else:
-        text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
-    return "0.00" if text == "-0.00" else text.replace("-", "−")
-
-
-def small(value: float | None) -> str:
-    """Return the number of a parameter, which is not rounded to nothing however small it is."""
-    if value is None or not 0 < abs(value) < 0.005:
-        return number(value)
-    return f"{value:.2g}".replace("-", "−")
-
-
-def quantity(value: float | None, unit: str) -> str:
-    """Return the number of a parameter, or a date where it is one in seconds since 1970."""
-    if value is not None and unit == "s" and DATES_S[0] < value < DATES_S[1]:
-        return moment(value)
-    return small(value)
-
-
-def about(value: float) -> str:
-    """Return a number of which two digits are known: 110 for 106.2."""
-    return f"{float(f'{value:.2g}'):,.10g}"
-
-
-def probability(value: float | None) -> str:
-    """Return a probability as a page shows it; none is ever 0 or 1."""
-    if value is None:
-        return "–"
-    return "> 0.99" if value > 0.99 else "< 0.01" if value < 0.01 else f"{value:.2f}"
 
 
 def _criteria(report: dict) -> dict[str, float]:
@@ -178,15 +165,15 @@ def _differ(difference_db: dict) -> bool:
 
 def _side_by_side(found: dict) -> str:
     value, low, high = (found["difference_db"][key] for key in ("value", "low", "high"))
-    where = (f"where both were, within metres: {found['pairs']:,} pairs of readings at "
-             f"{found['places']:,} places")
+    both = (f"where both were, within metres: {found['pairs']:,} pairs of readings at "
+            f"{found['places']:,} places")
     first, second = found["first"], found["second"]
     if low <= 0 <= high:
-        return f"{first} and {second} read alike ({number(low)} to {number(high)} dB) {where}"
+        return f"{first} and {second} read alike ({number(low)} to {number(high)} dB) {both}"
     if value < 0:
         first, second, value, low, high = second, first, -value, -high, -low
     return (f"{second} reads {number(value)} dB ({number(low)} to {number(high)}) more than "
-            f"{first} {where}")
+            f"{first} {both}")
 
 
 def _effect(report: dict) -> str:
@@ -227,17 +214,14 @@ def _unnamed_beside(report: dict) -> float | None:
 
 
 def _none(report: dict) -> str:
-    return (f"No cause was found{_of(report, NONE)}. {_sizes(report)}")
+    return (f"No group of links stands out, and no cause was found{_of(report, NONE)}. "
+            f"{_sizes(report)}").strip()
 
 
-def _unexplained(report: dict) -> str:
-    step = next(iter(report["posterior"]), None)
-    if step and step["probabilities"] and step["probabilities"][0]["name"] != OTHER:
-        return _too_much_of_places(report, step)
-    text = f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}"
-    if step and step["probabilities"] and (step["probabilities"][0]["probability"] or 0.0) < SURE:
-        text = f"Unexplained. Likeliest: {_likely(step['probabilities'])}"
-    return f"{text}. The {_residual(report)} {_not_looked_for(report)}{_sizes(report)}".strip()
+def _located(report: dict) -> str:
+    return " ".join(filter(None, [
+        f"The {_residual(report)}", _not_looked_for(report), _settled_by(report),
+        _sizes(report)]))
 
 
 def _not_looked_for(report: dict) -> str:
@@ -251,19 +235,7 @@ def _not_looked_for(report: dict) -> str:
             why[lacks] = [*why.get(lacks, []), name_label(each["name"]) + (form or "")]
     parts = [f"as {LACKING}{lacks}: {join_names(list(dict.fromkeys(names)))}"
              for lacks, names in why.items()]
-    return f"Not looked for, {'; '.join(parts)}. " if parts else ""
-
-
-def _too_much_of_places(report: dict, step: dict) -> str:
-    """Say that no cause is the likeliest, and that more belongs to places than "none" allows."""
-    most_db = _criteria(report)["max_rest_db"]
-    shadowing = "Correlated shadowing does this, too"
-    shadowing += ", as do errors of the map and of its materials" * _has_map(report)
-    return (f"Unexplained: about {number(step['rest_db'])} dB of what the base misses belong to "
-            f"places, and beyond {most_db:g} dB it is not said that nothing is missing. "
-            f"{shadowing}. Likeliest: {_likely(step['probabilities'])}. About "
-            f"{number(step['noise_db'])} dB belong to single readings. "
-            f"The {_residual(report)}")
+    return f"Not looked for, {'; '.join(parts)}." if parts else ""
 
 
 def _residual(report: dict) -> str:
@@ -274,19 +246,26 @@ def _residual(report: dict) -> str:
 
 def _undecided(report: dict) -> str:
     step = next(iter(report["posterior"]), None)
-    text = "Undecided: these measurements do not tell."
     if step is None:
-        return text
-    first = next(iter(step["probabilities"]), {"name": ""})
-    if first["name"] == OTHER or (step["rest_db"] or 0.0) > _criteria(report)["max_rest_db"]:
-        return _unexplained(report)
-    text += f" Likeliest: {_likely(step['probabilities'])}."
-    likely = [each["name"] for each in step["probabilities"]
-              if (each["probability"] or 0) >= LIKELY]
-    advice = list(filter(None, (_settles(name, step["step"], report) for name in likely)))
-    if advice:
-        text += f" To settle it: {'; '.join(dict.fromkeys(advice[:2]))}."
-    return f"{text} {_sizes(report)}".strip()
+        return "Undecided: no cause was looked for."
+    likely, sizes = _likely(step["probabilities"], report), _sizes(report)
+    none = next((each["probability"] or 0.0 for each in step["probabilities"]
+                 if each["name"] == NONE), 0.0)
+    if sizes and none >= HALF and not report.get("anomalies"):
+        sizes += " That much at places is not said to be nothing."
+    return " ".join(filter(None, [
+        "Undecided: these measurements do not tell the cause.", likely and f"Likeliest: {likely}.",
+        f"The {_residual(report)}", _not_looked_for(report), _settled_by(report), sizes]))
+
+
+def _settled_by(report: dict) -> str:
+    """Say what would settle which of the likeliest causes is there."""
+    step = next(iter(report["posterior"]), None)
+    if step is None:
+        return ""
+    names = [each["name"] for each in step["probabilities"] if (each["probability"] or 0) >= LIKELY]
+    advice = list(filter(None, (_settles(name, step["step"], report) for name in names)))
+    return f"To settle it: {'; '.join(dict.fromkeys(advice[:2]))}." if advice else ""
 
 
 def _settles(name: str, step: int, report: dict) -> str:
@@ -316,9 +295,13 @@ def _settles(name: str, step: int, report: dict) -> str:
     return first
 
 
-def _likely(probabilities: list[dict]) -> str:
-    """Name what is likeliest, with probabilities; empty where nothing is likely."""
-    likely = [each for each in probabilities if (each["probability"] or 0) >= LIKELY]
+def _likely(probabilities: list[dict], report: dict) -> str:
+    """Name what is likeliest, with probabilities; empty where nothing is likely.
+
+    While a group stands out, it is not said that nothing is missing.
+    """
+    likely = [each for each in probabilities if (each["probability"] or 0) >= LIKELY
+              and not (each["name"] == NONE and report.get("anomalies"))]
     return join_names([f"{_cause(each['name'])} ({probability(each['probability'])})"
                        for each in likely[:MAX_NAMED]])
 
@@ -330,16 +313,18 @@ def _of(report: dict, name: str) -> str:
 
 
 def _sizes(report: dict) -> str:
-    step = report["posterior"][-1] if report["posterior"] else None
-    if step is None or step["rest_db"] is None:
+    """Divide the error of the base between places and single readings; squares add up to it."""
+    step = next(iter(report["posterior"]), None)
+    whole_db = report["error"]["before"]["rmse_db"]
+    if step is None or None in (step["rest_db"], step["noise_db"], whole_db):
         return ""
     alike = ("errors of the map and of its materials do" if _has_map(report) else
              "shadowing does")
-    # The first is of a whole field, of which more is off than what its readings show.
-    seen_db = report["error"]["before"]["rmse_db"]
-    rest_db = step["rest_db"] if seen_db is None else min(step["rest_db"], seen_db)
-    return (f"Roughly {number(rest_db)} dB of what the base misses belong to places, as {alike}, "
-            f"and {number(step['noise_db'])} dB to single readings.")
+    both_db = hypot(step["rest_db"], step["noise_db"])
+    places_db, single_db = (whole_db * each / both_db if both_db else 0.0
+                            for each in (step["rest_db"], step["noise_db"]))
+    return (f"Of the base's {number(whole_db)} dB, roughly {number(places_db)} dB belong to "
+            f"places, as {alike}, and {number(single_db)} dB to single readings (squares add up).")
 
 
 def _has_map(report: dict) -> bool:

@@ -1,4 +1,4 @@
-"""The look that all pages and figures share: printed names, colours, canvas and file."""
+"""The look that all pages and figures share: printed names and numbers, colours, canvas, file."""
 
 import io
 import re
@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from radiotwin.display import plain
 from radiotwin.effects.registry import LAST_RESORTS, catalogue, effects_named
 from radiotwin.io.files import atomic_file
+from radiotwin.io.texts import moment
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 
 VARIABLES = {  # label and unit
@@ -53,6 +54,7 @@ NAMES = MODELS | {"log_distance": "log-distance law", "raytrace": "ray tracer"}
 LOS_COLOUR, NLOS_COLOUR = "#2a7f9e", "#d1495b"
 BEFORE, AFTER, FITTED, FOUND = "#c2571a", "#1f6f8b", "#22272c", "#7a0177"
 DPI = 110
+DATES_S = 1e9, 4e9  # times from 2001 to 2096; no other number of seconds is as large
 
 
 def name_label(name: str) -> str:
@@ -104,6 +106,51 @@ def join_names(names: list[str]) -> str:
     if not names:
         return "no variable"
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def number(value: float | None) -> str:
+    """Return a number as a page shows it."""
+    if value is None:
+        return "–"
+    if isinstance(value, int):
+        text = f"{value:,}"
+    elif 0.005 <= abs(value) < 0.1:
+        text = f"{value:.2g}"
+    else:
+        text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
+    return "0.00" if text == "-0.00" else text.replace("-", "−")
+
+
+def small(value: float | None) -> str:
+    """Return the number of a parameter, which is not rounded to nothing however small it is."""
+    if value is None or not 0 < abs(value) < 0.005:
+        return number(value)
+    return f"{value:.2g}".replace("-", "−")
+
+
+def quantity(value: float | None, unit: str) -> str:
+    """Return the number of a parameter, or a date where it is one in seconds since 1970."""
+    if value is not None and unit == "s" and DATES_S[0] < value < DATES_S[1]:
+        return moment(value)
+    return small(value)
+
+
+def about(value: float) -> str:
+    """Return a number of which two digits are known: 110 for 106.2."""
+    return f"{float(f'{value:.2g}'):,.10g}"
+
+
+def signed(value: float, digits: int = 1) -> str:
+    """Return a number with a few digits; one that is rounded to 0 has no sign."""
+    text = f"{value:,.{digits}f}"
+    return text.removeprefix("-") if not float(text.replace(",", "")) else text.replace("-", "−")
+
+
+def probability(value: float | None) -> str:
+    """Return a probability as a page shows it; none is ever 0 or 1."""
+    if value is None:
+        return "–"
+    return "> 0.99" if value > 0.99 else "< 0.01" if value < 0.01 else f"{value:.2f}"
 
 
 def _split_unit(name: str) -> tuple[str, str]:

@@ -7,12 +7,13 @@ import pytest
 
 from radiotwin.closeloop.verdict import intervals
 from radiotwin.closeloop.verdict.intervals import effect_parameters, effect_size_db
+from radiotwin.effects.antennas import SectorPattern
 from radiotwin.effects.boxes import Box
 from radiotwin.effects.catalogue.excess_attenuation import ExcessAttenuation
 from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.effects.catalogue.position_errors import DevicePositionError
 from radiotwin.effects.catalogue.sector_antenna import SectorAntenna
-from radiotwin.effects.params import Allowed, Parameter
+from radiotwin.effects.params import Allowed, Parameter, quantities
 from radiotwin.twin.model.uncertainty import estimates, linearise
 from tests.closeloop.drives import MASTS_M, drive, fitted
 
@@ -139,7 +140,8 @@ def test_a_parameter_that_most_folds_do_not_find_is_not_determined():
 
 @pytest.mark.parametrize(("low", "high", "allowed", "determined"), (
     (-100.0, 90.0, Allowed(period=360.0), False), (-40.0, 40.0, Allowed(period=360.0), True),
-    (-30.0, 31.0, "dB", False), (-29.0, 30.0, "dB", True),
+    (-139.0, 136.0, "dB", False), (-17.0, 17.0, "dB", False), (-16.0, 16.0, "dB", True),
+    (0.05, 5.0, Allowed(low=0.0, is_log=True), False), (0.1, 0.5, Allowed(low=0.0, is_log=True), True),
     (-230.0, 315.0, Allowed(8.0, 45.0), False), (0.1, 0.2, Allowed(0.05, 5.0, is_log=True), True),
     (0.1, 4.0, Allowed(0.05, 5.0, is_log=True), False), (-900.0, 900.0, Allowed(), True)))
 def test_intervals_of_more_than_half_of_what_is_allowed_say_nothing(low, high, allowed, determined):
@@ -147,6 +149,24 @@ def test_intervals_of_more_than_half_of_what_is_allowed_say_nothing(low, high, a
     checked = intervals._checked(Parameter(20.0 if low < 0 else 0.15, low, high, unit, allowed=allowed), 6, 6)
     assert checked.determined is determined
     assert checked.low >= allowed.low and checked.high <= allowed.high
+
+
+@pytest.mark.parametrize(("low", "high", "determined", "arc"), (
+    (330.0, 380.0, True, (330.0, 20.0)), (-104.0, 589.0, False, (None, None)), (-30.0, 20.0, True, (330.0, 20.0))))
+def test_an_angle_is_said_within_one_turn(low, high, determined, arc):
+    angle = intervals._checked(Parameter((low + high) / 2, low, high, "deg", allowed=Allowed(period=360.0)), 6, 6)
+    record = angle.record()
+    assert record["determined"] is determined and 0 <= record["value"] < 360
+    if determined:
+        assert (record["low"], record["high"]) == arc
+    else:
+        assert np.isnan([record["low"], record["high"]]).all()
+
+
+def test_what_may_turn_around_is_an_angle_and_a_turned_box_is_the_same_after_half_a_turn():
+    around = {name for name, field in quantities(SectorPattern).items() if np.isfinite(Allowed.of(field).period)}
+    assert around == {"azimuth_deg"}
+    assert Box.allowed("turn_deg", -90.0, 90.0).period == 180.0 and Box.allowed("x_m", 0.0, 9.0).high == 9.0
 
 
 def test_a_box_is_compared_in_the_form_that_is_closest():

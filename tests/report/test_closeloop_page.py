@@ -10,15 +10,15 @@ from matplotlib.figure import Figure
 from radiotwin.cli import model as loop
 from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
-from radiotwin.report.closeloop_words import (
+from radiotwin.report.closeloop_words import closeloop_summary, drivers, rivals
+from radiotwin.report.labels import (
     about,
-    closeloop_summary,
-    drivers,
+    join_names,
     number,
-    rivals,
+    parameter_label,
     small,
+    variable_label,
 )
-from radiotwin.report.labels import join_names, parameter_label, variable_label
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
 NOTHING = {"n": 0} | dict.fromkeys(["bias_db", "std_db", "correlation", "rmse_db", "mae_db", "nll"])
@@ -29,14 +29,18 @@ DRIFT = {"name": "receiver_drift", "variant": "", "rank": 1, "params": {}, "conf
          "evidence": {"heldout_nll_gain": 210.0, "p_value": 1e-9}}
 
 
+LOW = {"family": "device", "members": {"device": ["d3"]}, "sight": "all", "statistic": "level", "probability": 0.99,
+       "size": {"value": -5.6, "low": -6.1, "high": -5.1, "unit": "dB"}, "links": 461,
+       "causes": [{"name": "device_gain_offset", "probability": 0.7}, {"name": "foliage", "probability": 0.25}]}
+
+
 def report(verdict="effect", **changes):
     """The content of a `closeloop.json`."""
     found = verdict == "effect"
     after = SCORES | {"rmse_db": 2.0, "std_db": 2.0} if found else SCORES
     drivers = [{"variable": "time_in_flight_s", "p_value": 0.0004, "effect_db": 1.5}]
     return {
-        "schema": "radiotwin.closeloop/3", "radiotwin_version": "0", "base": "twin",
-        "verdict": "undecided" if verdict == "unexplained" else verdict,
+        "schema": "radiotwin.closeloop/3", "radiotwin_version": "0", "base": "twin", "verdict": verdict,
         "effects": [DRIFT | {"probability": 0.95}] if found else [],
         "candidates": [{"name": "receiver_drift", "step": 1, "heldout_rmse_db": 2.0, "heldout_nll_gain": 210.0,
                         "p_value": 1e-9, "kept": found, "reason": "" if found else "gains nothing"},
@@ -49,13 +53,13 @@ def report(verdict="effect", **changes):
         "baselines": {"log_distance": SCORES | {"rmse_db": 7.0},
                       "regression_kriging": {"rmse_db": 5.5, "median_db": 1}},
         "dependences_before": drivers,
-        "remaining": {"structured": verdict == "unexplained", "drivers": drivers if verdict == "unexplained" else []},
+        "remaining": {"structured": verdict == "located", "drivers": drivers if verdict == "located" else []},
         "posterior": [{"step": 1, "unnamed_nats": {"time": 12.0},
-                       "rest_db": 3.5 if verdict == "unexplained" else 2.5, "noise_db": 1.25, "probabilities": [
+                       "rest_db": 3.5 if verdict == "located" else 2.5, "noise_db": 1.25, "probabilities": [
             {"name": "none", "probability": 0.705}, {"name": "antenna_pattern", "probability": 0.29},
             {"name": "not in the catalogue", "probability": 0.005}]}],
         "detectable": [{"name": "excess_attenuation", "size": 4.2, "unit": "dB/km", "pattern": "on all links"}],
-        "notes": ["receiver <i> has 3 only"]} | changes
+        "anomalies": [LOW] if verdict == "located" else [], "notes": ["receiver <i> has 3 only"]} | changes
 
 
 def page(content, folder):
@@ -66,14 +70,15 @@ def page(content, folder):
 @pytest.mark.parametrize("verdict, sentence, badge", [
     ("effect", "The model lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB",
      "found: receiver drift"),
-    ("none", "No cause was found (probability 0.70).", "no cause found"),
-    ("undecided", "Undecided: these measurements do not tell. Likeliest: nothing is missing (0.70) and antenna pattern (0.29). "
-     "To settle it: fly around the device at one distance and one height.", "undecided"),
-    ("unexplained",
-     "Unexplained: about 3.50 dB of what the base misses belong to places, and beyond 3 dB it is not said that nothing is "
-     "missing. Correlated shadowing does this, too. Likeliest: nothing is missing (0.70) and antenna pattern (0.29). About "
-     "1.25 dB belong to single readings. The residual is 3.00 dB RMSE and depends on time in flight.",
-     "undecided")])
+    ("none", "No group of links stands out, and no cause was found (probability 0.70).", "nothing stands out"),
+    ("undecided", "Undecided: these measurements do not tell the cause. Likeliest: nothing is missing (0.70) and antenna pattern "
+     "(0.29). The residual is 3.00 dB RMSE and depends on time in flight. To settle it: fly around the device at one distance and "
+     "one height. Of the base&#39;s 3.00 dB, roughly 2.68 dB belong to places, as shadowing does, and 1.34 dB to single readings "
+     "(squares add up). That much at places is not said to be nothing.", "undecided"),
+    ("located",
+     "Device d3 reads 5.6 dB (5.1 to 6.1) less than the other device (0.99). Its cause is open: power, cable or antenna of the "
+     "device (0.70); vegetation (0.25). The residual is 3.00 dB RMSE and depends on time in flight.",
+     "located: device d3; cause open")])
 def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
     text = page(report(verdict), tmp_path)
     assert sentence in text and f"<b>{badge}</b>" in text
@@ -96,13 +101,13 @@ def test_only_what_meets_the_criteria_is_said_to_matter():
     chance, weak, strong = ({"variable": name, "p_value": p_value, "effect_db": effect_db} for name, p_value, effect_db in (
         ("distance_m", 1.0, 2.0), ("altitude_m", 0.001, 0.1), ("time_in_flight_s", 0.001, 1.5)))
     nothing = {"remaining": {"structured": False, "drivers": []}}
-    found = report("unexplained", dependences_before=[chance, weak, strong], **nothing)
+    found = report("located", dependences_before=[chance, weak, strong], **nothing)
     assert drivers(found) == ["time in flight"]
     assert "3.00 dB RMSE and depends on time in flight." in closeloop_summary(found)
     assert drivers(found | {"criteria": {"max_dependence_p_value": 1.0, "min_dependence_db": 1.0}}) == [
         "distance", "time in flight"]
-    without = closeloop_summary(report("unexplained", dependences_before=[chance, weak], **nothing))
-    assert without.endswith("3.00 dB RMSE.") and "depends" not in without
+    without = closeloop_summary(report("located", dependences_before=[chance, weak], **nothing))
+    assert "3.00 dB RMSE. To settle" in without and "depends" not in without
 
 
 def test_names_from_the_data_are_no_markup(tmp_path):
@@ -197,7 +202,7 @@ def test_the_member_that_others_are_compared_with_is_marked_and_no_table_is_empt
 def test_numbers_that_are_not_known_are_dashes(tmp_path):
     unknown = report("none", baselines={"log_distance": NOTHING}, dependences_before=[])
     unknown["error"] |= {"before": NOTHING, "after": NOTHING}
-    assert "No cause was found" in closeloop_summary(unknown)
+    assert "no cause was found" in closeloop_summary(unknown)
     assert "None" not in page(unknown, tmp_path) and "nan" not in page(unknown, tmp_path)
 
 
@@ -236,24 +241,18 @@ def test_a_step_between_flights_has_no_probability_and_is_called_probable(tmp_pa
     assert "goes from 3.00 to 3.01 dB" in closeloop_summary(rising)
 
 
-def test_something_without_a_likely_name_is_missing():
-    unnamed = report("unexplained")
-    unnamed["posterior"][0]["probabilities"] = [{"name": "not in the catalogue", "probability": 0.9}]
-    assert "missing that no effect of the catalogue explains (probability 0.90). The residual" in closeloop_summary(unnamed)
-
-
-def test_what_merely_leads_is_not_stated_and_what_was_not_looked_for_is():
-    unnamed = report("unexplained")
+def test_what_was_not_looked_for_is_said_and_parts_of_the_error_are_no_larger_than_it():
+    unnamed = report("undecided")
     unnamed["posterior"][0] |= {"rest_db": 9.0, "probabilities": [
         {"name": "not in the catalogue", "probability": 0.43}, {"name": "antenna_pattern", "probability": 0.34}]}
     unnamed["candidates"] = [unnamed["candidates"][0] | {
         "name": "body_shadowing", "variant": "loss around the body",
         "reason": "not looked for: there is no heading_deg, so directions are unknown", "kept": False}]
     text = closeloop_summary(unnamed)
-    assert text.startswith("Unexplained. Likeliest: something that is not in the catalogue (0.43) and antenna pattern (0.34). The")
+    assert "Likeliest: something that is not in the catalogue (0.43) and antenna pattern (0.34). The" in text
     assert "Not looked for, as there is no heading_deg: body shadowing (loss around the body)." in text
-    assert "Roughly 3.00 dB" in text  # no more than the whole error
-    assert "Not looked for" not in closeloop_summary(report("unexplained"))
+    assert "Of the base's 3.00 dB, roughly 2.97 dB belong to places" in text and "and 0.41 dB to" in text  # 9 to 1.25
+    assert "Not looked for" not in closeloop_summary(report("undecided"))
 
 
 @pytest.mark.parametrize("likelihood, is_said", [(0.87, True), (0.49, False)])
@@ -264,7 +263,7 @@ def test_what_is_left_without_a_name_beside_the_effects_is_said(likelihood, is_s
     assert ("Beside it something is left that has no name (probability 0.87)." in closeloop_summary(found)) == is_said
 
 
-@pytest.mark.parametrize("verdict", ["none", "undecided", "unexplained"])
+@pytest.mark.parametrize("verdict", ["none", "undecided", "located"])
 def test_errors_of_a_map_are_spoken_of_where_there_is_one(verdict):
     without = report(verdict, base="log-distance")
     hidden = {"by_los": {"nlos": {"before": SCORES, "after": SCORES}}}
@@ -275,7 +274,7 @@ def test_errors_of_a_map_are_spoken_of_where_there_is_one(verdict):
 
 def test_a_last_resort_is_not_called_an_explanation(tmp_path):
     shadowing = DRIFT | {"name": "correlated_shadowing", "rank": 2}
-    filled = report("unexplained", effects=[shadowing])
+    filled = report("located", effects=[shadowing])
     assert "which explains nothing, brings the RMSE to 3.00 dB" in closeloop_summary(filled)
     filled = report("effect", effects=[DRIFT | {"probability": 0.95}, shadowing])
     filled["error"]["after"] |= {"rmse_db": 1.5}
@@ -317,13 +316,13 @@ def test_the_two_probabilities_of_one_effect_are_told_apart(tmp_path):
 
 def test_what_remains_is_said_to_be_that_before_it_is_interpolated(tmp_path):
     before = "With the named effects, and before anything was interpolated, the residual depends on:"
-    assert before in page(report("unexplained"), tmp_path) and before not in page(report(), tmp_path)
+    assert before in page(report("located"), tmp_path) and before not in page(report(), tmp_path)
 
 
 def test_an_effect_that_no_size_would_have_shown_is_no_row(tmp_path):
     unseen = {"name": "episode", "size": None, "unit": "dB", "pattern": "over 10 % of the time"}
     text = page(report(detectable=[*report()["detectable"], unseen]), tmp_path)
-    assert "Not to be seen at any size that they may have: episode." in text and "– dB" not in text
+    assert "Not to be seen in a typical form, at any size that they may have: episode." in text and "– dB" not in text
     text = page(report(detectable=[unseen]), tmp_path)
     assert "may have: episode." in text and "would have been named from" not in text
 

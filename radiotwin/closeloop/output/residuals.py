@@ -161,7 +161,7 @@ def residual_table(loop: Loop) -> pd.DataFrame:
     """
     links = loop.after.links
     device_m = np.where(loop.after.whole.usable[:, None], links.device_m[links.device], np.nan)
-    before_db, after_db = (links.level_db - model.held_out_mean_db
+    before_db, after_db = (links.level_db - model.on_map[0]
                            for model in (loop.before, loop.after))
     return pd.DataFrame({
         "time_s": links.time_s, "flight": np.array(links.flight_names)[links.flight],

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Set
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from radiotwin import __version__
-from radiotwin.closeloop.crossfit import CrossFit, without_quality
+from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.output.result_schema import ReportRecord
 from radiotwin.closeloop.predict.blending import held_out_coverage
 from radiotwin.closeloop.run import Loop
 from radiotwin.closeloop.scan import Anomaly
 from radiotwin.closeloop.search.trials import Trial
+from radiotwin.closeloop.verdict.criteria import LIKELY
 from radiotwin.closeloop.verdict.posterior import Step
+from radiotwin.closeloop.verdict.sensitivity import Detectable
 from radiotwin.effects.params import Parameter
 from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_path
@@ -101,8 +104,9 @@ def make_report(loop: Loop) -> dict[str, Any]:
     links = loop.after.links
     error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),
                              "noise_floor_db": loop.noise_floor_db}
-    if any("quality" in each.uses for each in loop.after.whole.effects):
-        error["after_without_quality"] = scores(without_quality(loop.after))
+    if loop.after.reads_quality:
+        error["after_with_quality"] = _scores(links.level_db, loop.after.held_out_mean_db,
+                                              loop.after.held_out_nll)
     for name, groups in _groups(links).items():
         error[f"by_{name}"] = {label: {"before": scores(loop.before, rows),
                                        "after": scores(loop.after, rows)}
@@ -119,7 +123,8 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
         "anomalies": [_anomaly(each) for each in loop.anomalies],
         "posterior": [_step(each) for each in loop.found.steps],
-        "detectable": [vars(each) for each in loop.detectable],
+        "detectable": [vars(each) for each in agreeing(
+            loop.detectable, {each["name"] for each in effects}, loop.found.steps)],
         "receivers_compared": [_difference(each, links) for each in receiver_differences(links)],
         "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
                     "n": int(np.isfinite(loop.after.held_out_nll).sum())},
@@ -131,17 +136,38 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "criteria": vars(loop.criteria), "notes": [*links.notes, *loop.found.notes]})
 
 
+def agreeing(found: Iterable[Detectable], named: Set[str],
+             steps: Iterable[Step]) -> list[Detectable]:
+    """Return the sizes that would have been seen and agree with what was seen.
+
+    A typical pattern stands for each family. Where the search found another one of that family, it
+    was to be seen: of what was named no size is said, and of what is likely only one that is known.
+
+    Args:
+        found: a size for each family that was looked for.
+        named: effects that were found.
+        steps: with the probabilities of all that were looked for.
+    """
+    likely = {name for step in steps for name, each in step.probabilities.items()
+              if each >= LIKELY}
+    return [each for each in found if each.name not in named
+            and (np.isfinite(each.size) or each.name not in likely)]
+
+
 def scores(model: CrossFit, rows: np.ndarray | None = None) -> dict[str, float]:
-    """Return held-out errors of the links of a mask (n,), or of all.
+    """Return held-out errors, as a map has them, of the links of a mask (n,), or of all.
 
     Returns:
         as of `errors`, and `nll`, the mean negative log-likelihood of detected and
         blank links [nats].
     """
-    level_db, mean_db, nll = model.links.level_db, model.held_out_mean_db, model.held_out_nll
-    rows = np.ones(len(level_db), dtype=bool) if rows is None else rows
-    mean_nll = float(np.nanmean(nll[rows])) if np.isfinite(nll[rows]).any() else np.nan
-    return errors(level_db[rows], mean_db[rows]) | {"nll": mean_nll}
+    rows = np.ones(len(model.index), dtype=bool) if rows is None else rows
+    return _scores(model.links.level_db[rows], *(each[rows] for each in model.on_map))
+
+
+def _scores(level_db: np.ndarray, mean_db: np.ndarray, nll: np.ndarray) -> dict[str, float]:
+    mean_nll = float(np.nanmean(nll)) if np.isfinite(nll).any() else np.nan
+    return errors(level_db, mean_db) | {"nll": mean_nll}
 
 
 def errors(level_db: np.ndarray, mean_db: np.ndarray) -> dict[str, float]:

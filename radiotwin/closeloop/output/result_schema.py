@@ -35,7 +35,7 @@ class ErrorRecord(BothRecord):
     """Errors of all links and of groups of them, by the groups' names."""
 
     combined: ScoresRecord | None = None
-    after_without_quality: ScoresRecord | None = None
+    after_with_quality: ScoresRecord | None = None
     noise_floor_db: Real | None
     by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)
     by_device: dict[str, BothRecord] = Field(default_factory=dict)
@@ -84,6 +84,7 @@ class EffectRecord(Record):
     confused_with: list[str] = Field(default_factory=list)
     indistinguishable_from: list[str] = Field(default_factory=list)
     probability: Real | None = None
+    anomalies: list[Whole] = Field(default_factory=list)
     evidence: EvidenceRecord
 
 
@@ -170,6 +171,7 @@ class AnomalyRecord(Record):
     ranges: dict[str, Annotated[list[Real], Field(min_length=2, max_length=2)]] = Field(
         default_factory=dict)
     sight: Literal["los", "nlos", "all"] = "all"
+    same_over: list[Literal["flight", "direction"]] = Field(default_factory=list)
     statistic: Literal["level", "scatter", "blanks", "slope"]
     size: KnownParameterRecord
     probability: Real
@@ -240,4 +242,12 @@ class ReportRecord(Record):
         rmse_db = self.error.before.rmse_db, self.error.after.rmse_db
         if self.verdict == "effect" and None in rmse_db:
             raise ValueError("the verdict is effect, and error has no rmse_db before or after it")
+        return self
+
+    @model_validator(mode="after")
+    def _none_beside_no_group(self) -> Self:
+        if self.verdict == "none" and self.anomalies:
+            raise ValueError("the verdict is none, and groups of links stand out")
+        if self.verdict == "located" and not self.anomalies:
+            raise ValueError("the verdict is located, and no group of links stands out")
         return self

@@ -19,14 +19,13 @@ MIN_SHARED = 0.5  # of a fault's, on which its rival acts, or the same fault fou
 MIN_HELD_OUT_DEVICES = 4  # of known position, to hold some of them out where a fault is judged
 MAX_LOSS_NATS = 0.01  # a held-out link, where devices that are located anew can predict more links
 # Of intervals (`radiotwin.closeloop.verdict.intervals`).
-MAX_SHARE = 0.5  # of what is allowed, which an interval may span: more is less than one bit learnt
-LEVELS_DB = 120.0  # span of changes of a level that can be at all, where no bounds are given
 MIN_FOLDS = 0.5  # share of the folds that must have found a parameter, too
 MIN_CLUSTERS = 3  # effective ones, of which a spread can be told
 # Of probabilities (`radiotwin.closeloop.verdict.posterior`); the weights are in calibration.json.
 MIN_SURE = 0.9  # probability of a group that stands out, for the verdict to be `located`
 LEAST_RATIO = 0.2  # of what belongs to places to noise; less is none
 NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
+LIKELY = 0.05  # a cause that is less probable is not worth a word
 EXPLAINED = 0.3  # of what a pattern explains, for a search to have found it; it is refined later
 
 

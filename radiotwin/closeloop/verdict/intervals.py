@@ -22,7 +22,7 @@ import numpy as np
 from scipy.stats import t
 
 from radiotwin.closeloop.crossfit import CrossFit, same_effects
-from radiotwin.closeloop.verdict.criteria import LEVELS_DB, MAX_SHARE, MIN_CLUSTERS, MIN_FOLDS
+from radiotwin.closeloop.verdict.criteria import MIN_CLUSTERS, MIN_FOLDS
 from radiotwin.effects.params import Parameter
 from radiotwin.inference.sandwich import MAX_WIDTH
 from radiotwin.inference.student import DOF
@@ -113,14 +113,8 @@ def _checked(parameter: Parameter, found: int, folds: int) -> Parameter:
     # A value beyond its bounds stays: effects that cannot be are refused elsewhere.
     low = max(parameter.low, min(allowed.low, parameter.value))
     high = min(parameter.high, max(allowed.high, parameter.value))
-    ends, bounds = np.array([low, high]), np.array([allowed.low, allowed.high])
-    if allowed.is_log:
-        with np.errstate(divide="ignore"):
-            ends, bounds = np.log(ends), np.log(bounds)
-    span = min(np.ptp(bounds), allowed.period) if np.isfinite(bounds).all() else allowed.period
-    span = min(span, LEVELS_DB) if parameter.unit in ("dB", "dBm") else span
-    determined = bool(np.ptp(ends) <= MAX_SHARE * span) and found >= MIN_FOLDS * folds
-    return replace(parameter, low=low, high=high, determined=determined)
+    within = replace(parameter, low=low, high=high)
+    return replace(within, determined=within.is_narrow and found >= MIN_FOLDS * folds)
 
 
 def effect_size_db(model: CrossFit, number: int) -> Parameter:
@@ -152,7 +146,8 @@ def effect_size_db(model: CrossFit, number: int) -> Parameter:
                 default=0.0)
     rms_db = float(np.sqrt(np.mean(change_db**2)))
     low, value, high = rms_db * (slope + reach * np.array([-1.0, 0.0, 1.0]))
-    return Parameter(float(value), float(low), float(high), "dB")
+    size_db = Parameter(float(value), float(low), float(high), "dB")
+    return replace(size_db, determined=size_db.is_narrow)
 
 
 def why_not_borne_out(size_db: Parameter) -> str:

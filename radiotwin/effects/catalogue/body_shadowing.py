@@ -61,6 +61,7 @@ class BodyShadowing(BodyFrameEffect):
 
     name = "body_shadowing"
     variant = "loss around the body"
+    in_words = "the body that carries the receiver"
     parameter_labels = {"body_depth_db": "loss through the body",
                         "body_azimuth_deg": "body, from the heading",
                         "body_elevation_deg": "body, up from the deck",

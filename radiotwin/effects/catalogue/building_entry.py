@@ -73,6 +73,7 @@ class BuildingEntry(GainEffect):
     """Links with one end inside a building lose on the way in."""
 
     name = "building_entry"
+    in_words = "loss into buildings"
     parameter_labels = {"entry_loss_db": "building entry loss",
                         "scatter_sd_db": "standard deviation from place to place"}
     needs_map = True

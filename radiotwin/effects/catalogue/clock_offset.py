@@ -34,6 +34,7 @@ class ReceiverClockOffset(MovedEnd):
     """A clock offset of all positions of a receiver; one step finds one receiver, the worst."""
 
     name = "receiver_clock_offset"
+    in_words = "a wrong clock of the receiver"
     settled_by = "fly one track forth and back"
     of_receiver = True
     confused_with = ("receiver_position_error", "body_shadowing")

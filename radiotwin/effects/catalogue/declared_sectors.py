@@ -31,11 +31,11 @@ from radiotwin.effects.antennas import (
     Departures,
     SectorEffect,
     SectorPattern,
-    allowed_of,
 )
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import LevelAt, ResidualView, Term
 from radiotwin.effects.params import (
+    Allowed,
     Decibels,
     DeviceIndex,
     Estimate,
@@ -223,7 +223,7 @@ class DeclaredSectors(SectorEffect):
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         values = self.variation().values
-        reported = {name: Parameter.normal(value, sd, field["unit"], allowed_of(name, field))
+        reported = {name: Parameter.normal(value, sd, field["unit"], Allowed.of(field))
                     for (name, field), value, sd in zip(_numbers().items(), values,
                                                         estimate.params_sd, strict=True)}
         if not self.params.has_tilts:

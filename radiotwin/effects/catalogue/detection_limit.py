@@ -23,6 +23,7 @@ class DetectionLimit(LimitEffect):
     """A limit for each receiver whose blanks become likelier by it."""
 
     name = "noise_floor_censoring"
+    in_words = "a limit of detection"
     parameter_labels = {"limit": "limit of detection"}
     variant = "a receiver's own limit of detection"
     confused_with = ("lock_loss", "missing_obstacle", "receiver_gain_offset")

@@ -73,6 +73,7 @@ class Episode(GainEffect):
     """A loss or an attenuation between two times; a step finds the strongest."""
 
     name = "episode"
+    in_words = "something that lasted for a while, such as rain"
     settled_by = "repeat the flight in dry weather"
     figure = "dependence"
     of_receiver = True

@@ -30,6 +30,7 @@ class ExcessAttenuation(GainEffect):
     """A specific attenuation that the channel's exponent does not cover."""
 
     name = "excess_attenuation"
+    in_words = "attenuation along the whole way"
     parameter_labels = {"scale_height_m": "scale height (1/e)"}
     settled_by = "measure at much longer distances with line of sight"
     confused_with = ("foliage", "receiver_saturation")

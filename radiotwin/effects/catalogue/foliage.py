@@ -57,6 +57,7 @@ class Foliage(GainEffect):
     """A box of vegetation; one step finds one."""
 
     name = "foliage"
+    in_words = "vegetation"
     settled_by = "fly low on both sides of the suspected place"
     figure = "links"
     repeatable = True
@@ -130,7 +131,7 @@ class Foliage(GainEffect):
         variation = self.variation()
         low, high = variation.low.tolist(), variation.high.tolist()
         reported = {name: Parameter.normal(value, sd, "deg" if name == "turn_deg" else "m",
-                                           Allowed(least, most))
+                                           Box.allowed(name, least, most))
                     for name, value, sd, least, most in zip(Box._fields, self.params.box,
                                                             estimate.params_sd, low, high)}
         names = {"specific_attenuation_db_m": "dB/m", "greatest_loss_db": "dB"}

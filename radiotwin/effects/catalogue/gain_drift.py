@@ -207,6 +207,7 @@ class ReceiverDrift(_GainDrift):
     """A receiver that warms up, once or on each flight, ages, or has changed."""
 
     name = "receiver_drift"
+    in_words = "gain of the receiver that changes with time"
     settled_by = "return to the same places at other times"
     of_receiver = True
     confused_with = ("receiver_gain_offset", "interference")
@@ -226,6 +227,7 @@ class DeviceDrift(_GainDrift):
     """A device whose battery discharges or that has changed."""
 
     name = "device_drift"
+    in_words = "power of the device that changes with time"
     settled_by = "return to the same places at other times"
     confused_with = ("device_gain_offset", "device_position_error")
     forms = ("ageing", "step")

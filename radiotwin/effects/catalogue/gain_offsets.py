@@ -107,6 +107,7 @@ class DeviceGainOffset(_GainOffset):
     """Devices that radiate more or less than the others do."""
 
     name = "device_gain_offset"
+    in_words = "power, cable or antenna of the device"
     settled_by = "measure the device's power next to it, with line of sight"
     of_device = True
     end = "device"
@@ -124,6 +125,7 @@ class ReceiverGainOffset(_GainOffset):
     """Receivers that read more or less than the others do."""
 
     name = "receiver_gain_offset"
+    in_words = "gain, cable or antenna of the receiver"
     settled_by = "let the receivers measure side by side"
     end = "receiver"
     of_receiver = True

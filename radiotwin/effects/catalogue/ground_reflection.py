@@ -51,6 +51,7 @@ class GroundReflection(GainEffect):
     """One ground for all links with line of sight whose bounce no building blocks."""
 
     name = "ground_reflection"
+    in_words = "reflection off the ground"
     parameter_labels = {"roughness_m": "ground roughness", "ground_m": "ground height"}
     settled_by = "vary the height over open ground"
     confused_with = ("antenna_pattern", "wall_reflection")

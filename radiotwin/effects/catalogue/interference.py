@@ -43,6 +43,7 @@ class Interference(ReceiverEffect):
     """One emitter that all receivers hear."""
 
     name = "interference"
+    in_words = "an emitter beside the devices"
     parameter_labels = {"over_a_device_db": "power over a device's"}
     settled_by = "listen with the devices switched off"
     figure = "links"

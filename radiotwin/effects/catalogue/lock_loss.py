@@ -167,6 +167,7 @@ class LockLoss(DetectionEffect):
     """A probability of loss for each receiver whose links become likelier by it."""
 
     name = "lock_loss"
+    in_words = "loss of lock"
     parameter_labels = {"lost_share": "share lost", "drop_db": "level without lock, lower by"}
     confused_with = ("missing_obstacle", "noise_floor_censoring", "episode", "faulty_flight")
 

@@ -27,6 +27,7 @@ class MappedVegetation(GainEffect):
     """Loss in the declared vegetation of one kind; one step finds one kind's."""
 
     name = "mapped_vegetation"
+    in_words = "vegetation of the map"
     repeatable = True
     needs_map = True
     confused_with = ("foliage", "excess_attenuation")

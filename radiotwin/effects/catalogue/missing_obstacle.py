@@ -40,7 +40,6 @@ from radiotwin.effects.boxes import (
 )
 from radiotwin.effects.params import (
     QUANTILE_90,
-    Allowed,
     Decibels,
     EffectParams,
     Estimate,
@@ -78,6 +77,7 @@ class MissingObstacle(GainEffect):
     """A box that obstructs links; one step finds one."""
 
     name = "missing_obstacle"
+    in_words = "a building that the map lacks"
     settled_by = "fly low on both sides of the suspected place"
     figure = "links"
     repeatable = True
@@ -306,7 +306,7 @@ class MissingObstacle(GainEffect):
         reach = variation.values + QUANTILE_90 * estimate.sides_sd * np.array([[-1.0], [1.0]])
         units = {"turn_deg": "deg", "scattered_db": "dB"}
         return {name: Parameter(float(value), float(low), float(high), units.get(name, "m"),
-                                allowed=Allowed(float(least), float(most)))
+                                allowed=Box.allowed(name, float(least), float(most)))
                 for name, value, low, high, least, most in zip(
                     (*Box._fields, "scattered_db")[:len(variation.values)], variation.values,
                     *reach, variation.low, variation.high, strict=True)}

@@ -38,6 +38,7 @@ class NoiseFloor(ReceiverEffect):
     """A floor for each receiver."""
 
     name = "noise_floor_censoring"
+    in_words = "a limit of detection"
     parameter_labels = {"floor": "noise floor"}
     confused_with = ("interference", "excess_attenuation")
     nlos_only = True  # as good as: over a map, links with line of sight are far above a floor

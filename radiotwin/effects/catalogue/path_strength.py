@@ -89,6 +89,7 @@ class WallReflection(_Paths):
     """Specular paths off walls and the ground, up to four bounces; relative to concrete."""
 
     name = "wall_reflection"
+    in_words = "reflections off walls"
     kinds = ("reflected_1", "reflected_2", "reflected_more")
     confused_with = ("diffraction",)
 
@@ -97,5 +98,6 @@ class Diffraction(_Paths):
     """Paths over one or two roof edges or round corners, also with bounces; relative to theory."""
 
     name = "diffraction"
+    in_words = "diffraction"
     kinds = ("diffracted", "reflected_diffracted", "diffracted_2")
     confused_with = ("wall_reflection",)

@@ -73,6 +73,7 @@ class DevicePositionError(_PositionError):
     """A wrong position of an anchor and of all on its mast; one step finds one, the worst."""
 
     name = "device_position_error"
+    in_words = "a wrong position of the device"
     settled_by = "fly past the device on two sides, close by, or survey it again"
     step_m, max_move_m = 6.0, MAX_MOVE_M
     confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern",
@@ -157,6 +158,7 @@ class ReceiverPositionError(_PositionError):
     """A constant error of all positions of a receiver; one step finds one receiver, the worst."""
 
     name = "receiver_position_error"
+    in_words = "a wrong position of the receiver"
     parameter_labels = {"true_minus_given_x_m": "true − given position, east",
                         "true_minus_given_y_m": "true − given position, north",
                         "true_minus_given_z_m": "true − given height"}

@@ -46,6 +46,7 @@ class ReceiverSaturation(ReceiverEffect):
     """Receivers that read less than they receive where it is strong."""
 
     name = "receiver_saturation"
+    in_words = "saturation of the receiver"
     settled_by = "approach a device with line of sight"
     confused_with = ("antenna_pattern", "excess_attenuation")
 

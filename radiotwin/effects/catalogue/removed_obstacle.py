@@ -46,6 +46,7 @@ class RemovedObstacle(GainEffect):
     """One building of the map; one step finds one."""
 
     name = "removed_obstacle"
+    in_words = "a building that is gone"
     settled_by = "fly low on both sides of the suspected building"
     figure = "links"
     nlos_only = True

@@ -64,6 +64,7 @@ class TiltedDipole(BodyFrameEffect):
 
     name = "antenna_pattern"
     variant = "tilted dipole of a receiver"
+    in_words = "tilt of the receiver's antenna"
     parameter_labels = {"lean_azimuth_deg": "azimuth of the tilt, from the heading"}
     confused_with = ("body_shadowing", "receiver_gain_offset")
 

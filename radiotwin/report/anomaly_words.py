@@ -1,0 +1,235 @@
+"""Say which groups of links read otherwise than their peers, by how much, and why perhaps."""
+
+from collections.abc import Sequence
+
+from radiotwin.closeloop.verdict.criteria import LIKELY
+from radiotwin.closeloop.verdict.posterior import NONE, OTHER
+from radiotwin.display import count
+from radiotwin.effects.registry import effects_named
+from radiotwin.io.texts import moment
+from radiotwin.report.labels import (
+    DATES_S,
+    join_names,
+    name_label,
+    probability,
+    signed,
+    variable_label,
+)
+
+SURE = 0.9  # what is less probable is said to be probable only
+MAX_NAMED = 4  # members, causes or variables in a sentence
+MAX_SENTENCES = 3  # of groups; the others are in the table
+ANOTHER = "another"  # cause, which is not in the catalogue
+ENDS = ("device", "receiver", "flight")
+JOINED = {"receiver": "with", "flight": "on"}  # how an end follows another one
+COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten",
+          "eleven", "twelve")
+SIGHT = {"los": "with line of sight", "nlos": "without line of sight"}
+STATISTICS = {"level": "level", "scatter": "scatter", "blanks": "share of blanks",
+              "slope": "slope over distance"}
+PEERS = {"device x flight": "on {its} other flights", "receiver x flight": "on {its} other flights",
+         "device x receiver": "with {its} other receivers", "time": "in the rest of the time",
+         "direction": "in other directions", "distance": "at other distances",
+         "altitude": "at other altitudes", "level": "at other levels", "place": "elsewhere"}
+OVER = {"flight": "on all flights", "direction": "in all directions"}
+RANGES = {"azimuth_deg": "at azimuths", "elevation_deg": "at elevations",
+          "body_azimuth_deg": "at directions of arrival", "distance_m": "at distances",
+          "height_m": "at heights", "predicted_db": "at predicted levels"}
+
+
+def where(report: dict) -> str:
+    """Say which groups of links stand out, and what may be the cause of each; else empty.
+
+    Args:
+        report: content of `closeloop.json`.
+    """
+    anomalies = report.get("anomalies", [])
+    named = {index for each in report["effects"] for index in each.get("anomalies", [])}
+    text = [f"{sentence(each, report)} {causes(each, index in named)}"
+            for index, each in enumerate(anomalies[:MAX_SENTENCES])]
+    left = len(anomalies) - MAX_SENTENCES
+    if left > 0:
+        text.append(f"{count(left, 'more group').capitalize()} stand{'s' * (left == 1)} out.")
+    return " ".join(text)
+
+
+def sentence(anomaly: dict, report: dict) -> str:
+    """Say how a group reads otherwise than its peers: "Device d3 reads 5.6 dB less than …"."""
+    who, is_plural = group(anomaly)
+    sight = SIGHT.get(anomaly.get("sight", "all"))
+    start = f"{sight} {who}" if sight else who
+    maybe = "" if anomaly["probability"] >= SURE else "probably "
+    over = [OVER[each] for each in anomaly.get("same_over", [])]
+    everywhere = f", {join_names(over)}" if over else ""
+    text = f"{maybe}{_otherwise(anomaly, report, is_plural)}{everywhere}"
+    return f"{start[0].upper()}{start[1:]} {text} ({probability(anomaly['probability'])})."
+
+
+def causes(anomaly: dict, is_named: bool) -> str:
+    """Name the likeliest causes of a group: "Cause: …" if one of them was named."""
+    start = "Cause" if is_named else "Its cause is open"
+    likely = [each for each in anomaly.get("causes", []) if (each["probability"] or 0) >= LIKELY]
+    found = "; ".join(f"{cause(each['name'])} ({probability(each['probability'])})"
+                      for each in likely[:MAX_NAMED])
+    return f"{start}: {found}." if found else f"{start}." if not is_named else ""
+
+
+def cause(name: str) -> str:
+    """Return what a cause is called in a sentence."""
+    if name in (ANOTHER, OTHER):
+        return "another cause"
+    if name == NONE:
+        return "nothing is missing"
+    words = [each.in_words for each in effects_named(name) if each.in_words]
+    return " or ".join(dict.fromkeys(words)) or name_label(name)
+
+
+def group(anomaly: dict) -> tuple[str, bool]:
+    """Return a group in words, such as "device d3 on flight f2", and whether it is a plural."""
+    members = {end: names for end in ENDS if (names := anomaly["members"].get(end))}
+    text = ""
+    for end, names in members.items():
+        joined = f" {JOINED[end]} " if text else ""
+        text += f"{joined}{end}{'s' * (len(names) > 1)} {some_names(names)}"
+    is_plural = bool(members) and len(next(iter(members.values()))) > 1
+    ranges = [_range(name, *ends) for name, ends in _ranges(anomaly)]
+    if not members:
+        text, is_plural = "links", True
+    return " ".join([text, *ranges]), is_plural
+
+
+def rows(report: dict) -> list[list[str]]:
+    """Return a row for each anomaly: group, statistic, size, interval, probability, links, why."""
+    found = []
+    for each in report.get("anomalies", []):
+        sight = SIGHT.get(each.get("sight", "all"))
+        group_words = group(each)[0] + (f", {sight}" if sight else "")
+        likely = [why for why in each.get("causes", []) if (why["probability"] or 0) >= LIKELY]
+        found.append([
+            group_words, STATISTICS[each["statistic"]], size(each), interval(each["size"]),
+            probability(each["probability"]), f"{each['links']:,}",
+            "; ".join(f"{cause(why['name'])} {probability(why['probability'])}"
+                      for why in likely[:MAX_NAMED]) or "not known"])
+    return found
+
+
+COLUMNS = ("group", "statistic", "against its peers", "90 % interval", "probability", "links",
+           "possible causes")
+
+
+def size(anomaly: dict) -> str:
+    """Return the size of an anomaly with its unit."""
+    found = anomaly["size"]
+    value, unit = found["value"], found["unit"]
+    if value is None:
+        return "–"
+    if unit == "share":
+        return f"{'+' * (value > 0)}{signed(100 * value, 0)} %"
+    if unit == "times":
+        return f"{value:.1f} times"
+    return f"{'+' * (value > 0)}{signed(value)} {unit}"
+
+
+def interval(found: dict) -> str:
+    """Return the 90 % interval of an anomaly's size, without the unit."""
+    low, high = found["low"], found["high"]
+    if None in (low, high):
+        return "–"
+    if found["unit"] == "share":
+        return f"{signed(100 * low, 0)} to {signed(100 * high, 0)}"
+    if found["unit"] == "times":
+        return f"{low:.1f} to {high:.1f}"
+    return f"{signed(low)} to {signed(high)}"
+
+
+def _otherwise(anomaly: dict, report: dict, is_plural: bool) -> str:
+    """Return verb, size and peers: "reads 5.6 dB (5.1 to 6.1) less than the seven others"."""
+    found, peers = anomaly["size"], _peers(anomaly, report, is_plural)
+    value, end = found["value"] or 0.0, "" if is_plural else "s"
+    is_less = value < 0
+    more = "less" if is_less else "more"
+    # An amount is told without its sign, and so is its interval.
+    low, high = found["low"], found["high"]
+    if None not in (low, high) and is_less and found["unit"] != "times":
+        low, high = -high, -low
+    amount = abs(value)
+    if anomaly["statistic"] == "scatter":
+        return f"scatter{end} {amount:.1f} times{_within(low, high)} as much as {peers}"
+    if anomaly["statistic"] == "blanks":
+        low, high = (None if each is None else 100 * each for each in (low, high))
+        blank = "are" if is_plural else "is"
+        return (f"{blank} blank on {100 * amount:.0f} %{_within(low, high, 0)} {more} of "
+                f"{'their' if is_plural else 'its'} links than {peers}")
+    if anomaly["statistic"] == "slope":
+        more = "more" if is_less else "less"  # a level that falls faster loses more
+        return (f"lose{end} {amount:.1f} dB{_within(low, high)} {more} with each tenfold distance "
+                f"than {peers}")
+    return f"read{end} {amount:.1f} dB{_within(low, high)} {more} than {peers}"
+
+
+def _peers(anomaly: dict, report: dict, is_plural: bool) -> str:
+    family = anomaly["family"]
+    if family in PEERS:
+        return PEERS[family].format(its="their" if is_plural else "its")
+    known = report["error"].get(f"by_{family}") or {}
+    others = len(set(known) - set(anomaly["members"].get(family, ())))
+    if others == 1:
+        return f"the other {family}"
+    return f"the {COUNTS[others] if 1 < others < len(COUNTS) else others} others" \
+        if others > 0 else f"other {family}s"
+
+
+def _within(low: float | None, high: float | None, digits: int = 1) -> str:
+    if low is None or high is None:
+        return ""
+    return f" ({signed(low, digits)} to {signed(high, digits)})"
+
+
+def _ranges(anomaly: dict) -> list[tuple[str, Sequence[float | None]]]:
+    """Return the ranges of a group; those of a place as one."""
+    ranges = dict(anomaly.get("ranges") or {})
+    found = []
+    if "x_m" in ranges and "y_m" in ranges:
+        found.append(("place", [*ranges.pop("x_m"), *ranges.pop("y_m")]))
+    return [*found, *ranges.items()]
+
+
+def _range(name: str, *ends: float | None) -> str:
+    """Return a range in words: "at distances of 100 to 300 m"."""
+    if name == "place":
+        west, east, south, north = (_whole(each) for each in ends)
+        return f"at or through x {west} to {east} m, y {south} to {north} m"
+    low, high = ends
+    if name == "time_s":
+        return _times(low, high)
+    label, unit = variable_label(name)
+    start = RANGES.get(name, f"at {label}")
+    unit = unit.partition(" ")[0]
+    if unit == "°":
+        if "azimuth" in name or "heading" in name:
+            low, high = (None if each is None else each % 360 for each in (low, high))
+        return f"{start} of {_whole(low)}° to {_whole(high)}°"
+    if low is None or high is None:
+        beyond = f"up to {_whole(high)}" if low is None else f"from {_whole(low)}"
+        return f"{start} {beyond} {unit}"
+    return f"{start} of {_whole(low)} to {_whole(high)} {unit}"
+
+
+def _times(low: float | None, high: float | None) -> str:
+    ends = [None if each is None else
+            moment(each) if DATES_S[0] < each < DATES_S[1] else f"{_whole(each)} s"
+            for each in (low, high)]
+    words = [f"{word} {each}" for word, each in zip(("from", "to"), ends) if each is not None]
+    return " ".join(words)
+
+
+def some_names(names: Sequence[str]) -> str:
+    """Join the first few names, and count the others."""
+    left = len(names) - MAX_NAMED
+    if left <= 1:
+        return join_names(list(names))
+    return f"{', '.join(names[:MAX_NAMED])} and {left:,} others"
+
+
+def _whole(value: float | None) -> str:
+    return "–" if value is None else signed(value, 0)

@@ -1,0 +1,184 @@
+"""Heat maps of the held-out residual by device, receiver and flight; what stands out is framed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+
+from radiotwin.display import RESIDUAL_COLOURS, plain, residual_range_db
+from radiotwin.report.closeloop_data import DrawnLinks, LoopData
+from radiotwin.report.labels import FITTED, new_figure, signed
+
+MAX_MEMBERS = 40  # of an end; more would be too small to be read
+MIN_LINKS = 3  # of a cell
+MAX_NUMBERS = 12  # columns up to which each cell has its number
+SCATTER_COLOURS = "YlGnBu"
+SCATTER_OF_MEDIAN = 1.4826  # standard deviation over median absolute deviation, normal errors
+
+
+@dataclass(frozen=True, eq=False)
+class Pivot:
+    """Residuals by two ends.
+
+    Attributes:
+        ends: of rows and columns, such as `device` and `flight`.
+        names: of rows and of columns.
+        median_db: (rows, columns) [dB]; NaN where there are few links.
+        scatter_db: (rows, columns) standard deviation, robust [dB].
+        left_out: members that are not shown, by end.
+    """
+
+    ends: tuple[str, str]
+    names: tuple[list[str], list[str]]
+    median_db: np.ndarray
+    scatter_db: np.ndarray
+    left_out: dict[str, int]
+
+
+def pivot(links: DrawnLinks, residual_db: np.ndarray, ends: tuple[str, str],
+          anomalies: Sequence[dict]) -> Pivot:
+    """Return median and scatter of residuals (n,) by two ends.
+
+    Of an end with many members those that stand out are shown, and of the others those whose
+    residuals are largest.
+    """
+    seen = np.isfinite(residual_db)
+    kept, left_out = [], {}
+    for end in ends:
+        names, index = links.names[end], links.variables[end].astype(int)
+        framed = {name for each in anomalies for name in each["members"].get(end, ())}
+        count = np.bincount(index[seen], minlength=len(names))
+        mean_square = np.bincount(index[seen], weights=residual_db[seen]**2,
+                                  minlength=len(names)) / np.maximum(count, 1)
+        members = np.flatnonzero(count)
+        order = sorted(members, key=lambda each: (names[each] not in framed, -mean_square[each]))
+        kept.append(sorted(order[:MAX_MEMBERS]))
+        left_out[end] = len(members) - len(kept[-1])
+    shape = len(kept[0]), len(kept[1])
+    median_db, scatter_db = np.full(shape, np.nan), np.full(shape, np.nan)
+    first, second = (links.variables[end].astype(int) for end in ends)
+    pair = first * len(links.names[ends[1]]) + second
+    rows = np.flatnonzero(seen)
+    rows = rows[np.argsort(pair[rows], kind="stable")]
+    labels, starts = np.unique(pair[rows], return_index=True)
+    groups = dict(zip(labels.tolist(), np.split(rows, starts[1:]), strict=True))
+    for i, row in enumerate(kept[0]):
+        for j, column in enumerate(kept[1]):
+            group = groups.get(row * len(links.names[ends[1]]) + column, ())
+            if len(group) >= MIN_LINKS:
+                values_db = residual_db[group]
+                median_db[i, j] = np.median(values_db)
+                scatter_db[i, j] = SCATTER_OF_MEDIAN * np.median(
+                    np.abs(values_db - median_db[i, j]))
+    names = [[links.names[end][each] for each in members]
+             for end, members in zip(ends, kept, strict=True)]
+    return Pivot(ends, (names[0], names[1]), median_db, scatter_db, left_out)
+
+
+def groups_figure(data: LoopData, report: dict) -> Figure:
+    """Draw the residual of the base by device and flight, and by receiver and flight.
+
+    With one flight, receivers take its place. A row of panels for each pair of ends: the median,
+    and the scatter.
+
+    Args:
+        data: with the held-out prediction of the base.
+        report: content of `closeloop.json`, with the anomalies that are framed.
+    """
+    residual_db, anomalies = data.links.level_db - data.before_db, report.get("anomalies", [])
+    flights, receivers = len(data.links.flight_names), len(data.links.receiver_names)
+    ends = [("device", "flight")]
+    if receivers > 1:
+        ends = [("device", "receiver")] if flights == 1 else [*ends, ("receiver", "flight")]
+    pivots = [pivot(data.links, residual_db, each, anomalies) for each in ends]
+    heights = [0.26 * len(each.names[0]) + 1.3 for each in pivots]
+    widest = max(len(each.names[1]) for each in pivots)
+    figure = new_figure(min(max(2 * (0.62 * widest + 2.2), 7.0), 16.0), sum(heights) + 0.4)
+    grid = figure.add_gridspec(len(pivots), 2, height_ratios=heights)
+    high_db = residual_range_db(np.concatenate([each.median_db.ravel() for each in pivots]))
+    scatters_db = np.concatenate([each.scatter_db.ravel() for each in pivots])
+    known_db = scatters_db[np.isfinite(scatters_db)]
+    top_db = max(1.0, known_db.max(), 2 * np.median(known_db)) if len(known_db) else 1.0
+    for row, each in enumerate(pivots):
+        panels = ((each.median_db, "median residual [dB]", RESIDUAL_COLOURS, -high_db, high_db,
+                   ("level", "slope", "blanks")),
+                  (each.scatter_db, "scatter [dB]", SCATTER_COLOURS, 0.0, top_db, ("scatter",)))
+        for column, (values, label, colours, low, high, statistics) in enumerate(panels):
+            ax = figure.add_subplot(grid[row, column])
+            image = ax.imshow(values, cmap=colours, vmin=low, vmax=high, aspect="auto")
+            figure.colorbar(image, ax=ax, label=label, pad=0.02)
+            _label(ax, each, column)
+            _write_numbers(ax, values, low, high)
+            for anomaly in anomalies:
+                if anomaly["statistic"] in statistics:
+                    _frame(ax, each, anomaly["members"], bool(anomaly.get("ranges")))
+    return figure
+
+
+def _label(ax: Axes, found: Pivot, column: int) -> None:
+    rows, columns = found.names
+    crowded = len(columns) > 5 or max(map(len, columns)) > 8
+    ax.set_xticks(range(len(columns)), [_cut(name, 14) for name in columns],
+                  rotation=90 if crowded else 0, fontsize=8)
+    ax.set_yticks(range(len(rows)), [_cut(name, 20) for name in rows] if column == 0 else [],
+                  fontsize=8)
+    more = {end: f"{end}{'s' * (count != 1)}" for end, count in found.left_out.items()}
+    left = [f"{count} {more[end]} not shown" for end, count in found.left_out.items() if count]
+    ax.set_xlabel("; ".join([found.ends[1], *left]))
+    ax.set_ylabel(found.ends[0] if column == 0 else "")
+    ax.tick_params(length=0)
+    ax.spines[:].set_visible(False)
+
+
+def _write_numbers(ax: Axes, values: np.ndarray, low: float, high: float) -> None:
+    """Write the number of each cell into it, white on the dark ends of the colours."""
+    if values.shape[1] > MAX_NUMBERS:
+        return
+    for (row, column), value in np.ndenumerate(values):
+        if np.isfinite(value):
+            share = (value - low) / (high - low)
+            dark = share > (0.8 if low < 0 else 0.45) or (low < 0 and share < 0.2)
+            ax.text(column, row, signed(value), ha="center", va="center",
+                    fontsize=7, color="white" if dark else FITTED)
+
+
+def _frame(ax: Axes, found: Pivot, members: dict[str, Sequence[str]], is_part: bool) -> None:
+    """Frame the cells of a group, dashed where it is a part of their links.
+
+    A group of an end that the panel lacks is not in it.
+    """
+    if not members or not set(members) <= set(found.ends):
+        return
+    spans = []
+    for end, names in zip(found.ends, found.names, strict=True):
+        chosen = members.get(end)
+        at = [place for place, name in enumerate(names) if chosen is None or name in chosen]
+        spans.append(_runs(at))
+    for top, bottom in spans[0]:
+        for left, right in spans[1]:
+            ax.add_patch(Rectangle((left - 0.5, top - 0.5), right - left + 1, bottom - top + 1,
+                                   fill=False, edgecolor=FITTED, linewidth=2.2, zorder=5,
+                                   linestyle="--" if is_part else "-", clip_on=False,
+                                   path_effects=[withStroke(linewidth=5, foreground="white")]))
+
+
+def _cut(name: str, most: int) -> str:
+    """Cut a name in its middle: long names of one campaign often differ at their end."""
+    if len(name) > most:
+        name = f"{name[:most // 2 - 1]}…{name[len(name) - most // 2:]}"
+    return plain(name)
+
+
+def _runs(places: list[int]) -> list[tuple[int, int]]:
+    """Return first and last of each run of consecutive places: [0, 1, 4] -> [(0, 1), (4, 4)]."""
+    runs: list[tuple[int, int]] = []
+    for place in places:
+        if runs and runs[-1][1] == place - 1:
+            runs[-1] = runs[-1][0], place
+        else:
+            runs.append((place, place))
+    return runs
