@@ -30,7 +30,7 @@ STATISTICS = {"level": "level", "scatter": "scatter", "blanks": "share of blanks
 PEERS = {"device x flight": "on {its} other flights", "receiver x flight": "on {its} other flights",
          "device x receiver": "with {its} other receivers", "time": "in the rest of the time",
          "direction": "in other directions", "distance": "at other distances",
-         "altitude": "at other altitudes", "level": "at other levels", "place": "elsewhere"}
+         "altitude": "at other heights", "level": "at other levels", "place": "elsewhere"}
 OVER = {"flight": "on all flights", "direction": "in all directions"}
 RANGES = {"azimuth_deg": "at azimuths", "elevation_deg": "at elevations",
           "body_azimuth_deg": "at directions of arrival", "distance_m": "at distances",

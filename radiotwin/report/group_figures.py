@@ -74,9 +74,9 @@ def pivot(links: DrawnLinks, residual_db: np.ndarray, ends: tuple[str, str],
                 median_db[i, j] = np.median(values_db)
                 scatter_db[i, j] = SCATTER_OF_MEDIAN * np.median(
                     np.abs(values_db - median_db[i, j]))
-    names = [[links.names[end][each] for each in members]
+    shown = [[links.names[end][each] for each in members]
              for end, members in zip(ends, kept, strict=True)]
-    return Pivot(ends, (names[0], names[1]), median_db, scatter_db, left_out)
+    return Pivot(ends, (shown[0], shown[1]), median_db, scatter_db, left_out)
 
 
 def groups_figure(data: LoopData, report: dict) -> Figure:
