@@ -95,11 +95,11 @@ def test_every_figure_is_written_without_a_map(loop, tmp_path):
     (tmp_path / "effect_7_of_an_earlier_run.png").write_bytes(b"")
     write_closeloop_figures(loop, None, content, tmp_path)
     found = sorted(path.name for path in tmp_path.glob("*.png"))
-    assert found == ["drivers.png", "effect_1_receiver_gain_offset.png", "level_map.png", "residual_map.png",
-                     "waterfall.png"]
+    assert found == ["drivers.png", "effect_1_receiver_gain_offset.png", "groups.png", "level_map.png",
+                     "residual_map.png", "waterfall.png"]
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in found)
     write_closeloop_page(content, tmp_path, "page")
-    assert (tmp_path / "closeloop.html").read_text().count("data:image/png;base64,") == 5
+    assert (tmp_path / "closeloop.html").read_text().count("data:image/png;base64,") == 6
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -121,7 +121,7 @@ def test_figures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_p
     write_closeloop_figures(nothing, None, content, tmp_path)
     write_closeloop_page(content, tmp_path, "page")
     text = (tmp_path / "closeloop.html").read_text()
-    assert text.count("data:image/png;base64,") == 4 and "No structure" in text
+    assert text.count("data:image/png;base64,") == 5 and "No structure" in text
 
 
 @pytest.mark.parametrize("effect, params", [
