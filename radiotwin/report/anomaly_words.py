@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from radiotwin.closeloop.verdict.criteria import LIKELY
+from radiotwin.closeloop.verdict.criteria import LIKELY, MIN_SURE
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER
 from radiotwin.display import count
 from radiotwin.effects.registry import effects_named
@@ -16,7 +16,6 @@ from radiotwin.report.labels import (
     variable_label,
 )
 
-SURE = 0.9  # what is less probable is said to be probable only
 MAX_NAMED = 4  # members, causes or variables in a sentence
 MAX_SENTENCES = 3  # of groups; the others are in the table
 ANOTHER = "another"  # cause, which is not in the catalogue
@@ -58,7 +57,7 @@ def sentence(anomaly: dict, report: dict) -> str:
     who, is_plural = group(anomaly)
     sight = SIGHT.get(anomaly.get("sight", "all"))
     start = f"{sight} {who}" if sight else who
-    maybe = "" if anomaly["probability"] >= SURE else "probably "
+    maybe = "" if anomaly["probability"] >= MIN_SURE else "probably "
     over = [OVER[each] for each in anomaly.get("same_over", [])]
     everywhere = f", {join_names(over)}" if over else ""
     text = f"{maybe}{_otherwise(anomaly, report, is_plural)}{everywhere}"

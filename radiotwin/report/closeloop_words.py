@@ -3,10 +3,10 @@
 from collections import Counter
 from math import hypot
 
-from radiotwin.closeloop.verdict.criteria import LIKELY, SelectionCriteria
+from radiotwin.closeloop.verdict.criteria import LIKELY, MIN_SURE, SelectionCriteria
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER
 from radiotwin.effects.registry import effects_named
-from radiotwin.report.anomaly_words import MAX_NAMED, SURE, group, some_names, where
+from radiotwin.report.anomaly_words import MAX_NAMED, group, some_names, where
 from radiotwin.report.labels import (
     interpolations,
     join_names,
@@ -59,12 +59,12 @@ def cause_names(report: dict) -> list[str]:
 
 
 def is_sure(report: dict) -> bool:
-    """Return whether each cause that was found has a probability of at least `SURE`.
+    """Return whether each cause that was found has a probability of at least `MIN_SURE`.
 
     Steps between flights have none.
     """
     return not report["posterior"] or all(
-        (each.get("probability") or 0.0) >= SURE for each in _causes(report))
+        (each.get("probability") or 0.0) >= MIN_SURE for each in _causes(report))
 
 
 def rivals(report: dict) -> str:
@@ -220,8 +220,7 @@ def _none(report: dict) -> str:
 
 def _located(report: dict) -> str:
     return " ".join(filter(None, [
-        f"The {_residual(report)}", _not_looked_for(report), _settled_by(report),
-        _sizes(report)]))
+        f"The {_residual(report)}", _not_looked_for(report), _settled_by(report)]))
 
 
 def _not_looked_for(report: dict) -> str:
@@ -248,13 +247,16 @@ def _undecided(report: dict) -> str:
     step = next(iter(report["posterior"]), None)
     if step is None:
         return "Undecided: no cause was looked for."
-    likely, sizes = _likely(step["probabilities"], report), _sizes(report)
-    none = next((each["probability"] or 0.0 for each in step["probabilities"]
-                 if each["name"] == NONE), 0.0)
-    if sizes and none >= HALF and not report.get("anomalies"):
-        sizes += " That much at places is not said to be nothing."
+    likely, sizes = _likely(step["probabilities"], report), ""
+    what = "whether that is real"
+    if not report.get("anomalies"):
+        what, sizes = "the cause", _sizes(report)
+        none = next((each["probability"] or 0.0 for each in step["probabilities"]
+                     if each["name"] == NONE), 0.0)
+        if sizes and none >= HALF:
+            sizes += " That much at places is not said to be nothing."
     return " ".join(filter(None, [
-        "Undecided: these measurements do not tell the cause.", likely and f"Likeliest: {likely}.",
+        f"Undecided: these measurements do not tell {what}.", likely and f"Likeliest: {likely}.",
         f"The {_residual(report)}", _not_looked_for(report), _settled_by(report), sizes]))
 
 

@@ -263,7 +263,7 @@ def test_what_is_left_without_a_name_beside_the_effects_is_said(likelihood, is_s
     assert ("Beside it something is left that has no name (probability 0.87)." in closeloop_summary(found)) == is_said
 
 
-@pytest.mark.parametrize("verdict", ["none", "undecided", "located"])
+@pytest.mark.parametrize("verdict", ["none", "undecided"])
 def test_errors_of_a_map_are_spoken_of_where_there_is_one(verdict):
     without = report(verdict, base="log-distance")
     hidden = {"by_los": {"nlos": {"before": SCORES, "after": SCORES}}}

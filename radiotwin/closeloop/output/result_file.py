@@ -33,6 +33,7 @@ _WORDS = {"log_distance": "the log-distance law", "segmented_log_distance": "the
           "regression_kriging": "kriging", "extra_trees": "a tree ensemble (ExtraTrees)",
           "hist_gradient_boosting": "gradient boosting (HistGradientBoosting)"}
 SCHEMA = "radiotwin.closeloop/3"
+MIN_PART, AS_LARGE = 10, 0.5  # links of a flight or direction; share of a group's size
 REMEDY = "run `radiotwin close-loop` again"
 MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
 # Parts that a report need not have.
@@ -121,7 +122,8 @@ def make_report(loop: Loop) -> dict[str, Any]:
     return _for_json({
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
-        "anomalies": [_anomaly(each) for each in loop.anomalies],
+        "anomalies": [_anomaly(each) | {"same_over": same_over(each, loop.before)}
+                      for each in loop.anomalies],
         "posterior": [_step(each) for each in loop.found.steps],
         "detectable": [vars(each) for each in agreeing(
             loop.detectable, {each["name"] for each in effects}, loop.found.steps)],
@@ -241,6 +243,31 @@ def _anomaly(found: Anomaly) -> dict[str, Any]:
             "probability": found.probability, "links": int(found.rows.sum()),
             "causes": [{"name": name, "probability": probability}
                        for name, probability in found.causes.items()]}
+
+
+def same_over(found: Anomaly, base: CrossFit) -> list[str]:
+    """Return over what a group's level is the same: `flight`, `direction` or both.
+
+    In each flight, or each octant of directions, the median residual is at least half of the size
+    away from that of the peers, on the same side.
+    """
+    links = base.links
+    if found.statistic != "level" or found.family not in ("device", "receiver"):
+        return []
+    residual_db = links.level_db - base.held_out_mean_db
+    angle_deg = links.azimuth_deg if found.family == "device" else links.body_azimuth_deg
+    parts = {"flight": links.flight, "direction": np.floor(angle_deg / 45.0)}
+    seen = np.isfinite(residual_db)
+    peers_db = np.median(residual_db[seen & ~found.rows])
+    holds = []
+    for name, label in parts.items():
+        rows = seen & found.rows & np.isfinite(label)
+        _, index, links_in = np.unique(label[rows], return_inverse=True, return_counts=True)
+        shifts = [np.median(residual_db[rows][index == number]) - peers_db
+                  for number in np.flatnonzero(links_in >= MIN_PART)]
+        if len(shifts) > 1 and (np.array(shifts) / found.size.value >= AS_LARGE).all():
+            holds.append(name)
+    return holds
 
 
 def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:

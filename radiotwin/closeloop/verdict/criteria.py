@@ -22,7 +22,7 @@ MAX_LOSS_NATS = 0.01  # a held-out link, where devices that are located anew can
 MIN_FOLDS = 0.5  # share of the folds that must have found a parameter, too
 MIN_CLUSTERS = 3  # effective ones, of which a spread can be told
 # Of probabilities (`radiotwin.closeloop.verdict.posterior`); the weights are in calibration.json.
-MIN_SURE = 0.9  # probability of a group that stands out, for the verdict to be `located`
+MIN_SURE = 0.9  # of a group for the verdict `located`; what is less sure is said to be probable
 LEAST_RATIO = 0.2  # of what belongs to places to noise; less is none
 NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
 LIKELY = 0.05  # a cause that is less probable is not worth a word

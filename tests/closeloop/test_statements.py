@@ -1,0 +1,51 @@
+"""What is said of a result is true of the links: the error of a map, what holds everywhere, what would have been seen."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.closeloop.output.result_file import agreeing, same_over
+from radiotwin.closeloop.verdict.sensitivity import Detectable
+from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
+from tests.closeloop.drives import drive, fitted
+
+LOCK_DB, LOCKED = 19.0, 0.65
+
+
+def test_the_error_of_a_map_does_not_know_the_state_of_each_reading():
+    """Two states 19 dB apart: a map errs by the spread of the states, and is as likely as their mixture."""
+    table = drive(3)
+    lost = np.random.default_rng(3).random(len(table)) > LOCKED
+    table = table.assign(gain_db=table["gain_db"] - LOCK_DB * lost, quality=(~lost).astype(float))
+    model = fitted(table, UnexplainedTrend("quality"))
+    known_db = model.rmse_db()
+    spread_db = LOCK_DB * np.sqrt(LOCKED * (1 - LOCKED))
+    assert known_db < 4.5 and model.reads_quality
+    assert model.rmse_on_map_db() == pytest.approx(np.hypot(known_db, spread_db), rel=0.05)
+    states = -(LOCKED * np.log(LOCKED) + (1 - LOCKED) * np.log(1 - LOCKED))  # nats that tell the states apart
+    assert np.nanmean(model.on_map[1] - model.held_out_nll) == pytest.approx(states, abs=0.1)
+    plain = model.map(lambda fit: fit.model.with_effects([]).fit())
+    assert not plain.reads_quality and plain.on_map[0] is plain.held_out_mean_db
+
+
+@pytest.mark.parametrize(("factor", "over"), (
+    (lambda flight, octant: 1.0, ["flight", "direction"]), (lambda flight, octant: np.where(flight == 2, 0.0, 1.0), ["direction"]),
+    (lambda flight, octant: np.where(octant == 5, -1.0, 1.0), ["flight"])))
+def test_a_level_is_said_of_all_flights_and_directions_only_where_it_is_seen_there(factor, over):
+    device, flight, octant, _ = pd.MultiIndex.from_product([range(4), range(5), range(8), range(12)]).to_frame().to_numpy().T
+    level_db = np.random.default_rng(0).normal(0, 1, len(device)) - 6.0 * (device == 1) * factor(flight, octant)
+    links = SimpleNamespace(level_db=level_db, flight=flight, azimuth_deg=45.0 * octant + 20.0)
+    base = SimpleNamespace(links=links, held_out_mean_db=np.zeros(len(device)))
+    found = SimpleNamespace(statistic="level", family="device", rows=device == 1, size=SimpleNamespace(value=-6.0))
+    assert same_over(found, base) == over
+    found.statistic = "scatter"
+    assert same_over(found, base) == []
+
+
+def test_what_was_seen_is_not_said_to_be_invisible():
+    sizes = [Detectable(name, size, "dB", "") for name, size in (
+        ("antenna_pattern", np.inf), ("foliage", 9.0), ("interference", np.inf), ("device_gain_offset", 2.0))]
+    steps = [SimpleNamespace(probabilities={"antenna_pattern": 0.71, "interference": 0.01, "foliage": 0.4})]
+    assert [each.name for each in agreeing(sizes, {"device_gain_offset"}, steps)] == ["foliage", "interference"]
