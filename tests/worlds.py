@@ -11,6 +11,7 @@ import pytest
 
 from radiotwin.closeloop.predict.baselines import grow_trees
 from radiotwin.closeloop.predict.predictor import CombinedPrediction
+from radiotwin.closeloop.predict.weights import Combination
 from radiotwin.effects.registry import catalogue
 from radiotwin.links.links import Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements
@@ -75,8 +76,8 @@ def shortened():
     """Half of the time goes into what predicts best and what would have been seen, which have tests of their own."""
     def alone(model, *_):
         mean_db = model.held_out_mean_db
-        return CombinedPrediction(mean_db, ["named"], np.ones((2, 1)), mean_db[:, None], np.zeros(len(mean_db)),
-                                  {"log_distance": mean_db})
+        return CombinedPrediction(mean_db, mean_db, np.full(len(mean_db), 0.5),
+                                  Combination({"named": (1.0, 1.0)}, 50.0, (1.0, 1.0)), {"log_distance": mean_db})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("radiotwin.closeloop.run.combined_prediction", alone)
         patch.setattr("radiotwin.closeloop.run.detectable", lambda *_: [])

@@ -135,7 +135,7 @@ class Loop(Summarised):
     @cached_property
     def prediction(self) -> CombinedPrediction:
         """Held-out, by all that was learnt, and by other models alone; takes a while."""
-        return combined_prediction(self.for_twin, bool(self.remaining), self.criteria, self.seed)
+        return combined_prediction(self.for_twin, bool(self.remaining), self.seed)
 
     @cached_property
     def detectable(self) -> list[Detectable]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import gammaln, stdtr
@@ -48,6 +49,69 @@ class Losses:
 
 
 NO_LOSSES = Losses()
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingLaw:
+    """Distribution of n levels: Student-t about a mean, and blank below the limit of detection.
+
+    Attributes:
+        mean_db: (n,) mean level, also below the limit [dB].
+        scale_db: (n,) scale of its error [dB].
+        limit_db: (n,) below which nothing is detected [dB]; -inf where it is not known.
+        dof: degrees of freedom, above 2.
+        losses: of the links, whatever their level.
+    """
+
+    mean_db: np.ndarray
+    scale_db: np.ndarray
+    limit_db: np.ndarray
+    dof: float
+    losses: Losses = NO_LOSSES
+
+    @property
+    def sd_db(self) -> np.ndarray:
+        """(n,) standard deviation of the level [dB]."""
+        return self.scale_db * sd_of_scale(self.dof)
+
+    @cached_property
+    def reading_db(self) -> np.ndarray:
+        """(n,) mean of a reading: of the level, given that it is detected [dB]."""
+        return mean_if_detected(self.mean_db, self.scale_db, self.limit_db, self.dof, self.losses)
+
+    @property
+    def detection_probability(self) -> np.ndarray:
+        """(n,) probability that the link is detected."""
+        return detection_probability(self.mean_db, self.scale_db, self.limit_db, self.dof,
+                                     self.losses)
+
+    def nll(self, level_db: np.ndarray) -> np.ndarray:
+        """Return the negative log-likelihood of levels (n,), NaN = not detected [nats]."""
+        return censored_nll(level_db, self.limit_db, self.mean_db, self.scale_db, self.dof,
+                            self.losses)
+
+    def rank(self, level_db: np.ndarray) -> np.ndarray:
+        """Return the probability (n,) that a reading is below levels (n,); NaN of a blank.
+
+        It is uniform between 0 and 1 where the law is right (probability integral transform; Dawid
+        1984, Journal of the Royal Statistical Society A 147).
+        """
+        known = np.isfinite(self.limit_db)
+        limit_db = np.where(known, self.limit_db, 0.0)
+        own = self.mean_db, self.scale_db
+        missed = np.where(known, below_probability(*own, limit_db, self.dof, self.losses), 0.0)
+        below = below_probability(*own, level_db, self.dof, self.losses)
+        return np.clip((below - missed) / np.maximum(1 - missed, MIN_PROBABILITY), 0.0, 1.0)
+
+    def select(self, rows: np.ndarray) -> ReadingLaw:
+        """Return that of some of the links (a mask or indices)."""
+        return ReadingLaw(self.mean_db[rows], self.scale_db[rows], self.limit_db[rows], self.dof,
+                          self.losses.select(rows))
+
+
+def sd_of_scale(dof: float) -> float:
+    """Return the standard deviation of Student's t of scale 1."""
+    return float(np.sqrt(dof / (dof - 2)))
 
 
 def log_density(z: np.ndarray, dof: float) -> np.ndarray:

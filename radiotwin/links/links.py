@@ -585,14 +585,17 @@ class Prediction:
         mean_db: (n,) mean gain [dB] or power [dBm], also below what can be detected.
         sd_db: (n,) standard deviation [dB].
         detection_probability: (n,) that the link is detected.
+        reading_db: (n,) mean of a reading: of the level, given that it is detected. Compare
+            detected levels with this; near the limit it lies above `mean_db`.
     """
 
     mean_db: np.ndarray
     sd_db: np.ndarray
     detection_probability: np.ndarray
+    reading_db: np.ndarray
 
     @classmethod
     def concatenate(cls, parts: list[Prediction]) -> Prediction:
         """Return the predictions of several sets of links, one after the other."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts])
-                     for name in ("mean_db", "sd_db", "detection_probability")))
+                     for name in ("mean_db", "sd_db", "detection_probability", "reading_db")))

@@ -45,6 +45,8 @@ SUFFIXES = {"_db_km": "dB/km", "_db_m": "dB/m", "_deg": "°", "_db": "dB", "_dbm
 MODELS = {"log_distance": "log-distance", "segmented_log_distance": "segmented log-distance",
           "segmented_nn": "segmented NN", "regression_kriging": "regression kriging",
           "extra_trees": "extra trees", "hist_gradient_boosting": "gradient boosting",
+          "trees_of_levels": "extra trees, blanks included",
+          "boosting_of_levels": "gradient boosting, blanks included",
           "tr36777_uma": "TR 36.777 UMa", "tr36777_umi": "TR 36.777 UMi",
           "al_hourani_suburban": "Al-Hourani suburban", "al_hourani_urban": "Al-Hourani urban",
           "al_hourani_dense_urban": "Al-Hourani dense urban",

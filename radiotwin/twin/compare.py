@@ -246,8 +246,7 @@ def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
 
     Only detected links can be compared with a prediction, and near the limit only the strong ones
     were detected: the mean of all would lie below the mean of those, most for the model with the
-    largest standard deviation. So every model predicts the mean of what is detected (a truncated
-    normal distribution).
+    largest standard deviation. So every model predicts the mean of what is detected.
 
     Args:
         twin: predicts.
@@ -270,9 +269,7 @@ def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
         if antenna_of_uavs(scene, list(measurements.table["receiver"]))[0] is None:
             declared = replace(declared, receiver_antenna=None)
         links = links.with_ends(declared=declared)
-        found = twin.predict(links)
-        limit_db = -np.inf if twin.limit_db is None else twin.limit_db
-        predicted_db[row >= 0] = mean_if_detected(found.mean_db, found.sd_db, limit_db)
+        predicted_db[row >= 0] = twin.predict(links).reading_db
     return predicted_db
 
 

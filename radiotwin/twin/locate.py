@@ -8,6 +8,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_geographic, to_local
+from radiotwin.inference.student import sd_of_scale
 from radiotwin.io.cells import as_numbers, read_cells, refuse
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, link_geometry, prepare_links
@@ -17,7 +18,7 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import TwinDevice, locate, misfit, whole_area
-from radiotwin.twin.model.model import FittedModel
+from radiotwin.twin.model.model import CHANNEL_DOF, FittedModel
 from radiotwin.twin.twin import Twin
 
 NOT_BY_PATHS = ("and following paths from every position where a device may be takes too long: "
@@ -26,7 +27,6 @@ NOT_BY_PATHS = ("and following paths from every position where a device may be t
 MAX_NAMED = 5  # receivers in a note
 TRUTH_COLUMNS = ("x_m", "y_m"), ("latitude", "longitude")
 MAX_PROBES = 2000  # links by which a channel's error scale is looked up
-PLAIN_DOF = 30.0  # degrees of freedom of the errors of a twin of `fit`: nearly normal
 MIN_WIDENING = 1.2  # of residuals, from which a file's links are unlike those learnt from
 
 
@@ -131,9 +131,9 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
     sd_db, group = channel.predict(probes)[1], channel.error_group(probes)
     usual_db = [np.median(sd_db[group == each] if (group == each).any() else sd_db)
                 for each in range(channel.error_groups(probes))]
-    scale_db = np.array(usual_db) * np.sqrt((PLAIN_DOF - 2) / PLAIN_DOF)
+    scale_db = np.array(usual_db) / sd_of_scale(CHANNEL_DOF)
     levels = np.zeros(channel.level_columns(probes)[0].shape[1])
-    return FittedModel(channel, (), (), levels, scale_db, PLAIN_DOF,
+    return FittedModel(channel, (), (), levels, scale_db, CHANNEL_DOF,
                        np.nan_to_num(twin.device_m), (), links.first_s, 0.0)
 
 

@@ -17,7 +17,6 @@ from radiotwin.closeloop.predict.baselines import (
     held_out_baselines,
     published_laws,
 )
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.links import prepare_links
 from radiotwin.links.variables import feature_count, link_features
@@ -127,7 +126,7 @@ def test_published_laws_say_nothing_of_devices_that_are_nowhere(links):
     folds = [Model.build(links, LogDistance(LogDistanceLine(-35.0, -2.6, 2.0)), 5.0, device_m=device_m,
                              train=links.flight != flight).fit() for flight in range(6)]
     model = CrossFit(folds[0], tuple(folds), links.flight, None)
-    found, _ = held_out_baselines(model, [Part(each.links) for each in folds], SelectionCriteria(), 0)
+    found, _ = held_out_baselines(model, [Part(each.links) for each in folds], 0)
     known = links.device != 3
     for name, mean_db in found.items():
         assert np.isfinite(mean_db[known]).all() and np.isnan(mean_db[~known]).all(), name

@@ -8,7 +8,7 @@ from radiotwin.closeloop import crossfit as cross_validation
 from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
 from radiotwin.closeloop.predict import predictor
 from radiotwin.closeloop.predict.predictor import combined_prediction
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.predict.weights import Combination
 from radiotwin.links import prepare_links
 
 
@@ -31,7 +31,7 @@ def predicted(links, with_rest=False):
     """Return folds and the combination upon the log-distance law, without any effect."""
     folds = make_folds(links, 0)
     model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
-    return model, combined_prediction(model, with_rest, SelectionCriteria(), 0)
+    return model, combined_prediction(model, with_rest, 0)
 
 
 def rmse_db(links, mean_db):
@@ -40,7 +40,7 @@ def rmse_db(links, mean_db):
 
 def ratio(links, found):
     """Return its error over that of the best other model."""
-    return rmse_db(links, found.mean_db) / min(rmse_db(links, each) for each in found.baselines.values())
+    return rmse_db(links, found.reading_db) / min(rmse_db(links, each) for each in found.baselines.values())
 
 
 def test_of_levels_without_any_cause_the_mean_is_predicted(open_ground):
@@ -48,32 +48,25 @@ def test_of_levels_without_any_cause_the_mean_is_predicted(open_ground):
     world.gain_db = np.random.default_rng(3).normal(-80.0, 6.0, len(world.gain_db))
     links = prepare_links(open_ground.measured(world), None)
     _, found = predicted(links)
-    assert rmse_db(links, found.mean_db) < 1.02 * float(np.nanstd(links.level_db))
-    np.testing.assert_allclose(found.weights.sum(axis=1), 1.0)
-    assert (found.weights >= 0).all()
+    assert rmse_db(links, found.reading_db) < 1.02 * float(np.nanstd(links.level_db))
+    weights = np.array(list(found.combination.weights.values()))
+    np.testing.assert_allclose(weights.sum(axis=0), 1.0)
+    assert (weights >= 0).all()
 
 
-def test_no_reading_of_a_fold_changes_the_members_that_predict_it(open_ground):
-    links = prepare_links(open_ground.measured(flown(open_ground, 4)), None)
+def test_neither_members_nor_weights_of_a_fold_see_its_readings(open_ground, monkeypatch):
+    links = prepare_links(open_ground.measured(flown(open_ground, 4, part=12)), None)
+    given, weights = [], Combination({"named": (0.5, 0.5), "regression_kriging": (0.5, 0.5)}, 50.0, (1.0, 1.0))
+    monkeypatch.setattr(predictor, "combination", lambda held_out, *_: given.append(held_out) or weights)
     model, found = predicted(links)
     own = model.index == 2
     level_db = links.level_db + own * np.random.default_rng(0).normal(0, 9, len(links))
     _, other = predicted(links.with_columns(level_db=level_db))
-    np.testing.assert_allclose(found.members[own], other.members[own], atol=1e-6)
-    assert not np.allclose(found.members[~own], other.members[~own])
-
-
-def test_no_error_of_a_fold_has_a_part_in_its_weights(open_ground, monkeypatch):
-    links = prepare_links(open_ground.measured(flown(open_ground, 4, part=12)), None)
-    given = []
-    weighed = predictor._weights
-    monkeypatch.setattr(predictor, "_weights", lambda error_db, *rest: given.append(error_db) or weighed(error_db, *rest))
-    model, found = predicted(links)
-    error_db = links.level_db[:, None] - found.members
-    assert len(given) == len(model.folds) + 1
-    for number, weighed_db in enumerate(given[:-1]):
-        own = error_db[(model.index == number) & np.isfinite(error_db).all(axis=1)]
-        assert len(own) and not np.isin(own[:, 0], weighed_db[:, 0]).any()
+    np.testing.assert_allclose(found.reading_db[own], other.reading_db[own], atol=1e-6)
+    assert not np.allclose(found.reading_db[~own], other.reading_db[~own])
+    assert len(given) == 2 * (len(model.folds) + 1)
+    for number, weighed in enumerate(given[:len(model.folds)]):
+        assert number not in weighed.fold and len(weighed) == (model.index != number).sum()
 
 
 @pytest.mark.slow
@@ -86,7 +79,7 @@ def test_on_levels_that_hold_nothing_the_reported_error_is_not_below_theirs(open
         model, found = predicted(links, with_rest=True)
         seen = np.isfinite(links.level_db)
         mean_db = np.array([links.level_db[seen & (model.index != fold)].mean() for fold in model.index])
-        ratios.append(rmse_db(links, found.mean_db) / rmse_db(links, mean_db))
+        ratios.append(rmse_db(links, found.reading_db) / rmse_db(links, mean_db))
     assert np.mean(ratios) > 0.995  # each scatters by 0.01
 
 
@@ -110,6 +103,6 @@ def test_near_measurements_interpolation_wins_and_far_from_them_the_law(open_gro
     world.gain_db += 7.0 * np.sign(np.sin(world.receiver_m[:, 0] / 40) * np.sin(world.receiver_m[:, 1] / 40))
     links = prepare_links(open_ground.measured(world), None)
     _, found = predicted(links, with_rest=True)
-    law = [found.names.index(name) for name in ("named", "segmented_log_distance")]
-    near, far = found.weights[:, law].sum(axis=1)
+    near, far = np.sum([found.combination.weights.get(name, (0.0, 0.0))
+                        for name in ("named", "segmented_log_distance")], axis=0)
     assert ratio(links, found) < 1.02 and far > near

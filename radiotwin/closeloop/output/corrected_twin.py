@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import radiotwin
-from radiotwin.closeloop.predict.blending import make_blend, needs_rest
+from radiotwin.closeloop.predict.predictor import served
 from radiotwin.closeloop.run import Loop
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import RadiusCalibration, calibrate_radii, whole_area
@@ -24,12 +24,8 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
         scene: that it was found in, if there was one.
     """
     model = loop.for_twin
-    shadowing = model.whole.shadowing
-    if shadowing is None and needs_rest(loop.prediction):
-        shadowing = model.whole.rest(loop.seed)
-    fitted = replace(model.whole.learnt,
-                     **vars(_calibration(loop, scene)), shadowing=shadowing,
-                     blend=make_blend(model, loop.prediction, loop.seed))
+    fitted = replace(served(model, loop.prediction.combination, loop.seed),
+                     **vars(_calibration(loop, scene)))
     provenance: dict[str, Any] = {"links": len(model.links),
                                   "radiotwin_version": radiotwin.__version__}
     if loop.origin is not None:

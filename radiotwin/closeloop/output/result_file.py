@@ -12,7 +12,6 @@ import numpy as np
 from radiotwin import __version__
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.output.result_schema import ReportRecord
-from radiotwin.closeloop.predict.blending import held_out_coverage
 from radiotwin.closeloop.run import Loop
 from radiotwin.closeloop.scan import Anomaly
 from radiotwin.closeloop.search.trials import Trial
@@ -113,12 +112,13 @@ def make_report(loop: Loop) -> dict[str, Any]:
                                        "after": scores(loop.after, rows)}
                                for label, rows in groups.items()}
     predicted = loop.prediction
-    error["combined"] = errors(links.level_db, predicted.mean_db) | {
-        "in_90_percent_interval": held_out_coverage(loop.for_twin, predicted)}
+    error["combined"] = errors(links.level_db, predicted.reading_db) | {
+        "in_90_percent_interval": predicted.coverage}
+    error["map"] = errors(links.level_db, predicted.map_db)
     baselines = {name: errors(links.level_db, mean_db)
                  for name, mean_db in predicted.baselines.items()}
-    combination = [{"name": name, "weight_near": near, "weight_far": far} for name, near, far in
-                   zip(predicted.names, *predicted.weights, strict=True)]
+    combination = [{"name": name, "weight_near": near, "weight_far": far}
+                   for name, (near, far) in predicted.combination.weights.items()]
     return _for_json({
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,

@@ -35,6 +35,7 @@ class ErrorRecord(BothRecord):
     """Errors of all links and of groups of them, by the groups' names."""
 
     combined: ScoresRecord | None = None
+    map: ScoresRecord | None = None
     after_with_quality: ScoresRecord | None = None
     noise_floor_db: Real | None
     by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)

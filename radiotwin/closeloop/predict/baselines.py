@@ -10,9 +10,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from radiotwin.closeloop.crossfit import CrossFit
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.errors import BadInput
-from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.links import Links
 from radiotwin.links.variables import feature_count, link_features
 from radiotwin.propagation.laws import ChannelModel
@@ -22,6 +20,7 @@ from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDis
 from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.propagation.laws.registry import BUILT_IN, fit_once
 from radiotwin.runtime.pieces import kept
+from radiotwin.twin.model.model import FittedModel
 
 LAWS: tuple[type[ChannelModel], ...] = (LogDistance, SegmentedLogDistance, RegressionKriging)
 EXTRA_TREES, BOOSTING = "extra_trees", "hist_gradient_boosting"
@@ -123,7 +122,7 @@ def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: i
 
 
 def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,
-               like: RegressionKriging | None = None) -> ChannelModel:
+               like: ChannelModel | None = None) -> ChannelModel:
     """Return a channel model that is fitted to some links.
 
     Args:
@@ -135,54 +134,43 @@ def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,
     geometry, gain_db, limit_db = links.select(train).gains()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of classes with few links
-        if like is not None and kind is RegressionKriging:
+        if isinstance(like, RegressionKriging):
             return like.refit(geometry, gain_db, limit_db)
         return fit_once(kind, geometry, gain_db, limit_db, 0)
 
 
 def law_db(law: ChannelModel, links: Links, test: np.ndarray) -> np.ndarray:
-    """Return what a model predicts of rows (m,) of links that are detected [dB]."""
-    part = links.select(test)
-    mean_db, sd_db = law.predict(part.geometry)
-    return mean_if_detected(mean_db + part.declared_db, sd_db, part.limit_db)
+    """Return the mean readings of rows (m,) of links [dB], as a twin of the model predicts them."""
+    return FittedModel.of_channel(law).predict(links.select(test)).reading_db
 
 
-def laws_for(links: Links, criteria: SelectionCriteria) -> list[type[ChannelModel]]:
-    """Return `LAWS`, without kriging where links are too many for it."""
-    return [kind for kind in LAWS
-            if kind is not RegressionKriging or len(links) <= criteria.max_links_for_kriging]
-
-
-def held_out_baselines(model: CrossFit, parts: list[Part], criteria: SelectionCriteria, seed: int
-                       ) -> tuple[dict[str, np.ndarray], list[RegressionKriging]]:
+def held_out_baselines(model: CrossFit, parts: list[Part], seed: int
+                       ) -> tuple[dict[str, np.ndarray], list[dict[str, ChannelModel]]]:
     """Return the held-out prediction of other models.
 
     Args:
         model: whose folds are used, and whose devices.
         parts: the links of each fold.
-        criteria: when kriging takes too long.
         seed: of the trees.
 
     Returns:
-        (n,) prediction by each [dB], by name; and the kriging of each fold, empty without it.
+        (n,) prediction by each [dB], by name; and the `LAWS` of each fold, by name.
     """
-    kriging: list[RegressionKriging] = []
+    laws: list[dict[str, ChannelModel]] = []
     published = published_laws(model.links.select(model.whole.usable))
-    names = [*(kind.name for kind in laws_for(model.links, criteria)), EXTRA_TREES, BOOSTING,
+    names = [*(kind.name for kind in LAWS), EXTRA_TREES, BOOSTING,
              *(law.name for law in published)]
     result = {name: np.full(len(model.links), np.nan) for name in names}
     for number, (fold, part) in enumerate(zip(model.folds, parts, strict=True)):
         test = np.flatnonzero((model.index == number) & fold.usable)
-        for kind in laws_for(model.links, criteria):
-            law = fitted_law(kind, part.links, fold.train)
-            if isinstance(law, RegressionKriging):
-                kriging.append(law)
-            result[kind.name][test] = law_db(law, part.links, test)
+        laws.append({kind.name: fitted_law(kind, part.links, fold.train) for kind in LAWS})
+        for name, law in laws[-1].items():
+            result[name][test] = law_db(law, part.links, test)
         for learner in (EXTRA_TREES, BOOSTING):
             result[learner][test] = trees_db(learner, part, fold.train, test, seed)
         for law in published:  # a device of unknown position is where the fold has it
             result[law.name][test] = law_db(law, part.links, test)
-    return result, kriging
+    return result, laws
 
 
 def published_laws(links: Links) -> list[PublishedLaw]:

@@ -7,6 +7,9 @@ part in the members by which it is predicted, and no error of its fold has one i
 few numbers that many readings choose, nested cross-validation is not needed (Wainer and Cawley
 2021, 'Nested cross-validation when selecting classifiers is overzealous for most practical
 applications', Expert Systems with Applications 182).
+
+A fold predicts its held-out links as the twin of a loop predicts any link
+(`radiotwin.twin.model.model.FittedModel.law_on`): both have members from `_learn`.
 """
 
 from __future__ import annotations
@@ -16,7 +19,6 @@ from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.predict.baselines import (
@@ -28,26 +30,27 @@ from radiotwin.closeloop.predict.baselines import (
     fitted_law,
     grow_trees,
     held_out_baselines,
-    law_db,
-    laws_for,
 )
-from radiotwin.closeloop.verdict.criteria import SelectionCriteria
-from radiotwin.inference.held_out import combine, convex_weights
-from radiotwin.inference.student import mean_if_detected
+from radiotwin.closeloop.predict.weights import (
+    HALF_M,
+    Combination,
+    HeldOut,
+    combination,
+    half_distance_m,
+)
 from radiotwin.links import Links
+from radiotwin.propagation.laws.base import ChannelModel
 from radiotwin.propagation.laws.forest import Forest
-from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.runtime.processes import in_threads
-from radiotwin.twin.model.blend import FORESTS, NAMED, REST, TREES_ALONE, far_share
+from radiotwin.twin.model.blend import FORESTS, LEVEL_FORESTS, NAMED, REST, Blend, moving_ends
 from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing, receivers_move
-from radiotwin.twin.model.model import Fit
+from radiotwin.twin.model.model import Fit, FittedModel
 
-HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
-PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
 MAX_AWAY_LINKS = 12_000  # of which quadrants are held out
 AWAY_TREES = 20
 MIN_LEARNT = 60  # detected links that anything is learnt from
+SAME_M = 0.1  # measured places closer together are one
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,78 +58,29 @@ class CombinedPrediction:
     """Held-out prediction by all that was learnt, and by other models alone.
 
     Attributes:
-        mean_db: (n,) level of a link that is detected [dB]; NaN where there is none.
-        names: of the k members.
-        weights: (2, k) near measurements, and far from them; from all links.
-        members: (n, k) held-out prediction of each member [dB].
-        share: (n,) how far a link is from the measurements that it was predicted by.
+        reading_db: (n,) mean of a reading of each link [dB]: of its receiver and time, given that
+            it is detected; NaN where there is none.
+        map_db: (n,) what a map has there [dB]: the mean level at a faultless receiver, also below
+            the limit of detection.
+        rank: (n,) probability of a lower reading than the measured one.
+        combination: of all links, by which the twin predicts.
         baselines: (n,) held-out prediction of other models [dB], by name.
-        away: (r, 3) of links with a quadrant of the area held out: error over the scale of named
-            effects, how far away they are, and their fold; what extrapolation costs.
     """
 
-    mean_db: np.ndarray
-    names: list[str]
-    weights: np.ndarray
-    members: np.ndarray
-    share: np.ndarray
+    reading_db: np.ndarray
+    map_db: np.ndarray
+    rank: np.ndarray
+    combination: Combination
     baselines: dict[str, np.ndarray] = field(default_factory=dict)
-    away: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def coverage(self) -> float:
+        """Share of held-out readings in the central 90 % intervals; NaN where there is none."""
+        known = self.rank[np.isfinite(self.rank)]
+        return float((np.abs(known - 0.5) <= 0.45).mean()) if len(known) else np.nan
 
 
-@dataclass(frozen=True, eq=False)
-class _Learnt:
-    """A model of some links, with all that is learnt beside it, and which members count."""
-
-    fit: Fit
-    rest: CorrelatedShadowing | None
-    kriging: RegressionKriging | None
-    part: Part
-    names: list[str]
-
-    def without_quadrants(self, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Hold out each quadrant of its training links, fit to the others, and predict.
-
-        Of the physics the coefficients are fitted again, and of rest and kriging the values. What
-        the links that are held out still decide is, of a few numbers for all: the place of a box,
-        the length of a correlation.
-
-        Returns:
-            (r, k) measured minus predicted by each member [dB], (r,) far shares, (r,) error scales
-            of named effects [dB], and (r,) rows of the links.
-        """
-        rows = np.flatnonzero(self.fit.train)
-        if len(rows) > MAX_AWAY_LINKS:
-            rng = np.random.default_rng(seed)
-            rows = np.sort(rng.choice(rows, MAX_AWAY_LINKS, replace=False))
-        part, quadrant = self.part.select(rows), _quadrant(self.fit.links)[rows]
-        whole = self.fit.model.restrict(rows)
-        found = [(np.zeros((0, len(self.names))), np.zeros(0), np.zeros(0), rows[:0])]
-        for each in range(4):
-            out = quadrant == each
-            test = np.flatnonzero(out & np.isfinite(part.links.level_db))
-            if not len(test) or np.isfinite(part.links.level_db[~out]).sum() < MIN_LEARNT:
-                continue
-            fit = replace(whole, train=~out).fit(self.fit)
-            rest = self.rest and fit.rest(0, self.rest)
-            inner = _Learnt(fit, rest, self.kriging, part, self.names)
-            found.append((part.links.level_db[test, None] - inner.members_db(test, seed),
-                          _shares_of(part.links, ~out, test), fit.reading_parts()[1][test],
-                          rows[test]))
-        errors_db, shares, scales_db, tested = (np.concatenate(each) for each in zip(*found))
-        return errors_db, shares, scales_db, tested
-
-    def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
-        """Return predictions (m, k) of rows (m,), by few trees and known correlations [dB]."""
-        physics = _physics_db(self.fit, self.rest, self.part, test, seed, AWAY_TREES)
-        links = self.part.links
-        laws = [law_db(fitted_law(kind, links, self.fit.train, self.kriging), links, test)
-                for kind in LAWS if kind.name in self.names]
-        return np.column_stack([physics, *laws])
-
-
-def combined_prediction(model: CrossFit, with_rest: bool, criteria: SelectionCriteria,
-                        seed: int) -> CombinedPrediction:
+def combined_prediction(model: CrossFit, with_rest: bool, seed: int) -> CombinedPrediction:
     """Return the held-out prediction by all that was learnt.
 
     Trees upon the physics are members, and trees alone, too: a pattern that fits what was measured
@@ -135,49 +89,134 @@ def combined_prediction(model: CrossFit, with_rest: bool, criteria: SelectionCri
     Args:
         model: with all effects that have a name.
         with_rest: whether to interpolate the rest, too, where the model does not yet.
-        criteria: when kriging takes too long.
         seed: of trees and samples.
     """
-    links, count = model.links, len(model.folds)
+    links = model.links
     parts = [Part(each.links) for each in model.folds]
-    baselines, kriging = held_out_baselines(model, parts, criteria, seed)
-    laws = [kind.name for kind in laws_for(links, criteria) if kind is not LogDistance]
-    rest_too = [REST] if with_rest or model.whole.shadowing else []
-    names = [NAMED, *FORESTS, *TREES_ALONE, *rest_too, *laws]
+    baselines, laws = held_out_baselines(model, parts, seed)
+    rest = [REST] if with_rest or model.whole.shadowing else []
+    names = [NAMED, *FORESTS, *LEVEL_FORESTS, *rest,
+             *(kind.name for kind in LAWS if kind is not LogDistance)]
 
-    def of_fold(number: int) -> tuple[_Learnt, np.ndarray, np.ndarray, np.ndarray]:
-        """Return what is learnt outside a fold; its rows (m,), their members and far shares."""
-        fold, part, rest = model.folds[number], parts[number], None
-        if REST in names:
-            rest = fold.shadowing or fold.rest(seed)
-        learnt = _Learnt(fold, rest, kriging[number] if kriging else None, part, names)
+    def of_fold(number: int) -> tuple[FittedModel, HeldOut]:
+        """Return what is learnt outside a fold, and its links."""
+        fold = model.folds[number]
+        learnt = _learn(fold, parts[number], names, seed, laws=laws[number])
         test = np.flatnonzero((model.index == number) & fold.usable)
-        members = np.column_stack([_physics_db(fold, rest, part, test, seed),
-                                   *(baselines[name][test] for name in laws)])
-        return learnt, test, members, _shares_of(part.links, fold.train, test)
+        return learnt, _held_out(learnt, fold, test, model.index[test])
 
-    members, share = np.full((len(links), len(names)), np.nan), np.ones(len(links))
     with warnings.catch_warnings():  # whose filters threads leave as another one had them
-        folds = in_threads(of_fold, range(count))
-    for _, test, own_members, own_share in folds:
-        members[test], share[test] = own_members, own_share
-    far_db, far_share, far_scale_db, far_rows = folds[-1][0].without_quadrants(seed)
+        folds = in_threads(of_fold, range(len(model.folds)))
+    held_out = HeldOut.join([each for _, each in folds])
+    away = _quadrants_held_out(model, folds[-1][0], parts[-1], names, seed)
+    half_m, dof = half_distance_m(held_out, away), model.whole.model.dof
 
-    def weights_of(here: np.ndarray) -> np.ndarray:
-        """Return the weights (2, k) of some of the links, (n,) bool."""
-        away = here[far_rows]
-        error_db = links.level_db[here, None] - members[here]
-        return _weights(np.vstack([error_db, far_db[away]]),
-                        np.concatenate([share[here], far_share[away]]), names)
+    reading_db, map_db, rank = np.full((3, len(links)), np.nan)
+    for number, (learnt, _) in enumerate(folds):
+        own = combination(held_out.select(held_out.fold != number),
+                          away.select(away.fold != number), names, half_m, dof)
+        fold = model.folds[number]
+        test = np.flatnonzero((model.index == number) & fold.usable)
+        learnt = _combined(learnt, fold, own)
+        law = learnt.law_on(fold.on_rows(test))
+        reading_db[test], rank[test] = law.reading_db, law.rank(links.level_db[test])
+        map_db[test] = learnt.law_on(fold.for_map(test)).mean_db
+    return CombinedPrediction(reading_db, map_db, rank,
+                              combination(held_out, away, names, half_m, dof), baselines)
 
-    mean_db = np.full(len(links), np.nan)
-    for number in range(count):
-        own = model.index == number
-        mean_db[own] = combine(members[own], share[own], weights_of(~own))
-    weights = weights_of(np.ones(len(links), dtype=bool))
-    away = np.column_stack([combine(far_db, far_share, weights) / far_scale_db, far_share,
-                            model.index[far_rows]])
-    return CombinedPrediction(mean_db, names, weights, members, share, baselines, away)
+
+def served(model: CrossFit, found: Combination, seed: int) -> FittedModel:
+    """Return what a twin predicts by: all that was learnt from all links, combined.
+
+    Args:
+        model: with all effects that have a name.
+        found: `CombinedPrediction.combination`.
+        seed: as of `combined_prediction`.
+    """
+    whole = model.whole
+    return _combined(_learn(whole, Part(whole.links), found.weights, seed), whole, found)
+
+
+def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int = TREES,
+           rest: CorrelatedShadowing | None = None,
+           laws: dict[str, ChannelModel] | None = None) -> FittedModel:
+    """Return all that is learnt from the training links of a fit; its weights are still equal.
+
+    Args:
+        fit: to some of n links.
+        part: the links.
+        names: of the members.
+        seed: of trees and samples.
+        trees: number of them.
+        rest: interpolated rest; None: it is fitted where it is a member.
+        laws: fitted already, by name.
+    """
+    if REST in names:
+        rest = rest or fit.shadowing or fit.rest(seed)
+    laws = laws or {kind.name: fitted_law(kind, fit.links, fit.train)
+                    for kind in LAWS if kind.name in names}
+    move = receivers_move(fit.links)
+    ends_m, other = moving_ends(fit.links.select(fit.train), move)
+    places = np.unique(np.column_stack([np.round(ends_m / SAME_M) * SAME_M, other]), axis=0)
+    boresight_deg = fit.links.boresight_deg
+    declared = np.flatnonzero(np.isfinite(boresight_deg))
+    blend = Blend(dict.fromkeys(names, (1 / len(names), 1 / len(names))), HALF_M, (1.0, 1.0), move,
+                  places[:, :3], places[:, 3].astype(int), grown_forests(fit, part, seed, names,
+                                                                         trees),
+                  {name: law for name, law in laws.items() if name in names},
+                  np.column_stack([declared, boresight_deg[declared]]))
+    return replace(fit.learnt, shadowing=rest or fit.shadowing, blend=blend)
+
+
+def _combined(learnt: FittedModel, fit: Fit, found: Combination) -> FittedModel:
+    """Return what was learnt with its weights, without what has none."""
+    assert learnt.blend is not None
+    blend = learnt.blend.weighted(found.weights, found.half_m, found.sd_ratio)
+    shadowing = learnt.shadowing if REST in found.weights else fit.shadowing
+    return replace(learnt, blend=blend, shadowing=shadowing)
+
+
+def _held_out(learnt: FittedModel, fit: Fit, test: np.ndarray, fold: np.ndarray) -> HeldOut:
+    """Return rows (m,) of a fit's links, of folds (m,), and what members predict of them."""
+    assert learnt.blend is not None
+    own = fit.on_rows(test)
+    members_db, scale_db, unheard_db = learnt.members_on(own)
+    losses = own.model.losses
+    blank, drop, drop_db = (np.broadcast_to(np.asarray(each, dtype=float), len(test))
+                            for each in (losses.blank, losses.drop, losses.drop_db))
+    return HeldOut(own.links.level_db, own.model.limit_db, members_db, scale_db, unheard_db,
+                   learnt.blend.away_m(own.links), blank, drop, drop_db, fold)
+
+
+def _quadrants_held_out(model: CrossFit, learnt: FittedModel, part: Part, names: list[str],
+                        seed: int) -> HeldOut:
+    """Hold out each quadrant of the last fold's training links, fit to the others, and predict.
+
+    Of the physics the coefficients are fitted again, and of rest and kriging the values. What the
+    links that are held out still decide is, of a few numbers for all: the place of a box, the
+    length of a correlation.
+    """
+    fit = model.folds[-1]
+    assert learnt.blend is not None
+    rows = np.flatnonzero(fit.train)
+    if len(rows) > MAX_AWAY_LINKS:
+        rng = np.random.default_rng(seed)
+        rows = np.sort(rng.choice(rows, MAX_AWAY_LINKS, replace=False))
+    part, quadrant = part.select(rows), _quadrant(fit.links)[rows]
+    known = fit.on_rows(rows)
+    found = [_held_out(learnt, fit, rows[:0], rows[:0])]
+    for each in range(4):
+        out = quadrant == each
+        test = np.flatnonzero(out)
+        if not len(test) or np.isfinite(part.links.level_db[~out]).sum() < MIN_LEARNT:
+            continue
+        inner = replace(known.model, train=~out).fit(known)
+        rest = None if REST not in names else inner.rest(seed, learnt.shadowing)
+        laws = {kind.name: fitted_law(kind, part.links, ~out, learnt.blend.laws.get(kind.name))
+                for kind in LAWS if kind.name in names}
+        away = _learn(inner, part, names, seed, AWAY_TREES, rest, laws)
+        found.append(_held_out(away, inner, test, model.index[rows[test]]))
+    return HeldOut.join(found)
 
 
 def _quadrant(links: Links) -> np.ndarray:
@@ -185,37 +224,13 @@ def _quadrant(links: Links) -> np.ndarray:
 
     With one left out, as much is extrapolated as by a map of more than was measured.
     """
-    moving_m = links.receiver_m if receivers_move(links) else links.device_m[links.device]
+    moving_m = moving_ends(links, receivers_move(links))[0]
     above = moving_m[:, :2] > np.median(moving_m[:, :2], axis=0)
     return above @ np.array([1, 2])
 
 
-def _shares_of(links: Links, train: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """Return how far rows (m,) of links are from the measured ones, in 0..1, see `far_share`.
-
-    By the end that moves, from where it was measured with the same other end.
-    """
-    moving_m, other = (links.receiver_m, links.device) if receivers_move(links) else (
-        links.device_m[links.device], links.receiver)
-    away_m = np.full(len(test), np.inf)
-    learnt = np.arange(len(links))[train]
-    for label in np.unique(other[test]):
-        mine = np.flatnonzero(other[test] == label)
-        known = learnt[other[learnt] == label]
-        if len(known):
-            away_m[mine] = cKDTree(moving_m[known]).query(moving_m[test[mine]])[0]
-    return far_share(away_m, HALF_M)
-
-
-def _weights(error_db: np.ndarray, share: np.ndarray, names: list[str]) -> np.ndarray:
-    known = np.isfinite(error_db).all(axis=1)
-    if not known.any():  # nothing could be held out
-        return np.tile(np.array(names) == NAMED, (2, 1)).astype(float)
-    return convex_weights(error_db[known], share[known], PULL)
-
-
-def grown_forests(fit: Fit, part: Part, seed: int, trees: int = TREES,
-                  names: Collection[str] = (*FORESTS, *TREES_ALONE)) -> dict[str, Forest]:
+def grown_forests(fit: Fit, part: Part, seed: int, names: Collection[str],
+                  trees: int = TREES) -> dict[str, Forest]:
     """Grow trees on training links: on the standardised residual (`FORESTS`), and on the levels.
 
     A blank counts as the named effects' mean below the limit. The receiver is no feature of
@@ -225,35 +240,15 @@ def grown_forests(fit: Fit, part: Part, seed: int, trees: int = TREES,
         fit: to some of n links.
         part: the links, with the features of trees.
         seed: of the trees.
+        names: those that are asked for, among others.
         trees: number of them.
-        names: those that are asked for.
     """
+    if not set(names) & set(FORESTS + LEVEL_FORESTS):
+        return {}
     rows = np.flatnonzero(fit.train)
     z = fit.training_z
     mean_db, scale_db, _ = fit.reading_parts()
     level_db = mean_db[rows] + z * scale_db[rows]
     return {name: grow_trees(kind, part.common[rows], target, seed, trees)
-            for both, target in ((FORESTS, z), (TREES_ALONE, level_db))
+            for both, target in ((FORESTS, z), (LEVEL_FORESTS, level_db))
             for name, kind in zip(both, (EXTRA_TREES, BOOSTING), strict=True) if name in names}
-
-
-def _physics_db(fit: Fit, rest: CorrelatedShadowing | None, part: Part, test: np.ndarray,
-               seed: int, trees: int = TREES) -> np.ndarray:
-    """Return levels by named effects and trees, alone and together, and with the rest [dB].
-
-    Of rows (m,) of links, if they are detected: (m, 5), or (m, 6) with the rest.
-    """
-    limit_db, mean_db, scale_db, unheard_db = (each[test] for each in (
-        fit.model.limit_db, *fit.reading_parts()))
-    losses = fit.model.losses.select(test)
-    added: list[tuple] = [(0.0, 1.0)]
-    for name, forest in grown_forests(fit, part, seed, trees).items():
-        predicted = forest.predict(part.common[test])
-        alone = name in TREES_ALONE
-        added.append(((predicted - mean_db) / scale_db if alone else predicted, 1.0))
-    if rest is not None:
-        added.append(rest.at(fit.links.select(test)))
-    return np.column_stack([
-        mean_if_detected(mean_db + shift * scale_db, np.hypot(scale_db * left, unheard_db),
-                         limit_db, fit.model.dof, losses)
-        for shift, left in added])

@@ -65,7 +65,6 @@ class SelectionCriteria:
         min_dependence_db: standard deviation of the residual's mean over the variable; a weaker
             dependence changes no decision.
         max_trends: variables that the rest is described by, strongest first.
-        max_links_for_kriging: above, kriging is no baseline: it takes longer than the loop.
         min_repeats_for_noise: measurements repeated at one position, to estimate the noise floor.
     """
 
@@ -86,7 +85,6 @@ class SelectionCriteria:
     max_dependence_p_value: float = 0.01
     min_dependence_db: float = 0.5
     max_trends: int = 4
-    max_links_for_kriging: int = 30_000
     min_repeats_for_noise: int = 30
 
     def __post_init__(self) -> None:

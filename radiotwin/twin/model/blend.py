@@ -2,12 +2,12 @@
 
 Near measured places they know most, far from them physics does: each member has a weight near
 measurements and one far from them, found on held-out links by
-`radiotwin.closeloop.predict.predictor`.
+`radiotwin.closeloop.predict.weights`. Folds of a loop predict by the same class as twins.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -30,7 +30,7 @@ from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 
 NAMED, REST = "named", "named_and_rest"
 FORESTS = ("named_and_trees", "named_and_boosting")  # members, learnt of what named effects leave
-TREES_ALONE = ("extra_trees", "hist_gradient_boosting")  # members, learnt of the levels
+LEVEL_FORESTS = ("trees_of_levels", "boosting_of_levels")  # members, learnt of the levels
 LAWS = {each.name: each for each in (SegmentedLogDistance, RegressionKriging)}
 MAX_SD_RATIO = 100.0
 
@@ -51,18 +51,26 @@ def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
     return np.sqrt((1 - share) * near + share * far)
 
 
+def moving_ends(links: Links, receivers_move: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (n, 3) of the end that moves [m], and the row (n,) of the other end."""
+    if receivers_move:
+        return links.receiver_m, links.device
+    return links.device_m[links.device], links.receiver
+
+
 @dataclass(frozen=True, eq=False)
 class Blend:
-    """Members beside named effects, and the weights of all; devices stand still, receivers move.
+    """Members beside named effects, and the weights of all.
 
     Attributes:
         weights: of each member, near measurements and far from them; both sum to one.
         half_m: as of `far_share` [m].
         sd_ratio: standard deviation of the error over that of named effects, near and far.
-        measured_m: (p, 3) receivers' positions [m], and
-        measured_device: (p,) the device that was measured there.
+        receivers_move: whether devices stand still and receivers move, or the other way round.
+        measured_m: (p, 3) positions of the end that moves [m], and
+        measured_other: (p,) the end that stands still and was measured with it there.
         forests: by name, of the standardised residual of named effects (`FORESTS`), or of the
-            levels (`TREES_ALONE`) [dB].
+            levels (`LEVEL_FORESTS`) [dB].
         laws: fitted to the levels, by name.
         boresights_deg: (j, 2) device, and its declared azimuth [deg]; forests know of these.
     """
@@ -70,25 +78,29 @@ class Blend:
     weights: dict[str, tuple[float, float]]
     half_m: float
     sd_ratio: tuple[float, float]
+    receivers_move: bool
     measured_m: np.ndarray
-    measured_device: np.ndarray
+    measured_other: np.ndarray
     forests: dict[str, Forest]
     laws: dict[str, ChannelModel]
     boresights_deg: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
-    def far_share(self, links: Links) -> np.ndarray:
-        """Return how far the receivers of links are from where their device was measured (n,)."""
-        away_m = np.full(len(links), np.inf)
-        for device in np.unique(links.device):
-            known_m = self.measured_m[self.measured_device == device]
-            mine = links.device == device
-            if len(known_m):
-                away_m[mine] = cKDTree(known_m).query(links.receiver_m[mine])[0]
-        return far_share(away_m, self.half_m)
+    def away_m(self, links: Links) -> np.ndarray:
+        """Return how far the moving ends of links are from where they were measured (n,) [m].
 
-    def apply(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray,
-              rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and error scale (n,) of the combination [dB], before any limit of detection.
+        With the same other end; inf where it was not measured at all.
+        """
+        moving_m, other = moving_ends(links, self.receivers_move)
+        away_m = np.full(len(links), np.inf)
+        for label in np.unique(other):
+            known_m, own = self.measured_m[self.measured_other == label], other == label
+            if len(known_m):
+                away_m[own] = cKDTree(known_m).query(moving_m[own])[0]
+        return away_m
+
+    def members_db(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray,
+                   rest: np.ndarray) -> np.ndarray:
+        """Return the level (n, k) by each member, in the order of the weights [dB].
 
         Args:
             links: n links.
@@ -96,19 +108,35 @@ class Blend:
             scale_db: (n,) of their errors [dB].
             rest: (n,) what is interpolated [error scales]; 0 without it.
         """
-        geometry, share = links.geometry, self.far_share(links)
         members = {NAMED: mean_db, REST: mean_db + rest * scale_db}
         if self.forests:
             features = link_features(self._declared(links), receivers=False)
             for name, forest in self.forests.items():
                 predicted = forest.predict(features)
-                members[name] = predicted if name in TREES_ALONE else mean_db + predicted * scale_db
+                members[name] = predicted if name in LEVEL_FORESTS \
+                    else mean_db + predicted * scale_db
         for name, law in self.laws.items():
-            members[name] = law.predict(geometry)[0] + links.declared_db
-        names = list(self.weights)
-        blended_db = combine(np.column_stack([members[name] for name in names]), share,
-                             np.transpose([self.weights[name] for name in names]))
+            members[name] = law.predict(links.geometry)[0] + law.declared_db(links)
+        return np.column_stack([members[name] for name in self.weights])
+
+    def apply(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray,
+              rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and error scale (n,) of the combination [dB], before any limit of detection.
+
+        Arguments as of `members_db`.
+        """
+        share = far_share(self.away_m(links), self.half_m)
+        blended_db = combine(self.members_db(links, mean_db, scale_db, rest), share,
+                             np.transpose(list(self.weights.values())))
         return blended_db, scale_db * sd_factor(share, self.sd_ratio)
+
+    def weighted(self, weights: dict[str, tuple[float, float]], half_m: float,
+                 sd_ratio: tuple[float, float]) -> Blend:
+        """Return the members that have a weight, with it."""
+        return replace(self, weights=weights, half_m=half_m, sd_ratio=sd_ratio,
+                       forests={name: each for name, each in self.forests.items()
+                                if name in weights},
+                       laws={name: each for name, each in self.laws.items() if name in weights})
 
     def _declared(self, links: Links) -> Links:
         """Return links with the azimuths that were declared where this was fitted, no others."""
@@ -119,12 +147,13 @@ class Blend:
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return arrays by name, and settings that JSON can hold, for `from_state`."""
         arrays = {"measured_m": self.measured_m.astype(np.float32),
-                  "measured_device": self.measured_device.astype(np.int32)}
+                  "measured_other": self.measured_other.astype(np.int32)}
         if len(self.boresights_deg):
             arrays["boresights_deg"] = self.boresights_deg
         settings: dict[str, Any] = {
             "weights": {name: list(each) for name, each in self.weights.items()},
-            "half_m": self.half_m, "sd_ratio": list(self.sd_ratio), "models": {}}
+            "half_m": self.half_m, "sd_ratio": list(self.sd_ratio),
+            "receivers_move": self.receivers_move, "models": {}}
         models: dict[str, Forest | ChannelModel] = {**self.forests, **self.laws}
         for name, model in models.items():
             own, settings["models"][name] = model.state()
@@ -146,10 +175,11 @@ class Blend:
             ValueError: it is damaged.
             KeyError: a part is missing.
         """
-        require_names("settings", settings, ["weights", "half_m", "sd_ratio", "models"])
+        require_names("settings", settings, ["weights", "half_m", "sd_ratio", "receivers_move",
+                                              "models"])
         forests: dict[str, Forest] = {}
         laws: dict[str, ChannelModel] = {}
-        own = {"measured_m", "measured_device"} | (arrays.keys() & {"boresights_deg"})
+        own = {"measured_m", "measured_other"} | (arrays.keys() & {"boresights_deg"})
         boresights_deg = np.zeros((0, 2))
         if "boresights_deg" in own:
             boresights_deg = require_array(arrays, "boresights_deg", (None, 2), -MAX_ANGLE_DEG,
@@ -161,7 +191,7 @@ class Blend:
             parts = {each.removeprefix(f"{name}/"): array for each, array in arrays.items()
                      if each.startswith(f"{name}/")}
             own |= {f"{name}/{each}" for each in parts}
-            if name in FORESTS + TREES_ALONE:
+            if name in FORESTS + LEVEL_FORESTS:
                 forests[name] = Forest.from_state(parts, given, width)
             else:
                 laws[name] = LAWS[name].from_state(
@@ -176,8 +206,10 @@ class Blend:
         near, far = settings["sd_ratio"]
         ratios = {"near": near, "far": far}
         points = require_array(arrays, "measured_m", (None, 3), -MAX_POSITION_M, MAX_POSITION_M)
-        device = require_array(arrays, "measured_device", (len(points),), 0, 2**31 - 1)
+        other = require_array(arrays, "measured_other", (len(points),), 0, 2**31 - 1)
+        if not isinstance(settings["receivers_move"], bool):
+            raise ValueError("receivers_move is neither true nor false")
         return cls(weights, require_number(settings, "half_m", 1e-3, MAX_POSITION_M),
                    (require_number(ratios, "near", 0.01, MAX_SD_RATIO),
-                    require_number(ratios, "far", 0.01, MAX_SD_RATIO)), points, device,
-                   forests, laws, boresights_deg)
+                    require_number(ratios, "far", 0.01, MAX_SD_RATIO)),
+                   settings["receivers_move"], points, other, forests, laws, boresights_deg)

@@ -17,14 +17,14 @@ import numpy as np
 
 from radiotwin.effects.base import DetectionEffect, Effect, LevelAt, LimitEffect, ResidualView, Term
 from radiotwin.errors import BadInput
-from radiotwin.inference import censored_regression, gaussian
+from radiotwin.inference import censored_regression
 from radiotwin.inference.censored_regression import (
     CensoredRegression,
     FitResult,
     Linearisation,
     Response,
 )
-from radiotwin.inference.student import NO_LOSSES, Losses, detection_probability
+from radiotwin.inference.student import NO_LOSSES, Losses, ReadingLaw, sd_of_scale
 from radiotwin.links import Links
 from radiotwin.links.links import Prediction
 from radiotwin.propagation.laws import ChannelModel
@@ -37,6 +37,7 @@ VIEWS = 8  # that are remembered: of a model and its folds, which every candidat
 MIN_LINKS = 3  # of a device whose mean residual is known
 MIN_SLOPE = 0.5  # of a receiver's response that passes a device's own level on
 MAX_Z = 4.0  # an outlier counts as this many scales
+CHANNEL_DOF = 30.0  # degrees of freedom of the errors that a channel states: nearly normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,6 +263,19 @@ class Fit(FitResult):
         """Return the same with another effect at a place, fitted again; -1: the last."""
         return self.model.with_effect_at(place, effect).fit(self)
 
+    def for_map(self, rows: np.ndarray) -> Fit:
+        """Return the fit of some links (r,) at faultless receivers, as a map has them."""
+        fit = self.on_rows(rows)
+        for place in reversed(range(len(fit.effects))):
+            if _is_off_maps(fit.effects[place]):
+                fit = fit.without(place)
+        nobody = np.full(len(fit.links), -1)
+        return replace(fit, model=replace(fit.model, links=fit.links.with_columns(receiver=nobody)))
+
+    def on_rows(self, rows: np.ndarray) -> Fit:
+        """Return the fit of some links (r,), whose effects' terms are not made again."""
+        return replace(self, model=self.model.restrict(rows))
+
     def without(self, place: int) -> Fit:
         """Return the fit with one effect taken away; nothing else is changed."""
         rest = self.model.with_effects([*self.effects[:place], *self.effects[place + 1:]])
@@ -424,9 +438,10 @@ class FittedModel:
 
     @classmethod
     def of_channel(cls, channel: ChannelModel) -> FittedModel:
-        """Return a channel alone, with the Gaussian errors that it states; it has no scales."""
+        """Return a channel alone, with errors of the sizes that it states; it has no scales."""
         nothing = np.empty(0)
-        return cls(channel, (), (), nothing, nothing, np.inf, np.empty((0, 3)), (), np.nan, 0.0)
+        return cls(channel, (), (), nothing, nothing, CHANNEL_DOF, np.empty((0, 3)), (), np.nan,
+                   0.0)
 
     @property
     def is_channel_alone(self) -> bool:
@@ -453,7 +468,7 @@ class FittedModel:
         Where the links have no receivers (a map's have none) those are faultless: effects of
         receivers are left out.
         """
-        own = self if links.receiver_names else self._without(lambda each: not each.is_on_maps())
+        own = self if links.receiver_names else self._without(_is_off_maps)
         model = Model.build(links, self.channel, self.dof).with_effects(own.effects)
         coefficients = [self.level_coefficients, *own.coefficients]
         needed = [model.level_columns, *(term.columns for term in model.terms)]
@@ -465,30 +480,65 @@ class FittedModel:
 
     def predict(self, links: Links) -> Prediction:
         """Return the levels that are expected of links, see `Prediction`."""
-        if self.is_channel_alone:
-            mean_db, sd_db = self.channel.predict(links.geometry)
-            mean_db = mean_db + self.channel.declared_db(links)
-            detected = gaussian.detection_probability(mean_db, sd_db, links.limit_db)
-            return Prediction(mean_db, sd_db, detected)
-        fit = self.on_links(links)
-        model = fit.model
+        law = self.law(links)
+        return Prediction(law.mean_db, law.sd_db, law.detection_probability, law.reading_db)
+
+    def law(self, links: Links) -> ReadingLaw:
+        """Return the distribution of the levels of links."""
+        if not self.is_channel_alone:
+            return self.law_on(self.on_links(links))
+        mean_db, sd_db = self.channel.predict(links.geometry)
+        return ReadingLaw(mean_db + self.channel.declared_db(links), sd_db / sd_of_scale(self.dof),
+                          links.limit_db, self.dof)
+
+    def law_on(self, fit: Fit) -> ReadingLaw:
+        """Return the distribution of the levels of a fit's links.
+
+        Twins predict by it, and folds predict the links that they have not seen.
+
+        Args:
+            fit: of these coefficients to n links; `on_links` makes one for any links.
+        """
+        mean_db, scale_db, unheard_db = self._named(fit)
+        shift, left = self._rest_at(fit.links)
+        if self.blend is not None:
+            mean_db, scale_db = self.blend.apply(fit.links, mean_db, scale_db, shift)
+        else:
+            mean_db, scale_db = mean_db + shift * scale_db, scale_db * left
+        return ReadingLaw(mean_db, np.hypot(scale_db, unheard_db), fit.model.limit_db, self.dof,
+                          fit.model.losses)
+
+    def members_on(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what `law_on` combines, of a fit's n links.
+
+        Returns:
+            (n, k) level by each member of the blend [dB], (n,) error scale of named effects, and
+            (n,) standard deviation of what is unheard [dB].
+        """
+        assert self.blend is not None
+        mean_db, scale_db, unheard_db = self._named(fit)
+        members_db = self.blend.members_db(fit.links, mean_db, scale_db,
+                                           self._rest_at(fit.links)[0])
+        return members_db, scale_db, unheard_db
+
+    def _named(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return `Fit.reading_parts`, with what is known of devices without a reading."""
         mean_db, scale_db, unheard_db = fit.reading_parts()
         if self.unheard is not None:
-            of_them = np.isin(links.device, self.unheard.devices)
+            of_them = np.isin(fit.links.device, self.unheard.devices)
             mean_db = mean_db + self.unheard.mean_db * of_them
-            unheard_db = np.hypot(unheard_db, self.unheard.sd_db * of_them)
-        shift, left = np.zeros(len(links)), np.ones(len(links))
-        if self.shadowing is not None and self.shadowing.receivers_move:
-            shift, left = self.shadowing.at(links)
-        if self.blend is not None:
-            mean_db, scale_db = self.blend.apply(model.links, mean_db, scale_db, shift)
-        else:
-            mean_db = mean_db + shift * scale_db
-            scale_db = scale_db * left
-        return Prediction(
-            mean_db, np.hypot(scale_db * np.sqrt(self.dof / (self.dof - 2)), unheard_db),
-            detection_probability(mean_db, np.hypot(scale_db, unheard_db), model.limit_db, self.dof,
-                                  model.losses))
+            # The spread of all own effects of a device holds that of its offset.
+            unheard_db = np.maximum(unheard_db, self.unheard.sd_db * of_them)
+        return mean_db, scale_db, unheard_db
+
+    def _rest_at(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
+        if self.shadowing is None:
+            return np.zeros(len(links)), np.ones(len(links))
+        return self.shadowing.at(links)
+
+
+def _is_off_maps(effect: Effect) -> bool:
+    return not effect.is_on_maps()
 
 
 def device_sd_db(fit: Fit) -> float:
