@@ -161,8 +161,8 @@ def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int =
     boresight_deg = fit.links.boresight_deg
     declared = np.flatnonzero(np.isfinite(boresight_deg))
     blend = Blend(dict.fromkeys(names, (1 / len(names), 1 / len(names))), HALF_M, (1.0, 1.0), move,
-                  places[:, :3], places[:, 3].astype(int), grown_forests(fit, part, seed, names,
-                                                                         trees),
+                  places[:, :3].astype(np.float32), places[:, 3].astype(int),  # as they are stored
+                  grown_forests(fit, part, seed, names, trees),
                   {name: law for name, law in laws.items() if name in names},
                   np.column_stack([declared, boresight_deg[declared]]))
     return replace(fit.learnt, shadowing=rest or fit.shadowing, blend=blend)
