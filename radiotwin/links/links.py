@@ -585,8 +585,7 @@ class Prediction:
         mean_db: (n,) mean gain [dB] or power [dBm], also below what can be detected.
         sd_db: (n,) standard deviation [dB].
         detection_probability: (n,) that the link is detected.
-        reading_db: (n,) mean of a reading: of the level, given that it is detected. Compare
-            detected levels with this; near the limit it lies above `mean_db`.
+        reading_db: (n,) mean of a detected level: above `mean_db` near the limit of detection.
     """
 
     mean_db: np.ndarray
@@ -597,5 +596,5 @@ class Prediction:
     @classmethod
     def concatenate(cls, parts: list[Prediction]) -> Prediction:
         """Return the predictions of several sets of links, one after the other."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts])
-                     for name in ("mean_db", "sd_db", "detection_probability", "reading_db")))
+        arrays = zip(*(vars(each).values() for each in parts))
+        return cls(*map(np.concatenate, arrays))
