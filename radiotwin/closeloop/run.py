@@ -21,6 +21,7 @@ from radiotwin.closeloop.crossfit import (
 )
 from radiotwin.closeloop.predict.predictor import CombinedPrediction, combined_prediction
 from radiotwin.closeloop.scan import Anomaly, scan
+from radiotwin.closeloop.scan_limits import Seen, seen_from
 from radiotwin.closeloop.search.causes import add_causes
 from radiotwin.closeloop.search.declared import add_declared
 from radiotwin.closeloop.search.faults import add_changes, add_faults, drop_idle_faults
@@ -146,6 +147,11 @@ class Loop(Summarised):
         model, hypotheses = left
         return detectable(model.whole.view, hypotheses, self.criteria,
                           [effect() for effect in catalogue()], model.whole.model.effect_names)
+
+    @cached_property
+    def seen_from(self) -> list[Seen]:
+        """Sizes from which groups of each family would have been said, where none stands out."""
+        return [] if self.anomalies else seen_from(self.before)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:

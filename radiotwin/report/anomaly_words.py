@@ -116,6 +116,24 @@ COLUMNS = ("group", "statistic", "against its peers", "90 % interval", "probabil
            "possible causes")
 
 
+def seen_from(report: dict) -> str:
+    """Say from how far off a device, receiver or flight would have been said; else empty."""
+    found = [f"a {each['family']} from {each['size']:.1f} dB"
+             for each in report.get("seen_from", [])
+             if each["family"] in ENDS and each["statistic"] == "level"]
+    return f"Would surely have been seen: {join_names(found)} on." if found else ""
+
+
+def seen_rows(report: dict) -> list[list[str]]:
+    """Return a row for each family: the least level, scatter and share of blanks, to be said."""
+    sizes: dict[str, dict[str, str]] = {}
+    for each in report.get("seen_from", []):
+        sizes.setdefault(each["family"], {})[each["statistic"]] = size({"size": each | {
+            "value": each["size"]}}).removeprefix("+")
+    return [[family, *(each.get(statistic, "–") for statistic in ("level", "scatter", "blanks"))]
+            for family, each in sizes.items()]
+
+
 def size(anomaly: dict) -> str:
     """Return the size of an anomaly with its unit."""
     found = anomaly["size"]

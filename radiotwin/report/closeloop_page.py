@@ -95,6 +95,8 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
             ("effect", "would have been named from", "what its size is"),
             [[name_label(each["name"]), f"{about(each['size'])} {each['unit']}",
               each["pattern"]] for each in report["detectable"] if each["size"] is not None]),
+        "seen_from": Table(("group", "level from", "scatter from", "blanks from"),
+                           anomaly_words.seen_rows(report)),
         "undetectable": words.undetectable(report),
         "side_by_side": words.side_by_side(report),
         "trials": f"{count(len(candidates), 'trial')} in "

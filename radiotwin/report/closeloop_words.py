@@ -6,7 +6,7 @@ from math import hypot
 from radiotwin.closeloop.verdict.criteria import LIKELY, MIN_SURE, SelectionCriteria
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER
 from radiotwin.effects.registry import effects_named
-from radiotwin.report.anomaly_words import MAX_NAMED, group, some_names, where
+from radiotwin.report.anomaly_words import MAX_NAMED, group, seen_from, some_names, where
 from radiotwin.report.labels import (
     interpolations,
     join_names,
@@ -214,8 +214,9 @@ def _unnamed_beside(report: dict) -> float | None:
 
 
 def _none(report: dict) -> str:
-    return (f"No group of links stands out, and no cause was found{_of(report, NONE)}. "
-            f"{_sizes(report)}").strip()
+    return " ".join(filter(None, [
+        f"No group of links stands out, and no cause was found{_of(report, NONE)}.",
+        seen_from(report), _sizes(report)]))
 
 
 def _located(report: dict) -> str:

@@ -7,11 +7,19 @@ import pandas as pd
 import pytest
 
 from radiotwin.closeloop.output.result_file import agreeing, same_over
+from radiotwin.closeloop.scan import scan
+from radiotwin.closeloop.scan_limits import seen_from
 from radiotwin.closeloop.verdict.sensitivity import Detectable
+from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset
 from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
 from tests.closeloop.drives import drive, fitted
 
 LOCK_DB, LOCKED = 19.0, 0.65
+
+
+def of_base(table):
+    """Return the base alone."""
+    return fitted(table, DeviceGainOffset()).map(lambda fit: fit.model.with_effects([]).fit())
 
 
 def test_the_error_of_a_map_does_not_know_the_state_of_each_reading():
@@ -28,6 +36,16 @@ def test_the_error_of_a_map_does_not_know_the_state_of_each_reading():
     assert np.nanmean(model.on_map[1] - model.held_out_nll) == pytest.approx(states, abs=0.1)
     plain = model.map(lambda fit: fit.model.with_effects([]).fit())
     assert not plain.reads_quality and plain.on_map[0] is plain.held_out_mean_db
+
+
+def test_a_device_that_is_off_by_what_would_have_been_seen_is_seen():
+    table = drive(5, sd_db=1.0)
+    (least,) = [each.size for each in seen_from(of_base(table)) if (each.family, each.statistic) == ("device", "level")]
+    assert 0.5 < least < 10.0
+    for share, is_seen in ((0.3, False), (1.5, True)):
+        off = table.assign(gain_db=table["gain_db"] + share * least * (table["device"] == "d1"))
+        sure = [each.members for each in scan(of_base(off)) if each.probability >= 0.9]
+        assert ({"device": ("d1",)} in sure) == is_seen
 
 
 @pytest.mark.parametrize(("factor", "over"), (

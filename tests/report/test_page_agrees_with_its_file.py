@@ -75,7 +75,10 @@ def _reports():
     yield with_members("located", [group for group, _ in GROUPS])
     yield with_members("undecided", [LOW | {"probability": 0.6}])
     yield with_members("undecided")
-    yield with_members("none")
+    yield with_members("none", seen_from=[
+        {"family": family, "statistic": statistic, "size": each, "unit": unit} for family, statistic, each, unit in (
+            ("device", "level", 1.83, "dB"), ("receiver", "level", 1.2, "dB"), ("device", "scatter", 2.1, "times"),
+            ("place", "blanks", 0.31, "share"))])
     yield json.loads(SAMPLE.read_text(encoding="utf-8"))
 
 
@@ -116,7 +119,7 @@ def summary(content):
     """Text of the summary of a page without names: lead, rivals, cards and table of groups."""
     context = closeloop_context(content, Path("no-such-folder"))
     cards = [value for _, value in context["cards"]]
-    rows = [cell for row in context["anomalies"].rows for cell in row]
+    rows = [cell for table in ("anomalies", "seen_from") for row in context[table].rows for cell in row]
     text = " ".join([context["lead"], context["rivals"], context["verdict"], *cards, *rows])
     advice = (content.get("prediction") or {}).get("advice", "")
     text = text.replace(advice, "") if advice else text

@@ -37,7 +37,7 @@ REMEDY = "run `radiotwin close-loop` again"
 MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
 # Parts that a report need not have.
 ABSENT: dict[str, Any] = {"posterior": [], "detectable": [], "combination": [], "prediction": None,
-                          "receivers_compared": []}
+                          "anomalies": [], "seen_from": [], "receivers_compared": []}
 # Of the interpolated rest.
 NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, "probability": None}
 
@@ -127,6 +127,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "posterior": [_step(each) for each in loop.found.steps],
         "detectable": [vars(each) for each in agreeing(
             loop.detectable, {each["name"] for each in effects}, loop.found.steps)],
+        "seen_from": [vars(each) for each in loop.seen_from],
         "receivers_compared": [_difference(each, links) for each in receiver_differences(links)],
         "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
                     "n": int(np.isfinite(loop.after.held_out_nll).sum())},

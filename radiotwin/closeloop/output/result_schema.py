@@ -189,6 +189,15 @@ class DetectableRecord(Record):
     pattern: str
 
 
+class SeenRecord(Record):
+    """How far a group of a family would have had to be from its peers, to be said."""
+
+    family: str
+    statistic: Literal["level", "scatter", "blanks", "slope"]
+    size: Real
+    unit: str
+
+
 class ReceiverDifferenceRecord(Record):
     """How much more one receiver reads than another where both have been."""
 
@@ -226,6 +235,7 @@ class ReportRecord(Record):
     anomalies: list[AnomalyRecord] = Field(default_factory=list)
     posterior: list[StepRecord] = Field(default_factory=list)
     detectable: list[DetectableRecord] = Field(default_factory=list)
+    seen_from: list[SeenRecord] = Field(default_factory=list)
     receivers_compared: list[ReceiverDifferenceRecord] = Field(default_factory=list)
     heldout: FoldsRecord
     error: ErrorRecord

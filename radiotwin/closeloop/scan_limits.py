@@ -1,0 +1,101 @@
+"""How far a group of links would have had to be from its peers, to be said to stand out.
+
+A typical group of each family is moved away from its peers, further and further until the scan
+finds it. What is not said and is smaller may be there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from radiotwin.closeloop.crossfit import CrossFit
+from radiotwin.closeloop.scan import (
+    UNITS,
+    Readings,
+    _compare,
+    _Compared,
+    _families,
+    _units,
+)
+from radiotwin.closeloop.verdict.criteria import MIN_SURE
+from radiotwin.inference.groups import Units
+
+STATISTICS = ("level", "scatter")
+FIRST, STEP = 3.0, 1.25  # errors of a typical group; each size that is tried over the one before
+MOST = {"level": 30.0, "scatter": 3.0}  # dB; logarithm of the scatter
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Least size from which a typical group of a family would surely have been said.
+
+    Attributes:
+        family: of groups.
+        statistic: `level` or `scatter`.
+        size: dB or times.
+        unit: of the size.
+    """
+
+    family: str
+    statistic: str
+    size: float
+    unit: str
+
+
+def seen_from(model: CrossFit) -> list[Seen]:
+    """Return from which size on a group of each family would have been said.
+
+    Args:
+        model: in whose held-out links no group stands out.
+    """
+    readings = Readings.of(model)
+    units = _units(readings)
+    families = [replace(each, statistics=tuple({*each.statistics} & {*STATISTICS}))
+                for each in _families(readings)]
+    sharpest: dict[tuple[str, str], _Compared] = {}
+    for each in _compare(readings, families, units):
+        key = each.family.name, each.statistic
+        if key not in sharpest or _typical(each)[1] < _typical(sharpest[key])[1]:
+            sharpest[key] = each
+    found = []
+    for (family, statistic), each in sharpest.items():
+        size = _least_size(each, readings, units)
+        if np.isfinite(size):
+            value = float(np.exp(size)) if statistic == "scatter" else size
+            found.append(Seen(family, statistic, value, UNITS[statistic]))
+    return found
+
+
+def _typical(compared: _Compared) -> tuple[int, float]:
+    """Return the group whose error and spread together are the median, and what they are."""
+    judged = np.isfinite(compared.distance.size)
+    total = np.where(judged, np.hypot(compared.distance.error, compared.distance.spread), np.inf)
+    group = int(np.argsort(total)[(judged.sum() - 1) // 2])
+    return group, float(total[group])
+
+
+def _least_size(compared: _Compared, readings: Readings, units: Units) -> float:
+    """Return the size from which a typical group is surely said; inf if there is none."""
+    (group, total), statistic = _typical(compared), compared.statistic
+    family = replace(compared.family, statistics=(statistic,))
+    rows, sure = family.groups.members(group, len(readings)), np.log(MIN_SURE / (1 - MIN_SURE))
+    size = FIRST * total
+    while size <= MOST[statistic]:
+        tables = _compare(_moved(readings, rows, statistic, size), [family], units)
+        if max(each.log_odds[group] for each in tables) >= sure:
+            return size
+        size *= STEP
+    return np.inf
+
+
+def _moved(readings: Readings, rows: np.ndarray, statistic: str, size: float) -> Readings:
+    """Return readings of which the level or the scatter of a group (n,) is off by a size more."""
+    residual_db = readings.residual_db.copy()
+    middle_db = np.nanmedian(residual_db[rows])
+    if statistic == "level":
+        residual_db[rows] += size
+    else:
+        residual_db[rows] = middle_db + (residual_db[rows] - middle_db) * np.exp(size)
+    return replace(readings, residual_db=residual_db)
