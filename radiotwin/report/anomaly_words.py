@@ -43,8 +43,7 @@ def where(report: dict) -> str:
         report: content of `closeloop.json`.
     """
     anomalies = report.get("anomalies", [])
-    named = {index for each in report["effects"] for index in each.get("anomalies", [])}
-    text = [f"{sentence(each, report)} {causes(each, index in named)}"
+    text = [f"{sentence(each, report)} {causes(each, _named(index, report))}"
             for index, each in enumerate(anomalies[:MAX_SENTENCES])]
     left = len(anomalies) - MAX_SENTENCES
     if left > 0:
@@ -64,13 +63,25 @@ def sentence(anomaly: dict, report: dict) -> str:
     return f"{start[0].upper()}{start[1:]} {text} ({probability(anomaly['probability'])})."
 
 
-def causes(anomaly: dict, is_named: bool) -> str:
-    """Name the likeliest causes of a group: "Cause: …" if one of them was named."""
-    start = "Cause" if is_named else "Its cause is open"
-    likely = [each for each in anomaly.get("causes", []) if (each["probability"] or 0) >= LIKELY]
-    found = "; ".join(f"{cause(each['name'])} ({probability(each['probability'])})"
-                      for each in likely[:MAX_NAMED])
-    return f"{start}: {found}." if found else f"{start}." if not is_named else ""
+def causes(anomaly: dict, named: Sequence[dict]) -> str:
+    """Name the likeliest causes of a group: "Cause: …" if effects were named that explain it."""
+    found = _likely(anomaly)
+    likely = {each["name"] for each in found}
+    found = [*(each for each in named if each["name"] not in likely), *found]
+    start = "Cause" if named else "Its cause is open"
+    words = "; ".join(f"{cause(each['name'])} ({probability(each['probability'])})"
+                      if each["probability"] is not None else cause(each["name"])
+                      for each in found[:MAX_NAMED])
+    return f"{start}: {words}." if words else f"{start}."
+
+
+def _likely(anomaly: dict) -> list[dict]:
+    return [each for each in anomaly.get("causes", []) if (each["probability"] or 0) >= LIKELY]
+
+
+def _named(index: int, report: dict) -> list[dict]:
+    """Return the effects that were named and explain an anomaly."""
+    return [each for each in report["effects"] if index in each.get("anomalies", [])]
 
 
 def cause(name: str) -> str:
@@ -100,15 +111,13 @@ def group(anomaly: dict) -> tuple[str, bool]:
 def rows(report: dict) -> list[list[str]]:
     """Return a row for each anomaly: group, statistic, size, interval, probability, links, why."""
     found = []
-    for each in report.get("anomalies", []):
+    for index, each in enumerate(report.get("anomalies", [])):
         sight = SIGHT.get(each.get("sight", "all"))
         group_words = group(each)[0] + (f", {sight}" if sight else "")
-        likely = [why for why in each.get("causes", []) if (why["probability"] or 0) >= LIKELY]
         found.append([
             group_words, STATISTICS[each["statistic"]], size(each), interval(each["size"]),
             probability(each["probability"]), f"{each['links']:,}",
-            "; ".join(f"{cause(why['name'])} {probability(why['probability'])}"
-                      for why in likely[:MAX_NAMED]) or "not known"])
+            causes(each, _named(index, report)).partition(": ")[2].removesuffix(".") or "open"])
     return found
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.output.result_file import agreeing, same_over
+from radiotwin.closeloop.output.result_file import _explained_share, agreeing, same_over
 from radiotwin.closeloop.scan import scan
 from radiotwin.closeloop.scan_limits import seen_from
 from radiotwin.closeloop.verdict.sensitivity import Detectable
@@ -67,3 +67,16 @@ def test_what_was_seen_is_not_said_to_be_invisible():
         ("antenna_pattern", np.inf), ("foliage", 9.0), ("interference", np.inf), ("device_gain_offset", 2.0))]
     steps = [SimpleNamespace(probabilities={"antenna_pattern": 0.71, "interference": 0.01, "foliage": 0.4})]
     assert [each.name for each in agreeing(sizes, {"device_gain_offset"}, steps)] == ["foliage", "interference"]
+
+
+@pytest.mark.parametrize(("statistic", "size", "change_db", "scatters", "share"), (
+    ("level", -6.0, -6.0, None, 1.0), ("level", -6.0, -1.0, None, 1 / 6), ("level", -6.0, 6.0, None, -1.0),
+    ("scatter", 5.0, 0.0, 8.0, 1.0), ("scatter", 5.0, "noise", None, 1.0), ("scatter", 5.0, 0.0, None, 0.0)))
+def test_an_effect_explains_a_group_whose_level_or_scatter_it_has(statistic, size, change_db, scatters, share):
+    rows = np.arange(4000) < 1000
+    noise_db = np.random.default_rng(1).normal(0, 1, (2, 4000))
+    extra_db = np.sqrt(24.0) * noise_db[1] * rows if statistic == "scatter" else -6.0 * rows
+    change_db = extra_db if change_db == "noise" else change_db * rows
+    found = SimpleNamespace(statistic=statistic, rows=rows, size=SimpleNamespace(value=size))
+    explained = _explained_share(found, noise_db[0] + extra_db, change_db, None if scatters is None else scatters * rows)
+    assert explained == pytest.approx(share, abs=0.1)

@@ -39,7 +39,8 @@ MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
 ABSENT: dict[str, Any] = {"posterior": [], "detectable": [], "combination": [], "prediction": None,
                           "anomalies": [], "seen_from": [], "receivers_compared": []}
 # Of the interpolated rest.
-NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, "probability": None}
+NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, "probability": None,
+                             "anomalies": []}
 
 
 def compare_with_baselines(error: dict[str, Any],
@@ -85,12 +86,12 @@ def make_report(loop: Loop) -> dict[str, Any]:
                 "size_db": size.record(),
                 "confused_with": list(each.confused_with),
                 "indistinguishable_from": list(trial.rivals),
-                "probability": trial.probability,
+                "probability": trial.probability, "anomalies": explained,
                 "evidence": {"heldout_nll_gain": trial.nll_gain, "p_value": trial.p_value,
                              "evidence_nats": trial.evidence_nats}}
-               for rank, (trial, each, parameters, size) in enumerate(
+               for rank, (trial, each, parameters, size, explained) in enumerate(
                    zip(named, loop.after.whole.effects, loop.parameters, loop.sizes_db,
-                       strict=True), start=1)]
+                       explained_anomalies(loop), strict=True), start=1)]
     if loop.after.whole.shadowing:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
     candidates = [{"name": trial.name, "variant": trial.variant, "step": trial.step + 1,
@@ -269,6 +270,50 @@ def same_over(found: Anomaly, base: CrossFit) -> list[str]:
         if len(shifts) > 1 and (np.array(shifts) / found.size.value >= AS_LARGE).all():
             holds.append(name)
     return holds
+
+
+def explained_anomalies(loop: Loop) -> list[list[int]]:
+    """Return for each effect the anomalies, by index, of which it explains half or more.
+
+    What the effect changes is laid beside the shift of a group's level against its peers, or taken
+    off the residuals of a group that scatters.
+    """
+    whole, found = loop.after.whole, []
+    if not loop.anomalies:
+        return [[] for _ in whole.effects]
+    residual_db = whole.links.level_db - loop.before.held_out_mean_db
+    for number, effect in enumerate(whole.effects):
+        change_db = whole.readings().mean_db - whole.without(number).readings().mean_db
+        scatters = whole.model.terms[number].random_effect_sd_db
+        shares = [_explained_share(each, residual_db, change_db, scatters)
+                  for each in loop.anomalies]
+        found.append([index for index, share in enumerate(shares)
+                      if share >= AS_LARGE and effect.is_cause and not effect.is_declared])
+    return found
+
+
+def _explained_share(anomaly: Anomaly, residual_db: np.ndarray, change_db: np.ndarray,
+                     scatters: np.ndarray | None) -> float:
+    """Return how much of an anomaly a change (n,) of the predicted level explains; about 1 is all.
+
+    Args:
+        anomaly: a group of n links.
+        residual_db: (n,) of the base.
+        change_db: (n,) by the effect.
+        scatters: (n,) standard deviation that the effect adds to single links [dB]; None: none.
+    """
+    seen = np.isfinite(residual_db) & np.isfinite(change_db)
+    rows, size = seen & anomaly.rows, anomaly.size.value
+    if anomaly.statistic == "level":
+        peers_db = np.median(change_db[seen & ~rows]) if (seen & ~rows).any() else 0.0
+        return float((np.median(change_db[rows]) - peers_db) / size) if rows.any() else 0.0
+    if anomaly.statistic != "scatter" or not rows.any():
+        return 0.0
+    if scatters is not None:
+        return float((scatters[rows] > 0).mean() - (scatters[seen & ~rows] > 0).mean())
+    spread_db = [np.subtract(*np.quantile(each, [0.75, 0.25])) for each in
+                 (residual_db[rows], (residual_db - change_db)[rows])]
+    return float(np.log(spread_db[0] / max(spread_db[1], 1e-9)) / np.log(size))
 
 
 def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:
