@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 from typing_extensions import override
 
+from radiotwin.effects.arrays import subsample
 from radiotwin.errors import BadInput
 from radiotwin.inference.held_out import deal_groups
 from radiotwin.inference.student import mean_if_detected
@@ -42,6 +43,8 @@ STRETCHES = 4  # of each fold, where nothing moves
 MAX_ENDS = 500  # more are positions of one end that moves, and need not return
 QUALITIES = 16  # quantiles of the column `quality` that a map's prediction is averaged over
 MAX_RADIUS_M = 100.0  # of a device's circle by the law, for paths to be followed to locate it
+FIRST_LOOK_LINKS = 300  # whose paths are followed first; minutes on a map of many buildings
+MIN_GAIN_DB = 0.1  # of the error of these, for the paths of all to be followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -471,6 +474,40 @@ def best_base(models: dict[str, CrossFit]) -> str:
     if not in_common.any():
         return max(known, key=lambda name: known[name].sum())
     return min(models, key=lambda name: models[name].rmse_db(in_common))
+
+
+def paths_gain_db(links: Links, scene: Scene, folds: Folds, seed: int) -> float:
+    """Return by how much paths make the held-out error of a few links of anchors smaller [dB].
+
+    Following those of all links takes minutes to hours, and over maps whose buildings are guesses
+    paths explain no more than line of sight does.
+
+    Args:
+        links: n links.
+        scene: its map.
+        folds: of the links.
+        seed: as of `make_bases`.
+
+    Returns:
+        the gain over the law; infinite if so few links cannot tell.
+    """
+    known = np.isin(links.device, sorted(links.anchors)) & np.isfinite(links.level_db)
+    rows = subsample(np.flatnonzero(known & (folds.index >= 0)), FIRST_LOOK_LINKS)
+    kept = np.unique(folds.index[rows], return_inverse=True)[1].ravel()
+    few, bases = links.select(rows), make_bases(scene, seed)
+    few_folds = Folds(folds.by, kept)
+    if len(rows) < FIRST_LOOK_LINKS or few_folds.count < 2:
+        return np.inf
+    parts = training_parts(few, few_folds)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the fit to all links warns
+            law, paths = (cross_validate(few, bases[name], few_folds, parts)
+                          for name in (TwinBase.name, RaytraceBase.name))
+    except BadInput:
+        return np.inf
+    common = np.isfinite(law.held_out_mean_db + paths.held_out_mean_db)
+    return law.rmse_db(common) - paths.rmse_db(common)
 
 
 def _with_evidence(links: Links, whole: Model) -> Links:

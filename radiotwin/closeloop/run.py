@@ -10,13 +10,18 @@ import numpy as np
 
 from radiotwin.closeloop.crossfit import (
     BASES,
+    FIRST_LOOK_LINKS,
+    MIN_GAIN_DB,
     CrossFit,
     Folds,
     LogDistanceBase,
+    RaytraceBase,
+    TwinBase,
     best_base,
     cross_validate,
     make_bases,
     make_folds,
+    paths_gain_db,
     training_parts,
 )
 from radiotwin.closeloop.predict.predictor import CombinedPrediction, combined_prediction
@@ -174,7 +179,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     Args:
         measurements: links.
         scene: 3D map and radio; None: every link counts as one with line of sight.
-        base: one of `BASES`, or `auto`: the one with the least held-out error.
+        base: one of `BASES`, or `auto`: the one with the least held-out error. Paths are then
+            followed only if they make that of a few links smaller.
         seed: of folds, fits and permutations.
         on_progress: called with what is being done.
         hold_out: which links are held out together, see `make_folds`.
@@ -200,7 +206,18 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     folds = make_folds(links, seed, hold_out)
     names = [base]
     if base == "auto":
-        names = ["log-distance"] if scene is None else ["twin", "raytrace"]
+        names = ["log-distance"] if scene is None else [TwinBase.name]
+        if scene is not None:
+            on_progress("looking whether paths explain more than line of sight does")
+            gain_db = paths_gain_db(links, scene, folds, seed)
+            if gain_db >= MIN_GAIN_DB:
+                names.append(RaytraceBase.name)
+            else:
+                links = links.with_notes(
+                    f"Paths were followed on {FIRST_LOOK_LINKS} links of anchors only. There the "
+                    f"held-out error is {abs(gain_db):.2f} dB "
+                    f"{'smaller' if gain_db > 0 else 'larger'} than without them; the paths of all "
+                    f"links are followed from {MIN_GAIN_DB} dB less on, or with --base raytrace.")
     bases = make_bases(scene, seed)
     models, parts = {}, training_parts(links, folds)
     for name in names:

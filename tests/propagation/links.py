@@ -15,4 +15,4 @@ def powers_of_links(city, device_m, receiver_m, device, frequency_hz=2.4e9, **se
         for name, values in arrays.items():
             values[links] = getattr(found, name)
         directions.append(found.directions._replace(link=links[found.directions.link]))
-    return PathPowers(**arrays, directions=PathDirections.joined(directions))
+    return PathPowers(**arrays, directions=PathDirections.joined(directions), strongest=found.strongest)

@@ -21,6 +21,7 @@ WEDGES = {"luebbers": LUEBBERS, "sionna": SIONNA}
 PATH_CHUNK = 50_000  # paths at once: about 30 MB
 DARK_CHUNK = 100  # receivers at once that only two edges may reach
 DEPTH = 4  # interactions of a path at most
+WEAK_SHARE = 1e-3  # of a link's power: a weaker path need not be tried from places nearby
 NEGLECTED = 1e-5  # of a link's power, carried by its weakest paths, whose directions are not kept
 
 
@@ -115,6 +116,8 @@ class PathPowers:
             more than 5 km apart have this or, with line of sight, `direct` less what the ground
             takes of it, and nothing else.
         directions: of the single paths.
+        strongest: the candidates of the paths that carry nearly all of these powers, and all edges
+            that the device sees: what is worth trying from places a few metres away.
     """
 
     direct: np.ndarray
@@ -127,6 +130,7 @@ class PathPowers:
     ground: np.ndarray
     diffracted_terrain: np.ndarray
     directions: PathDirections
+    strongest: Candidates
 
     @property
     def total(self) -> np.ndarray:
@@ -134,12 +138,13 @@ class PathPowers:
         return np.sum([getattr(self, name) for name in COMPONENTS], axis=0)
 
 
-COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-1]
+COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 
 
 def path_powers(
     city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float, *,
     depth: int = DEPTH, wedge: str = "luebbers", rays: int = DEVICE_RAYS,
+    candidates: Candidates | None = None,
 ) -> PathPowers:
     """Follow the paths from a device to receivers and add up their powers.
 
@@ -156,6 +161,7 @@ def path_powers(
         wedge: coefficient of diffraction: `luebbers`, reciprocal and exact for conductors; or, for
             comparisons, that of `sionna`. See `radiotwin.propagation.paths.interactions`.
         rays: shot from the device to find what paths of several interactions visit.
+        candidates: what to try instead, such as the `strongest` of a place nearby.
 
     Raises:
         BadInput: a position or the frequency is no number, or the depth is out of its range.
@@ -179,19 +185,23 @@ def path_powers(
     search = candidate_search(city, depth)
     buffer = PathBuffer.allocate(PATH_CHUNK)
     slabs = city_slabs(city, frequency_hz)
-    candidates = search.candidates(device_m, rays)
+    if candidates is None:
+        candidates = search.candidates(device_m, rays)
     kind = _kinds(candidates, search.is_ground)
+    found = [(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0))]
     for clear, gain in clear_paths_gains(city, search, candidates, device_m, receiver_m[near],
                                          buffer, wave_number, slabs, WEDGES[wedge]):
         link, points_m = near[buffer.receiver[clear]], buffer.points_m[clear]
         last, path = buffer.count[clear] - 1, np.arange(len(clear))
         np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
+        found.append((buffer.candidate[clear], link, gain))
         directions.append(_directions(link, gain, points_m[:, 1] - points_m[:, 0],
                                       points_m[path, last - 1] - points_m[path, last]))
+    over_seen_edge = (candidates.before[:, 0] < 0) & (candidates.edge >= 0)
+    strongest = _strongest_candidates(candidates, found, powers.sum(axis=0), over_seen_edge)
     dark = near[powers[:, near].sum(axis=0) == 0]
     if len(dark) and depth > 1:
-        seen_edges = candidates.edge[(candidates.before[:, 0] < 0) & (candidates.edge >= 0)]
-        to_try = search.pairs_of_edges(np.unique(seen_edges))
+        to_try = search.pairs_of_edges(np.unique(candidates.edge[over_seen_edge]))
         for first in range(0, len(dark), DARK_CHUNK):
             part = dark[first:first + DARK_CHUNK]
             pairs = paths_over_two_edges(city, search.surfaces, to_try, device_m, receiver_m[part])
@@ -209,7 +219,27 @@ def path_powers(
     directions.append(_directions(rows, along.gain, along.edge_m - device_m,
                                   along.edge_m - receiver_m[rows]))
     return PathPowers(*powers, _strongest(  # type: ignore[call-arg]  # a row a kind
-        PathDirections.joined(directions), len(receiver_m)))
+        PathDirections.joined(directions), len(receiver_m)), strongest)
+
+
+def _strongest_candidates(
+    candidates: Candidates, found: list[tuple[np.ndarray, ...]], total: np.ndarray,
+    over_seen_edge: np.ndarray,
+) -> Candidates:
+    """Return candidates (c,) that matter for a link, and one for each edge seen.
+
+    Args:
+        candidates: that were tried.
+        found: of paths (p,): candidate, link, and power.
+        total: (n,) power of each link.
+        over_seen_edge: (c,) bool, whether the first interaction is at an edge.
+    """
+    candidate, link, power = (np.concatenate(each) for each in zip(*found, strict=True))
+    matters = np.zeros(len(candidates.edge), dtype=bool)
+    matters[candidate[power > WEAK_SHARE * total[link]]] = True
+    rows = np.flatnonzero(over_seen_edge & (candidates.after[:, :1] < 0).all(axis=1))
+    matters[rows] = True
+    return Candidates(*(each[matters] for each in candidates))
 
 
 def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,

@@ -2,9 +2,10 @@
 
 A law with two classes of links takes one just behind an edge, a few decibels below line of sight,
 for one with it, and moves a device in a narrow street to where it would have line of sight. Paths
-tell the two apart, and take long. So the likelihood of each position is that of some of the
-device's links, by the law in all cells around, by paths in the best of these and downhill of them.
-The powers along paths that were followed are kept for other parts of the same links.
+tell the two apart, and take long. So the search goes from coarse to fine: by the law in all cells
+around, by short paths of a few links in the best of these, by all paths of more links in the best
+of those, and downhill from there. A step downhill tries only the reflections and diffractions that
+matter a few metres away. The powers along paths are kept for other parts of the same links.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from radiotwin.inference.student import DOF
 from radiotwin.links import Links
 from radiotwin.links.declared import Declared
 from radiotwin.propagation.laws.image_paths import ImagePaths
-from radiotwin.propagation.paths import path_powers
+from radiotwin.propagation.paths.images import Candidates
+from radiotwin.propagation.paths.powers import PathPowers, path_powers
 from radiotwin.runtime.console import progress
 from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.runtime.pieces import KeptParts, Piece, keeps, kept_with_name
@@ -33,6 +35,7 @@ from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.model.model import Fit, Model
 
+_Place = tuple[float, float]  # x and y of a device [m]
 Followed = dict[tuple[float, ...], dict[int, float]]
 """Position -> hash of the other end's position and of the antenna -> power."""
 LINKS = 150  # of a device, about
@@ -45,6 +48,9 @@ FOLLOWED_SHARE, MIN_FOLLOWED, MAX_FOLLOWED = 0.12, 16, 40  # of the cells
 DESCENTS, DESCENTS_APART_M = 2, 15.0
 STEPS_M = (4.0, 2.0, 1.0, 0.5)
 AROUND_M = (14.0, 7.0)  # rings about where a descent has ended, in case it was a local minimum
+COARSE_LINKS, COARSE_DEPTH = 50, 3  # of a first look at a position
+SECOND_LOOKS = 8  # positions that are then looked at with all links and paths
+NEAR_M = 4.0  # as far away, the same reflections and diffractions matter
 RAYS = 10_000  # from each position, 2 degrees apart: ten times as many find the same places
 MAX_MISFIT = 4.0  # square of how many times the errors of other devices
 CREDIBLE = 0.9
@@ -186,26 +192,58 @@ class Relocation:
             self.thresholds[name] = least
         return rows[hashes >= self.thresholds[name]]
 
-    def follow(self, city: CityMap, position_m: tuple[float, ...], ends_m: np.ndarray,
-               frequency_hz: float, declared: Declared, device: int) -> np.ndarray:
-        """Return the power (n,) from a position to ends (n, 3), through what antennas a device has.
+    def follow(self, links: Links, device: int, candidates: Candidates | None = None
+               ) -> tuple[np.ndarray, Candidates | None]:
+        """Follow the paths of links (n,) of a device that are not known yet.
 
-        Receivers have the antenna that is declared of them.
+        Args:
+            links: with the device where it is tried.
+            device: its row.
+            candidates: what to try; None: all that rays find.
+
+        Returns:
+            power (n,) through the antennas that are declared, and the candidates that matter at
+            this position if all of its paths were followed.
         """
-        known = self.powers.setdefault(city, {}).setdefault(position_m, {})
-        antenna = declared.radios[device].antenna if declared.radios else None
-        number = [None, *(each for each, _ in declared.antennas)].index(antenna)
-        hashes = (_hashes(ends_m) + np.uint64(number)).tolist()  # devices may be tried at one place
-        missing = {key: row for row, key in enumerate(hashes) if key not in known}
+        assert links.city is not None
+        position_m = tuple(map(float, links.device_m[device]))
+        known = self.powers.setdefault(links.city, {}).setdefault(position_m, {})
+        keys = _keys(links, device)
+        missing = {key: row for row, key in enumerate(keys) if key not in known}
+        strongest = None
         if missing:
-            new_m = ends_m[list(missing.values())]
-            followed = path_powers(city, np.array(position_m), new_m, frequency_hz, rays=RAYS)
-            power = followed.total
-            if declared.has_antennas:
-                power = power * np.nan_to_num(10 ** (followed.directions.antenna_gain_db(
-                    len(new_m), antenna, declared.receiver_antenna) / 10))
-            known.update(zip(missing, power.tolist(), strict=True))
-        return np.array([known[key] for key in hashes])
+            followed = path_powers(
+                links.city, links.device_m[device], links.receiver_m[list(missing.values())],
+                links.frequency_hz, rays=RAYS, candidates=candidates)
+            known.update(zip(missing, _through_antennas(followed, links.declared, device).tolist(),
+                             strict=True))
+            if candidates is None and len(missing) == len(keys):
+                strongest = followed.strongest
+        return np.array([known[key] for key in keys]), strongest
+
+    def is_followed(self, links: Links, device: int) -> bool:
+        """Return whether the paths of all these links of a device are known."""
+        assert links.city is not None
+        known = self.powers.get(links.city, {}).get(tuple(map(float, links.device_m[device])), {})
+        return all(key in known for key in _keys(links, device))
+
+
+def _keys(links: Links, device: int) -> list[int]:
+    """Return what tells links (n,) of a device apart: receivers, and the device's antenna."""
+    declared = links.declared
+    antenna = declared.radios[device].antenna if declared.radios else None
+    number = [None, *(each for each, _ in declared.antennas)].index(antenna)
+    # Several devices may be tried at one place
+    return (_hashes(links.receiver_m) + np.uint64(number)).tolist()
+
+
+def _through_antennas(followed: PathPowers, declared: Declared, device: int) -> np.ndarray:
+    """Return the power (n,) of the paths from a device through the antennas that are declared."""
+    if not declared.has_antennas:
+        return followed.total
+    antenna_db = followed.directions.antenna_gain_db(
+        len(followed.direct), declared.radios[device].antenna, declared.receiver_antenna)
+    return followed.total * np.nan_to_num(10 ** (antenna_db / 10))
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,12 +283,14 @@ class _Search:
         by_law, by_paths: likelihood of its links.
         relocation: its bounds, and what was followed.
         tried: position -> negative log-likelihood by paths [nats].
+        strongest: position -> the candidates that matter there, of those fully followed.
     """
 
     by_law: _Likelihood
     by_paths: _Likelihood
     relocation: Relocation
-    tried: dict[tuple[float, float], float] = field(default_factory=dict)
+    tried: dict[_Place, float] = field(default_factory=dict)
+    strongest: dict[_Place, Candidates] = field(default_factory=dict)
 
     def from_law(self, device: TwinDevice, known: list[tuple[float, float]]) -> TwinDevice:
         """Return the device where paths put it, or where it is.
@@ -265,7 +305,7 @@ class _Search:
         """
         start_m = np.array([device.x_m, device.y_m])
         known_m = self._free(np.array(known).reshape(-1, 2))
-        worth_m = known_m if len(known_m) else self._likely_cells(device)
+        worth_m = known_m if len(known_m) else self._second_looks(self._likely_cells(device))
         self._try([*self._free(np.round(start_m)[None]), *worth_m])
         if not self.tried:
             return device
@@ -302,6 +342,8 @@ class _Search:
             while better:
                 cross = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
                 around_m = self._free(best + step_m * cross)
+                if not all(self._is_cheap(each_m) for each_m in around_m):
+                    self._find_strongest(best)
                 values = self._try(around_m)
                 better = min(values, default=np.inf) < value
                 if better:
@@ -315,7 +357,7 @@ class _Search:
             angles = np.arange(8) * np.pi / 4
             ring = np.column_stack([np.cos(angles), np.sin(angles)])
             rings = np.vstack([best + away_m * ring for away_m in AROUND_M])
-            around_m = self._free(np.round(rings))
+            around_m = self._second_looks([*self._free(np.round(rings))])
             values = self._try(around_m)
             better = min(values, default=np.inf) < self.tried[best]
             if better:
@@ -336,37 +378,81 @@ class _Search:
         links = self.by_law.at(position_m)
         return self.by_law.nll(links, self.by_law.fit.model.level_at(links))
 
-    def _paths_db(self, links: Links) -> np.ndarray:
-        device, declared = self.by_paths.device, links.declared
-        position_m = tuple(map(float, links.device_m[device]))
+    def _second_looks(self, positions_m: list[np.ndarray]) -> list[np.ndarray]:
+        """Return those of positions (2,) that short paths of a few links explain best."""
+        if len(positions_m) <= SECOND_LOOKS:
+            return positions_m
+        order = np.argsort(in_threads(self._coarse_nll, positions_m), kind="stable")
+        return [positions_m[place] for place in order[:SECOND_LOOKS]]
+
+    def _coarse_nll(self, position_m: np.ndarray) -> float:
+        rows = self.by_paths.rows[::max(len(self.by_paths.rows) // COARSE_LINKS, 1)]
+        likelihood = replace(self.by_paths, rows=rows)
+        links, device = likelihood.at(position_m), likelihood.device
         assert links.city is not None
-        power = self.relocation.follow(links.city, position_m, links.receiver_m,
-                                       links.frequency_hz, declared, device)
-        channel = self.by_paths.fit.channel
+        followed = path_powers(links.city, links.device_m[device], links.receiver_m,
+                               links.frequency_hz, depth=COARSE_DEPTH, rays=RAYS)
+        power = _through_antennas(followed, links.declared, device)
+        return likelihood.nll(links, self._level_db(links, power))
+
+    def _level_db(self, links: Links, power: np.ndarray) -> np.ndarray:
+        channel, declared = self.by_paths.fit.channel, links.declared
         assert isinstance(channel, ImagePaths)
-        fed_db = 0.0 if declared.adds_nothing else declared.fed_db[device]
+        fed_db = 0.0 if declared.adds_nothing else declared.fed_db[self.by_paths.device]
         return channel.level_db(power, links.geometry) + fed_db
 
     def _try(self, positions_m: Iterable[np.ndarray]) -> list[float]:
         """Return the negative log-likelihood by paths of each position (2,) [nats]."""
         keys = [(float(x_m), float(y_m)) for x_m, y_m in positions_m]
         new = [key for key in dict.fromkeys(keys) if key not in self.tried]
-        self.tried.update(zip(new, in_threads(self._paths_nll, new), strict=True))
+        # What one finds, others of the same call do not use: how many threads there are is all one.
+        asked = [(key, self._nearby(key)) for key in new]
+        for key, (nll, strongest) in zip(new, in_threads(self._paths_nll, asked), strict=True):
+            self.tried[key] = nll
+            if strongest is not None:
+                self.strongest[key] = strongest
         return [self.tried[key] for key in keys]
 
-    def _paths_nll(self, position_m: tuple[float, float]) -> float:
+    def _paths_nll(self, asked: tuple[_Place, Candidates | None]
+                   ) -> tuple[float, Candidates | None]:
+        """Return the negative log-likelihood [nats], and what matters if all was followed."""
+        position_m, candidates = asked
         links = self.by_paths.at(np.array(position_m))
-        return self.by_paths.nll(links, self._paths_db(links))
+        power, strongest = self.relocation.follow(links, self.by_paths.device, candidates)
+        return self.by_paths.nll(links, self._level_db(links, power)), strongest
 
-    def _view(self, best: tuple[float, float]) -> ResidualView:
+    def _nearby(self, position_m: _Place) -> Candidates | None:
+        """Return what matters at the nearest place within `NEAR_M` that was fully followed."""
+        away_m = {place: np.hypot(place[0] - position_m[0], place[1] - position_m[1])
+                  for place in self.strongest}
+        nearest = min(away_m, key=away_m.__getitem__, default=None)
+        return None if nearest is None or away_m[nearest] > NEAR_M else self.strongest[nearest]
+
+    def _is_cheap(self, position_m: np.ndarray) -> bool:
+        """Return whether all paths from a position (2,) are known, or those of one nearby."""
+        place = float(position_m[0]), float(position_m[1])
+        return self._nearby(place) is not None or self.relocation.is_followed(
+            self.by_paths.at(position_m), self.by_paths.device)
+
+    def _find_strongest(self, position_m: np.ndarray) -> None:
+        """Find what matters at a position (2,), where paths may have been followed before."""
+        place, links = (float(position_m[0]), float(position_m[1])), self.by_paths.at(position_m)
+        if place not in self.strongest:
+            assert links.city is not None
+            self.strongest[place] = path_powers(
+                links.city, links.device_m[self.by_paths.device], links.receiver_m,
+                links.frequency_hz, rays=RAYS).strongest
+
+    def _view(self, best: _Place) -> ResidualView:
         """Return the links with the device where it was found."""
         likelihood, links = self.by_paths, self.by_paths.at(np.array(best))
-        problem = likelihood.problem(links, self._paths_db(links))
+        power, _ = self.relocation.follow(links, likelihood.device)
+        problem = likelihood.problem(links, self._level_db(links, power))
         reading = problem.predict(likelihood.fit)
         return ResidualView(links, problem.residual_db(likelihood.fit), reading.scale_db,
                             reading.mean_db, likelihood.fit.model.level_at)
 
-    def _radius_m(self, best: tuple[float, float], links_as_one: float) -> float:
+    def _radius_m(self, best: _Place, links_as_one: float) -> float:
         """Return the radius of a circle that holds 90 % of the probability of what was tried [m].
 
         Each position stands for the ground that is nearer to it than to others.
@@ -388,7 +474,7 @@ def _search_alone(searches: list[_Question], number: int) -> Piece:
     """Return the result of a search by its number, as if it were the only one."""
     search, device, before = searches[number]
     alone = replace(search.relocation, powers=WeakKeyDictionary())
-    found = replace(search, relocation=alone, tried={}).from_law(device, before)
+    found = replace(search, relocation=alone, tried={}, strongest={}).from_law(device, before)
     city = search.by_law.fit.links.city
     assert city is not None
     return followed_since({}, alone.powers.get(city, {})), found.record
