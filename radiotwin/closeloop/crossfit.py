@@ -26,10 +26,12 @@ from radiotwin.inference.student import mean_if_detected
 from radiotwin.links import Links, with_evidence
 from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.evidence import fitting_width_m
+from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_known, fit_links, reliable_m
 from radiotwin.twin.fit_paths import LOST_M, best_dof, fit_paths, relocation_from
+from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.model import Fit, Model
 from radiotwin.twin.twin import Twin
 
@@ -224,6 +226,10 @@ class RaytraceBase(Base):
     @override
     def fit(self, links: Links) -> Twin:
         return fit_paths(links, self._scene, self._law.fit(links), self._relocation)
+
+    def locate(self, links: Links, channel: ImagePaths) -> list[TwinDevice]:
+        """Return the devices where paths over the map of links put them, by a fitted channel."""
+        return self._relocation.relocate(links, self._law.fit(links).devices, channel)
 
 
 BASES = (TwinBase.name, RaytraceBase.name, LogDistanceBase.name)

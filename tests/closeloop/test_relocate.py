@@ -72,7 +72,8 @@ def test_along_paths_folds_are_located_anew_only_where_a_device_moves(monkeypatc
     model = model.map(lambda fit: replace(fit, model=replace(fit.model, channel=Following(fit.channel))))
     located = []
 
-    def anew(each, links, mine, base):
+    def anew(each, links, mine, base, wanted):
+        assert wanted == [1]
         located.append(mine.sum())
         device_m = each.links.device_m.copy()
         device_m[1, 0] += moved_m

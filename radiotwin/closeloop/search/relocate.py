@@ -11,10 +11,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from radiotwin.closeloop.crossfit import Base, CrossFit
+from radiotwin.closeloop.crossfit import Base, CrossFit, RaytraceBase
 from radiotwin.closeloop.verdict.criteria import MAX_LOSS_NATS
 from radiotwin.effects.arrays import subsample
 from radiotwin.links import Links
+from radiotwin.propagation.laws.image_paths import ImagePaths
+from radiotwin.twin.fit_links import reliable_m
 from radiotwin.twin.localize import position_log_likelihood
 from radiotwin.twin.localize.estimate import TwinDevice
 from radiotwin.twin.model.model import Fit, FittedModel, Model
@@ -52,10 +54,11 @@ def relocate_devices(model: CrossFit, links: Links, base: Base
         moved = [_relocated(each, unknown) for each in model.each]
         twin = replace(twin, devices=_with_positions(twin.devices, moved[0].links.device_m))
     elif model.whole.model.corrected_map is not links.city:
-        located = [_located_anew(model.whole, links, np.ones(len(links), bool), base)]
-        if not _is_moved(model.whole, located[0][0]):
+        located = [_located_anew(model.whole, links, np.ones(len(links), bool), base, unknown)]
+        moves = _moved(model.whole, located[0][0])
+        if not len(moves):
             return model  # which takes folds minutes, too
-        located += [_located_anew(each, links, model.index != number, base)
+        located += [_located_anew(each, links, model.index != number, base, moves)
                     for number, each in enumerate(model.folds)]
         moved = [each for each, _ in located]
         twin = replace(twin, devices=located[0][1])
@@ -66,11 +69,12 @@ def relocate_devices(model: CrossFit, links: Links, base: Base
     return found if is_better(model.held_out_nll, found.held_out_nll) else model
 
 
-def _is_moved(before: Fit, after: Model) -> bool:
-    """Return whether any device with links moves noticeably, is found or is lost."""
+def _moved(before: Fit, after: Model) -> list[int]:
+    """Return the devices with links that move noticeably, are found or are lost."""
     apart_m = np.linalg.norm(after.links.device_m - before.links.device_m, axis=1)
     moved = apart_m[before.links.device] > MIN_MOVE_M
-    return bool(((before.usable != after.usable) | (before.usable & moved)).any())
+    changed = (before.usable != after.usable) | (before.usable & moved)
+    return np.unique(before.links.device[changed]).tolist()
 
 
 def is_better(before_nll: np.ndarray, after_nll: np.ndarray) -> bool:
@@ -96,19 +100,30 @@ def _with_positions(devices: list[TwinDevice], device_m: np.ndarray) -> list[Twi
             for each, (x_m, y_m, _) in zip(devices, device_m, strict=True)]
 
 
-def _located_anew(fit: Fit, links: Links, mine: np.ndarray,
-                  base: Base) -> tuple[Model, list[TwinDevice]]:
-    """Return one model with its devices where its base, over the corrected map, has them.
+def _located_anew(fit: Fit, links: Links, mine: np.ndarray, base: Base,
+                  wanted: list[int]) -> tuple[Model, list[TwinDevice]]:
+    """Return one model with devices where its base, over the corrected map, has them.
 
-    Of links as the base was given them, from those in `mine` (n,).
+    Args:
+        fit: one model.
+        links: n links as the base was given them.
+        mine: (n,) bool, those that the model learns from.
+        base: follows paths.
+        wanted: devices to be located; others stay where the model has them, if it does.
     """
     model = fit.model
+    stay = np.setdiff1d(model.links.device[model.usable], wanted).tolist()
+    device_m = links.device_m.copy()
+    device_m[stay] = model.links.device_m[stay]
+    asked = links.with_city(model.corrected_map).with_devices(device_m)
+    asked = asked.with_ends(anchors=links.anchors | frozenset(stay)).select(mine)
+    assert isinstance(base, RaytraceBase) and isinstance(model.channel, ImagePaths)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the base has warned already
-        twin = base.fit(links.with_city(model.corrected_map).select(mine))
-    moved = Model.build(model.links, model.channel, model.dof, device_m=base.device_m(twin),
-                            train=mine)
-    return moved.with_effects(model.effects), twin.devices
+        devices = base.locate(asked, model.channel)
+    moved = Model.build(model.links, model.channel, model.dof,
+                        device_m=reliable_m(devices, base.max_radius_m), train=mine)
+    return moved.with_effects(model.effects), devices
 
 
 def _relocated(fit: Fit, unknown: list[int]) -> Model:

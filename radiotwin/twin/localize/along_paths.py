@@ -19,6 +19,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.special import stdtrit
 
+from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import ResidualView
 from radiotwin.inference.censored_regression import CensoredRegression
 from radiotwin.inference.student import DOF
@@ -39,6 +40,7 @@ _Place = tuple[float, float]  # x and y of a device [m]
 Followed = dict[tuple[float, ...], dict[int, float]]
 """Position -> hash of the other end's position and of the antenna -> power."""
 LINKS = 150  # of a device, about
+FIT_LINKS = 1000  # that levels and error scales are fitted to
 MIN_HEARD = 30  # of these; what is not heard says little, and fits many positions
 MAX_DEVICES = 30  # of unknown position; each takes some ten seconds
 CELL_M, CELLS_APART_M = 7.0, 9.0
@@ -120,8 +122,11 @@ class Relocation:
         if unknown > MAX_DEVICES:
             return list(devices)
         device_m = np.array([each.position_m for each in devices])
-        fits = [Model.build(links, each, DOF, device_m=device_m).fit()
+        placed = np.isfinite(device_m).all(axis=1)
+        few = links.select(subsample(np.flatnonzero(placed[links.device]), FIT_LINKS))
+        fits = [Model.build(few, each, DOF, device_m=device_m).fit()
                 for each in (channel.law, channel)]
+        links = links.with_devices(np.where(placed[:, None], device_m, 0.0))
         searches: dict[int, _Question] = {}
         for number, device in enumerate(devices):
             if device.role != "unknown":
@@ -129,7 +134,7 @@ class Relocation:
             rows = self._rows(links, number)
             heard = np.isfinite(links.level_db[rows]).sum()
             if device.credible_radius_m <= self.max_radius_m and heard >= MIN_HEARD:
-                by_law, by_paths = (_Likelihood(fit, rows, number) for fit in fits)
+                by_law, by_paths = (_Likelihood(fit, links, rows, number) for fit in fits)
                 before = self.positions.setdefault(device.device, [])
                 searches[number] = _Search(by_law, by_paths, self), device, before
         self._search_ahead(list(searches.values()))
@@ -164,7 +169,7 @@ class Relocation:
     def _search(self, search: _Search, device: TwinDevice,
                 before: list[tuple[float, float]]) -> TwinDevice:
         """Return a device where paths put it, and remember what was followed for that."""
-        city = search.by_law.fit.links.city
+        city = search.by_law.links.city
         assert city is not None
         followed = self.powers.setdefault(city, {})
         known = {position_m: len(powers) for position_m, powers in followed.items()}
@@ -251,20 +256,22 @@ class _Likelihood:
     """Likelihood of some links of a device, wherever it is.
 
     Attributes:
-        fit: of all links.
+        fit: of links of all devices.
+        links: of all devices, with each where the law has it.
         rows: links of the device that take part.
         device: its row.
     """
 
     fit: Fit
+    links: Links
     rows: np.ndarray
     device: int
 
     def at(self, position_m: np.ndarray) -> Links:
         """Return the links with the device at a position (2,)."""
-        device_m = self.fit.links.device_m.copy()
+        device_m = self.links.device_m.copy()
         device_m[self.device, :2] = position_m
-        return self.fit.links.select(self.rows).with_devices(device_m)
+        return self.links.select(self.rows).with_devices(device_m)
 
     def problem(self, links: Links, mean_db: np.ndarray) -> CensoredRegression:
         """Return the regression on the links, of which the channel predicts (n,)."""
@@ -369,7 +376,7 @@ class _Search:
         x_m, y_m = positions_m.T
         inside = (x_m >= west) & (x_m <= east) & (y_m >= south) & (y_m <= north)
         positions_m = positions_m[inside]
-        links = self.by_law.fit.links
+        links = self.by_law.links
         assert links.city is not None
         height_m = np.full(len(positions_m), links.device_m[self.by_law.device, 2])
         return positions_m[~links.city.inside(np.column_stack([positions_m, height_m]))]
@@ -475,7 +482,7 @@ def _search_alone(searches: list[_Question], number: int) -> Piece:
     search, device, before = searches[number]
     alone = replace(search.relocation, powers=WeakKeyDictionary())
     found = replace(search, relocation=alone, tried={}, strongest={}).from_law(device, before)
-    city = search.by_law.fit.links.city
+    city = search.by_law.links.city
     assert city is not None
     return followed_since({}, alone.powers.get(city, {})), found.record
 
