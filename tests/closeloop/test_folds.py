@@ -2,8 +2,12 @@
 
 import numpy as np
 
-from radiotwin.closeloop.crossfit import make_folds
+from radiotwin.closeloop.crossfit import MIN_GAIN_DB, make_folds, paths_gain_db
 from radiotwin.links import prepare_links
+from radiotwin.maps.radiomap import RadioMap
+from radiotwin.maps.survey import fly_survey, segmented_truth
+from radiotwin.scene import Scene
+from tests.worlds import RBM
 
 
 def test_flights_are_held_out_where_they_are_alike_and_blocks_of_ground_where_not(open_ground):
@@ -34,3 +38,13 @@ def test_a_quadrant_is_held_out_as_a_whole(open_ground):
         for north in (False, True):
             part = ((world.receiver_m[:, 0] > middle[0]) == east) & ((world.receiver_m[:, 1] > middle[1]) == north)
             assert len(np.unique(folds.index[part])) == 1
+
+
+def test_few_links_tell_whether_paths_are_worth_following():
+    """RBM as Sionna RT traced it, and levels of a law with two classes of links there, in which no path is."""
+    scene = Scene.load(RBM)
+    gains_db = []
+    for truth in (RadioMap.read(RBM / "truth.nc"), segmented_truth(scene)):
+        links = prepare_links(fly_survey(scene, truth, flights=1, seed=2), scene)
+        gains_db.append(paths_gain_db(links, scene, make_folds(links, 0), 0))
+    assert gains_db[0] > 1.0 > MIN_GAIN_DB > gains_db[1]

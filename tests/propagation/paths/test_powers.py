@@ -210,3 +210,14 @@ def test_bad_input(city_of, change, message):
 def test_no_links(city_of):
     none = path_powers(city_of((0, 10, 10, 20, 5)), np.ones(3), np.empty((0, 3)), FREQUENCY_HZ)
     assert none.total.shape == (0,)
+
+
+def test_what_matters_at_a_place_gives_the_powers_there_and_a_few_metres_away(town, links):
+    device_m, receiver_m, device = links
+    city, far_m = town(), receiver_m[device == device[0]]
+    there = path_powers(city, device_m[device[0]], far_m, FREQUENCY_HZ)
+    for away_m, most_db in ((0.0, 0.2), (1.5, 1.0)):
+        near_m = device_m[device[0]] + [away_m, 0, 0]
+        asked = path_powers(city, near_m, far_m, FREQUENCY_HZ, candidates=there.strongest)
+        error_db = 10 * np.log10(asked.total / path_powers(city, near_m, far_m, FREQUENCY_HZ).total)
+        assert np.quantile(np.abs(error_db), 0.9) < most_db and (error_db < 1e-9).all()
