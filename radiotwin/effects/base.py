@@ -330,6 +330,10 @@ class Effect(ABC):
         """Return what in the map of n links speaks against it as fitted; None for nothing."""
         return None
 
+    def contradicted_declarations(self, links: Links) -> list[str]:
+        """Return what of the tables its fit contradicts, a sentence each; by default nothing."""
+        return []
+
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         """Return what was found, by name; by default every parameter made with `quantity`."""
         return {name: Parameter.normal(getattr(self.params, name), sd, each["unit"],

@@ -98,6 +98,25 @@ def test_azimuths_that_the_readings_contradict_are_left_out_and_told(turn_deg):
     assert abs((float(turned[1]) + turn_deg + 180) % 360 - 180) < 10
 
 
+@pytest.mark.parametrize(("wrong", "by_deg"), [(None, 0.0), (4, 120.0), (1, -60.0)])
+def test_one_wrong_azimuth_is_named_among_right_ones(wrong, by_deg):
+    """All azimuths are 2 degrees off, one by more: its own readings put it back, and nobody else is named."""
+    measurements = network(1)
+    azimuth_deg = measurements.devices["azimuth_deg"].to_numpy() + 2
+    if wrong is not None:
+        azimuth_deg[wrong] += by_deg
+    devices = measurements.devices.assign(azimuth_deg=azimuth_deg % 360)
+    links = prepare_links(replace(measurements, devices=devices), None)
+    kind, folds = make_bases(None, 0)["log-distance"], make_folds(links, 0, "block")
+    view = cross_validate(links, kind, folds, training_parts(links, folds)).whole.view
+    (params,) = DeclaredSectors().propose(view)
+    assert list(params.own_turns_deg) == ([] if wrong is None else [wrong])
+    for turn_deg, sd_deg in params.own_turns_deg.values():
+        assert abs(turn_deg + by_deg) < 12 and sd_deg < 12
+    said = DeclaredSectors().with_params(params).contradicted_declarations(links)
+    assert [NAMES[wrong] in each for each in said] == ([] if wrong is None else [True])
+
+
 def test_where_no_azimuth_is_declared_nothing_is_said_of_it():
     measurements = network(2)
     found = taken(replace(measurements, devices=measurements.devices.drop(columns="azimuth_deg")))

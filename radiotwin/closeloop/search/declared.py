@@ -41,6 +41,8 @@ def _with_best(state: SearchState, forms: list[Effect], inputs: SearchInputs) ->
         state = state.note(
             f"{effect.variant} are part of the base: the RMSE on held-out links is "
             f"{best.rmse_db:.2f} dB, and {before.rmse_db():.2f} dB without them")
+        for sentence in extended.whole.effects[-1].contradicted_declarations(extended.links):
+            state = state.note(sentence)
         return state.keep(best, extended).refuse(*(
             each.refuse(each.reason or f"{effect.variant} gain more")
             for each in tried if each is not best))

@@ -4,7 +4,8 @@ All declared devices have one pattern (that of `radiotwin.effects.antennas`), ea
 azimuth and tilt, and levels that have much in common. All azimuths may be off by one small angle (a
 compass, another north), and all tilts (what is electrical is in few tables); by a large one the
 table is wrong. So it holds for a sector that nobody has measured, too, which a pattern learnt for
-each device by itself does not.
+each device by itself does not. Beside what all share, each azimuth is judged by the device's own
+readings: one that they contradict (cables exchanged, a digit) is turned to where they put it.
 
 Levels have the more in common the more of a site devices share. Radios and cables of a mast come
 from one installation, and sectors of one direction are carriers that share an antenna. So levels
@@ -13,8 +14,9 @@ the others then says what to expect of a sector that nobody has measured, and ho
 """
 
 from collections import Counter
+from dataclasses import replace
 from itertools import product
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -35,6 +37,7 @@ from radiotwin.effects.antennas import (
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import LevelAt, ResidualView, Term
 from radiotwin.effects.params import (
+    QUANTILE_90,
     Allowed,
     Decibels,
     DeviceIndex,
@@ -45,7 +48,7 @@ from radiotwin.effects.params import (
     quantity,
 )
 from radiotwin.links import Links
-from radiotwin.links.sites import antenna_of, site_of
+from radiotwin.links.sites import MAD_SD, antenna_of, site_of
 
 GROUP_SD_DB = 3.0  # between masts, and between directions of a mast
 DEVICE_SD_DB = 3.0  # between carriers of an antenna: powers and cables differ
@@ -54,6 +57,16 @@ TILT_SD_DEG = 4.0  # by which declared tilts are off: electrical ones are a few 
 MAX_TURN_DEG = 20.0  # by which compasses, maps and declination are off; more is a wrong table
 OFFSETS = ("azimuth_offset_deg", "tilt_offset_deg")  # numbers that all devices share
 TURNS_DEG = (0.0, -45.0, 45.0, -90.0, 90.0, -135.0, 135.0, 180.0)  # that are tried first
+OWN_TURNS_DEG = np.arange(-175.0, 181.0, 5.0)  # of one device
+OWN_TURN_NATS = 10.0  # evidence that contradicts a table; shadows of streets bring a few nats
+ROUNDS = 3  # of the turn that all share, and of those of single devices
+
+
+class OwnTurn(NamedTuple):
+    """By how much the declared azimuth of one device is off, clockwise [deg]."""
+
+    turn_deg: Annotated[float, Field(ge=-180, le=180)]
+    sd_deg: Annotated[float, Field(ge=0, le=180)]
 
 
 def level_groups(links: Links, devices: list[int]) -> list[list[int]]:
@@ -134,6 +147,8 @@ class DeclaredSectors(SectorEffect):
             [], description="Devices whose levels have more in common: of a mast, of a direction.")
         unheard_sd_db: dict[DeviceIndex, Decibels] = Field(
             {}, description="How uncertain the level of each device without a reading is.")
+        own_turns_deg: dict[DeviceIndex, OwnTurn] = Field(
+            {}, description="Declared azimuths that are wrong: by how much, beside what all are.")
 
         @model_validator(mode="after")
         def _check_groups(self) -> Self:
@@ -158,13 +173,21 @@ class DeclaredSectors(SectorEffect):
         declared = _declared(view.links)
         if np.isin(view.links.device, declared).sum() < MIN_LINKS:
             return []
-        nats, shape, offset_deg = _best_shape(view, declared, self.straight)
+        readings = _Readings.of(view, declared, self.straight)
+        own: dict[int, OwnTurn] = {}
+        for _ in range(ROUNDS):
+            nats, shape, offset_deg = readings.best_shape(own)
+            again = readings.own_turns(shape, offset_deg)
+            if again.keys() == own.keys():
+                break
+            own = again
         if nats <= MIN_NATS:
             return []
         groups = level_groups(view.links, declared)
         heard = view.links.device[np.isfinite(view.links.level_db)]
         unheard = unheard_sd_db(declared, groups, set(heard.tolist()), LEVEL_SD_DB)
-        return [self.Params(devices=_turned(view.links, declared, shape, offset_deg),
+        return [self.Params(devices=_turned(view.links, declared, shape, offset_deg, own),
+                            own_turns_deg=own,
                             straight=self.straight, azimuth_offset_deg=offset_deg,
                             tilt_offset_deg=shape.tilt_deg, groups=groups, unheard_sd_db=unheard,
                             has_tilts=bool(np.isfinite(view.links.tilt_deg[declared]).any()))]
@@ -177,10 +200,22 @@ class DeclaredSectors(SectorEffect):
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
-        if abs(self.params.azimuth_offset_deg) <= MAX_TURN_DEG:
+        params = self.params
+        if len(params.own_turns_deg) > len(params.devices) / 2:
+            return (f"of {len(params.devices)} declared azimuths {len(params.own_turns_deg)} are "
+                    f"off by more than {MAX_TURN_DEG:g}° by the readings of their devices")
+        if abs(params.azimuth_offset_deg) <= MAX_TURN_DEG:
             return None
-        return (f"they fit azimuths that are all turned by {self.params.azimuth_offset_deg:+.0f}°; "
+        return (f"they fit azimuths that are all turned by {params.azimuth_offset_deg:+.0f}°; "
                 "azimuth_deg counts clockwise from north")
+
+    @override
+    def contradicted_declarations(self, links: Links) -> list[str]:
+        return [f"the declared azimuth of device {links.device_names[device]}, "
+                f"{links.boresight_deg[device]:.0f}°, is contradicted by its own readings, which "
+                f"put it {turn_deg:+.0f}° (± {QUANTILE_90 * sd_deg:.0f}°) away; all azimuths share "
+                f"an error of {self.params.azimuth_offset_deg:+.0f}°"
+                for device, (turn_deg, sd_deg) in self.params.own_turns_deg.items()]
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
@@ -230,6 +265,9 @@ class DeclaredSectors(SectorEffect):
             reported["tilt_deg"] = reported.pop("tilt_offset_deg")
         if links.city is None or self.params.straight:
             reported.pop("scattered_db")
+        for device, own_turn in self.params.own_turns_deg.items():
+            reported[f"azimuth_error_deg[{links.device_names[device]}]"] = Parameter.normal(
+                *own_turn, "deg", Allowed(-180.0, 180.0))
         # The common one is the channel's.
         shares = np.column_stack([_shared(self.params)[:, 1:], np.eye(len(self.params.devices))])
         level_db = shares @ estimate.coefficients[1:]
@@ -268,7 +306,7 @@ def _declared(links: Links) -> list[int]:
 
 
 def _turned(links: Links, devices: list[int], shape: SectorPattern,
-            offset_deg: float) -> dict[int, SectorPattern]:
+            offset_deg: float, own: dict[int, OwnTurn]) -> dict[int, SectorPattern]:
     """Return device -> a pattern, turned to what is declared for it, and further.
 
     A tilt that is not declared is the median of those that are, or else 0; that of `shape` is
@@ -280,41 +318,92 @@ def _turned(links: Links, devices: list[int], shape: SectorPattern,
     tilts_deg = np.clip(np.where(np.isfinite(known), known, usual) + shape.tilt_deg,
                         bounds["low"], bounds["high"])
     return {device: shape.model_copy(
-        update={"azimuth_deg": float(links.boresight_deg[device]) + offset_deg, "tilt_deg": tilt})
+        update={"azimuth_deg": float(links.boresight_deg[device]) + offset_deg
+                + (own[device].turn_deg if device in own else 0.0), "tilt_deg": tilt})
         for device, tilt in zip(devices, tilts_deg.tolist(), strict=True)}
 
 
-def _best_shape(view: ResidualView, devices: list[int],
-                straight: bool) -> tuple[float, SectorPattern, float]:
-    """Return what the best pattern of a grid gains over a level [nats], the pattern, its turn."""
-    parts = []
-    for device in devices:
-        every = np.flatnonzero(view.links.device == device)
-        rows = subsample(every, MAX_PROPOSE_LINKS)
-        if len(rows):
-            parts.append((device, rows, np.full(len(rows), len(every) / len(rows)),
-                          Departures.of(view.links, rows, straight)))
-    rows, times = (np.concatenate([part[column] for part in parts]) for column in (1, 2))
-    residual_db = view.residual_db[rows]
-    weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
+class _Readings(NamedTuple):
+    """Readings of the declared devices that patterns are compared by.
 
-    def nats(offset_db: np.ndarray) -> float:
-        level_db = weight @ (residual_db - offset_db) / max(weight.sum(), 1e-12)
-        return float(times @ view.gain_nats(rows, offset_db + level_db))
+    Attributes:
+        view: of all links.
+        devices: all that are declared.
+        parts: of each device with readings: its rows (r,), how many links each stands for, and the
+            directions in which they leave it.
+    """
 
-    def tried(width: float, back_db: float, tilt: float, height: float,
-              offset_deg: float) -> tuple[float, SectorPattern, float]:
-        shape = SectorPattern(beamwidth_deg=width, front_to_back_db=back_db, tilt_deg=tilt,
-                              vertical_beamwidth_deg=height)
-        turned = _turned(view.links, devices, shape, offset_deg)
-        return nats(np.concatenate([rays.offset_db(turned[device])
-                                    for device, _, _, rays in parts])), shape, offset_deg
+    view: ResidualView
+    devices: list[int]
+    parts: dict[int, tuple[np.ndarray, float, Departures]]
 
-    # A turn first, with the pattern flat: of azimuths in another convention no shape is right.
-    offset_deg = max((tried(*numbers, 0.0, 360.0, turn) for turn in TURNS_DEG
-                    for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
-                   key=lambda each: each[0])[2]
-    best, shape, _ = max((tried(*numbers, *vertical, offset_deg) for vertical in VERTICALS_DEG
+    @classmethod
+    def of(cls, view: ResidualView, devices: list[int], straight: bool) -> Self:
+        parts = {}
+        for device in devices:
+            every = np.flatnonzero(view.links.device == device)
+            rows = subsample(every, MAX_PROPOSE_LINKS)
+            if len(rows):
+                parts[device] = (rows, len(every) / len(rows),
+                                 Departures.of(view.links, rows, straight))
+        return cls(view, devices, parts)
+
+    def nats(self, offsets_db: dict[int, np.ndarray]) -> float:
+        """Return what offsets (r,) of devices gain, with one level for all [nats]."""
+        rows = np.concatenate([self.parts[device][0] for device in offsets_db])
+        times = np.concatenate([np.full(len(self.parts[device][0]), self.parts[device][1])
+                                for device in offsets_db])
+        offset_db = np.concatenate(list(offsets_db.values()))
+        weight = self.view.weight[rows] * np.isfinite(self.view.links.level_db[rows])
+        level_db = weight @ (self.view.residual_db[rows] - offset_db) / max(weight.sum(), 1e-12)
+        return float(times @ self.view.gain_nats(rows, offset_db + level_db))
+
+    def best_shape(self, own: dict[int, OwnTurn]) -> tuple[float, SectorPattern, float]:
+        """Return what the best pattern of a grid gains over a level [nats], and its common turn."""
+        def tried(width: float, back_db: float, tilt: float, height: float,
+                  offset_deg: float) -> tuple[float, SectorPattern, float]:
+            shape = SectorPattern(beamwidth_deg=width, front_to_back_db=back_db, tilt_deg=tilt,
+                                  vertical_beamwidth_deg=height)
+            turned = _turned(self.view.links, self.devices, shape, offset_deg, own)
+            return self.nats({device: rays.offset_db(turned[device])
+                              for device, (_, _, rays) in self.parts.items()}), shape, offset_deg
+
+        # A turn first, with the pattern flat: of azimuths in another convention no shape is right.
+        offset_deg = max((tried(*numbers, 0.0, 360.0, turn) for turn in TURNS_DEG
                           for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
-                         key=lambda each: each[0])
-    return best - nats(np.zeros(len(rows))), shape, offset_deg
+                         key=lambda each: each[0])[2]
+        best, shape, _ = max((tried(*numbers, *vertical, offset_deg) for vertical in VERTICALS_DEG
+                              for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
+                             key=lambda each: each[0])
+        flat_db = {device: np.zeros(len(rows)) for device, (rows, _, _) in self.parts.items()}
+        return best - self.nats(flat_db), shape, offset_deg
+
+    def own_turns(self, shape: SectorPattern, offset_deg: float) -> dict[int, OwnTurn]:
+        """Return the turns of devices whose own readings contradict what is declared for them.
+
+        Each has a level of its own; turns are equally probable before.
+        """
+        declared, found = _turned(self.view.links, self.devices, shape, offset_deg, {}), {}
+        rest_db = {}
+        for device, (rows, _, rays) in self.parts.items():
+            rest_db[device] = self.view.residual_db[rows] - rays.offset_db(declared[device])
+            rest_db[device] -= np.nanmedian(rest_db[device])
+        # The pattern explains a part, so what is left is less than the scale of the base.
+        left_db = MAD_SD * float(np.nanmedian(np.abs(np.concatenate(list(rest_db.values())))))
+        sharp = replace(self.view, scale_db=np.minimum(self.view.scale_db, max(left_db, 1.0)))
+        for device, (_, _, rays) in self.parts.items():
+            pattern, readings = declared[device], self._replace(view=sharp)
+            nats = np.array([readings.nats({device: rays.offset_db(pattern.model_copy(
+                update={"azimuth_deg": pattern.azimuth_deg + turn_deg}))})
+                for turn_deg in OWN_TURNS_DEG])
+            share = np.exp(nats - nats.max())
+            small = np.abs(OWN_TURNS_DEG) <= MAX_TURN_DEG
+            if np.log(share[~small].sum() / max(share[small].sum(), 1e-300)) <= OWN_TURN_NATS:
+                continue
+            best_deg = OWN_TURNS_DEG[nats.argmax()]
+            off_deg = (OWN_TURNS_DEG - best_deg + 180) % 360 - 180
+            mean_deg = share @ off_deg / share.sum()
+            sd_deg = np.sqrt(share @ (off_deg - mean_deg) ** 2 / share.sum())
+            turn_deg = (best_deg + mean_deg + 180) % 360 - 180
+            found[device] = OwnTurn(float(turn_deg), float(sd_deg))
+        return found
