@@ -56,10 +56,10 @@ MIN_DEVICES = 2  # of declared azimuth; of one, the pattern is that of `SectorAn
 TILT_SD_DEG = 4.0  # by which declared tilts are off: electrical ones are a few degrees
 MAX_TURN_DEG = 20.0  # by which compasses, maps and declination are off; more is a wrong table
 OFFSETS = ("azimuth_offset_deg", "tilt_offset_deg")  # numbers that all devices share
-TURNS_DEG = (0.0, -45.0, 45.0, -90.0, 90.0, -135.0, 135.0, 180.0)  # that are tried first
-OWN_TURNS_DEG = np.arange(-175.0, 181.0, 5.0)  # of one device
-OWN_TURN_NATS = 10.0  # evidence that contradicts a table; shadows of streets bring a few nats
-ROUNDS = 3  # of the turn that all share, and of those of single devices
+TURNS_DEG = np.arange(-170.0, 181.0, 10.0)  # that are tried
+WRONG_TABLE, WRONG_AZIMUTH = 0.05, 0.02  # prior probability: of all azimuths, of one
+SURE = 0.9  # probability from which on one azimuth is taken to be wrong
+ROUNDS = 2  # the second knows how little the pattern leaves
 
 
 class OwnTurn(NamedTuple):
@@ -174,13 +174,8 @@ class DeclaredSectors(SectorEffect):
         if np.isin(view.links.device, declared).sum() < MIN_LINKS:
             return []
         readings = _Readings.of(view, declared, self.straight)
-        own: dict[int, OwnTurn] = {}
-        for _ in range(ROUNDS):
-            nats, shape, offset_deg = readings.best_shape(own)
-            again = readings.own_turns(shape, offset_deg)
-            if again.keys() == own.keys():
-                break
-            own = again
+        offset_deg, own = readings.turns()
+        nats, shape = readings.best_shape(offset_deg, own)
         if nats <= MIN_NATS:
             return []
         groups = level_groups(view.links, declared)
@@ -358,52 +353,83 @@ class _Readings(NamedTuple):
         level_db = weight @ (self.view.residual_db[rows] - offset_db) / max(weight.sum(), 1e-12)
         return float(times @ self.view.gain_nats(rows, offset_db + level_db))
 
-    def best_shape(self, own: dict[int, OwnTurn]) -> tuple[float, SectorPattern, float]:
-        """Return what the best pattern of a grid gains over a level [nats], and its common turn."""
-        def tried(width: float, back_db: float, tilt: float, height: float,
-                  offset_deg: float) -> tuple[float, SectorPattern, float]:
+    def turns(self) -> tuple[float, dict[int, OwnTurn]]:
+        """Return the turn that declared azimuths share, and those of devices with another one.
+
+        A mixture: each azimuth has the common turn, or, rarely, any. So one that is wrong does not
+        turn the others. Levels are each device's own, and patterns flat in elevation.
+        """
+        found, view = (0.0, {}), self.view
+        for _ in range(ROUNDS):
+            common_deg, nats, shape = max((self._replace(view=view)._mixture(*numbers) for numbers
+                                           in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
+                                          key=lambda each: each[0])[1:]
+            found = common_deg, {device: _own_turn(each, common_deg)
+                                 for device, each in nats.items()
+                                 if _chance_wrong(each, common_deg) >= SURE}
+            turned = _turned(self.view.links, self.devices, shape, *found)
+            left_db = [self.view.residual_db[rows] - rays.offset_db(turned[device])
+                       for device, (rows, _, rays) in self.parts.items()]
+            scale_db = MAD_SD * float(np.nanmedian(np.abs(np.concatenate(
+                [each - np.nanmedian(each) for each in left_db]))))
+            view = replace(self.view, scale_db=np.minimum(self.view.scale_db, max(scale_db, 1.0)))
+        return found
+
+    def _mixture(self, width_deg: float, back_db: float
+                 ) -> tuple[float, float, dict[int, np.ndarray], SectorPattern]:
+        """Return how likely a flat pattern is, its common turn, and the nats (t,) of turns."""
+        shape = SectorPattern(beamwidth_deg=width_deg, front_to_back_db=back_db)
+        declared = _turned(self.view.links, self.devices, shape, 0.0, {})
+        nats = {device: np.array([self.nats({device: rays.offset_db(declared[device].model_copy(
+            update={"azimuth_deg": declared[device].azimuth_deg + turn_deg}))})
+            for turn_deg in TURNS_DEG]) for device, (_, _, rays) in self.parts.items()}
+        likely = np.log(np.where(TURNS_DEG == 0, 1 - WRONG_TABLE, WRONG_TABLE / len(TURNS_DEG)))
+        for each in nats.values():
+            likely = likely + np.logaddexp(np.log(1 - WRONG_AZIMUTH) + each,
+                                           np.log(WRONG_AZIMUTH) + _logmeanexp(each))
+        best = int(likely.argmax())
+        return float(likely[best]), float(TURNS_DEG[best]), nats, shape
+
+    def best_shape(self, offset_deg: float, own: dict[int, OwnTurn]
+                   ) -> tuple[float, SectorPattern]:
+        """Return what the best pattern of a grid gains over a level [nats], and the pattern."""
+        def tried(width: float, back_db: float, tilt: float, height: float
+                  ) -> tuple[float, SectorPattern]:
             shape = SectorPattern(beamwidth_deg=width, front_to_back_db=back_db, tilt_deg=tilt,
                                   vertical_beamwidth_deg=height)
             turned = _turned(self.view.links, self.devices, shape, offset_deg, own)
             return self.nats({device: rays.offset_db(turned[device])
-                              for device, (_, _, rays) in self.parts.items()}), shape, offset_deg
+                              for device, (_, _, rays) in self.parts.items()}), shape
 
-        # A turn first, with the pattern flat: of azimuths in another convention no shape is right.
-        offset_deg = max((tried(*numbers, 0.0, 360.0, turn) for turn in TURNS_DEG
-                          for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
-                         key=lambda each: each[0])[2]
-        best, shape, _ = max((tried(*numbers, *vertical, offset_deg) for vertical in VERTICALS_DEG
-                              for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
-                             key=lambda each: each[0])
+        best, shape = max((tried(*numbers, *vertical) for vertical in VERTICALS_DEG
+                           for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
+                          key=lambda each: each[0])
         flat_db = {device: np.zeros(len(rows)) for device, (rows, _, _) in self.parts.items()}
-        return best - self.nats(flat_db), shape, offset_deg
+        return best - self.nats(flat_db), shape
 
-    def own_turns(self, shape: SectorPattern, offset_deg: float) -> dict[int, OwnTurn]:
-        """Return the turns of devices whose own readings contradict what is declared for them.
 
-        Each has a level of its own; turns are equally probable before.
-        """
-        declared, found = _turned(self.view.links, self.devices, shape, offset_deg, {}), {}
-        rest_db = {}
-        for device, (rows, _, rays) in self.parts.items():
-            rest_db[device] = self.view.residual_db[rows] - rays.offset_db(declared[device])
-            rest_db[device] -= np.nanmedian(rest_db[device])
-        # The pattern explains a part, so what is left is less than the scale of the base.
-        left_db = MAD_SD * float(np.nanmedian(np.abs(np.concatenate(list(rest_db.values())))))
-        sharp = replace(self.view, scale_db=np.minimum(self.view.scale_db, max(left_db, 1.0)))
-        for device, (_, _, rays) in self.parts.items():
-            pattern, readings = declared[device], self._replace(view=sharp)
-            nats = np.array([readings.nats({device: rays.offset_db(pattern.model_copy(
-                update={"azimuth_deg": pattern.azimuth_deg + turn_deg}))})
-                for turn_deg in OWN_TURNS_DEG])
-            share = np.exp(nats - nats.max())
-            small = np.abs(OWN_TURNS_DEG) <= MAX_TURN_DEG
-            if np.log(share[~small].sum() / max(share[small].sum(), 1e-300)) <= OWN_TURN_NATS:
-                continue
-            best_deg = OWN_TURNS_DEG[nats.argmax()]
-            off_deg = (OWN_TURNS_DEG - best_deg + 180) % 360 - 180
-            mean_deg = share @ off_deg / share.sum()
-            sd_deg = np.sqrt(share @ (off_deg - mean_deg) ** 2 / share.sum())
-            turn_deg = (best_deg + mean_deg + 180) % 360 - 180
-            found[device] = OwnTurn(float(turn_deg), float(sd_deg))
-        return found
+def _logmeanexp(nats: np.ndarray) -> float:
+    """Return the logarithm of the mean of exponentials (t,)."""
+    return float(np.logaddexp.reduce(nats) - np.log(len(nats)))
+
+
+def _chance_wrong(nats: np.ndarray, common_deg: float) -> float:
+    """Return the probability that an azimuth has not the common turn, by the nats (t,) of turns.
+
+    One within `MAX_TURN_DEG` of it counts as having it.
+    """
+    apart_deg = np.abs((TURNS_DEG - common_deg + 180) % 360 - 180)
+    share = np.exp(nats - nats.max())
+    right = (1 - WRONG_AZIMUTH) * share[apart_deg <= MAX_TURN_DEG].max()
+    wrong = WRONG_AZIMUTH * share[apart_deg > MAX_TURN_DEG].sum() / len(TURNS_DEG)
+    return float(wrong / (right + wrong))
+
+
+def _own_turn(nats: np.ndarray, common_deg: float) -> OwnTurn:
+    """Return the turn beside the common one, mean and standard deviation about the likeliest."""
+    best_deg, share = TURNS_DEG[nats.argmax()], np.exp(nats - nats.max())
+    off_deg = (TURNS_DEG - best_deg + 180) % 360 - 180
+    mean_deg = share @ off_deg / share.sum()
+    sd_deg = np.sqrt(share @ (off_deg - mean_deg) ** 2 / share.sum())
+    turn_deg = (best_deg + mean_deg - common_deg + 180) % 360 - 180
+    return OwnTurn(float(turn_deg), float(sd_deg))
