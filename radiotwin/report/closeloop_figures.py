@@ -422,9 +422,10 @@ def _connect(ax: Axes, position: int, level: float) -> None:
 def _draw_lines(ax: Axes, lines: list[tuple[float, str, str]]) -> None:
     """Draw horizontal lines (value, name, style) with labels at the right that do not overlap."""
     top, last = ax.get_ylim()[1], -np.inf
-    for value, name, style in sorted(lines):
+    apart = min(0.085, 1 / max(len(lines), 1)) * top
+    for left, (value, name, style) in zip(range(len(lines) - 1, -1, -1), sorted(lines)):
         ax.axhline(value, color="0.45", linewidth=0.9, linestyle=style, zorder=1)
-        last = max(value, last + 0.085 * top)
+        last = min(max(value, last + apart), top - left * apart)  # room for those above it
         ax.annotate(f"{name} {value:.2f}", (1.0, last), xycoords=("axes fraction", "data"),
                     xytext=(4, 0), textcoords="offset points", va="center", fontsize=9, color="0.3",
                     annotation_clip=False)

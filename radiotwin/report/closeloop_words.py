@@ -169,7 +169,8 @@ def _side_by_side(found: dict) -> str:
             f"{found['places']:,} places")
     first, second = found["first"], found["second"]
     if low <= 0 <= high:
-        return f"{first} and {second} read alike ({number(low)} to {number(high)} dB) {both}"
+        return (f"{first} and {second} show no difference ({number(low)} to {number(high)} dB) "
+                f"{both}")
     if value < 0:
         first, second, value, low, high = second, first, -value, -high, -low
     return (f"{second} reads {number(value)} dB ({number(low)} to {number(high)}) more than "

@@ -172,7 +172,7 @@ def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
     ((-4.0, -4.8, -3.1), "A reads 4.00 dB (3.10 to 4.80) more than B", True),
     ((2.7, 0.4, 4.9), "B reads 2.70 dB (0.40 to 4.90) more than A", True),
     ((0.4, 0.1, 0.7), "B reads 0.40 dB (0.10 to 0.70) more than A", False),
-    ((0.2, -0.5, 0.9), "A and B read alike (−0.50 to 0.90 dB)", False)])
+    ((0.2, -0.5, 0.9), "A and B show no difference (−0.50 to 0.90 dB)", False)])
 def test_receivers_that_were_at_the_same_places_are_compared(tmp_path, ends, sentence, in_lead):
     difference_db = dict(zip(("value", "low", "high"), ends), unit="dB")
     content = report(receivers_compared=[
