@@ -67,9 +67,9 @@ def test_without_rain_nothing_is_found(effect):
 
 def test_what_pages_say_of_it(effect):
     assert parameter_label("loss_db", parameter_labels(effect.name)) == "loss of the wet antennas"
-    undecided = {"posterior": [{"step": 1, "rest_db": None, "probabilities": [
+    undecided = {"posterior": [{"step": 1, "rest_db": None, "noise_db": None, "probabilities": [
         {"name": effect.name, "probability": 0.6}]}], "verdict": "undecided", "candidates": [],
-        "effects": []}
+        "effects": [], "remaining": {"drivers": []}, "error": {"before": {"rmse_db": 3.0}}}
     assert "To settle it: repeat the flight in dry weather" in closeloop_summary(undecided)
     values = features((20.0, 20.0, 20.0), 0.1, 1.0, False)
     assert probability_of(effect.name, values) == probability_of("episode", values)
