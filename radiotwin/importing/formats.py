@@ -33,6 +33,7 @@ _MAPPER = (_CAUTION + ". Devices are the gateways, the receiver is the node that
 _STACK = "https://www.thethingsindustries.com/docs/the-things-stack/concepts/data-formats/"
 _CHIRPSTACK = "https://docs.rs/crate/chirpstack_api (integration.proto, gw.proto; JSON of proto3)"
 _UNITS = {"level_unit": "dBm", "length_unit": "m", "time_format": "ISO 8601"}
+_GATEWAYS = {**_UNITS, "read_at": "device"}
 _UNKNOWN = 2147483647  # of Android's telephony, CellInfo.UNAVAILABLE
 _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ by more than "
           "10 dB and are no one quantity; keep one with --only {}=LTE")
@@ -214,7 +215,7 @@ def _things_stack(prefix: str) -> tuple[Format, Format]:
              "device_altitude": gateway + "location.altitude"},
             (gateway + "rssi", gateway + "gateway_ids.gateway_id", node, decoded + "latitude",
              decoded + "longitude"),
-            _LEVEL, _STACK, _UNITS, caution=_MAPPER),
+            _LEVEL, _STACK, _GATEWAYS, caution=_MAPPER),
         Format(
             name, f"{title} (JSON lines)",
             {**common, "device": node, "receiver": gateway + "gateway_ids.gateway_id",
@@ -234,7 +235,7 @@ LORA = (
         ("time", "snr", "rssi", "freq", "lat", "lon", "alt", "hdop", "sats", "provider"),
         _LEVEL,
         "https://ttnmapper.org, export of a user; header and two rows quoted in a public README",
-        {**_UNITS, "time_zone": "UTC"},
+        {**_GATEWAYS, "time_zone": "UTC"},
         caution=_MAPPER + ". Times are taken for UTC. alt may be 0 where the node has no height"),
     *_things_stack(""),
     *_things_stack("result."),
@@ -249,7 +250,7 @@ LORA = (
          "device_altitude": "rxInfo.location.altitude"},
         ("rxInfo.rssi", "rxInfo.gatewayId", "deviceInfo.devEui", "object.latitude",
          "object.longitude"),
-        _LEVEL, _CHIRPSTACK, _UNITS, caution=_MAPPER),
+        _LEVEL, _CHIRPSTACK, _GATEWAYS, caution=_MAPPER),
     Format(
         "chirpstack", "ChirpStack 4, uplink events (JSON lines)",
         {"level": "rxInfo.rssi", "snr": "rxInfo.snr", "time": "time",

@@ -21,7 +21,7 @@ from radiotwin.importing.units import ISO, METRES, in_metres, seconds
 from radiotwin.io.budgets import DEVICES
 from radiotwin.io.cells import listed, shown
 from radiotwin.io.forms import MAX_POSITION_M, Origin
-from radiotwin.links.measurements import DEVICE_OPTIONAL, refuse_limits
+from radiotwin.links.measurements import DEVICE_OPTIONAL, READS, refuse_limits
 
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
 ORIGIN_DECIMALS = 7  # of a computed origin [degrees]: 1 cm
@@ -415,6 +415,8 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     if np.isfinite(above_m).any():
         devices["above_ground_m"] = pd.Series(above_m).groupby(links["device"].to_numpy(),
                                                                sort=False).median()
+    if READS in links:
+        devices[READS] = links.groupby("device", sort=False)[READS].max()
     if "frequency_hz" in links:
         own_hz = links.groupby("device", sort=False)["frequency_hz"].median()
         devices["frequency_hz"] = own_hz.fillna(devices["frequency_hz"]) \

@@ -1,7 +1,7 @@
 """The files of an import as links, each by its own format: a row per receiver, device, reading."""
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +27,7 @@ from radiotwin.importing.units import LEVEL_COLUMN, calendar_days, in_metres, re
 from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, listed, shown
 from radiotwin.io.forms import name_fault
-from radiotwin.links.measurements import refuse_limits
+from radiotwin.links.measurements import READS, refuse_limits
 
 ANGLES = ("heading", "pitch", "roll")
 LIMITS_DEG = {"latitude": 90.0, "longitude": 360.0}
@@ -327,6 +327,8 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
             links, per_row = _links_of(source, own, tally, problems, name)
             if not per_row:
                 continue
+            if own.read_at == "device":
+                links[READS] = 1.0
             parts.append(links)
             formats.add(format_name)
             level_column = LEVEL_COLUMN[str(own.level_unit)]  # one for all files
@@ -373,9 +375,11 @@ def _settings_of(source: Source, settings: Settings,
                            f"{', '.join(found.signature)}; it has {listed(header)}")
     elif not settings.columns.level and not settings.wide:
         found = find_format(header)
-    defaults: Mapping[str, Any] = {"columns": {"flight": flight}}
+    defaults: dict[str, Any] = {"columns": {"flight": flight}}
     if found is not None:
         defaults = {**found.settings, "columns": {"flight": flight, **found.mapping(header)}}
+        if settings.columns.device:  # the ends may be exchanged
+            defaults.pop("read_at", None)
     own = merged(settings, defaults)
     own.require_columns(str(source.path), header)
     return own, found.name if found else None, found.caution if found else ""

@@ -146,6 +146,9 @@ class Settings(Table):
         None, description="edges of the band whose power counts, of a spectrum scan")
     level_unit: Literal["dBm", "dB", "mW", "W"] | None = None
     level_offset_db: Number = Field(0.0, description="added to each level")
+    read_at: Literal["receiver", "device"] = Field(
+        "receiver", description="which end reads the levels: of a node that sends to gateways, "
+                                "which are the devices, these do")
     length_unit: Literal["m", "ft"] | None = None
     time_format: str | None = Field(
         None, max_length=200,

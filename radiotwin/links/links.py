@@ -286,6 +286,7 @@ class Ends:
             NaN where none is, and where None is given.
         tilt_deg: (k,) declared tilt of each device's antenna, upwards [deg]; likewise.
         declared: what is declared of the devices' powers, cables, antennas and carriers.
+        reads: (k,) bool, devices at which levels are read, as by a gateway; None: none.
         flown: when and where receivers measured.
     """
 
@@ -297,6 +298,7 @@ class Ends:
     boresight_deg: np.ndarray = None  # type: ignore[assignment]  # filled in below, as the next
     tilt_deg: np.ndarray = None  # type: ignore[assignment]
     declared: Declared = NOTHING
+    reads: np.ndarray | None = None
     flown: Flown = Flown()
 
     def __post_init__(self) -> None:
@@ -374,6 +376,7 @@ class Links:
     boresight_deg = _Of[np.ndarray]("ends")
     tilt_deg = _Of[np.ndarray]("ends")
     declared = _Of[Declared]("ends")
+    reads = _Of[np.ndarray | None]("ends")
     first_s = _Of[float]("ends.flown")
     last_s = _Of[float]("ends.flown")
     tracks = _Of[Tracks]("ends.flown")
@@ -438,6 +441,13 @@ class Links:
     def offset_m(self) -> np.ndarray:
         """(n, 3) from the device to the receiver [m]."""
         return self.receiver_m - self.device_m[self.device]
+
+    @property
+    def reading_m(self) -> np.ndarray:
+        """(n, 3) position of the end that reads the level, and hears what else is there [m]."""
+        if self.reads is None:
+            return self.receiver_m
+        return np.where(self.reads[self.device, None], self.device_m[self.device], self.receiver_m)
 
     @cached_property
     def distance_m(self) -> np.ndarray:
@@ -544,9 +554,10 @@ class Links:
         """
         radio = np.full(len(names), -1)
         radio[device] = self.device
+        reads = None if self.reads is None else self.reads[radio] & (radio >= 0)
         links = self.with_columns(device=device, known_los=None)
         return links.with_ends(device_m=device_m, device_names=names, anchors=anchors,
-                               declared=self.declared.of_devices(radio))
+                               declared=self.declared.of_devices(radio), reads=reads)
 
     def located(self, device_m: np.ndarray) -> Links:
         """Return the links of devices that have a position in (k, 3) [m], there; NaN: none."""

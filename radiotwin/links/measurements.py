@@ -77,7 +77,8 @@ OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality", "receiv
 DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
 # What is declared of a device's radio, besides its antenna.
 RADIO = ["tx_power_dbm", "eirp_dbm", "cable_loss_db", "frequency_hz", "azimuth_deg", "tilt_deg"]
-DEVICE_OPTIONAL = [*RADIO, "above_ground_m"]
+READS = "reads_levels"  # 1: levels are read at the device, as by a gateway, of what receivers send
+DEVICE_OPTIONAL = [*RADIO, "above_ground_m", READS]
 ROLES = ("anchor", "unknown")
 _RECEIVER_POSITION = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
 _DEVICE_POSITION = ["x_m", "y_m", "z_m"]
@@ -171,6 +172,9 @@ def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
     if name == "tilt_deg":
         refuse(np.abs(numbers) > MAX_TILT_DEG,
                f"is no tilt; allowed are -{MAX_TILT_DEG:g} (down) to {MAX_TILT_DEG:g} (up)")
+    if name == READS:
+        refuse(~np.isin(numbers, (0, 1)) & ~np.isnan(numbers),
+               "is neither 0 (levels are read at the receiver) nor 1 (at the device)")
     if name == "cable_loss_db":
         refuse((numbers < 0) | (numbers > MAX_CABLE_LOSS_DB),
                f"is no loss; allowed are 0 to {MAX_CABLE_LOSS_DB:g} dB")

@@ -25,7 +25,7 @@ from radiotwin.links.checks import (
 from radiotwin.links.declared import Declared, Radio, antenna_of_uavs, complete, radios_of
 from radiotwin.links.limits import estimate_limits
 from radiotwin.links.links import RESTART_NOTE, Columns, Ends, Flown, Links, World
-from radiotwin.links.measurements import Measurements
+from radiotwin.links.measurements import READS, Measurements
 from radiotwin.scene import Scene
 
 MAX_EXTENT_M = 100_000.0  # farther apart, two ends are not of one campaign and frame
@@ -199,6 +199,7 @@ def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
         boresight_deg=np.where(of_sector, _column(devices, "azimuth_deg"), np.nan),
         tilt_deg=np.where(of_sector, _column(devices, "tilt_deg"), np.nan),
         declared=Declared(radios, frequency_hz, not is_gain, receiver_antenna),
+        reads=(_column(devices, READS) == 1) if READS in devices else None,
         flown=Flown.of(columns))
     city = scene.city if scene is not None else None
     links = Links(columns=columns, ends=ends, notes=tuple(notes),

@@ -36,6 +36,18 @@ def test_receivers_that_stay_at_few_positions_cannot_locate_an_emitter(make_link
     assert Interference().unavailable(make_links([[0.0, 0, 1.5]], np.vstack([positions_m, positions_m + (0, 50, 0)]))) is None
 
 
+def test_beside_a_node_that_sends_nothing_raises_a_gateway(make_links):
+    """Where devices read the levels their places count, and two gateways cannot locate an emitter."""
+    receiver_m = np.column_stack([np.arange(40) * 30.0, np.zeros(40), np.full(40, 20.0)])
+    links = make_links([[0.0, 0, 30.0], [600.0, 50, 30.0]], receiver_m)
+    params = Interference.Params(place_m=(120.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300))
+    assert Interference().unavailable(links) is None
+    uplink = links.with_ends(reads=np.array([True, True]))
+    assert "read at 2 positions" in Interference().unavailable(uplink)
+    power = Interference().with_params(params).term(uplink, None).inputs
+    np.testing.assert_allclose(power, heard(links.device_m[links.device], np.array([120.0, 80.0, 1.5]), -90.0))
+
+
 def test_an_emitter_at_the_edge_of_the_searched_area_is_implausible():
     params = Interference.Params(place_m=(300.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300))
     assert "edge" in Interference().with_params(params).implausible(np.zeros(0))

@@ -139,7 +139,7 @@ def test_qualipoc_repeats_names(bring_in):
 def test_ttn_mapper_corrects_below_the_noise(bring_in):
     result, table, formats = imported(bring_in, TTN_MAPPER)
     assert formats == ["ttn-mapper"] and list(table["device"]) == ["GW1", "GW2"] and set(table["receiver"]) == {"node1"}
-    assert list(table["rssi_dbm"]) == [-84, -119 - 7.5]
+    assert list(table["rssi_dbm"]) == [-84, -119 - 7.5] and list(result.devices["reads_levels"]) == [1, 1]
     assert any("5.5.5" in note for note in result.report["warnings"])
 
 
@@ -208,7 +208,9 @@ def test_a_sweep_that_does_not_cover_the_band_is_not_measured(bring_in):
 
 
 def test_what_is_declared_overrules_the_format(bring_in):
-    _, table, formats = imported(bring_in, TTN_MAPPER, format="ttn-mapper", columns={"device": "nodeaddr", "snr": "always 0"})
+    result, table, formats = imported(bring_in, TTN_MAPPER, format="ttn-mapper",
+                                      columns={"device": "nodeaddr", "snr": "always 0"})
+    assert "reads_levels" not in result.devices  # the ends are exchanged
     assert formats == ["ttn-mapper"] and set(table["device"]) == {"node1"} and list(table["rssi_dbm"]) == [-84, -119]
     with pytest.raises(BadInput, match=r"is not of format ttn-mapper, which has the columns .*; it has MAC"):
         imported(bring_in, WIGLE, format="ttn-mapper")

@@ -1,5 +1,7 @@
-"""An unknown emitter adds its power to all readings: the more, the closer the receiver is.
+"""An unknown emitter adds its power to all readings: the more, the closer the end that reads is.
 
+That is the receiver, or the device where it is a gateway that listens (`reads_levels`): an emitter
+beside a node that sends raises nothing at a gateway far away.
 Powers of signal and interference add (ITU-R SM.1753). The emitter is assumed to be near the ground.
 Over a 3D map its power falls as that of a device at its place, by the channel, buildings in the way
 included; without one by the free-space law, 20 log10 d (ITU-R P.525), as a slope that was fitted to
@@ -29,8 +31,8 @@ from radiotwin.links.declared import NOTHING
 
 HEIGHT_M = 1.5  # of the emitter
 REFERENCE_M = 100.0  # distance of its level
-MIN_POSITIONS, SAME_POSITION_M = 20, 10.0  # of receivers, and what counts as one
-AROUND_M = 100.0  # searched beyond the receivers; farther away it would be a noise floor
+MIN_POSITIONS, SAME_POSITION_M = 20, 10.0  # of ends that read, and what counts as one
+AROUND_M = 100.0  # searched beyond these ends; farther away it would be a noise floor
 EDGE_M = 10.0  # of the searched area, where an estimate means "outside"
 MAX_CELLS, MIN_CELL_M = 300, 20.0  # of the search
 QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8)  # of the readings over the emitter's, tried as its level
@@ -65,17 +67,17 @@ class Interference(ReceiverEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
-        positions = np.unique((links.receiver_m[:, :2] / SAME_POSITION_M).round(), axis=0)
+        positions = np.unique((links.reading_m[:, :2] / SAME_POSITION_M).round(), axis=0)
         if len(positions) < MIN_POSITIONS:
-            return (f"receivers were at {len(positions)} positions; {MIN_POSITIONS} are needed to "
-                    "locate an emitter")
+            return (f"levels were read at {len(positions)} positions; {MIN_POSITIONS} are needed "
+                    "to locate an emitter")
         return None
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links = view.links
-        low = links.receiver_m[:, :2].min(axis=0) - AROUND_M
-        high = links.receiver_m[:, :2].max(axis=0) + AROUND_M
+        low = links.reading_m[:, :2].min(axis=0) - AROUND_M
+        high = links.reading_m[:, :2].max(axis=0) + AROUND_M
         step_m = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
         axes = (np.arange(a, b, step_m) for a, b in zip(low, high))
         positions_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
@@ -157,9 +159,10 @@ def _fall_db(links: Links, position_m: Sequence[float] | np.ndarray,
     ground_m = 0.0 if links.city is None else float(links.city.ground_height_m(*position_m))
     emitter_m = np.array([*position_m, ground_m + HEIGHT_M])
     if level_at is not None:
-        emitter = links.with_devices(np.tile(emitter_m, (len(links.device_m), 1)))
+        emitter = links.with_receivers(links.reading_m).with_devices(
+            np.tile(emitter_m, (len(links.device_m), 1)))
         return level_at(emitter.with_ends(declared=NOTHING)) + links.declared.usual_db
-    distance_m = np.linalg.norm(links.receiver_m - emitter_m, axis=1)
+    distance_m = np.linalg.norm(links.reading_m - emitter_m, axis=1)
     return -20 * np.log10(np.maximum(distance_m, 1.0) / REFERENCE_M)
 
 
