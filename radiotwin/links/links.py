@@ -6,7 +6,6 @@ be compared is told from the tracks of their receivers.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from operator import attrgetter
@@ -442,13 +441,6 @@ class Links:
         """(n, 3) from the device to the receiver [m]."""
         return self.receiver_m - self.device_m[self.device]
 
-    @property
-    def reading_m(self) -> np.ndarray:
-        """(n, 3) position of the end that reads the level, and hears what else is there [m]."""
-        if self.reads is None:
-            return self.receiver_m
-        return np.where(self.reads[self.device, None], self.device_m[self.device], self.receiver_m)
-
     @cached_property
     def distance_m(self) -> np.ndarray:
         """(n,) at least `REFERENCE_DISTANCE_M` [m]."""
@@ -563,16 +555,6 @@ class Links:
         """Return the links of devices that have a position in (k, 3) [m], there; NaN: none."""
         rows = np.isfinite(device_m).all(axis=1)[self.device]
         return self.with_devices(np.nan_to_num(device_m)).select(rows)
-
-    def renumber_receivers(self, names: Sequence[str]) -> Links:
-        """Return the same links, counting receivers by `names`, which hold all of theirs."""
-        place = {name: i for i, name in reversed(list(enumerate(names)))}
-        number = np.array([place[name] for name in self.receiver_names])
-        tracks = {(int(number[receiver]), flight): track
-                  for (receiver, flight), track in self.tracks.items()}
-        links = self.with_columns(receiver=number[self.receiver])
-        return links.with_ends(receiver_names=list(names),
-                               flown=replace(self.ends.flown, tracks=tracks))
 
     def since(self, first_s: float) -> Links:
         """Return the same links, with times that count from another first measurement [s]."""

@@ -1,5 +1,6 @@
 """Devices of unknown position in a file of measurements, located by a twin."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,7 +89,7 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
         others = " and others" if len(strangers) > MAX_NAMED else ""
         notes.append(f"nothing is known of receivers {', '.join(strangers[:MAX_NAMED])}{others}: "
                      "they are taken for faultless ones")
-    links = links.renumber_receivers([*model.receivers, *strangers])
+    links = _with_receivers_of(links, [*model.receivers, *strangers])
     links = links.with_devices(np.nan_to_num(links.device_m))
     if twin.limit_db is not None:  # a few links do not tell how weak a level can be detected
         links = links.with_columns(limit_db=np.full(len(links), twin.limit_db))
@@ -113,6 +114,16 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
         east_deg, north_deg = to_geographic(measurements.origin, table["x_m"], table["y_m"])
         table = table.assign(latitude_deg=north_deg.round(7), longitude_deg=east_deg.round(7))
     return table, notes
+
+
+def _with_receivers_of(links: Links, names: Sequence[str]) -> Links:
+    """Return the same links, counting receivers by `names`, which hold all of theirs."""
+    place = {name: i for i, name in reversed(list(enumerate(names)))}
+    number = np.array([place[name] for name in links.receiver_names])
+    tracks = {(int(number[receiver]), flight): track
+              for (receiver, flight), track in links.tracks.items()}
+    return links.with_columns(receiver=number[links.receiver]).with_ends(
+        receiver_names=list(names), flown=replace(links.ends.flown, tracks=tracks))
 
 
 def _by_channel(twin: Twin, links: Links) -> FittedModel:

@@ -67,7 +67,7 @@ class Interference(ReceiverEffect):
 
     @override
     def unavailable(self, links: Links) -> str | None:
-        positions = np.unique((links.reading_m[:, :2] / SAME_POSITION_M).round(), axis=0)
+        positions = np.unique((_reading_m(links)[:, :2] / SAME_POSITION_M).round(), axis=0)
         if len(positions) < MIN_POSITIONS:
             return (f"levels were read at {len(positions)} positions; {MIN_POSITIONS} are needed "
                     "to locate an emitter")
@@ -76,8 +76,8 @@ class Interference(ReceiverEffect):
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links = view.links
-        low = links.reading_m[:, :2].min(axis=0) - AROUND_M
-        high = links.reading_m[:, :2].max(axis=0) + AROUND_M
+        low = _reading_m(links)[:, :2].min(axis=0) - AROUND_M
+        high = _reading_m(links)[:, :2].max(axis=0) + AROUND_M
         step_m = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
         axes = (np.arange(a, b, step_m) for a, b in zip(low, high))
         positions_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
@@ -150,6 +150,13 @@ class Interference(ReceiverEffect):
                     names, of.values.tolist(), estimate.params_sd, units, of.low, of.high)}
 
 
+def _reading_m(links: Links) -> np.ndarray:
+    """Return the position (n, 3) of the end that reads each level [m]: it hears what is there."""
+    if links.reads is None:
+        return links.receiver_m
+    return np.where(links.reads[links.device, None], links.device_m[links.device], links.receiver_m)
+
+
 def _fall_db(links: Links, position_m: Sequence[float] | np.ndarray,
              level_at: LevelAt | None) -> np.ndarray:
     """Return the level (n,) of an emitter of 0 dB: by the channel, or else by free space.
@@ -159,10 +166,10 @@ def _fall_db(links: Links, position_m: Sequence[float] | np.ndarray,
     ground_m = 0.0 if links.city is None else float(links.city.ground_height_m(*position_m))
     emitter_m = np.array([*position_m, ground_m + HEIGHT_M])
     if level_at is not None:
-        emitter = links.with_receivers(links.reading_m).with_devices(
+        emitter = links.with_receivers(_reading_m(links)).with_devices(
             np.tile(emitter_m, (len(links.device_m), 1)))
         return level_at(emitter.with_ends(declared=NOTHING)) + links.declared.usual_db
-    distance_m = np.linalg.norm(links.reading_m - emitter_m, axis=1)
+    distance_m = np.linalg.norm(_reading_m(links) - emitter_m, axis=1)
     return -20 * np.log10(np.maximum(distance_m, 1.0) / REFERENCE_M)
 
 
