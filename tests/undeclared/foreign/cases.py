@@ -51,6 +51,8 @@ class ForeignCase:
         plain_level_db: (n,) the same with nothing hidden.
         size_db: root mean square of what is hidden, over the detected links [dB]: the change of levels, or what the
             wrong map or position changes in free space with the median loss of shadowed links.
+        changes_db: of each hidden effect alone, (n,) what it changes [dB], as for `size_db`; NaN where it takes the
+            reading away.
     """
 
     name: str
@@ -61,6 +63,7 @@ class ForeignCase:
     clean_level_db: np.ndarray
     plain_level_db: np.ndarray
     size_db: float
+    changes_db: tuple[np.ndarray, ...]
 
 
 def names(split: str | None = None) -> list[str]:
@@ -120,7 +123,9 @@ def foreign_case(name: str, hidden: bool = True) -> ForeignCase:
     clean_db, plain_db = (np.where(np.isfinite(one), one + offset_db, np.nan)[link] for one in (clean_db, at.plain_db))
     return ForeignCase(name, at.where.city.split, Measurements(table, _devices(device_m, habits)),
                        _scene(at, habits, found), _answer(at, habits, found, device_m), clean_db, plain_db,
-                       _size_db(at, found, np.isfinite(level_db)))
+                       _size_db(at, found, np.isfinite(level_db)),
+                       tuple(np.where(one.lost, np.nan, _change_db(at, [one]))[link] if one.lost is not None
+                             else _change_db(at, [one])[link] for one in found))
 
 
 def _seen(family: str, at: Scenario, audible: np.ndarray, rng: np.random.Generator) -> Hidden:
@@ -178,6 +183,11 @@ def _written(at: Scenario, found: list[Hidden]) -> tuple[np.ndarray, np.ndarray]
 
 def _size_db(at: Scenario, found: list[Hidden], detected: np.ndarray) -> float:
     """See `ForeignCase.size_db`; `detected` (n,) bool."""
+    return float(np.sqrt(np.mean(_change_db(at, found)[detected]**2)))
+
+
+def _change_db(at: Scenario, found: list[Hidden]) -> np.ndarray:
+    """Return what effects change (n,) [dB]; what a wrong map or position does is rough."""
     reading_db = at.arriving_db(found)
     for one in found:
         reading_db = one.reads(reading_db) if one.reads is not None else reading_db
@@ -190,7 +200,7 @@ def _size_db(at: Scenario, found: list[Hidden], detected: np.ndarray) -> float:
         mapped = [one for one in at.standing if one not in lacks] + shows
         change_db = change_db + (at.rough_db(at.where.device_m[:-1], at.where.campaign.points_m, at.standing)
                                  - at.rough_db(device_m, written_m, mapped))
-    return float(np.sqrt(np.mean(change_db[detected]**2)))
+    return change_db
 
 
 def write(name: str, folder: Path) -> None:
