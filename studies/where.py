@@ -5,8 +5,8 @@
     python -m studies where --only judge
 
 The base is `twin`; nothing else of the loop runs. `studies.where_truth` says which groups are those
-of an effect. A group that is caused by buildings which only the map or only the world has, beside
-what is hidden, is neither right nor wrong.
+of an effect. Where a map is off by a metre or two, and by a building or two beside what is hidden,
+a group of links most of which it has with the wrong sight is neither right nor wrong.
 """
 
 import warnings
@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from radiotwin.closeloop.scan import Anomaly, scan
 
 from radiotwin import Measurements, Scene
 from radiotwin.closeloop.crossfit import (
@@ -25,6 +24,7 @@ from radiotwin.closeloop.crossfit import (
     make_folds,
     training_parts,
 )
+from radiotwin.closeloop.scan import Anomaly, scan
 from radiotwin.links import prepare_links
 from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.limits import limits_to_explain
@@ -36,7 +36,6 @@ from studies.where_truth import (
     ENDS,
     Group,
     Truth,
-    behind_wrong_buildings,
     holds_mostly,
     is_there,
     rows_of_links,
@@ -64,24 +63,25 @@ def where_cases(seed: int) -> dict[str, dict]:
 
 def say_where(seed: int, settings: dict) -> dict:
     """Scan a case, and compare the groups that are said with those of the hidden effects."""
-    measurements, scene, effects, changes_db, nuisance = hidden_case(settings)
+    measurements, scene, effects, changes_db, true_los = hidden_case(settings)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         model = base_of(measurements, scene, seed)
         anomalies = scan(model)
-    return compare(model, anomalies, measurements, effects, changes_db, nuisance)
+    return compare(model, anomalies, measurements, effects, changes_db, true_los)
 
 
-def hidden_case(settings: dict) -> tuple[Measurements, Scene, list[dict], list[np.ndarray], dict]:
-    """Return a case: measurements, scene, effects, what each changes (rows,) [dB], nuisances."""
+def hidden_case(settings: dict) -> tuple[Measurements, Scene, list[dict], list[np.ndarray],
+                                         np.ndarray | None]:
+    """Return a case: measurements, scene, effects, what each changes (rows,) [dB], true sight."""
     if "case" in settings:
         foreign = foreign_case(settings["case"])
         return (foreign.measurements, foreign.scene, foreign.answer["effects"],
-                list(foreign.changes_db), foreign.answer["nuisance"])
+                list(foreign.changes_db), foreign.los)
     older = case(settings["family"], settings["number"])
     effects = older.answer["effects"]
     change_db = older.clean_gain_db - older.plain_gain_db
-    return older.measurements, older.scene, effects, [change_db] * len(effects), {}
+    return older.measurements, older.scene, effects, [change_db] * len(effects), None
 
 
 def base_of(measurements: Measurements, scene: Scene, seed: int) -> CrossFit:
@@ -93,13 +93,13 @@ def base_of(measurements: Measurements, scene: Scene, seed: int) -> CrossFit:
 
 
 def compare(model: CrossFit, anomalies: Sequence[Anomaly], measurements: Measurements,
-            effects: list[dict], changes_db: list[np.ndarray], nuisance: dict) -> dict[str, Any]:
+            effects: list[dict], changes_db: list[np.ndarray], true_los: np.ndarray | None
+            ) -> dict[str, Any]:
     """Return a row: the hidden effects, and what the scan and both pivot tables say of them."""
     links, residual_db = model.links, model.links.level_db - model.held_out_mean_db
     row_of = rows_of_links(links, measurements)
     hidden = truths(effects, [change_db[row_of] for change_db in changes_db], links)
-    buildings = [*nuisance.get("unmapped", ()), *nuisance.get("gone", ())]
-    wrong = behind_wrong_buildings(buildings, links)
+    wrong = np.zeros(len(links), dtype=bool) if true_los is None else true_los[row_of] != links.los
     heard = np.isfinite(links.level_db)
     ends = {end: np.array(getattr(links, f"{end}_names"), dtype=object)[getattr(links, end)]
             for end in ENDS}

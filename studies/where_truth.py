@@ -26,8 +26,6 @@ import pandas as pd
 
 from radiotwin.links import Links
 from radiotwin.links.measurements import Measurements
-from radiotwin.scene.citymap import CityMap
-from tests.undeclared.shapes import prism
 
 NEAR_M, PLACE_M = 30.0, 25.0
 LEAST_SHARE, LEAST_RATIO = 0.5, 1.5
@@ -160,18 +158,6 @@ def _places_m(effect: dict) -> np.ndarray:
             half_m = 0.5 * max(each.get("widths_m", [0.0]))
             found.append([x_m - half_m, x_m + half_m, y_m - half_m, y_m + half_m])
     return np.array(found, dtype=float).reshape(-1, 4)
-
-
-def behind_wrong_buildings(footprints_m: Sequence, links: Links) -> np.ndarray:
-    """Return (n,) whether a building that only the map or only the world has is in the way."""
-    found = np.zeros(len(links), dtype=bool)
-    a_m, b_m = links.device_m[links.device], links.receiver_m
-    known = np.isfinite(a_m).all(axis=1)
-    for corners_m in footprints_m:
-        solid = prism(np.array(corners_m), 60.0)  # its height is not in the answer
-        city = CityMap(solid.vertices, solid.faces)
-        found[known] |= ~city.line_of_sight(a_m[known], b_m[known])
-    return found
 
 
 def visibility(truth: Truth, residual_db: np.ndarray, links: Links) -> float | None:

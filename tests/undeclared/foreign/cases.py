@@ -64,6 +64,7 @@ class ForeignCase:
     plain_level_db: np.ndarray
     size_db: float
     changes_db: tuple[np.ndarray, ...]
+    los: np.ndarray
 
 
 def names(split: str | None = None) -> list[str]:
@@ -125,7 +126,7 @@ def foreign_case(name: str, hidden: bool = True) -> ForeignCase:
                        _scene(at, habits, found), _answer(at, habits, found, device_m), clean_db, plain_db,
                        _size_db(at, found, np.isfinite(level_db)),
                        tuple(np.where(one.lost, np.nan, _change_db(at, [one]))[link] if one.lost is not None
-                             else _change_db(at, [one])[link] for one in found))
+                             else _change_db(at, [one])[link] for one in found), at.direct[link])
 
 
 def _seen(family: str, at: Scenario, audible: np.ndarray, rng: np.random.Generator) -> Hidden:

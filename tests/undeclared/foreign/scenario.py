@@ -129,12 +129,17 @@ class Scenario:
         return space_db - self._shadow_db * blocked(buildings, a_m, b_m)
 
     @cached_property
+    def direct(self) -> np.ndarray:
+        """(n,) bool, whether a direct path arrives."""
+        found = np.zeros(self.links, dtype=bool)
+        found[self.paths.link[self.paths.bounces == 0]] = True
+        return found
+
+    @cached_property
     def _shadow_db(self) -> float:
-        direct = np.zeros(self.links, dtype=bool)
-        direct[self.paths.link[self.paths.bounces == 0]] = True
         way_m = self.where.device_m[self.device] - self.where.campaign.points_m[self.point]
         space_db = 20 * np.log10(LIGHT_M_S / (4 * np.pi * self.where.frequency_hz * np.linalg.norm(way_m, axis=1)))
-        shadowed = ~direct & np.isfinite(self.plain_db)
+        shadowed = ~self.direct & np.isfinite(self.plain_db)
         return float(np.median((space_db - self.plain_db)[shadowed])) if shadowed.any() else 20.0
 
 
