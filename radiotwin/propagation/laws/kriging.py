@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from typing_extensions import override
 
@@ -33,9 +34,16 @@ MIN_LENGTH_M = 1e-3  # of a correlation that is read
 MAX_PAIRS = 36e6  # points squared, over all series: their matrices take 8 bytes a pair
 MAX_POINTS, MIN_POINTS = 2500, 30  # range of the number of points that is kept of a longer series
 MAX_POINTS_TO_FIT, MAX_SERIES_TO_FIT = 300, 400  # for the correlation; at most MAX_PAIRS again
+SAME_PLACE_M = 1.0  # a receiver that stands still is known by its place
 SAME_POINT_M = 0.1  # points within a cell this wide are one [m]
+LOCAL_POINTS = 400  # nearest ones of a series that has too many, see `ResidualField`
+LOCAL_ROWS = 200  # places at most that share them
+LOCAL_SPREAD = 0.5  # how far apart these may be, relative to how far the points reach
 COARSER = 1.5  # ratio of one width of cells to the next
 BATCH = 2000  # points that are predicted at a time: bounds memory
+
+
+_Solved = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,9 @@ class ResidualField:
     Electronics Letters 27), b between measurements of one kind, such as those by one phone,
     wherever they are, and a nugget 1 - a - b for noise and what changes between neighbours. The
     parameters have the highest marginal likelihood on at most MAX_POINTS_TO_FIT points of each of
-    at most MAX_SERIES_TO_FIT series. Where points are too many, neighbours become their mean.
+    at most MAX_SERIES_TO_FIT series. Where points of a series are too many, neighbours become their
+    mean; or, in a local field, each place is predicted by the LOCAL_POINTS nearest ones (moving
+    neighbourhood: Chiles and Delfiner 2012, Geostatistics, section 3.6).
 
     Attributes:
         share: a, the same for all series.
@@ -71,9 +81,14 @@ class ResidualField:
         fields: the points of each series, by its index.
     """
 
-    def __init__(self, max_pairs: float = MAX_PAIRS) -> None:
-        """Make an empty field; of more points squared, over all series, neighbours are merged."""
-        self.max_pairs = max_pairs
+    def __init__(self, max_pairs: float = MAX_PAIRS, is_local: bool = False) -> None:
+        """Make an empty field.
+
+        Args:
+            max_pairs: points squared, over all series; of more, points are too many.
+            is_local: whether these are all kept and the nearest ones count, or they are merged.
+        """
+        self.max_pairs, self.is_local = max_pairs, is_local
         self.share, self.kind_share, self.length_m = 0.5, 0.0, 50.0
         self.fields: dict[int, _Field] = {}
 
@@ -104,7 +119,7 @@ class ResidualField:
                     kind: np.ndarray | None = None) -> Self:
         """Return a field of the same correlation with other points, as of `fit`."""
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
-        field = type(self)(self.max_pairs)
+        field = type(self)(self.max_pairs, self.is_local)
         field.share, field.kind_share, field.length_m = self.share, self.kind_share, self.length_m
         field._store(series, position_m, residual, kind)
         field._factor()
@@ -113,18 +128,20 @@ class ResidualField:
     def _store(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray,
                kind: np.ndarray) -> dict[int, np.ndarray]:
         """Store the points, as of `fit`; return the rows of each series."""
-        numbers = np.unique(series)
-        limit = int(np.clip(np.sqrt(self.max_pairs / max(len(numbers), 1)), MIN_POINTS, MAX_POINTS))
-        order = np.argsort(series, kind="stable")
-        rows_of_series = dict(zip(map(int, numbers), np.split(
-            order, np.searchsorted(series[order], numbers[1:])), strict=True))
+        rows_of_series = _rows_by_series(series)
+        limit = self._limit(len(rows_of_series))
         self.fields = {}
         for number, rows in rows_of_series.items():
             points = position_m[rows], residual[rows], kind[rows]
             field = _merged(*points, SAME_POINT_M)
-            self.fields[number] = (
-                field if len(field.residual) <= limit else _coarsened(*points, limit))
+            if len(field.residual) > limit and not self.is_local:
+                field = _coarsened(*points, limit)
+            self.fields[number] = field
         return rows_of_series
+
+    def _limit(self, series: int) -> int:
+        """Return how many points each of so many series may have."""
+        return int(np.clip(np.sqrt(self.max_pairs / max(series, 1)), MIN_POINTS, MAX_POINTS))
 
     def predict(self, series: np.ndarray, position_m: np.ndarray,
                 kind: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -134,8 +151,7 @@ class ResidualField:
         grow with n.
         """
         mean, sd = np.zeros(len(series)), np.ones(len(series))
-        for number, rows, cross in self._crossing(series, position_m, kind):
-            factor, weights = self._solved[number]
+        for (factor, weights), rows, cross in self._crossing(series, position_m, kind):
             mean[rows] = weights @ cross
             whitened = solve_triangular(factor, cross, lower=True, overwrite_b=True)
             sd[rows] = np.sqrt(np.maximum(1.0 - np.square(whitened).sum(axis=0), 0.0))
@@ -145,20 +161,45 @@ class ResidualField:
              kind: np.ndarray | None = None) -> np.ndarray:
         """Return the mean that `predict` returns, of the same arguments, in less time."""
         mean = np.zeros(len(series))
-        for number, rows, cross in self._crossing(series, position_m, kind):
-            mean[rows] = self._solved[number][1] @ cross
+        for (_, weights), rows, cross in self._crossing(series, position_m, kind):
+            mean[rows] = weights @ cross
         return mean
 
     def _crossing(self, series: np.ndarray, position_m: np.ndarray, kind: np.ndarray | None,
-                  ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """Give a series, some rows of it, and how its points correlate with them; in batches."""
+                  ) -> Iterator[tuple[_Solved, np.ndarray, np.ndarray]]:
+        """Give solved points, rows that they predict, and how both correlate; in batches."""
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
-        for number, field in self.fields.items():
-            mine = np.flatnonzero(series == number)
-            for start in range(0, len(mine), BATCH):
-                rows = mine[start : start + BATCH]
-                yield number, rows, self._correlation(cdist(field.position_m, position_m[rows]),
-                                                      field.kind, kind[rows])
+        for number, own in _rows_by_series(series).items():
+            if number not in self.fields:
+                continue
+            for field, solved, asked in self._solved_for(number, position_m, own):
+                for start in range(0, len(asked), BATCH):
+                    rows = asked[start : start + BATCH]
+                    distance_m = cdist(field.position_m, position_m[rows])
+                    yield solved, rows, self._correlation(distance_m, field.kind, kind[rows])
+
+    def _solved_for(self, number: int, position_m: np.ndarray, rows: np.ndarray
+                    ) -> Iterator[tuple[_Field, _Solved, np.ndarray]]:
+        """Give points of a series, solved, and those of some rows that they predict."""
+        field = self.fields[number]
+        if number in self._solved or len(field.residual) <= LOCAL_POINTS:
+            yield field, self._solved.get(number) or self._solve(field), rows
+            return
+        tree = cKDTree(field.position_m)
+        waiting = [rows]
+        while waiting:
+            own = waiting.pop()
+            low_m, high_m = position_m[own].min(axis=0), position_m[own].max(axis=0)
+            reach_m, near = tree.query((low_m + high_m) / 2, LOCAL_POINTS)
+            wide_m = np.linalg.norm(high_m - low_m) / 2
+            if len(own) > 1 and wide_m > 0 and (
+                    len(own) > LOCAL_ROWS or wide_m > LOCAL_SPREAD * reach_m[-1]):
+                order = own[np.argsort(position_m[own, (high_m - low_m).argmax()], kind="stable")]
+                waiting += [order[:len(own) // 2], order[len(own) // 2:]]
+                continue
+            part = _Field(field.position_m[near], field.residual[near], field.kind[near],
+                          field.count[near])
+            yield part, self._solve(part), own
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return arrays by name, and settings that JSON can hold, for `from_state`."""
@@ -172,9 +213,10 @@ class ResidualField:
                         "kind_share": self.kind_share, "length_m": self.length_m}
 
     @classmethod
-    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
-        """Return the field that `state` described."""
-        field = cls()
+    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any],
+                   is_local: bool = False) -> Self:
+        """Return the field that `state` described; `is_local` as of `__init__`."""
+        field = cls(is_local=is_local)
         require_names("settings", settings, ["devices", "share", "kind_share", "length_m"])
         numbers = settings["devices"]
         if not isinstance(numbers, list) or len(set(numbers)) < len(numbers) or any(
@@ -186,7 +228,8 @@ class ResidualField:
         field.kind_share = require_number(settings, "kind_share", 0, 1 - field.share + 1e-9)
         field.length_m = require_number(settings, "length_m", MIN_LENGTH_M, MAX_POSITION_M)
         field.fields = {number: _stored(arrays, number) for number in numbers}
-        points = [len(each.residual) for each in field.fields.values()]
+        points = [len(each.residual) for number, each in field.fields.items()
+                  if not field._has_too_many(number)]
         FIELD_PAIRS.check(sum(count**2 for count in points), "the interpolated residual")
         field._factor()
         return field
@@ -235,13 +278,29 @@ class ResidualField:
         options = {"initial_simplex": simplex, "maxfev": 30 * number, "xatol": 0.05, "fatol": 0.1}
         assign(minimize(objective, start, method="Nelder-Mead", bounds=bounds, options=options).x)
 
+    def _has_too_many(self, number: int) -> bool:
+        """Return whether the nearest points of a series count."""
+        most = self._limit(len(self.fields))
+        return self.is_local and len(self.fields[number].residual) > most
+
     def _factor(self) -> None:
-        """Compute the Cholesky factor (p, p) and the weights (p,) of every series."""
-        self._solved = {}
-        for number, field in self.fields.items():
-            distance_m = cdist(field.position_m, field.position_m)
-            factor = cholesky(self._covariance(field, distance_m), lower=True)
-            self._solved[number] = factor, cho_solve((factor, True), field.residual)
+        """Solve every series whose points all count."""
+        self._solved = {number: self._solve(field) for number, field in self.fields.items()
+                        if not self._has_too_many(number)}
+
+    def _solve(self, field: _Field) -> _Solved:
+        """Return the Cholesky factor (p, p) of the covariance, and the weights (p,)."""
+        covariance = self._covariance(field, cdist(field.position_m, field.position_m))
+        factor = cholesky(covariance, lower=True, overwrite_a=True)
+        return factor, cho_solve((factor, True), field.residual)
+
+
+def _rows_by_series(series: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the rows of each series, in order."""
+    order = np.argsort(series, kind="stable")
+    numbers, first = np.unique(series[order], return_index=True)
+    return {int(number): order[start:end] for number, start, end in
+            zip(numbers, first, [*first[1:], len(order)], strict=True)}
 
 
 def _stored(arrays: dict[str, np.ndarray], number: int) -> _Field:
@@ -293,6 +352,8 @@ class RegressionKriging(ChannelModel):
     would fill a shadow with the detected levels around it.
 
     A device is its index in `LinkGeometry.device`: use the same indices to fit and to predict.
+    Where there are more devices than places of receivers, each receiver, known by where it stands,
+    has a process over the device's position.
     """
 
     name = "regression_kriging"
@@ -300,17 +361,22 @@ class RegressionKriging(ChannelModel):
 
     def __init__(self) -> None:
         self.law = SegmentedLogDistance()
-        self.field = ResidualField()
+        self.field = ResidualField(is_local=True)
+        self.fixed_m = np.zeros((0, 3))  # receivers, where devices move
 
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
+        places_m = np.unique(links.receiver_m, axis=0)
+        if len(np.unique(places_m[:, :2].round(), axis=0)) < len(np.unique(links.device)):
+            self.fixed_m = places_m
         self.field.fit(*self._residual(links, level_db, limit_db), seed)
         return self
 
     def refit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit) -> Self:
         """Return a model of the same correlation that is fitted to other links, as of `fit`."""
         model = type(self)()
+        model.fixed_m = self.fixed_m
         model.field = self.field.with_points(*model._residual(links, level_db, limit_db))
         return model
 
@@ -320,12 +386,19 @@ class RegressionKriging(ChannelModel):
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         mean_db, sd_db = self.law.predict(links)
-        return links.device, links.receiver_m, standardised(level_db, mean_db, sd_db, limit_db)
+        return *self._ends(links), standardised(level_db, mean_db, sd_db, limit_db)
+
+    def _ends(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return series (n,), -1 of an unknown one, and positions (n, 3) [m]."""
+        if not len(self.fixed_m):
+            return links.device, links.receiver_m
+        away_m, nearest = cKDTree(self.fixed_m).query(links.receiver_m)
+        return np.where(away_m <= SAME_PLACE_M, nearest, -1), links.device_m
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         mean_db, sd_db = self.law.predict(links)
-        mean, sd = self.field.predict(links.device, links.receiver_m)
+        mean, sd = self.field.predict(*self._ends(links))
         return mean_db + sd_db * mean, sd_db * sd
 
     @property
@@ -337,6 +410,8 @@ class RegressionKriging(ChannelModel):
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         arrays, settings = self.law.state()
         field_arrays, field_settings = self.field.state()
+        if len(self.fixed_m):
+            arrays = arrays | {"fixed_m": self.fixed_m}
         return arrays | field_arrays, settings | field_settings
 
     @classmethod
@@ -345,7 +420,10 @@ class RegressionKriging(ChannelModel):
         model = cls()
         law = {"lines": arrays["lines"]}
         model.law = SegmentedLogDistance.from_state(law, {"borrowed": settings["borrowed"]})
+        if "fixed_m" in arrays:
+            model.fixed_m = require_array(arrays, "fixed_m", (None, 3), -MAX_POSITION_M,
+                                          MAX_POSITION_M)
         model.field = ResidualField.from_state(
-            {name: array for name, array in arrays.items() if name not in law},
-            {name: value for name, value in settings.items() if name != "borrowed"})
+            {name: array for name, array in arrays.items() if name not in (*law, "fixed_m")},
+            {name: value for name, value in settings.items() if name != "borrowed"}, True)
         return model

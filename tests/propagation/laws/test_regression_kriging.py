@@ -87,19 +87,34 @@ def test_batches_do_not_show(world):
     assert np.allclose(whole, np.concatenate(parts, axis=1), atol=1e-9)
 
 
-def test_of_too_many_points_neighbours_become_their_mean(world, monkeypatch):
-    data = world(10, 600)
+def test_of_too_many_points_the_nearest_count(world, monkeypatch, tmp_path):
+    data, probe = world(10, 900), world(13, 300).links
     level_db = data.level_db + shadowing(data.links)
     whole = RegressionKriging().fit(data.links, level_db, None, seed=1)
-    monkeypatch.setattr(residual_field, "MAX_POINTS", 150)
-    few, again = (RegressionKriging().fit(data.links, level_db, None, seed=1) for _ in range(2))
-    (device,) = (number for number in few.field.fields if number == 0)
-    field, mine = few.field.fields[device], data.links.device == 0
-    assert 40 < len(field.residual) <= 150 and field.count.sum() == mine.sum()
-    assert all(np.array_equal(few.state()[0][name], array) for name, array in again.state()[0].items())
-    probe = world(13, 300).links
-    difference_db = few.predict(probe)[0] - whole.predict(probe)[0]
-    assert np.sqrt(np.mean(difference_db**2)) < 2.0
+    for name, value in (("MAX_POINTS", 150), ("LOCAL_POINTS", 100), ("LOCAL_ROWS", 20)):
+        monkeypatch.setattr(residual_field, name, value)
+    local = RegressionKriging().fit(data.links, level_db, None, seed=1)
+    assert sum(len(field.residual) for field in local.field.fields.values()) == 900
+    assert all(len(factor) <= 150 for factor, _ in local.field._solved.values())
+    np.testing.assert_allclose(local.predict(probe), whole.predict(probe), atol=0.5)
+    again = RegressionKriging.from_state(*local.state()).predict(probe)
+    np.testing.assert_allclose(again, local.predict(probe), atol=1e-9)
+    alone = [local.predict(probe.select(slice(i, i + 1))) for i in range(20)]
+    np.testing.assert_allclose(np.hstack(alone), np.array(local.predict(probe))[:, :20], atol=0.5)
+
+
+def test_where_devices_move_each_receiver_has_a_field(world):
+    """The ends are exchanged, and each link is of a device of its own: as well predicted as before."""
+    data, probe = world(10, 400), world(13, 200)
+    def exchanged(links):
+        return LinkGeometry(links.receiver_m, links.device_m, links.los, np.arange(len(links)))
+    here = RegressionKriging().fit(data.links, data.level_db + shadowing(data.links), None, seed=1)
+    there = RegressionKriging().fit(exchanged(data.links), data.level_db + shadowing(data.links), None, seed=1)
+    again = RegressionKriging.from_state(*there.state())
+    expected_db = here.predict(probe.links)[0]
+    np.testing.assert_allclose(there.predict(exchanged(probe.links))[0], expected_db, atol=0.5)
+    np.testing.assert_allclose(again.predict(exchanged(probe.links))[0], expected_db, atol=0.5)
+    assert np.abs(there.law.predict(exchanged(probe.links))[0] - expected_db).mean() > 1.0
 
 
 def test_repeated_visits_become_one_point(world):
