@@ -115,6 +115,10 @@ def _cards(report: dict) -> list[tuple[str, str]]:
     if prediction:
         cards.append(("all that was learnt together, RMSE",
                       f"{number(prediction['combined_rmse_db'])} dB"))
+        of_map = report["error"].get("map")
+        if of_map:
+            cards.append(("RMSE of its map, which has the mean gain at a faultless receiver, also "
+                          "below the limit of detection", f"{number(of_map['rmse_db'])} dB"))
         inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
         if inside is not None:
             cards.append(("held-out readings in its 90 % intervals", f"{100 * inside:.0f} %"))
