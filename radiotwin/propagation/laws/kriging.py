@@ -34,7 +34,7 @@ MIN_LENGTH_M = 1e-3  # of a correlation that is read
 MAX_PAIRS = 36e6  # points squared, over all series: their matrices take 8 bytes a pair
 MAX_POINTS, MIN_POINTS = 2500, 30  # range of the number of points that is kept of a longer series
 MAX_POINTS_TO_FIT, MAX_SERIES_TO_FIT = 300, 400  # for the correlation; at most MAX_PAIRS again
-SAME_PLACE_M = 1.0  # a receiver that stands still is known by its place
+SAME_PLACE_M = 1.0  # a receiver that stands still is within it
 SAME_POINT_M = 0.1  # points within a cell this wide are one [m]
 LOCAL_POINTS = 400  # nearest ones of a series that has too many, see `ResidualField`
 LOCAL_ROWS = 200  # places at most that share them
@@ -299,8 +299,8 @@ def _rows_by_series(series: np.ndarray) -> dict[int, np.ndarray]:
     """Return the rows of each series, in order."""
     order = np.argsort(series, kind="stable")
     numbers, first = np.unique(series[order], return_index=True)
-    return {int(number): order[start:end] for number, start, end in
-            zip(numbers, first, [*first[1:], len(order)], strict=True)}
+    return {int(number): order[start:start + count] for number, start, count in
+            zip(numbers, first, np.diff([*first, len(order)]), strict=True)}
 
 
 def _stored(arrays: dict[str, np.ndarray], number: int) -> _Field:
@@ -342,6 +342,16 @@ def _sample(field: _Field, rng: np.random.Generator) -> _Field:
     return _Field(field.position_m[rows], field.residual[rows], field.kind[rows], field.count[rows])
 
 
+def _fixed_receivers_m(links: LinkGeometry) -> np.ndarray:
+    """Return places (k, 3) of receivers that stand still while devices move [m]; else none."""
+    cells, place, count = np.unique(np.round(links.receiver_m / SAME_PLACE_M), axis=0,
+                                    return_inverse=True, return_counts=True)
+    of_device = np.bincount(links.device)[links.device]
+    if np.median(count[place.ravel()]) <= np.median(of_device):
+        return np.zeros((0, 3))
+    return cells[count >= MIN_POINTS] * SAME_PLACE_M
+
+
 class RegressionKriging(ChannelModel):
     """The law as trend, and for each device a Gaussian process over the receiver's position.
 
@@ -352,8 +362,8 @@ class RegressionKriging(ChannelModel):
     would fill a shadow with the detected levels around it.
 
     A device is its index in `LinkGeometry.device`: use the same indices to fit and to predict.
-    Where there are more devices than places of receivers, each receiver, known by where it stands,
-    has a process over the device's position.
+    Where most links are of a place of receivers that has more links than their device, each of
+    these places has a process over the device's position.
     """
 
     name = "regression_kriging"
@@ -367,9 +377,7 @@ class RegressionKriging(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        places_m = np.unique(links.receiver_m, axis=0)
-        if len(np.unique(places_m[:, :2].round(), axis=0)) < len(np.unique(links.device)):
-            self.fixed_m = places_m
+        self.fixed_m = _fixed_receivers_m(links)
         self.field.fit(*self._residual(links, level_db, limit_db), seed)
         return self
 
