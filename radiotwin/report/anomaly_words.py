@@ -1,6 +1,6 @@
 """Say which groups of links read otherwise than their peers, by how much, and why perhaps."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from radiotwin.closeloop.verdict.criteria import LIKELY, MIN_SURE
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER
@@ -69,9 +69,9 @@ def causes(anomaly: dict, named: Sequence[dict]) -> str:
     likely = {each["name"] for each in found}
     found = [*(each for each in named if each["name"] not in likely), *found]
     start = "Cause" if named else "Its cause is open"
-    words = "; ".join(f"{cause(each['name'])} ({probability(each['probability'])})"
-                      if each["probability"] is not None else cause(each["name"])
-                      for each in found[:MAX_NAMED])
+    words = "; ".join(cause(each["name"], anomaly["members"]) + (
+        "" if each["probability"] is None else f" ({probability(each['probability'])})")
+        for each in found[:MAX_NAMED])
     return f"{start}: {words}." if words else f"{start}."
 
 
@@ -84,13 +84,16 @@ def _named(index: int, report: dict) -> list[dict]:
     return [each for each in report["effects"] if index in each.get("anomalies", [])]
 
 
-def cause(name: str) -> str:
-    """Return what a cause is called in a sentence."""
+def cause(name: str, members: Collection[str]) -> str:
+    """Return what a cause is called in a sentence about a group with members of these ends."""
     if name in (ANOTHER, OTHER):
         return "another cause"
     if name == NONE:
         return "nothing is missing"
-    words = [each.in_words for each in effects_named(name) if each.in_words]
+    forms, of_receiver = effects_named(name), "receiver" in members
+    if of_receiver != ("device" in members):  # of a device's and a receiver's form, its own
+        forms = [each for each in forms if each.of_receiver == of_receiver] or forms
+    words = [each.in_words for each in forms if each.in_words]
     return " or ".join(dict.fromkeys(words)) or name_label(name)
 
 

@@ -56,11 +56,11 @@ MIN_SHARE = 0.3  # of the variance of a contribution that a variable explains, t
 AZIMUTHS = {"device": "azimuth_deg", "receiver": "body_azimuth_deg"}
 BINS = 20
 MAX_PANELS = 6
-MAX_MEMBERS = 24  # receivers, devices or flights in one panel
 MAX_LINE = 1.5  # times the highest bar: other models up to there are lines
 MIN_STEP_DB = 0.005  # smaller changes are not a bar of their own
 CONTRIBUTION = "contribution of the effects"
-ON_MAP = ("place_of_ray", "place_of_receiver")  # variables that the residual map shows
+# Variables that the residual map and the figure of groups show.
+ELSEWHERE = {"place_of_ray", "place_of_receiver", "device", "receiver", "flight", "los"}
 
 
 def effect_figure(effect: EffectData, background: MapBackground) -> Figure:
@@ -277,15 +277,15 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
     """
     folder, data = Path(folder), collect(loop)
     background = MapBackground(data.links, scene)
-    for old in [*folder.glob("effect_*.png"), folder / "level_map.png"]:
+    for old in [*folder.glob("effect_*.png"), folder / "level_map.png", folder / "drivers.png"]:
         old.unlink(missing_ok=True)
     save(groups_figure(data, report), folder / "groups.png")
     save(waterfall_figure(report), folder / "waterfall.png")
     save(residual_map_figure(data, background), folder / "residual_map.png")
-    level_map = level_map_figure(data, background)
-    if level_map is not None:
-        save(level_map, folder / "level_map.png")
-    save(dependence_figure(data), folder / "drivers.png")
+    for name, figure in (("level_map", level_map_figure(data, background)),
+                         ("drivers", dependence_figure(data))):
+        if figure is not None:
+            save(figure, folder / f"{name}.png")
     for rank, effect in enumerate(data.effects, start=1):
         save(effect_figure(effect, background), folder / effect_picture(rank, effect.found.name))
     if data.interpolated_db is not None:
@@ -341,12 +341,17 @@ def waterfall_figure(report: dict) -> Figure:
     return figure
 
 
-def dependence_figure(data: LoopData) -> Figure:
-    """Draw the mean held-out residual against the variables that it depends on most."""
+def dependence_figure(data: LoopData) -> Figure | None:
+    """Draw the mean held-out residual against the continuous variables that it depends on most.
+
+    None where it was tested against none.
+    """
     residual_db = [data.links.level_db - predicted for predicted in (data.before_db, data.after_db)]
     known = np.isfinite(residual_db[0]) & np.isfinite(residual_db[1])
     variables = [name for name in dict.fromkeys(data.drivers)
-                 if name in data.links.variables and name not in ON_MAP][:MAX_PANELS]
+                 if name in data.links.variables and name not in ELSEWHERE][:MAX_PANELS]
+    if not variables:
+        return None
     columns = {1: 1, 2: 2, 4: 2}.get(len(variables), 3)
     rows = max(-(-len(variables) // columns), 1)
     figure = new_figure(4.1 * columns, 3.2 * rows + 0.4)
@@ -354,24 +359,17 @@ def dependence_figure(data: LoopData) -> Figure:
         ax = figure.add_subplot(rows, columns, number + 1)
         value, axis_label = data.links.on_axis(variable, data.links.variables[variable])
         used = known & np.isfinite(value)
-        labels = data.links.names.get(variable)
-        index = bin_index(value[used], BINS) if labels is None else value[used]
+        index = bin_index(value[used], BINS)
         before, after = (bin_means(index, value[used].astype(float), each[used],
                                    data.links.block[used]) for each in residual_db)
-        if labels is None:
-            _draw_curves(ax, before, after, data.changed)
-        else:
-            _draw_members(ax, before, after, labels, data.changed)
+        _draw_curves(ax, before, after, data.changed)
         ax.set(xlabel=axis_label, ylabel="mean residual [dB]" if number % columns == 0 else "")
         ax.axhline(0, color="0.6", linewidth=0.8, zorder=0)
         hide_spines(ax)
-    if variables:
-        handles = dict(zip(*figure.axes[0].get_legend_handles_labels()[::-1]))
-        shown = [label for label in ("before", "after", CONTRIBUTION) if label in handles]
-        figure.legend([handles[label] for label in shown], shown, loc="outside upper center",
-                      ncols=min(columns + 1, 3), frameon=False)  # one panel has room for two
-    else:
-        figure.text(0.5, 0.5, "no variable could be tested", ha="center", va="center", fontsize=12)
+    handles = dict(zip(*figure.axes[0].get_legend_handles_labels()[::-1]))
+    shown = [label for label in ("before", "after", CONTRIBUTION) if label in handles]
+    figure.legend([handles[label] for label in shown], shown, loc="outside upper center",
+                  ncols=min(columns + 1, 3), frameon=False)  # one panel has room for two
     return figure
 
 
@@ -385,25 +383,6 @@ def _draw_curves(ax: Axes, before: BinMeans, after: BinMeans, changed: bool) -> 
     if changed:
         ax.plot(before.at, before.mean - after.mean, color=FITTED, linewidth=1.3, linestyle="--",
                 label=CONTRIBUTION)
-
-
-def _draw_members(ax: Axes, before: BinMeans, after: BinMeans, labels: list[str],
-                  changed: bool) -> None:
-    """Draw means with their standard errors for the members with the largest residuals."""
-    shown = np.sort(np.argsort(-np.abs(before.mean))[:MAX_MEMBERS])
-    position = np.arange(len(shown))
-    shift = 0.16 if changed else 0.0
-    ax.errorbar(position - shift, before.mean[shown], before.error[shown], fmt="o", color=BEFORE,
-                markersize=5, elinewidth=1.5, label="before")
-    if changed:
-        ax.errorbar(position + shift, after.mean[shown], after.error[shown], fmt="o", color=AFTER,
-                    markersize=5, elinewidth=1.5, label="after")
-        ax.plot(position, (before.mean - after.mean)[shown], "_", color=FITTED, markersize=12,
-                markeredgewidth=1.5, label=CONTRIBUTION)
-    names = [shorten(labels[int(before.at[each])]) for each in shown]
-    crowded = sum(map(len, names)) > 36
-    ax.set_xticks(position, names, rotation=90 if crowded else 0, fontsize=8 if crowded else 10)
-    ax.set_xlim(-0.6, len(shown) - 0.4)
 
 
 def _draw_bar(ax: Axes, position: int, start: float, end: float, colour: str, text: str,

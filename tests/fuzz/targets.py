@@ -83,7 +83,7 @@ TARGETS = (
     Target("radio map", "map.nc", "radiotwin coverage map.nc --scene scene --tx-power-dbm 20 --formats tif,png -o out"),
     Target("twin", "twin/twin.json", "radiotwin coverage twin --scene scene --tx-power-dbm 20 --step 30 --formats nc -o out"),
     *(Target("run folder", file, "radiotwin report loop -o out.html")
-      for file in ("loop/closeloop.json", "loop/residuals.csv.gz", "loop/drivers.png")),
+      for file in ("loop/closeloop.json", "loop/residuals.csv.gz", "loop/groups.png")),
     *(Target("run folder", f"comparison/{name}", "radiotwin report comparison --scene scene -o out.html")
       for name in ("compare.json",)),
     Target("run folder", "run/config.json", "radiotwin report run -o out.html"),

@@ -105,7 +105,7 @@ def test_every_figure_is_written_without_a_map(loop, tmp_path):
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_the_legend_of_the_dependences_is_not_cut_off(loop, count):
     data = collect(loop)
-    names = ["receiver", "distance_m", "elevation_deg"][:count]
+    names = ["altitude_m", "distance_m", "elevation_deg"][:count]
     figure = dependence_figure(dataclasses.replace(data, drivers=names))
     figure.canvas.draw()
     [legend], whole = figure.legends, figure.bbox
@@ -121,7 +121,7 @@ def test_figures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_p
     write_closeloop_figures(nothing, None, content, tmp_path)
     write_closeloop_page(content, tmp_path, "page")
     text = (tmp_path / "closeloop.html").read_text()
-    assert text.count("data:image/png;base64,") == 5 and "No structure" in text
+    assert text.count("data:image/png;base64,") == 4 and "No structure" in text
 
 
 @pytest.mark.parametrize("effect, params", [

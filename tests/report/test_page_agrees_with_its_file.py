@@ -183,3 +183,12 @@ def test_where_comes_before_why_and_a_named_cause_is_told_from_an_open_one():
     assert "Its cause is open: power" in closeloop_summary(with_members("located", [LOW]))
     many = closeloop_summary(with_members("located", [group for group, _ in GROUPS]))
     assert "9 more groups stand out." in many
+
+
+@pytest.mark.parametrize(("name", "members", "words"), (
+    ("antenna_pattern", {"device": ["d3"]}, "directions of the device's antenna"),
+    ("antenna_pattern", {"receiver": ["u1"]}, "tilt of the receiver's antenna"),
+    ("antenna_pattern", {}, "directions of the device's antenna or tilt of the receiver's antenna"),
+    ("another", {}, "another cause"), ("of_a_plugin_that_is_gone", {}, "of a plugin that is gone")))
+def test_a_cause_is_called_what_it_is_at_that_end(name, members, words):
+    assert anomaly_words.cause(name, members) == words
