@@ -33,6 +33,7 @@ from radiotwin.inference.groups import (
     without_shared,
 )
 from radiotwin.links.correlation import moving_end_m
+from radiotwin.links.sites import never_part
 
 PASSING_M, LASTING_M = 25.0, 75.0  # errors of one flight, and of the map, are alike within
 TOLERANCE_DB = 0.4  # spread of levels of peers: instruments, antennas, cables
@@ -377,6 +378,12 @@ def _without(readings: Readings, found: _Found) -> Readings:
 def _anomaly(found: _Found, readings: Readings) -> Anomaly:
     compared = found.compared
     members, ranges = compared.family.describe(found.group)
+    if compared.family.name in ENDS:  # another end that has the same links may be meant
+        labels = {end: getattr(readings, end) for end in ENDS}
+        for other in (end for end in ENDS if end != compared.family.name):
+            same = never_part(labels[compared.family.name], labels[other])
+            if found.group in same:
+                members = {**members, other: (readings.names[other][same[found.group]],)}
     error = QUANTILE_90 * float(compared.distance.error[found.group])
     value, low, high = found.size, found.size - error, found.size + error
     if compared.statistic == "scatter":

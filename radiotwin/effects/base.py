@@ -330,6 +330,15 @@ class Effect(ABC):
         """Return what in the map of n links speaks against it as fitted; None for nothing."""
         return None
 
+    def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
+        """Return names of effects that n links cannot tell from it, as no two ends of it part.
+
+        Args:
+            links: that it was fitted to.
+            parameters: what was found, as of `parameters`.
+        """
+        return []
+
     def contradicted_declarations(self, links: Links) -> list[str]:
         """Return what of the tables its fit contradicts, a sentence each; by default nothing."""
         return []

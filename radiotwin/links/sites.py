@@ -15,11 +15,14 @@ import pandas as pd
 from scipy.spatial import cKDTree
 from scipy.stats import t as student
 
+from radiotwin.display import some
 from radiotwin.links.correlation import devices_move
 from radiotwin.links.links import Links
 
 SAME_SITE_M = 1.0  # apart at most: sectors of one mast; declared positions are good to that
+OTHER_END = {"device": "receiver", "receiver": "device"}
 SAME_DIRECTION_DEG = 5.0  # azimuths within it are of one antenna, or of two side by side
+MAX_NAMED = 4  # pairs in a note
 MAX_RELATIVES = 4  # more tell nothing new
 SAME_M = 3.0  # a phone's position is known no better outdoors
 PLACE_M = 30.0  # readings so close to each other err alike: the median of a square counts as one
@@ -62,6 +65,45 @@ def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
     others = ([other for other in group if other != device and other in heard]
               for group in (antenna_of(links, device), site_of(links, device)))
     return next(filter(None, others), [])[:MAX_RELATIVES]
+
+
+def never_part(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
+    """Return the labels of one end that have the same links as a label of another end, and that.
+
+    What one of the two has wrong cannot be told from what the other has.
+
+    Args:
+        one: (n,) index of one end of each link, such as its device.
+        other: (n,) index of another, such as its receiver or flight.
+    """
+    code, links = np.unique(one * (int(other.max(initial=0)) + 1) + other, return_counts=True)
+    first, second = np.divmod(code, int(other.max(initial=0)) + 1)
+    same = (np.bincount(one)[first] == links) & (np.bincount(other)[second] == links)
+    return dict(zip(first[same].tolist(), second[same].tolist(), strict=True))
+
+
+def never_apart_from(links: Links, end: str, members: set[int]) -> str | None:
+    """Return the other of `device` and `receiver` if it is never apart from one of some members.
+
+    Only links that were heard tell.
+    """
+    other, heard = OTHER_END[end], np.isfinite(links.level_db)
+    together = never_part(getattr(links, end)[heard], getattr(links, other)[heard])
+    return other if members & together.keys() else None
+
+
+def parting_notes(links: Links) -> list[str]:
+    """Return a note on devices that are never apart from their receiver, or from their flight."""
+    notes, heard = [], np.isfinite(links.level_db)
+    for end in ("receiver", "flight"):
+        names = getattr(links, f"{end}_names")
+        pairs = [f"{links.device_names[device]} and {names[member]}" for device, member
+                 in never_part(links.device[heard], getattr(links, end)[heard]).items()]
+        if pairs:
+            notes.append(f"device and {end} are never apart ({some(pairs, MAX_NAMED)}): what one "
+                         f"of the two has wrong, an offset or a drift, may be the other's; let "
+                         f"another {end} read the device, or this one another device")
+    return notes
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from radiotwin.links.sites import receiver_differences
+from radiotwin.effects.catalogue.gain_drift import DeviceDrift, Drift, ReceiverDrift
+from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
+from radiotwin.effects.params import Parameter
+from radiotwin.links.sites import never_part, parting_notes, receiver_differences
 from tests.worlds import synthetic_links
 
 OFFSET_DB, SQUARE_M = -4.0, 100.0
@@ -72,3 +75,22 @@ def test_receivers_that_never_met_are_not_compared():
     links = walked(0)
     links.receiver_m[links.receiver == 1] += [0.0, 50.0, 0.0]
     assert receiver_differences(links) == []
+
+
+def test_ends_that_never_part_are_said_to_be_one():
+    """d2 and r2 are read by nobody else; d0 and d1 share r0 and r1. A blank of r0 tells nothing of d2."""
+    device, receiver = (np.repeat(each, 40) for each in ([0, 0, 1, 1, 2, 2], [0, 1, 0, 1, 2, 0]))
+    assert never_part(device[:200], receiver[:200]) == {2: 2} and never_part(device, receiver) == {}
+    level_db = np.where(np.arange(240) < 200, -90.0, np.nan)
+    links = synthetic_links([[0.0, 0, 10], [90.0, 0, 10], [0.0, 90, 10]], device, np.tile([50.0, 50.0, 1.5], (240, 1)),
+                            level_db=level_db, receiver=receiver)
+    (note,) = parting_notes(links)
+    assert note.startswith("device and receiver are never apart (d2 and r2)")
+    for effect, end, rival in ((ReceiverDrift, "receivers", ["device_drift"]), (DeviceDrift, "devices", ["receiver_drift"])):
+        found = {member: effect().with_params(effect.Params.model_validate({end: {member: Drift("ageing", 0.0)}}))
+                 for member in (0, 2)}
+        assert found[2].same_as(links, {}) == rival and found[0].same_as(links, {}) == []
+    offsets = ReceiverGainOffset().with_params(ReceiverGainOffset.Params(members=[0, 1, 2], offsets_sd_db=2.0))
+    for sizes_db, rivals in (((0.1, 0.3, -5.0), ["device_gain_offset"]), ((0.1, 5.0, 0.2), [])):
+        values = {f"offset_db[r{each}]": Parameter(size, None, None, "dB") for each, size in enumerate(sizes_db)}
+        assert offsets.same_as(links, values) == rivals

@@ -85,7 +85,8 @@ def make_report(loop: Loop) -> dict[str, Any]:
                 "parameters": {name: parameter.record() for name, parameter in parameters.items()},
                 "size_db": size.record(),
                 "confused_with": list(each.confused_with),
-                "indistinguishable_from": list(trial.rivals),
+                "indistinguishable_from": sorted({*trial.rivals,
+                                                  *each.same_as(loop.after.links, parameters)}),
                 "probability": trial.probability, "anomalies": explained,
                 "evidence": {"heldout_nll_gain": trial.nll_gain, "p_value": trial.p_value,
                              "evidence_nats": trial.evidence_nats}}

@@ -6,7 +6,7 @@ an unknown time (two means, Hinkley 1970, 'Inference about the change-point in a
 variables', Biometrika 57).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -27,6 +27,7 @@ from radiotwin.effects.params import (
 )
 from radiotwin.effects.patterns import Pattern, timed_members
 from radiotwin.links import Links
+from radiotwin.links.sites import never_apart_from
 
 MIN_LINKS = 60  # of a receiver or device, with a time
 MIN_FLIGHTS = 3  # that a device was heard on: within a flight, time and position change together
@@ -177,6 +178,11 @@ class _GainDrift(GainEffect):
             return self.changed(**{f"{self.end}s": drifts | new})
 
         return Variation(values, np.full(n, 0.3), np.full(n, 0.0), np.full(n, MAX_LOG_S), varied)
+
+    @override
+    def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
+        other = never_apart_from(links, self.end, set(self.drifts()))
+        return [] if other is None else [self.name.replace(self.end, other)]
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:

@@ -4,7 +4,7 @@ Cable and connector loss, antenna efficiency, transmit power and calibration add
 link budget (ITU-R P.341, 'The concept of transmission loss for radio links').
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -24,6 +24,7 @@ from radiotwin.effects.params import (
 )
 from radiotwin.effects.patterns import Pattern, members
 from radiotwin.links import Links
+from radiotwin.links.sites import never_apart_from
 
 PRIOR_SD_DB = 10.0  # wide: an error of a cable, a connector or a declared power
 MIN_LINKS = 30  # of a member; fewer do not outweigh shadowing
@@ -76,6 +77,14 @@ class _GainOffset(GainEffect):
         unknown = ~np.isin(index, self.params.members)
         return replace(Term.of_columns(one_hot(index, self.params.members), PRIOR_SD_DB),
                        unheard_sd_db=np.where(unknown, self.params.offsets_sd_db, 0.0))
+
+    @override
+    def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
+        names = getattr(links, f"{self.end}_names")
+        largest = max(self.params.members,
+                      key=lambda each: abs(parameters[f"offset_db[{names[each]}]"].value))
+        other = never_apart_from(links, self.end, {largest})
+        return [] if other is None else [self.name.replace(self.end, other)]
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
