@@ -53,8 +53,14 @@ def verdict(report: dict) -> str:
 
 
 def cause_names(report: dict) -> list[str]:
-    """Return the names of the effects that explain something, with counts."""
-    counts = Counter(name_label(each["name"]) for each in _causes(report))
+    """Return the names of the effects that explain something, with counts.
+
+    Where two ends never part, the same effect of the other end has an equal claim.
+    """
+    counts = Counter(" or ".join(name_label(name) for name in (
+        each["name"], *(other for other in each.get("indistinguishable_from", [])
+                        if other.partition("_")[2] == each["name"].partition("_")[2])))
+        for each in _causes(report))
     return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
 
 
