@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
-from scipy.special import log_ndtr, ndtr
+from scipy.special import log_ndtr
 
 if TYPE_CHECKING:
     import torch
@@ -105,12 +105,6 @@ def gaussian_nll_torch(level: torch.Tensor, mean: torch.Tensor, log_sd: torch.Te
     below = -torch.special.log_ndtr(torch.where(censored, z, 0.0))
     seen = 0.5 * torch.where(censored, 0.0, z) ** 2 + log_sd + HALF_LOG_2PI
     return torch.where(censored, below, seen)
-
-
-def detection_probability(mean_db: np.ndarray, sd_db: np.ndarray,
-                          limit_db: np.ndarray | float) -> np.ndarray:
-    """Return the probability that a level lies above the limit [dB]; the arguments broadcast."""
-    return ndtr((mean_db - limit_db) / sd_db)
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,12 @@ from radiotwin.propagation.laws.base import ChannelModel
 from radiotwin.propagation.laws.forest import Forest
 from radiotwin.propagation.laws.log_distance import LogDistance
 from radiotwin.runtime.processes import in_threads
-from radiotwin.twin.model.blend import FORESTS, LEVEL_FORESTS, NAMED, REST, Blend, moving_ends
-from radiotwin.twin.model.correlated_shadowing import CorrelatedShadowing, receivers_move
+from radiotwin.twin.model.blend import FORESTS, LEVEL_FORESTS, NAMED, REST, Blend
+from radiotwin.twin.model.correlated_shadowing import (
+    CorrelatedShadowing,
+    moving_ends,
+    receivers_move,
+)
 from radiotwin.twin.model.model import Fit, FittedModel
 
 MAX_AWAY_LINKS = 12_000  # of which quadrants are held out

@@ -151,10 +151,12 @@ def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[fl
         return found / found.sum(axis=1, keepdims=True)
 
     folds = np.unique(fold)
-    for counts in AWAY_COUNTS if len(folds) > 1 else AWAY_COUNTS[:1]:
+    if len(folds) < 2:
+        return fitted(AWAY_COUNTS[0])
+    for counts in AWAY_COUNTS:
         square = sum(np.square(combine(error[fold == each], share[fold == each],
                                        fitted(counts, each))).sum() for each in folds)
-        if np.sqrt(square / len(error)) <= AS_GOOD or len(folds) < 2:
+        if np.sqrt(square / len(error)) <= AS_GOOD:
             return fitted(counts)
     best = np.square(error).mean(axis=0).argmin()
     return np.tile(np.arange(error.shape[1]) == best, (2, 1)).astype(float)

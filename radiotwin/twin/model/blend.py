@@ -27,6 +27,7 @@ from radiotwin.propagation.laws.base import (
 from radiotwin.propagation.laws.forest import Forest
 from radiotwin.propagation.laws.kriging import RegressionKriging
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
+from radiotwin.twin.model.correlated_shadowing import moving_ends
 
 NAMED, REST = "named", "named_and_rest"
 FORESTS = ("named_and_trees", "named_and_boosting")  # members, learnt of what named effects leave
@@ -49,13 +50,6 @@ def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
     """Return the ratio of standard deviations (n,) at `far_share` (n,), as of `Blend`."""
     near, far = np.square(sd_ratio)
     return np.sqrt((1 - share) * near + share * far)
-
-
-def moving_ends(links: Links, receivers_move: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (n, 3) of the end that moves [m], and the row (n,) of the other end."""
-    if receivers_move:
-        return links.receiver_m, links.device
-    return links.device_m[links.device], links.receiver
 
 
 @dataclass(frozen=True, eq=False)

@@ -245,9 +245,15 @@ def _points(links: Links,
 
     Where two receivers were at one position, their difference shows.
     """
+    position_m, series = moving_ends(links, receivers_move)
+    return series, position_m, links.receiver if receivers_move else None
+
+
+def moving_ends(links: Links, receivers_move: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions (n, 3) of the end that moves [m], and the row (n,) of the other end."""
     if receivers_move:
-        return links.device, links.receiver_m, links.receiver
-    return links.receiver, links.device_m[links.device], None
+        return links.receiver_m, links.device
+    return links.device_m[links.device], links.receiver
 
 
 def receivers_move(links: Links) -> bool:
