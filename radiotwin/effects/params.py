@@ -133,7 +133,8 @@ class Parameter:
     @classmethod
     def normal(cls, value: float, sd: float, unit: str, allowed: Allowed = ANY_VALUE
                ) -> "Parameter":
-        """Return a parameter from an estimate and its standard deviation."""
+        """Return a parameter from an estimate and its standard deviation; angles in one turn."""
+        value = value % allowed.period if np.isfinite(allowed.period) else value
         reach = QUANTILE_90 * sd
         return cls(float(value), float(value - reach), float(value + reach), unit, allowed=allowed)
 
