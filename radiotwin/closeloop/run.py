@@ -27,6 +27,7 @@ from radiotwin.closeloop.crossfit import (
 from radiotwin.closeloop.predict.predictor import CombinedPrediction, combined_prediction
 from radiotwin.closeloop.scan import Anomaly, scan
 from radiotwin.closeloop.scan_limits import Seen, seen_from
+from radiotwin.closeloop.search.anomaly_causes import add_causes_of_anomalies
 from radiotwin.closeloop.search.causes import add_causes
 from radiotwin.closeloop.search.declared import add_declared
 from radiotwin.closeloop.search.faults import add_changes, add_faults, drop_idle_faults
@@ -69,7 +70,6 @@ class Loop(Summarised):
         explained: base and named effects, without trends and interpolation of the rest.
         found: base and effects, and the log of all trials.
         criteria: thresholds that decided.
-        anomalies: groups of links that stand out in the held-out residual of `before`.
         dependences_before, dependences_after: of the held-out residual.
         seed: of the folds, and of the draws in `prediction`.
         noise_floor_db: from links measured twice at one position; NaN where there are none.
@@ -83,7 +83,6 @@ class Loop(Summarised):
     explained: CrossFit
     found: SearchState
     criteria: SelectionCriteria
-    anomalies: list[Anomaly]
     dependences_before: list[ResidualDependence]
     dependences_after: list[ResidualDependence]
     seed: int
@@ -112,6 +111,11 @@ class Loop(Summarised):
     def remaining(self) -> list[ResidualDependence]:
         """Dependences that are left."""
         return significant(self.dependences_after, self.criteria)
+
+    @property
+    def anomalies(self) -> tuple[Anomaly, ...]:
+        """Groups of links that stand out in the held-out residual of `before`, with causes."""
+        return self.found.anomalies
 
     @property
     def verdict(self) -> str:
@@ -230,9 +234,10 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
                           executor or Executor(), on_progress)
     declared = search(SearchState(models[best]), [add_declared], inputs)
     on_progress("looking at the residual")
-    anomalies = scan(declared.model)
+    declared = replace(declared, anomalies=tuple(scan(declared.model)))
     before = after = dependences(declared.model, seed)
-    found = search(declared, [add_faults, add_changes, add_causes, drop_idle_faults], inputs)
+    found = search(declared, [add_causes_of_anomalies, add_faults, add_changes, add_causes,
+                              drop_idle_faults], inputs)
     on_progress("unknown devices again, beside the effects")
     anew = make_bases(scene, seed)[best]  # which remembers no earlier position
     explained = relocate_devices(found.model, links, anew)
@@ -242,5 +247,5 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     left = [each.variable for each in significant(after, criteria)]
     found = search(replace(found, model=explained),
                    [partial(add_trends, variables=left), add_shadowing] if left else [], inputs)
-    return Loop(best, links, folds, declared.model, explained, found, criteria, anomalies, before,
-                after, seed, noise_floor_db(all_links, criteria), measurements.origin)
+    return Loop(best, links, folds, declared.model, explained, found, criteria, before, after, seed,
+                noise_floor_db(all_links, criteria), measurements.origin)

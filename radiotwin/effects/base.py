@@ -17,7 +17,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
@@ -146,6 +146,8 @@ class Effect(ABC):
             device's name.
         parameter_labels: printed names of reported parameters (without the member), where those
             made from their own names do not do.
+        acts_on: families of groups (`radiotwin.closeloop.scan`) that it may be the cause of.
+        of_groups: whether it is looked for only where a group stands out.
         calibrated_like: name of the effect whose calibration it takes where it has none of its own,
             because it has not been traced; "" = it is judged as effects are on the whole.
         params: of one that was found, an instance of `Params`; the catalogue's own have none.
@@ -174,6 +176,8 @@ class Effect(ABC):
     needs_map: ClassVar[bool] = False
     settled_by: ClassVar[str] = ""
     parameter_labels: ClassVar[Mapping[str, str]] = {}
+    acts_on: ClassVar[tuple[str, ...]] = ()
+    of_groups: ClassVar[bool] = False
     calibrated_like: ClassVar[str] = ""
 
     params: EffectParams
@@ -477,6 +481,7 @@ class ResidualView:
         mean_db: (n,) predicted level [dB].
         level_at: the channel's levels of other links, such as with devices elsewhere.
         found: the effects so far.
+        group: (n,) bool, links that read otherwise than their peers; None: any may.
     """
 
     links: Links
@@ -485,6 +490,27 @@ class ResidualView:
     mean_db: np.ndarray
     level_at: LevelAt
     found: tuple[Effect, ...] = ()
+    group: np.ndarray | None = None
+
+    def of_group(self, group: np.ndarray) -> ResidualView:
+        """Return the view with a residual only where the cause of a group (n,) may act.
+
+        That is on all links of the device, the receiver or the flight that the group has in common;
+        all others are the reference. Everywhere, where it has none of them in common.
+        """
+        links = self.links
+        ends = [label == label[group][0] for label in (links.device, links.receiver)
+                if (label[group] == label[group][0]).all()]
+        if not ends and (links.flight[group] == links.flight[group][0]).all():
+            ends = [links.flight == links.flight[group][0]]
+        may_act = np.all(ends, axis=0) if ends else np.ones(len(links), dtype=bool)
+        found = replace(self, residual_db=np.where(may_act, self.residual_db, 0.0), group=group)
+        vars(found)["design_effect"] = self.design_effect
+        return found
+
+    def in_group(self, label: np.ndarray) -> list[int]:
+        """Return the labels (n,) of the group's links, in order; all labels without a group."""
+        return np.unique(label if self.group is None else label[self.group]).tolist()
 
     def found_params(self, name: str, parameter: str) -> list[Any]:
         """Return the values of a parameter of the effects of that name that were found before."""

@@ -24,6 +24,12 @@ class MovedEnd(GainEffect):
 
     repeatable = True
     always_exact = True  # a map's streets are what shows where it was
+    params: Any
+
+    @override
+    def propose_like(self, view: ResidualView) -> list[Any]:
+        rows = np.isin(np.arange(len(view.links)), self.rows(view.links))
+        return self.propose(view.of_group(rows)) if rows.sum() >= MIN_LINKS else []
 
     @abstractmethod
     def rows(self, links: Links) -> np.ndarray:

@@ -23,7 +23,11 @@ from radiotwin.effects.catalogue.mapped_vegetation import MappedVegetation
 from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
 from radiotwin.effects.catalogue.noise_floor import NoiseFloor
 from radiotwin.effects.catalogue.path_strength import Diffraction, WallReflection
-from radiotwin.effects.catalogue.position_errors import DevicePositionError, ReceiverPositionError
+from radiotwin.effects.catalogue.position_errors import (
+    DeviceMoved,
+    DevicePositionError,
+    ReceiverPositionError,
+)
 from radiotwin.effects.catalogue.receiver_saturation import ReceiverSaturation
 from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
 from radiotwin.effects.catalogue.roof_heights import RoofHeights
@@ -38,10 +42,10 @@ ENTRY_POINTS = "radiotwin.effects"
 BUILT_IN: tuple[type[Effect], ...] = (
     DeviceGainOffset, ReceiverGainOffset, DeviceDrift, ReceiverDrift, ReceiverSaturation,
     NoiseFloor, DetectionLimit, SectorAntenna, DeclaredSectors, DeclaredSectorsOnPaths,
-    TiltedDipole, BodyShadowing, ExcessAttenuation, DevicePositionError, ReceiverPositionError,
-    ReceiverClockOffset, MissingObstacle, RemovedObstacle, BuildingEntry, Foliage,
-    MappedVegetation, WallReflection, Diffraction, GroundReflection, Interference, LockLoss,
-    FaultyFlight, Episode, RoofHeights, UncertainSight)
+    TiltedDipole, BodyShadowing, ExcessAttenuation, DevicePositionError, DeviceMoved,
+    ReceiverPositionError, ReceiverClockOffset, MissingObstacle, RemovedObstacle, BuildingEntry,
+    Foliage, MappedVegetation, WallReflection, Diffraction, GroundReflection, Interference,
+    LockLoss, FaultyFlight, Episode, RoofHeights, UncertainSight)
 LAST_RESORTS: tuple[type[Effect], ...] = (UnexplainedTrend,)  # no candidates: they fit anything
 
 _registered: list[type[Effect]] = []

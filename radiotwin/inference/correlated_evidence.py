@@ -111,6 +111,17 @@ class CorrelatedEvidence:
         """Return the log marginal likelihood of residuals (n,) at the best variances [nats]."""
         return self.of_rotated(self.rotated(z), self.rotated(columns.values), columns.prior_sd)[0]
 
+    def coefficients(self, z: np.ndarray, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+        """Return the coefficients (q,) of columns at the best variances, and their errors (q,).
+
+        An error is the standard deviation that a coefficient has after the data.
+        """
+        rotated, values = self.rotated(z), self.rotated(columns.values)
+        theta = self.of_rotated(rotated, values, columns.prior_sd)[1]
+        weighted = values.T / (np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum))
+        spread = np.linalg.inv(weighted @ values + np.diag(1.0 / np.square(columns.prior_sd)))
+        return spread @ (weighted @ rotated), np.sqrt(np.diag(spread))
+
     def of_rotated(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
                    start: np.ndarray = START) -> tuple[float, np.ndarray]:
         """Return the same of rotated values (m,), (m, q), and the two variances' logarithms."""

@@ -19,7 +19,7 @@ from radiotwin.closeloop.search.causes import Tried, forward_selection
 from radiotwin.closeloop.search.scoring import score_model
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
 from radiotwin.closeloop.search.trials import Trial, TrialLog
-from radiotwin.closeloop.verdict import posterior
+from radiotwin.closeloop.verdict import intervals, posterior
 from radiotwin.closeloop.verdict.posterior import Step
 from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.links import prepare_links
@@ -115,14 +115,14 @@ def passed(name, nats, step=0, repeatable=False):
 def test_what_may_be_nothing_at_all_is_not_named(open_ground, monkeypatch):
     world = open_ground.fly(3)
     world.gain_db[world.receiver == 1] += 6.0
-    measured = causes.effect_size_db
+    measured = intervals.effect_size_db
 
     def uncertain(model, number):
         size_db = measured(model, number)
         assert size_db.low > 0
         return replace(size_db, low=size_db.value - 20.0, high=size_db.value + 20.0)
 
-    monkeypatch.setattr(causes, "effect_size_db", uncertain)
+    monkeypatch.setattr(intervals, "effect_size_db", uncertain)
     monkeypatch.setattr("radiotwin.closeloop.run.catalogue", lambda: [ReceiverGainOffset, DeviceGainOffset])
     loop = close_loop(open_ground.measured(world), base="log-distance")
     assert loop.verdict != "effect" and not [each for each in loop.after.whole.effects if each.is_cause]

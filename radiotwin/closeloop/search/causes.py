@@ -34,7 +34,7 @@ from radiotwin.closeloop.verdict.criteria import (
     SelectionCriteria,
 )
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses
-from radiotwin.closeloop.verdict.intervals import effect_size_db, why_not_borne_out
+from radiotwin.closeloop.verdict.intervals import why_not_borne_out
 from radiotwin.closeloop.verdict.posterior import judge, probability_of_all
 from radiotwin.effects.base import Effect, LimitEffect
 from radiotwin.effects.registry import catalogue
@@ -62,7 +62,7 @@ class Tried:
 def add_causes(state: SearchState, inputs: SearchInputs) -> SearchState:
     """Add causes that last, the most evident first, until none passes."""
     return forward_selection(state, [effect for effect in inputs.undeclared
-                                     if not effect.within_flights], inputs)
+                                     if not (effect.within_flights or effect.of_groups)], inputs)
 
 
 def forward_selection(state: SearchState, effects: Sequence[Effect],
@@ -176,7 +176,7 @@ def _judged(state: SearchState, tried: list[Tried], hypotheses: Hypotheses,
     found = []
     for each, trial in zip(tried, judged[len(earlier):], strict=True):
         if trial.passed and not trial.reason:
-            trial = replace(trial, reason=why_not_borne_out(effect_size_db(each.model, step)))
+            trial = replace(trial, reason=why_not_borne_out(each.model, step))
         found.append(replace(each, trial=trial))
     steps = (*(each for each in state.steps if each.number < step), summary)
     log = state.log.supersede(*judged[:len(earlier)])
@@ -186,7 +186,7 @@ def _judged(state: SearchState, tried: list[Tried], hypotheses: Hypotheses,
 def _all_borne_out(model: CrossFit, last: int) -> bool:
     """Return whether each of a model's last effects is larger than nothing at all."""
     count = len(model.whole.effects)
-    return not any(why_not_borne_out(effect_size_db(model, number))
+    return not any(why_not_borne_out(model, number)
                    for number in range(count - last, count))
 
 

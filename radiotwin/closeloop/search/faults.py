@@ -44,7 +44,7 @@ from radiotwin.closeloop.verdict.criteria import (
     MIN_SHARED,
     SelectionCriteria,
 )
-from radiotwin.closeloop.verdict.intervals import effect_size_db, why_not_borne_out
+from radiotwin.closeloop.verdict.intervals import why_not_borne_out
 from radiotwin.closeloop.verdict.posterior import judge
 from radiotwin.effects.base import DetectionEffect, Effect
 from radiotwin.links import Links
@@ -78,7 +78,7 @@ def _with_one_kind(state: SearchState, effect: Effect, inputs: SearchInputs) -> 
         trial, extended = score_candidate(model, candidate, 1, inputs)
         if extended is None:
             return state.refuse(trial)
-        why = why_not_borne_out(effect_size_db(extended, state.step))
+        why = why_not_borne_out(extended, state.step)
         if why:
             return state.refuse(trial.refuse(why, passed=False))
         model = extended
@@ -164,11 +164,11 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
                 trial = replace(trial, evidence_nats=candidate.evidence)
                 trial = judge([trial], model, hypotheses, criteria)[0][0]
                 if not trial.reason:
-                    why = why_not_borne_out(effect_size_db(extended, step))
+                    why = why_not_borne_out(extended, step)
                     trial = replace(trial, passed=not why, reason=why)
                 if not trial.reason:
                     model = extended
-                    state = state.keep(trial, _adopted(state.model, candidate))
+                    state = state.keep(trial, adopted(state.model, candidate))
                     break
             refused.append(trial)
         else:
@@ -269,12 +269,12 @@ def _within_flights(links: Links, seed: int) -> Folds:
     return make_folds(links, seed, "device" if by_device and not devices_move(links) else "block")
 
 
-def _adopted(model: CrossFit, candidate: Candidate) -> CrossFit:
+def adopted(model: CrossFit, candidate: Candidate) -> CrossFit:
     """Return a model with the effect; a fold has it as far as its own training links show it."""
     found = candidate.whole.effects[-1]
 
-    def adopted(fold: Fit) -> Fit:
+    def of_fold(fold: Fit) -> Fit:
         own = found.propose_like(fold.view)
         return fold.with_effects([*fold.effects, found.with_params(own[0])]) if own else fold
 
-    return model.extended(candidate.whole, [adopted(fold) for fold in model.folds])
+    return model.extended(candidate.whole, [of_fold(fold) for fold in model.folds])

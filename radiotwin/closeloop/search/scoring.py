@@ -68,7 +68,8 @@ class Candidate:
 
 
 def fit_candidate(model: CrossFit, effect: Effect, criteria: SelectionCriteria,
-                  hypotheses: Hypotheses | None = None) -> Candidate | Trial:
+                  hypotheses: Hypotheses | None = None, group: np.ndarray | None = None,
+                  min_gain: float = 0.0) -> Candidate | Trial:
     """Fit a candidate to all links; return a trial with the reason if that refuses it already.
 
     Args:
@@ -76,9 +77,11 @@ def fit_candidate(model: CrossFit, effect: Effect, criteria: SelectionCriteria,
         effect: that is tried.
         criteria: that decide.
         hypotheses: about what the model lacks; None: not to be looked at.
+        group: (m,) bool, training links that it is to explain; None: any.
+        min_gain: nats with quick levels, below which no paths are followed for it.
     """
     refused = Trial(effect.name, step=len(model.whole.effects), variant=effect.variant)
-    whole = add_effect(model.whole, effect)
+    whole = add_effect(model.whole, effect, group=group)
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
     links, city = model.links.select(model.whole.usable), model.whole.model.corrected_map
@@ -87,7 +90,8 @@ def fit_candidate(model: CrossFit, effect: Effect, criteria: SelectionCriteria,
     why = whole.effects[-1].contradicted(links)
     if why:
         return replace(refused, reason=why)
-    whole = along_paths(whole, model.whole)
+    if model.whole.objective - whole.objective >= min_gain:
+        whole = along_paths(whole, model.whole)
     found = whole.effects[-1]
     why = found.implausible(whole.coefficients_of(-1)) or found.contradicted(links)
     if why:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 from radiotwin.closeloop.crossfit import Base, CrossFit, Folds
+from radiotwin.closeloop.scan import Anomaly
 from radiotwin.closeloop.search.trials import Trial, TrialLog
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses
@@ -55,6 +56,7 @@ class SearchState:
             of effects beside another (pairs, more of a kind) only those kept.
         steps: what the residual says before each named effect; the last is of what is left.
         looked_at: the model that was looked at last, and the hypotheses about what it lacks.
+        anomalies: groups of links that stand out in the residual of the base, with their causes.
         notes: what was found about effects that are declared, a sentence each.
     """
 
@@ -62,6 +64,7 @@ class SearchState:
     log: TrialLog = field(default_factory=TrialLog)
     steps: tuple[Step, ...] = ()
     looked_at: tuple[CrossFit, Hypotheses] | None = None
+    anomalies: tuple[Anomaly, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property

@@ -1,7 +1,11 @@
 """Competing explanations of a residual: nuisances of the base, unnamed and named causes.
 
-Nuisances are always there: a level and a slope of each class of line of sight, small errors of each
-device, receiver and flight, and a field over positions (`radiotwin.inference.correlated_evidence`).
+Nuisances are always there: a level and a slope of each class of line of sight, tolerances of
+devices, receivers and flights, and a field over positions (`radiotwin.inference`). How far ends of
+a kind usually differ is estimated from most of them, so that the few that are off further are not
+within the tolerance of the others (empirical Bayes; Efron 2008, 'Microarrays, empirical Bayes and
+the two-groups model', Stat. Sci. 23).
+
 Causes without a name are curves over each variable, for all links, each receiver or each device:
 what one of them explains better than any named effect is not in the catalogue.
 """
@@ -9,14 +13,15 @@ what one of them explains better than any named effect is not in the catalogue.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import comb, log
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import logsumexp
 
-from radiotwin.effects.arrays import curve_columns, one_hot
+from radiotwin.effects.arrays import MAD_SD, curve_columns, one_hot, robust_sd
 from radiotwin.effects.base import Effect
 from radiotwin.effects.params import NEAR_SHARE
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
@@ -27,7 +32,9 @@ from radiotwin.twin.model.model import Fit
 MAX_Z = 3.0  # an outlier counts as this many scales from its neighbours
 NEIGHBOURS = 9
 LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # of a class of line of sight, at 100 m and per decade
-DEVICE_SD_DB, RECEIVER_SD_DB, FLIGHT_SD_DB = 1.0, 0.3, 0.3  # within tolerances: no effect
+# Usual spread of the levels of a kind of ends before any is seen, and how many ends it counts for.
+SPREAD_DB, SPREAD_ENDS = 0.5, 4
+ANY_LEVEL_DB = 10.0  # prior standard deviation of a level whose spread is not known yet
 MAX_ENDS = 40  # devices or receivers that have terms of their own
 CURVE_KNOTS, NUISANCE_SD_DB = 6, 2.0  # of the base's errors over its prediction and elevation
 KNOTS = 8  # of a curve over a variable
@@ -72,7 +79,7 @@ class Hypotheses:
         """
         training = fit.model.training
         links, predicted = fit.links.select(fit.train), training.predict(fit)
-        nuisance = _nuisance(links, predicted.mean_db)
+        nuisance, families = _nuisance(links, predicted.mean_db)
         nuisance = Columns(nuisance.values / predicted.scale_db[:, None], nuisance.prior_sd)
         residual_db = training.residual_db(fit)
         # A blank that was to be expected says nothing.
@@ -81,9 +88,10 @@ class Hypotheses:
         moving = receivers_move(links)
         series = links.device if moving else links.receiver
         position_m = links.receiver_m if moving else links.device_m[links.device]
-        near = _neighbours(series, position_m, np.isfinite(residual_db))
+        near = _neighbours(series, links.track, position_m, np.isfinite(residual_db))
         z = _tamed(residual_db / predicted.scale_db, near)
         evidence = CorrelatedEvidence.fit(series, position_m, z, nuisance, seed)
+        nuisance = _with_usual_spreads(evidence, z, nuisance, families)
         return cls(evidence, links, predicted.scale_db, nuisance, z, predicted.mean_db,
                    fit.coefficients, near)
 
@@ -102,9 +110,20 @@ class Hypotheses:
         noise_db = np.exp(0.5 * theta[0]) * float(np.median(self.scale_db))
         return noise_db * np.exp(0.5 * theta[1]), noise_db
 
-    def gain_nats(self, z: np.ndarray, columns: Columns) -> float:
-        """Return how much likelier residuals z (n,) with columns are than those of the model."""
+    def gain_nats(self, z: np.ndarray, columns: Columns,
+                  widening: np.ndarray | None = None) -> float:
+        """Return how much likelier residuals are with columns than those of the model.
+
+        Args:
+            z: (n,) residuals with the effect [its error scales].
+            columns: likewise.
+            widening: (n,) error scales with the effect over those without; None: the same.
+        """
         nuisance, base, theta = self._rotated
+        if widening is not None:
+            nuisance = self.evidence.rotated(self.nuisance.values / widening[:, None])
+            widened = np.log(widening[self.evidence.rows])
+            base += widened.sum() + 0.5 * np.log(max(np.count_nonzero(widened), 1))
         both = np.hstack([nuisance, self.evidence.rotated(columns.values)])
         sd = np.concatenate([self.nuisance.prior_sd, columns.prior_sd])
         return self.evidence.of_rotated(self.evidence.rotated(z), both, sd, theta)[0] - base
@@ -131,21 +150,23 @@ class Hypotheses:
         """
         effect, own = fit.effects[-1], fit.coefficients_of(-1)
         term = fit.model.terms[-1].select(fit.train)
-        if term.random_effect_sd_db is not None and effect.within_flights:
-            return np.nan  # it makes errors larger, which levels alone do not show
-        z = _tamed(fit.model.training.residual_db(fit) / self.scale_db, self.near)
+        scale_db, widening = self.scale_db, None
+        if term.random_effect_sd_db is not None:  # an effect that makes errors larger
+            scale_db = np.hypot(scale_db, term.random_effect_sd_db)
+            widening = scale_db / self.scale_db
+        z = _tamed(fit.model.training.residual_db(fit) / scale_db, self.near)
         # What its columns brought, and what levels gave way for it, is integrated over again.
         shown_db = term.columns @ own
         levels = fit.model.level_columns[fit.train]
         p = levels.shape[1]
         shown_db += levels @ (fit.coefficients[:p] - self.coefficients[:p])
-        z += shown_db / self.scale_db
-        columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
+        z += shown_db / scale_db
+        columns = Columns(term.columns / scale_db[:, None], term.prior_sd_db)
         if effect.sparse:
             return self._of_few(z, columns, own)
         slopes = _slopes(fit)
         return self.gain_nats(z, columns.beside(
-            Columns(slopes.values / self.scale_db[:, None], slopes.prior_sd)))
+            Columns(slopes.values / scale_db[:, None], slopes.prior_sd)), widening)
 
     def _of_few(self, z: np.ndarray, columns: Columns, coefficients: np.ndarray) -> float:
         """Return the evidence for the likeliest few of columns, largest coefficients (q,) first.
@@ -161,6 +182,19 @@ class Hypotheses:
             found.append(self.gain_nats(z, few) - log(comb(q, count)) - log(q))
         return max(found)
 
+    def of_group(self, group: np.ndarray) -> float:
+        """Return the evidence for a cause without a name that acts on a group of links (n,) only.
+
+        It is a curve over any one variable, which is as probable as any other.
+        """
+        found = []
+        for value, knots, is_angle in self._variables().values():
+            basis = curve_columns(np.where(group, value, np.nan), knots, is_angle)
+            columns = Columns(basis / self.scale_db[:, None],
+                              np.full(basis.shape[1], CURVE_SD_DB))
+            found.append(self.gain_nats(self.base_z, columns))
+        return float(logsumexp(found)) - log(len(found))
+
     @cached_property
     def unnamed_nats(self) -> dict[str, float]:
         """Evidence for a cause without a name over each variable [nats]."""
@@ -171,6 +205,22 @@ class Hypotheses:
             found[name] = self.gain_nats(self.base_z, columns)
         return found
 
+    def _variables(self) -> dict[str, tuple[np.ndarray, int, bool]]:
+        """Return values (n,), number of knots, and whether it is an angle, of each variable."""
+        links = self.links
+        variables = {
+            "time": (links.time_s, TIME_KNOTS, False),
+            "time in flight": (links.time_in_flight_s, KNOTS, False),
+            "azimuth": (links.azimuth_deg, KNOTS, True),
+            "elevation": (links.elevation_deg, KNOTS, False),
+            "body azimuth": (links.body_azimuth_deg, KNOTS, True),
+            "distance": (links.distance_m, KNOTS, False),
+            "predicted level": (self.mean_db, KNOTS, False),
+            "altitude": (links.receiver_m[:, 2], KNOTS, False)}
+        return {name: each for name, each in variables.items()
+                if (known := np.isfinite(each[0])).mean() >= 0.5
+                and len(np.unique(each[0][known])) >= KNOTS}  # else it is a label
+
     def _curves(self) -> Iterator[tuple[str, np.ndarray]]:
         links = self.links
         ends = {"": None, "receiver": links.receiver, "device": links.device}
@@ -180,16 +230,8 @@ class Hypotheses:
                 pairs = label * (links.flight.max() + 1) + links.flight
                 if len(np.unique(pairs)) > len(np.unique(label)):
                     yield f"flight, {name}", one_hot(pairs, np.unique(pairs).tolist())
-        variables = {
-            "time": (links.time_s, TIME_KNOTS), "time in flight": (links.time_in_flight_s, KNOTS),
-            "azimuth": (links.azimuth_deg, KNOTS), "elevation": (links.elevation_deg, KNOTS),
-            "body azimuth": (links.body_azimuth_deg, KNOTS), "distance": (links.distance_m, KNOTS),
-            "predicted level": (self.mean_db, KNOTS), "altitude": (links.receiver_m[:, 2], KNOTS)}
-        for variable, (value, knots) in variables.items():
-            known = np.isfinite(value)
-            if known.mean() < 0.5 or len(np.unique(value[known])) < KNOTS:  # a label, then
-                continue
-            basis = curve_columns(value, knots, variable in ("azimuth", "body azimuth"))
+        for variable, (value, knots, is_angle) in self._variables().items():
+            basis = curve_columns(value, knots, is_angle)
             for name, label in ends.items():
                 members = [None] if label is None else np.unique(label).tolist()
                 if label is not None and len(members) < 2:
@@ -224,48 +266,77 @@ def _slopes(fit: Fit) -> Columns:
     return Columns(np.column_stack(slopes_db), width / np.sqrt(12.0))
 
 
-def _neighbours(series: np.ndarray, position_m: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return rows (n, `NEIGHBOURS`) that are known and nearest to each, of the same series."""
+def _neighbours(series: np.ndarray, track: np.ndarray, position_m: np.ndarray,
+                known: np.ndarray) -> np.ndarray:
+    """Return rows (n, `NEIGHBOURS`) that are known and nearest to each, of the same series.
+
+    Of the same track (n,) where it has as many: what all links of a flight have in common, be it a
+    scatter, is not measured by other flights.
+    """
     near = np.repeat(np.arange(len(series))[:, None], NEIGHBOURS, axis=1)
-    for label in np.unique(series):
-        mine = np.flatnonzero(series == label)
-        there = mine[known[mine]]
-        if len(there) >= NEIGHBOURS:
-            found = cKDTree(position_m[there]).query(position_m[mine], NEIGHBOURS)[1]
-            near[mine] = there[found]
+    for labels in (series[:, None], np.column_stack([series, track])):
+        member = np.unique(labels, axis=0, return_inverse=True)[1].ravel()
+        order = np.argsort(member, kind="stable")
+        for own in np.split(order, np.cumsum(np.bincount(member))[:-1]):
+            there = own[known[own]]
+            if len(there) >= NEIGHBOURS:
+                near[own] = there[cKDTree(position_m[there]).query(position_m[own], NEIGHBOURS)[1]]
     return near
 
 
 def _tamed(z: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return residuals (n,) in which a link counts as so far from its neighbours at most.
+    """Return residuals (n,) without outliers: `MAX_Z` scales from its neighbours at most.
 
-    Outliers are single links. What neighbours have in common is none, however large.
+    The scale is their own where they scatter more: an outlier is a single link, and what neighbours
+    have in common, level or scatter, is none.
     """
     common = np.median(z[near], axis=1)
-    return common + np.clip(z - common, -MAX_Z, MAX_Z)
+    most = MAX_Z * np.maximum(MAD_SD * np.median(np.abs(z[near] - common[:, None]), axis=1), 1.0)
+    return common + np.clip(z - common, -most, most)
 
 
-def _nuisance(links: Links, mean_db: np.ndarray) -> Columns:
-    """Return what every base may be wrong in [dB].
+def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[slice]]:
+    """Return what every base may be wrong in [dB], and which columns are of ends of one kind.
 
     Also over its prediction (n,): weak levels are those of ways that it does not follow.
     """
     slope = np.log10(links.distance_m / 100.0)
-    blocks, prior_sd_db = [], []
+    blocks, prior_sd_db, families = [], [], []
     for members in (links.los, ~links.los):
         if members.any():
             blocks += [members[:, None].astype(float), (members * slope)[:, None]]
             prior_sd_db += [LEVEL_SD_DB, SLOPE_SD_DB]
-    for label, sd_db in ((links.device, DEVICE_SD_DB), (links.receiver, RECEIVER_SD_DB),
-                         (links.track, FLIGHT_SD_DB)):
-        members = np.unique(label)
-        if 1 < len(members) <= MAX_ENDS:
-            blocks.append(one_hot(label, members.tolist()))
-            prior_sd_db += [sd_db] * len(members)
     for values in (mean_db, links.elevation_deg):
         blocks.append(curve_columns(values, CURVE_KNOTS, circular=False))
         prior_sd_db += [NUISANCE_SD_DB] * blocks[-1].shape[1]
-    return Columns(np.hstack(blocks), np.array(prior_sd_db))
+    for label in (links.device, links.receiver, links.track):
+        members = np.unique(label)
+        if 1 < len(members) <= MAX_ENDS:
+            blocks.append(one_hot(label, members.tolist()))
+            families.append(slice(len(prior_sd_db), len(prior_sd_db) + len(members)))
+            prior_sd_db += [SPREAD_DB] * len(members)
+    return Columns(np.hstack(blocks), np.array(prior_sd_db)), families
+
+
+def _with_usual_spreads(evidence: CorrelatedEvidence, z: np.ndarray, nuisance: Columns,
+                        families: list[slice]) -> Columns:
+    """Return the nuisance with the spread of most ends of each kind as their prior.
+
+    The levels of ends are estimated beside all else and a wide prior. Half of them are nearer to
+    their median than those that are off, so the robust spread is that of the others; two tell
+    nothing of how much most differ.
+    """
+    for family in families:
+        prior_sd = nuisance.prior_sd.copy()
+        prior_sd[family] = ANY_LEVEL_DB
+        level_db, error_db = evidence.coefficients(z, Columns(nuisance.values, prior_sd))
+        level_db, error_db = level_db[family], error_db[family]
+        freedom = len(level_db) - 2
+        usual = robust_sd(level_db) ** 2 - float(np.median(error_db)) ** 2
+        spread = (SPREAD_ENDS * SPREAD_DB**2 + freedom * max(usual, 0.0)) / (SPREAD_ENDS + freedom)
+        prior_sd[family] = np.sqrt(spread)
+        nuisance = replace(nuisance, prior_sd=prior_sd)
+    return nuisance
 
 
 def is_judged_by_levels(effect: Effect) -> bool:

@@ -150,9 +150,14 @@ def effect_size_db(model: CrossFit, number: int) -> Parameter:
     return replace(size_db, determined=size_db.is_narrow)
 
 
-def why_not_borne_out(size_db: Parameter) -> str:
-    """Return why an effect of this size is not named; "" where there is no reason."""
-    if size_db.low > 0 or np.isnan(size_db.value):
+def why_not_borne_out(model: CrossFit, number: int) -> str:
+    """Return why an effect of a model is not named; "" where there is no reason.
+
+    One that makes readings scatter need not change their level.
+    """
+    size_db = effect_size_db(model, number)
+    scatter_sd_db = model.whole.model.terms[number].random_effect_sd_db
+    if size_db.low > 0 or np.isnan(size_db.value) or scatter_sd_db is not None:
         return ""
     return ("links that are held out may show nothing of it: "
             f"{size_db.value:.1f} dB ({size_db.low:.1f} to {size_db.high:.1f})")

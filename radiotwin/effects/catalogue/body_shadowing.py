@@ -60,6 +60,7 @@ class BodyShadowing(BodyFrameEffect):
     """Receivers that lose more on one side."""
 
     name = "body_shadowing"
+    acts_on = ("receiver", "direction")
     variant = "loss around the body"
     in_words = "the body that carries the receiver"
     parameter_labels = {"body_depth_db": "loss through the body",

@@ -74,6 +74,7 @@ class BuildingEntry(GainEffect):
 
     name = "building_entry"
     in_words = "loss into buildings"
+    acts_on = ("receiver", "place")
     parameter_labels = {"entry_loss_db": "building entry loss",
                         "scatter_sd_db": "standard deviation from place to place"}
     needs_map = True

@@ -35,6 +35,7 @@ class ReceiverClockOffset(MovedEnd):
 
     name = "receiver_clock_offset"
     in_words = "a wrong clock of the receiver"
+    acts_on = ("receiver",)
     settled_by = "fly one track forth and back"
     of_receiver = True
     confused_with = ("receiver_position_error", "body_shadowing")

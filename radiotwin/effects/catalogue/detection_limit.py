@@ -24,6 +24,7 @@ class DetectionLimit(LimitEffect):
 
     name = "noise_floor_censoring"
     in_words = "a limit of detection"
+    acts_on = ("receiver", "level")
     parameter_labels = {"limit": "limit of detection"}
     variant = "a receiver's own limit of detection"
     confused_with = ("lock_loss", "missing_obstacle", "receiver_gain_offset")

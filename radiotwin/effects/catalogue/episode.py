@@ -74,6 +74,7 @@ class Episode(GainEffect):
 
     name = "episode"
     in_words = "something that lasted for a while, such as rain"
+    acts_on = ("time", "receiver", "flight", "receiver x flight")
     settled_by = "repeat the flight in dry weather"
     figure = "dependence"
     of_receiver = True

@@ -31,6 +31,7 @@ class ExcessAttenuation(GainEffect):
 
     name = "excess_attenuation"
     in_words = "attenuation along the whole way"
+    acts_on = ("distance",)
     parameter_labels = {"scale_height_m": "scale height (1/e)"}
     settled_by = "measure at much longer distances with line of sight"
     confused_with = ("foliage", "receiver_saturation")

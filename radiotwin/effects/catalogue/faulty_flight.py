@@ -1,4 +1,4 @@
-"""A flight of one receiver whose readings disagree with all others: a loose plug, a wrong set-up.
+"""A flight whose readings disagree with all others: a loose plug, a wrong set-up.
 
 Its readings have an offset, follow the prediction with another slope (0: not at all), and scatter
 more (a random effect beside the error scale). So they no longer corrupt what is learnt of others.
@@ -7,8 +7,9 @@ A flight stands out if its level, compared with other flights at the same places
 among the flights of its receiver, or its scatter or its roughness (the scatter from one reading of
 a device to its next) among all flights: Student's t with the pooled standard deviation of all
 others, corrected for the number of flights and of statistics (Grubbs 1969, 'Procedures for
-detecting outlying observations in samples', Technometrics 11). Maps that are wrong make the scatter
-of flights differ; roughness they hardly change.
+detecting outlying observations in samples', Technometrics 11). Other receivers' readings of the
+same flight are no peers: where all of them are off, the fault is one of the flight. Maps that are
+wrong make the scatter of flights differ; roughness they hardly change.
 """
 
 from collections.abc import Iterator
@@ -55,6 +56,7 @@ MIN_SCATTER_DB = 1e-3
 # median, of 0.78 in one of ten and more; this prior has 0.68 and 1.4, as other worlds are others.
 PRIOR_LEVEL_SD_DB, PRIOR_LOG_SD, PRIOR_FREEDOM = 0.6, (0.35, 0.25), 3
 STATISTICS = 4  # that are tested
+MIN_GROUP = 0.5  # share of a flight's links in a group that stands out, to be one of its flights
 MAX_P_VALUE = 0.02  # corrected for the number of flights
 PRIOR_SD_DB = 15.0
 RELATION_SD = 0.5  # of the slope that is lost or gained
@@ -80,7 +82,7 @@ class _Flight:
 
 
 class FaultyFlight(GainEffect):
-    """One flight of one receiver that disagrees with all others; a step finds the worst."""
+    """One flight that disagrees with all others; a step finds the worst."""
 
     name = "faulty_flight"
     in_words = "a fault of the receiver on that flight"
@@ -89,12 +91,13 @@ class FaultyFlight(GainEffect):
     of_receiver = True
     repeatable = True
     within_flights = True
+    acts_on = ("flight", "receiver x flight")
     confused_with = ("receiver_drift", "episode", "lock_loss")
 
     class Params(EffectParams):
-        """A receiver, one of its flights, and how much more that scatters."""
+        """A flight, of which receiver, and how much more that scatters."""
 
-        receiver: ReceiverIndex = Field(description="Index of the receiver.")
+        receiver: ReceiverIndex | None = Field(description="Index of the receiver; None: all.")
         flight: str = Field(max_length=10_000, description="Name of the flight.")
         centre_db: Decibels = Field(description="Predicted level at which the offset holds [dB].")
         noise_sd_db: float = quantity(
@@ -117,17 +120,27 @@ class FaultyFlight(GainEffect):
         known = list(zip(view.found_params(self.name, "receiver"),
                          view.found_params(self.name, "flight"), strict=True))
         flights = _flights(view)
-        found = []
+        found: dict[int, list[tuple[float, float, _Flight]]] = {}
         for each in flights:
             name = str(view.links.flight_names[each.flight])
-            if (each.receiver, name) in known:
+            if (each.receiver, name) in known or (None, name) in known:
                 continue
             p_value, scatter_db = _disagreement(each, flights, view.links)
-            if p_value * len(flights) <= MAX_P_VALUE:
-                centre_db = float(np.median(view.mean_db[each.rows]))
-                found.append((p_value, self.Params(receiver=each.receiver, flight=name,
-                                                   centre_db=centre_db, noise_sd_db=scatter_db)))
-        return [params for _, params in sorted(found, key=lambda each: each[0])[:1]]
+            stands_out = view.group is not None and view.group[each.rows].mean() > MIN_GROUP
+            if stands_out or (view.group is None and p_value * len(flights) <= MAX_P_VALUE):
+                found.setdefault(each.flight, []).append((p_value, scatter_db, each))
+        if not found:
+            return []
+        worst = min(found.values(), key=lambda faults: min(each[0] for each in faults))
+        receivers = {each.receiver for each in flights if each.flight == worst[0][2].flight}
+        if not 1 < len(receivers) == len(worst):  # not all of them: the worst one
+            worst = [min(worst, key=lambda each: each[0])]
+        rows = np.concatenate([each.rows for _, _, each in worst])
+        return [self.Params(
+            receiver=worst[0][2].receiver if len(worst) == 1 else None,
+            flight=str(view.links.flight_names[worst[0][2].flight]),
+            centre_db=float(np.median(view.mean_db[rows])),
+            noise_sd_db=float(np.median([scatter_db for _, scatter_db, _ in worst])))]
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
@@ -158,7 +171,9 @@ class FaultyFlight(GainEffect):
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
-        member = f"[{links.receiver_names[self.params.receiver]}, flight {self.params.flight}]"
+        receiver = self.params.receiver
+        who = "all" if receiver is None else links.receiver_names[receiver]
+        member = f"[{who}, flight {self.params.flight}]"
         offset_db, slope = estimate.coefficients
         offset_sd_db, slope_sd = estimate.coefficients_sd
         noise = Parameter.normal(self.params.noise_sd_db, estimate.params_sd[0], "dB")
@@ -226,7 +241,7 @@ def _from_reading_to_reading_db(residual_db: np.ndarray, links: Links) -> np.nda
 
 def _disagreement(flight: _Flight, flights: list[_Flight], links: Links) -> tuple[float, float]:
     """Return the p-value of a flight's disagreement, and the scatter that it adds [dB]."""
-    others = [each for each in flights if each is not flight]
+    others = [each for each in flights if each.flight != flight.flight]
     noisy = [_excess(own, np.array([each.log_scatters[kind] for each in others]), prior_sd)
              for kind, (own, prior_sd) in enumerate(zip(flight.log_scatters, PRIOR_LOG_SD,
                                                         strict=True))]

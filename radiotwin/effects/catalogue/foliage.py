@@ -58,6 +58,7 @@ class Foliage(GainEffect):
 
     name = "foliage"
     in_words = "vegetation"
+    acts_on = ("device", "device x receiver", "direction", "place")
     settled_by = "fly low on both sides of the suspected place"
     figure = "links"
     repeatable = True

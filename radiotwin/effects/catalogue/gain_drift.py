@@ -214,6 +214,7 @@ class ReceiverDrift(_GainDrift):
 
     name = "receiver_drift"
     in_words = "gain of the receiver that changes with time"
+    acts_on = ("receiver", "receiver x flight", "time")
     settled_by = "return to the same places at other times"
     of_receiver = True
     confused_with = ("receiver_gain_offset", "interference")
@@ -234,6 +235,7 @@ class DeviceDrift(_GainDrift):
 
     name = "device_drift"
     in_words = "power of the device that changes with time"
+    acts_on = ("device", "device x flight", "time")
     settled_by = "return to the same places at other times"
     confused_with = ("device_gain_offset", "device_position_error")
     forms = ("ageing", "step")

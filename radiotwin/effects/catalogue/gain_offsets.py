@@ -67,6 +67,17 @@ class _GainOffset(GainEffect):
         members = frequent_labels(index, MIN_LINKS)
         if len(members) < 2:  # a fold may have fewer than all links
             return []
+        return self._of_members(view, sorted(set(members) & set(view.in_group(index))))
+
+    @override
+    def propose_like(self, view: ResidualView) -> list[Params]:
+        members = frequent_labels(self._index(view.links), MIN_LINKS)
+        return self._of_members(view, sorted(set(members) & set(self.params.members)))
+
+    def _of_members(self, view: ResidualView, members: list[int]) -> list[Params]:
+        index = self._index(view.links)
+        if not members:
+            return []
         offsets_db = [np.average(view.residual_db[index == member],
                                  weights=view.weight[index == member]) for member in members]
         return [self.Params(members=members, offsets_sd_db=float(np.std(offsets_db)))]
@@ -94,7 +105,7 @@ class _GainOffset(GainEffect):
 
     @override
     def implausible(self, coefficients: np.ndarray) -> str | None:
-        largest_db = np.abs(coefficients - np.median(coefficients)).max()
+        largest_db = np.abs(_relative_db(coefficients)).max()
         if largest_db < MIN_OFFSET_DB:
             return (f"none of them is off by more than {largest_db:.1f} dB, which is within any "
                     "instrument's tolerance")
@@ -105,7 +116,9 @@ class _GainOffset(GainEffect):
         # Relative to the median member: a common offset is the channel's intercept.
         order = np.argsort(estimate.coefficients)
         median = order[len(order) // 2]
-        contrast = np.eye(len(order)) - np.eye(len(order))[median]
+        contrast = np.eye(len(order))
+        if len(order) > 1:
+            contrast -= contrast[median].copy()
         sd_db, names = estimate.sd_of(contrast), getattr(links, f"{self.end}_names")
         return {f"offset_db[{names[member]}]": Parameter.normal(value_db, each_sd_db, "dB")
                 for member, value_db, each_sd_db in zip(
@@ -120,6 +133,7 @@ class DeviceGainOffset(_GainOffset):
     settled_by = "measure the device's power next to it, with line of sight"
     of_device = True
     end = "device"
+    acts_on = ("device",)
     confused_with = ("antenna_pattern", "device_position_error")
 
     class Params(_GainOffset.Params):
@@ -138,6 +152,7 @@ class ReceiverGainOffset(_GainOffset):
     settled_by = "let the receivers measure side by side"
     end = "receiver"
     of_receiver = True
+    acts_on = ("receiver",)
     confused_with = ("receiver_drift", "antenna_pattern")
 
     class Params(_GainOffset.Params):
@@ -149,5 +164,9 @@ class ReceiverGainOffset(_GainOffset):
 
     @override
     def reading_offsets_db(self, coefficients: np.ndarray) -> dict[int, float]:
-        off_db = coefficients - np.median(coefficients)
-        return dict(zip(self.params.members, off_db.tolist(), strict=True))
+        return dict(zip(self.params.members, _relative_db(coefficients).tolist(), strict=True))
+
+
+def _relative_db(coefficients: np.ndarray) -> np.ndarray:
+    """Return offsets (q,) relative to their median; one by itself is relative to all others."""
+    return coefficients - np.median(coefficients) if len(coefficients) > 1 else coefficients

@@ -52,6 +52,7 @@ class GroundReflection(GainEffect):
 
     name = "ground_reflection"
     in_words = "reflection off the ground"
+    acts_on = ("distance", "direction")
     parameter_labels = {"roughness_m": "ground roughness", "ground_m": "ground height"}
     settled_by = "vary the height over open ground"
     confused_with = ("antenna_pattern", "wall_reflection")

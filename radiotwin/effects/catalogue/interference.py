@@ -46,6 +46,7 @@ class Interference(ReceiverEffect):
 
     name = "interference"
     in_words = "an emitter beside the devices"
+    acts_on = ("receiver", "device x receiver", "place", "level")
     parameter_labels = {"over_a_device_db": "power over a device's"}
     settled_by = "listen with the devices switched off"
     figure = "links"

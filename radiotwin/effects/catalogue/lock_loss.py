@@ -168,6 +168,7 @@ class LockLoss(DetectionEffect):
 
     name = "lock_loss"
     in_words = "loss of lock"
+    acts_on = ("receiver", "flight", "receiver x flight", "time")
     parameter_labels = {"lost_share": "share lost", "drop_db": "level without lock, lower by"}
     confused_with = ("missing_obstacle", "noise_floor_censoring", "episode", "faulty_flight")
 

@@ -78,6 +78,7 @@ class MissingObstacle(GainEffect):
 
     name = "missing_obstacle"
     in_words = "a building that the map lacks"
+    acts_on = ("device", "device x receiver", "direction", "place")
     settled_by = "fly low on both sides of the suspected place"
     figure = "links"
     repeatable = True

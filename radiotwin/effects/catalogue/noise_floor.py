@@ -39,6 +39,7 @@ class NoiseFloor(ReceiverEffect):
 
     name = "noise_floor_censoring"
     in_words = "a limit of detection"
+    acts_on = ("receiver", "level")
     parameter_labels = {"floor": "noise floor"}
     confused_with = ("interference", "excess_attenuation")
     nlos_only = True  # as good as: over a map, links with line of sight are far above a floor

@@ -1,4 +1,4 @@
-"""Ends of links that are not at their declared positions: an anchor, or a receiver.
+"""Ends of links that are not at their declared positions.
 
 No law of its own: the channel predicts again with the end elsewhere, lines of sight included.
 """
@@ -11,9 +11,9 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import ResidualView
-from radiotwin.effects.moves import MAX_ENDS, MIN_LINKS, MovedEnd
+from radiotwin.effects.moves import MAX_ENDS, MAX_PROPOSE_LINKS, MIN_LINKS, MIN_NATS, MovedEnd
 from radiotwin.effects.params import (
     Allowed,
     DeviceIndex,
@@ -22,6 +22,7 @@ from radiotwin.effects.params import (
     Metres,
     Parameter,
     ReceiverIndex,
+    Unique,
     Variation,
 )
 from radiotwin.effects.patterns import Pattern, members
@@ -76,8 +77,9 @@ class DevicePositionError(_PositionError):
     in_words = "a wrong position of the device"
     settled_by = "fly past the device on two sides, close by, or survey it again"
     step_m, max_move_m = 6.0, MAX_MOVE_M
+    acts_on = ("device", "device x receiver", "direction")
     confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern",
-                     "device_gain_offset")
+                     "device_gain_offset", "device_moved")
 
     class Params(EffectParams):
         """An anchor and its move."""
@@ -101,14 +103,13 @@ class DevicePositionError(_PositionError):
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links = view.links
-        moves = [(float(radius * np.sin(angle)), float(radius * np.cos(angle)))
-                 for radius in RADII_M
-                 for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
         known = {other for device in view.found_params(self.name, "device")
                  for other in site_of(links, device)}
-        masts = {min(site_of(links, device)) for device in _movable_anchors(links)}
-        return self.best_move(view, ([self.Params(device=device, move_m=move_m) for move_m in moves]
-                                     for device in sorted(masts - known)))
+        masts = {min(site_of(links, device)) for device in _movable_anchors(links)
+                 if device in view.in_group(links.device)}
+        return self.best_move(view, (
+            [self.Params(device=device, move_m=move_m) for move_m in _moves_around_m()]
+            for device in sorted(masts - known)))
 
     @override
     def rows(self, links: Links) -> np.ndarray:
@@ -154,6 +155,102 @@ class DevicePositionError(_PositionError):
                                                    estimate.params_sd, strict=True)}
 
 
+class DeviceMoved(_PositionError):
+    """An anchor that was elsewhere from one flight on, or up to one."""
+
+    name = "device_moved"
+    in_words = "a device that was moved between flights"
+    settled_by = "survey the device's position before and after each flight"
+    step_m, max_move_m = 6.0, MAX_MOVE_M
+    of_groups = True
+    acts_on = ("device", "device x flight", "device x receiver", "time")
+    confused_with = ("device_position_error", "device_drift", "faulty_flight")
+
+    class Params(EffectParams):
+        """An anchor, its move, and when."""
+
+        device: DeviceIndex = Field(description="Index of the anchor.")
+        flights: Unique[str] = Field(description="Names of the flights on which it was elsewhere.")
+        move_m: tuple[Metres, Metres] = Field(
+            description="True minus declared position on these flights, east and north [m].")
+
+    params: Params
+
+    @override
+    def unavailable(self, links: Links) -> str | None:
+        if not _movable_anchors(links):
+            return f"no anchor has {MIN_LINKS} links"
+        return None if len(np.unique(links.flight)) > 1 else "there is one flight"
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        if view.group is None:
+            return []
+        found = [self._best_of(view, device) for device in view.in_group(links.device)
+                 if device in _movable_anchors(links)]
+        return [params for nats, params in sorted(found, key=lambda each: -each[0])
+                if nats > MIN_NATS][:1]
+
+    @override
+    def propose_like(self, view: ResidualView) -> list[Params]:
+        return [self.params] if len(self.rows(view.links)) else []
+
+    def _best_of(self, view: ResidualView, device: int) -> tuple[float, Params]:
+        """Return the move of a device that gains most from one flight on, or up to one [nats]."""
+        links = view.links
+        every = np.flatnonzero(links.device == device)
+        rows = subsample(every, MAX_PROPOSE_LINKS)
+        device_links = links.select(rows)
+        flights = in_order_of_time(device_links)
+        place = np.array([flights.index(each) for each in device_links.flight.tolist()])
+        before_db = view.level_at(device_links)
+        best: tuple[float, int, bool, tuple[float, float]] = (-np.inf, 0, False, (0.0, 0.0))
+        for move_m in _moves_around_m():
+            device_m = links.device_m.copy()
+            device_m[device, :2] += move_m
+            change_db = view.level_at(device_links.with_devices(device_m)) - before_db
+            nats = np.bincount(place, weights=view.gain_nats(rows, change_db),
+                               minlength=len(flights))
+            up_to = np.cumsum(nats)
+            for first in range(1, len(flights)):
+                for total, is_before in ((up_to[-1] - up_to[first - 1], False),
+                                         (up_to[first - 1], True)):
+                    best = max(best, (float(total), first, is_before, move_m))
+        total, first, is_before, move_m = best
+        moved = flights[:first] if is_before else flights[first:]
+        names = [str(links.flight_names[each]) for each in moved]
+        return total * len(every) / len(rows), self.Params(
+            device=device, flights=names or [str(links.flight_names[flights[0]])], move_m=move_m)
+
+    @override
+    def rows(self, links: Links) -> np.ndarray:
+        named = [number for number, name in enumerate(links.flight_names)
+                 if str(name) in self.params.flights]
+        return np.flatnonzero((links.device == self.params.device)
+                              & np.isin(links.flight, named))
+
+    @override
+    def moved(self, links: Links) -> Links:
+        device_m = links.device_m.copy()
+        device_m[self.params.device, :2] += self.params.move_m
+        return links.with_devices(device_m)
+
+    @override
+    def is_on_maps(self) -> bool:
+        return False
+
+    @override
+    def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
+        given_m, flights = links.device_m[self.params.device, :2], self.params.flights
+        name = links.device_names[self.params.device]
+        when = flights[0] if len(flights) == 1 else f"{flights[0]} to {flights[-1]}"
+        return {f"{axis}_m[{name}, {when}]": Parameter.normal(
+                    old_m + move_m, sd, "m", Allowed(old_m - MAX_MOVE_M, old_m + MAX_MOVE_M))
+                for axis, old_m, move_m, sd in zip("xy", given_m, self.params.move_m,
+                                                   estimate.params_sd, strict=True)}
+
+
 class ReceiverPositionError(_PositionError):
     """A constant error of all positions of a receiver; one step finds one receiver, the worst."""
 
@@ -165,6 +262,7 @@ class ReceiverPositionError(_PositionError):
     settled_by = "fly one track forth and back"
     of_receiver = True
     step_m, max_move_m = 3.0, MAX_RECEIVER_MOVE_M
+    acts_on = ("receiver",)
     confused_with = ("receiver_gain_offset",)
 
     class Params(EffectParams):
@@ -188,7 +286,8 @@ class ReceiverPositionError(_PositionError):
         moves = [sign * size_m * np.array(axis) for axis in RECEIVER_AXES
                  for size_m in RECEIVER_MOVES_M for sign in (-1, 1)]
         known = set(view.found_params(self.name, "receiver"))
-        receivers = sorted(set(frequent_labels(view.links.receiver, MIN_LINKS)) - known)
+        receivers = sorted((set(frequent_labels(view.links.receiver, MIN_LINKS)) - known)
+                           & set(view.in_group(view.links.receiver)))
         return self.best_move(view, (
             [self.Params(receiver=receiver, move_m=tuple(move_m.tolist())) for move_m in moves]
             for receiver in receivers))
@@ -208,6 +307,21 @@ class ReceiverPositionError(_PositionError):
         return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(
                     move_m, sd, "m", Allowed(-MAX_RECEIVER_MOVE_M, MAX_RECEIVER_MOVE_M))
                 for axis, move_m, sd in zip("xyz", params.move_m, estimate.params_sd, strict=True)}
+
+
+def _moves_around_m() -> list[tuple[float, float]]:
+    """Return moves of a device that are tried, east and north [m]."""
+    return [(float(radius_m * np.sin(angle)), float(radius_m * np.cos(angle)))
+            for radius_m in RADII_M
+            for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
+
+
+def in_order_of_time(links: Links) -> list[int]:
+    """Return the flights of links in the order in which they were, or else in which they are."""
+    flights = np.unique(links.flight)
+    known = np.isfinite(links.time_s).all() and not links.time_restarts
+    return sorted(flights.tolist(), key=lambda flight: float(
+        links.time_s[links.flight == flight].min()) if known else flight)
 
 
 def _movable_anchors(links: Links) -> list[int]:

@@ -47,6 +47,7 @@ class ReceiverSaturation(ReceiverEffect):
 
     name = "receiver_saturation"
     in_words = "saturation of the receiver"
+    acts_on = ("receiver", "level")
     settled_by = "approach a device with line of sight"
     confused_with = ("antenna_pattern", "excess_attenuation")
 

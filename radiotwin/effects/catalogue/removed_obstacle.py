@@ -47,6 +47,7 @@ class RemovedObstacle(GainEffect):
 
     name = "removed_obstacle"
     in_words = "a building that is gone"
+    acts_on = ("device", "device x receiver", "direction", "place")
     settled_by = "fly low on both sides of the suspected building"
     figure = "links"
     nlos_only = True

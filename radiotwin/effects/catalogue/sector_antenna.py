@@ -34,13 +34,15 @@ class SectorAntenna(SectorEffect):
 
     settled_by = "fly around the device at one distance and one height"
     variant = "sector antenna of a device"
+    acts_on = ("device", "device x receiver", "direction")
     repeatable = True
 
     @override
     def propose(self, view: ResidualView) -> list[SectorEffect.Params]:
         known = {device for devices in view.found_params(self.name, "devices")
                  for device in devices}
-        devices = sorted(set(eligible_devices(view.links)) - known)
+        devices = sorted((set(eligible_devices(view.links)) - known)
+                         & set(view.in_group(view.links.device)))
         ways = {straight: _best_patterns(view, devices, straight)
                 for straight in ([False, True] if view.links.city is not None else [False])}
         straight = max(ways, key=lambda way: max((nats for _, nats in ways[way].values()),

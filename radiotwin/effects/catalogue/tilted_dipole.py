@@ -63,6 +63,7 @@ class TiltedDipole(BodyFrameEffect):
     """A dipole for each receiver that fits better with one."""
 
     name = "antenna_pattern"
+    acts_on = ("receiver", "direction")
     variant = "tilted dipole of a receiver"
     in_words = "tilt of the receiver's antenna"
     parameter_labels = {"lean_azimuth_deg": "azimuth of the tilt, from the heading"}

@@ -173,7 +173,8 @@ def _better(fit: Fit, last: Effect, variation: Variation, numbers: np.ndarray) -
     return better if gain > 0 else fit
 
 
-def add_effect(fit: Fit, effect: Effect, like: Effect | None = None) -> Fit | None:
+def add_effect(fit: Fit, effect: Effect, like: Effect | None = None,
+               group: np.ndarray | None = None) -> Fit | None:
     """Find the best parameters of an effect on the training links, beside the effects there are.
 
     On all links with quick levels, which `along_paths` replaces; on those of a fold with exact ones
@@ -183,11 +184,13 @@ def add_effect(fit: Fit, effect: Effect, like: Effect | None = None) -> Fit | No
         fit: without it.
         effect: what is added.
         like: what was found of it on all links, where the fit is of a fold.
+        group: (m,) bool, training links that it is to explain, see `ResidualView.of_group`.
 
     Returns:
         the fit with the effect; None where nothing in the residual looks like the effect.
     """
-    return kept("effect", (fit, effect, like), lambda: _best_addition(fit, effect, like),
+    inputs = (fit, effect, like) if group is None else (fit, effect, like, group)
+    return kept("effect", inputs, lambda: _best_addition(fit, effect, like, group),
                 _write_addition, _reader(fit.model, effect))
 
 
@@ -272,8 +275,10 @@ def _reader(model: Model, effect: Effect) -> Callable[..., Fit | None]:
     return read
 
 
-def _best_addition(fit: Fit, effect: Effect, like: Effect | None) -> Fit | None:
-    proposals = effect.propose(fit.view) if like is None else like.propose_like(fit.view)
+def _best_addition(fit: Fit, effect: Effect, like: Effect | None,
+                   group: np.ndarray | None = None) -> Fit | None:
+    view = fit.view if group is None else fit.view.of_group(group)
+    proposals = effect.propose(view) if like is None else like.propose_like(view)
     kinds: dict[Any, list[Effect]] = {}
     for params in proposals:
         proposed = effect.with_params(params)

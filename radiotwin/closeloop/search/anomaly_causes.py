@@ -1,0 +1,101 @@
+"""Causes of groups of links that stand out: only effects that act on such groups are tried.
+
+The scan says where; here each effect of the catalogue that may act on a group of that family is
+fitted to it, with all other links as the reference. They are judged once, by their evidence on all
+readings, beside a cause without a name that acts on the same links; all are equally probable
+before. One that is then more probable than not is named, and what it explains is no open question
+any more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import softmax
+
+from radiotwin.closeloop.crossfit import CrossFit
+from radiotwin.closeloop.scan import Anomaly, scan
+from radiotwin.closeloop.search.faults import adopted
+from radiotwin.closeloop.search.scoring import Candidate, fit_candidate, score_candidate
+from radiotwin.closeloop.search.stages import SearchInputs, SearchState
+from radiotwin.closeloop.search.trials import Trial
+from radiotwin.closeloop.verdict.criteria import MIN_RIVAL_SHARE, MIN_SHARED, MIN_SURE
+from radiotwin.effects.base import Effect
+
+ANOTHER = "another"  # name of a cause that the catalogue does not have
+
+
+def add_causes_of_anomalies(state: SearchState, inputs: SearchInputs) -> SearchState:
+    """Name causes of groups that surely stand out, most evident first."""
+    explained: list[Anomaly] = []
+    left, latest = list(state.anomalies), None
+    for anomaly in state.anomalies:
+        if anomaly.probability >= MIN_SURE and not state.is_full(inputs.criteria):
+            if latest is not None and not any(_is_same(anomaly, each) for each in left):
+                anomaly = replace(anomaly, causes=latest)  # what was named explains this one, too
+            else:
+                before = state.model
+                state, causes = _with_cause(state, anomaly, inputs)
+                anomaly = replace(anomaly, causes=causes)
+                if state.model is not before:
+                    left, latest = scan(state.model), causes
+        explained.append(anomaly)
+    return replace(state, anomalies=tuple(explained))
+
+
+def _is_same(anomaly: Anomaly, other: Anomaly) -> bool:
+    """Return whether most links of an anomaly are in another one."""
+    return bool(other.rows[anomaly.rows].mean() >= MIN_SHARED)
+
+
+def _with_cause(state: SearchState, anomaly: Anomaly, inputs: SearchInputs
+                ) -> tuple[SearchState, dict[str, float]]:
+    """Return the state with the cause of a group, if one is named, and the probability of each."""
+    model, criteria = state.model, inputs.criteria
+    inputs.on_progress("causes of what " + _named(anomaly) + " reads")
+    state, hypotheses = state.look(inputs.seed)
+    group = anomaly.rows[model.whole.train]
+    if not group.any():
+        return state, {}
+    candidates: list[Candidate] = []
+    for effect in _acting_on(anomaly, model, inputs):
+        # Following paths takes longest, and what explains little without them is no rival.
+        most = max((each.gain for each in candidates), default=0.0)
+        fitted = fit_candidate(model, effect, criteria, hypotheses, group, MIN_RIVAL_SHARE * most)
+        if isinstance(fitted, Candidate) and np.isfinite(fitted.evidence):
+            candidates.append(fitted)
+    nats = [*(each.evidence for each in candidates), hypotheses.of_group(group)]
+    causes: dict[str, float] = {}
+    names = [*(each.effect.name for each in candidates), ANOTHER]
+    for name, share in sorted(zip(names, softmax(nats), strict=True), key=lambda each: -each[1]):
+        causes[name] = causes.get(name, 0.0) + float(share)
+    best = max(candidates, key=lambda each: each.evidence, default=None)
+    if best is None or causes[best.effect.name] < criteria.min_probability:
+        return state, causes
+    trial, extended = _held_out(model, best, inputs)
+    trial = replace(trial, probability=causes[best.effect.name])
+    return (state.refuse(trial) if extended is None else state.keep(trial, extended)), causes
+
+
+def _named(anomaly: Anomaly) -> str:
+    ends = [name for names in anomaly.members.values() for name in names]
+    return " × ".join(ends) or f"one {anomaly.family}"
+
+
+def _acting_on(anomaly: Anomaly, model: CrossFit, inputs: SearchInputs) -> list[Effect]:
+    """Return the effects that may act on a group of that family; those along paths come last."""
+    return sorted((effect for effect in inputs.undeclared if anomaly.family in effect.acts_on
+                   and not effect.unavailable(model.links)), key=lambda each: each.always_exact)
+
+
+def _held_out(model: CrossFit, candidate: Candidate,
+              inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
+    """Return what held-out links say of a cause, and the model with it unless they refuse it.
+
+    What happened on a flight does not return on others, and so they cannot refuse it.
+    """
+    trial, extended = score_candidate(model, candidate, 1, inputs)
+    if candidate.effect.within_flights:
+        return replace(trial, reason="", passed=True), adopted(model, candidate)
+    return trial, extended
