@@ -5,12 +5,13 @@ coordinates are converted. A device of `devices.csv` has one position: one that 
 places over time becomes the devices `NAME@1`, `NAME@2`, ….
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from radiotwin.display import count, some
 from radiotwin.errors import BadInput
 from radiotwin.geo import ALLOWED, reference_system, to_local
 from radiotwin.importing.read_source import read_source
@@ -28,6 +29,7 @@ ORIGIN_DECIMALS = 7  # of a computed origin [degrees]: 1 cm
 SINCE, UNTIL = "since_s", "until_s"
 """Columns of a table of devices: from when until when a device was there [s]; NaN = always."""
 _MAX_PLACES = 1000  # of one device; one that moves all the time has no places
+SAME_BAND = 1.05  # ratio of carriers between which a device hops: 0.4 dB by 20 lg f
 MOVING_M = 1.0  # a device whose positions differ by more than this is not at rest
 
 
@@ -295,19 +297,21 @@ class PositionedLinks:
         devices: as in `devices.csv`: those of the links, in the order of their first ones.
         device_m: position of each link's device [m], (n, 3); NaN where unknown.
         origin: of the local frame; None where all positions were local already.
+        notes: on what was told apart.
     """
 
     links: pd.DataFrame
     devices: pd.DataFrame
     device_m: np.ndarray
     origin: Origin | None
+    notes: list[str] = field(default_factory=list)
 
     def select(self, keep: np.ndarray) -> "PositionedLinks":
         """Return the links of a mask (n,) with their devices."""
         links = self.links[keep]
         devices = self.devices[self.devices["device"].isin(links["device"])]
         return PositionedLinks(links, devices.reset_index(drop=True), self.device_m[keep],
-                               self.origin)
+                               self.origin, self.notes)
 
 
 def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
@@ -341,9 +345,38 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
         tally.count(f"no position of receiver {name}", "", len(rows), source.where(rows.index[0]))
     if unknown.any():
         links, device_m = links[~unknown], device_m[~unknown]
-    table = _device_table(source, links, device_m, tables["device"],
+    links, declared_as, notes = _by_carrier(links)
+    table = _device_table(source, links, device_m, tables["device"], declared_as,
                           max(MOVING_M, 2 * (settings.place_m or 0.0)))
-    return PositionedLinks(links, table, device_m, origin)
+    return PositionedLinks(links, table, device_m, origin, notes)
+
+
+def _by_carrier(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list[str]]:
+    """Return links whose devices have one carrier each, the names before, and a note.
+
+    A name that is read on carriers of different bands is of several transmitters: their levels and
+    antennas differ. Channels of one band, between which a device hops, are one.
+    """
+    if "frequency_hz" not in links:
+        return links, {}, []
+    hz = links["frequency_hz"].to_numpy(dtype=float)
+    by_device = links.groupby("device", sort=False)["frequency_hz"]
+    wide = by_device.transform("max").to_numpy() > SAME_BAND * by_device.transform("min").to_numpy()
+    names, before = links["device"].astype(object).to_numpy(copy=True), {}
+    for device in pd.unique(names[wide]):
+        rows = np.flatnonzero((names == device) & np.isfinite(hz))
+        known_hz = np.unique(hz[rows])
+        band = np.cumsum(np.r_[0, known_hz[1:] > SAME_BAND * known_hz[:-1]])
+        usual_hz = np.array([np.median(known_hz[band == each]) for each in range(band[-1] + 1)])
+        own_hz = usual_hz[band[np.searchsorted(known_hz, hz[rows])]]
+        names[rows] = [f"{device} {each / 1e6:g} MHz" for each in own_hz]
+        before |= dict.fromkeys(names[rows], device)
+    if not before:
+        return links, {}, []
+    split = list(dict.fromkeys(before.values()))
+    return links.assign(device=names), before, [
+        f"{count(len(split), 'device')} read on carriers of several bands ({some(split, 5)}): each "
+        "carrier is a device of its own, with its frequency in its name"]
 
 
 def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end: str) -> None:
@@ -393,8 +426,12 @@ def _above_ground_m(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None
 
 
 def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
-                  table: pd.DataFrame | None, moving_m: float) -> pd.DataFrame:
-    """Return the devices of the links as in `devices.csv`."""
+                  table: pd.DataFrame | None, declared_as: dict[str, str],
+                  moving_m: float) -> pd.DataFrame:
+    """Return the devices of the links as in `devices.csv`.
+
+    Some have another name in the table of devices, see `_by_carrier`.
+    """
     by_device = pd.DataFrame(device_m, columns=["x_m", "y_m", "z_m"], index=links.index).groupby(
         links["device"].to_numpy(), sort=False)
     range_m = by_device.max() - by_device.min()
@@ -410,8 +447,10 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     devices.loc[devices["role"] == "unknown", ["x_m", "y_m"]] = np.nan
     for name in (*DEVICE_OPTIONAL, "antenna"):
         if table is not None and name in table and name != "above_ground_m":
-            devices[name] = table[name].reindex(devices.index)
-    above_m = _above_ground_m(links, "device_", table, links["device"], device_m[:, 2])
+            devices[name] = table[name].reindex(
+                [declared_as.get(each, each) for each in devices.index]).to_numpy()
+    declared = links["device"].replace(declared_as) if declared_as else links["device"]
+    above_m = _above_ground_m(links, "device_", table, declared, device_m[:, 2])
     if np.isfinite(above_m).any():
         devices["above_ground_m"] = pd.Series(above_m).groupby(links["device"].to_numpy(),
                                                                sort=False).median()

@@ -215,8 +215,8 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
     measurements = _measurements(table, positioned.devices, logs.level_column, positioned.origin)
     if settings.devices is not None:
         measurements = _with_antennas(measurements, Path(settings.devices))
-    report = _make_report(logs, [*logs.notes, *notes], others, kept, tally, positioned,
-                         measurements, settings)
+    report = _make_report(logs, [*logs.notes, *notes, *positioned.notes], others, kept, tally,
+                         positioned, measurements, settings)
     on_progress("writing")
     used = settings.model_copy(update={"origin": positioned.origin,
                                        "format": settings.format or logs.format})

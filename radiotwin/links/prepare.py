@@ -27,7 +27,7 @@ from radiotwin.links.declared import Declared, Radio, antenna_of_uavs, complete,
 from radiotwin.links.limits import estimate_limits
 from radiotwin.links.links import RESTART_NOTE, Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import READS, Measurements
-from radiotwin.links.sites import parting_notes
+from radiotwin.links.sites import end_notes
 from radiotwin.scene import Scene
 
 MAX_EXTENT_M = 100_000.0  # farther apart, two ends are not of one campaign and frame
@@ -147,7 +147,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     device = (np.cumsum(placed) - 1)[device_index[keep]]
     links = _join(measurements, table[keep], scene, level_db[keep], receiver_m[keep],
                   device_m[placed], device, np.flatnonzero(placed), notes)
-    links = links if to_locate or devices_move(links) else links.with_notes(*parting_notes(links))
+    links = links if to_locate or devices_move(links) else links.with_notes(*end_notes(links))
     return links.with_notes(RESTART_NOTE) if links.time_restarts else links
 
 

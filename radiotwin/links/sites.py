@@ -7,6 +7,7 @@ that went to different places also differ by what a model does not know of these
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -22,6 +23,8 @@ from radiotwin.links.links import Links
 SAME_SITE_M = 1.0  # apart at most: sectors of one mast; declared positions are good to that
 OTHER_END = {"device": "receiver", "receiver": "device"}
 SAME_DIRECTION_DEG = 5.0  # azimuths within it are of one antenna, or of two side by side
+MIN_REPEATS = 20  # of a device, to tell how they scatter
+SHARED_DB, SHARED_RATIO = 3.0, 2.0  # scatter that is of two transmitters, also over that of others
 MAX_NAMED = 4  # pairs in a note
 MAX_RELATIVES = 4  # more tell nothing new
 SAME_M = 3.0  # a phone's position is known no better outdoors
@@ -67,6 +70,65 @@ def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
     return next(filter(None, others), [])[:MAX_RELATIVES]
 
 
+@dataclass(frozen=True, eq=False)
+class Repeats:
+    """Scatter of readings that should be equal, of each device.
+
+    Attributes:
+        squares_db2: (k,) sum of squares about the means [dB²].
+        freedom: (k,) readings less means.
+    """
+
+    squares_db2: np.ndarray
+    freedom: np.ndarray
+
+    @classmethod
+    def of(cls, links: Links, *same: np.ndarray) -> Repeats:
+        """Return that of readings of one receiver and device with the same other labels (n, …)."""
+        seen = np.isfinite(links.level_db)
+        label = np.column_stack([links.device, links.receiver, *same])[seen]
+        group = np.unique(label, axis=0, return_inverse=True)[1].ravel()
+        level_db, count = links.level_db[seen], np.bincount(group)
+        rest_db = level_db - (np.bincount(group, level_db) / count)[group]
+        devices, device = len(links.device_names), links.device[seen]
+        return cls(np.bincount(device, rest_db**2, devices),
+                   np.bincount(device, 1 - 1 / count[group], devices))
+
+    def sd_db(self) -> np.ndarray:
+        """Return the standard deviation of one reading (k,) [dB]; NaN of few repeats."""
+        few = self.freedom < MIN_REPEATS
+        return np.where(few, np.nan, np.sqrt(self.squares_db2 / np.maximum(self.freedom, 1)))
+
+    def without(self, devices: Sequence[int]) -> Repeats:
+        """Return the same without some devices."""
+        return Repeats(*(np.delete(each, devices) for each in (self.squares_db2, self.freedom)))
+
+
+def repeats_at_places(links: Links) -> Repeats:
+    """Return the scatter of readings at one place, within a decimetre."""
+    return Repeats.of(links, np.round(links.receiver_m, 1))
+
+
+def shared_names(links: Links) -> dict[int, str]:
+    """Return devices that may be two transmitters of one name, and why.
+
+    Cells share an identity, or the carriers of a cell a name. Then a receiver reads two levels at
+    one time, or at one place, that differ by more than readings of other devices do.
+    """
+    timed, found = links.select(np.isfinite(links.time_s)), {}
+    for when, repeats in (("at one time", Repeats.of(timed, timed.time_s)),
+                          ("at one place", repeats_at_places(links))):
+        own_db = repeats.sd_db()
+        for device in np.flatnonzero(own_db > SHARED_DB):
+            others_db = np.delete(own_db, device)
+            usual_db = float(np.median(others_db[np.isfinite(others_db)])) \
+                if np.isfinite(others_db).any() else np.nan
+            if own_db[device] > SHARED_RATIO * usual_db:
+                found.setdefault(int(device), f"its readings {when} scatter by "
+                                 f"{own_db[device]:.1f} dB, those of others by {usual_db:.1f} dB")
+    return found
+
+
 def never_part(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
     """Return the labels of one end that have the same links as a label of another end, and that.
 
@@ -92,9 +154,12 @@ def never_apart_from(links: Links, end: str, members: set[int]) -> str | None:
     return other if members & together.keys() else None
 
 
-def parting_notes(links: Links) -> list[str]:
-    """Return a note on devices that are never apart from their receiver, or from their flight."""
-    notes, heard = [], np.isfinite(links.level_db)
+def end_notes(links: Links) -> list[str]:
+    """Return notes on ends that are never apart, and on devices that are probably two each."""
+    notes = [f"device {links.device_names[device]} may be two transmitters of one name, such as "
+             f"cells of one identity or carriers of a cell: {why}; if so, give each its name"
+             for device, why in shared_names(links).items()]
+    heard = np.isfinite(links.level_db)
     for end in ("receiver", "flight"):
         names = getattr(links, f"{end}_names")
         pairs = [f"{links.device_names[device]} and {names[member]}" for device, member

@@ -54,6 +54,18 @@ def test_positions_of_devices_from_a_table(bring_in, local, tmp_path):
     assert devices.loc["b"].tolist() == [30.48, 0, 24, "anchor", 9e8, 120]
 
 
+def test_carriers_of_several_bands_are_told_apart_and_channels_are_not(bring_in, local, tmp_path):
+    """Cell 12 is read on 800 and 1800 MHz, node n hops between channels; both stay where the table has them."""
+    (tmp_path / "sites.csv").write_text("device,x,y,above_ground_m,azimuth_deg\n12,10,20,30,120\nn,5,5,2,\n")
+    text = ("device,x,y,level,f\n12,0,0,-80,8e8\n12,1,0,-70,1.8e9\n12,2,0,-81,8.02e8\nn,0,0,-90,868.1e6\n"
+            "n,1,1,-91,869.5e6\n")
+    result = bring_in(text, columns=local | {"frequency_hz": "f"}, length_unit="m", devices=str(tmp_path / "sites.csv"))
+    assert list(result.table["device"]) == ["12 801 MHz", "12 1800 MHz", "12 801 MHz", "n", "n"]
+    devices = result.devices.set_index("device")
+    assert devices.loc["12 1800 MHz", ["x_m", "above_ground_m", "azimuth_deg", "frequency_hz"]].tolist() == [10, 30, 120, 1.8e9]
+    assert any("1 device read on carriers of several bands (12)" in text for text in result.report["warnings"])
+
+
 def test_a_moving_device_is_named_by_its_position(bring_in, local):
     """Hand-held transmitters heard by a fixed receiver."""
     text = "device,x,y,level,tx,ty\n_,1,2,-80,30,40\n_,1,2,-81,50,60\n_,1,2,-82,30,40\n_,1,2,-83,,60\n"

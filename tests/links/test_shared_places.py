@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from radiotwin.closeloop.verdict.residual_tests import noise_floor_db
 from radiotwin.effects.catalogue.gain_drift import DeviceDrift, Drift, ReceiverDrift
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.effects.params import Parameter
-from radiotwin.links.sites import never_part, parting_notes, receiver_differences
+from radiotwin.links.sites import end_notes, never_part, receiver_differences, shared_names
 from tests.worlds import synthetic_links
 
 OFFSET_DB, SQUARE_M = -4.0, 100.0
@@ -84,7 +86,7 @@ def test_ends_that_never_part_are_said_to_be_one():
     level_db = np.where(np.arange(240) < 200, -90.0, np.nan)
     links = synthetic_links([[0.0, 0, 10], [90.0, 0, 10], [0.0, 90, 10]], device, np.tile([50.0, 50.0, 1.5], (240, 1)),
                             level_db=level_db, receiver=receiver)
-    (note,) = parting_notes(links)
+    (note,) = end_notes(links)
     assert note.startswith("device and receiver are never apart (d2 and r2)")
     for effect, end, rival in ((ReceiverDrift, "receivers", ["device_drift"]), (DeviceDrift, "devices", ["receiver_drift"])):
         found = {member: effect().with_params(effect.Params.model_validate({end: {member: Drift("ageing", 0.0)}}))
@@ -94,3 +96,20 @@ def test_ends_that_never_part_are_said_to_be_one():
     for sizes_db, rivals in (((0.1, 0.3, -5.0), ["device_gain_offset"]), ((0.1, 5.0, 0.2), [])):
         values = {f"offset_db[r{each}]": Parameter(size, None, None, "dB") for each, size in enumerate(sizes_db)}
         assert offsets.same_as(links, values) == rivals
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_two_cells_of_one_name_are_told_and_are_no_noise(timed):
+    """Of four cells the last is two, 10 dB apart: readings repeat within 1 dB otherwise."""
+    rng = np.random.default_rng(0)
+    place_m = np.column_stack([rng.uniform(0, 300, (60, 2)), np.full(60, 1.5)])
+    device, place = np.repeat(np.arange(4), 120), np.tile(np.repeat(np.arange(60), 2), 4)
+    level_db = -80.0 + rng.normal(0, 1.0, 480) - 10.0 * (device == 3) * (np.arange(480) % 2)
+    times = {"time_s": 10.0 * place} if timed else {}
+    links = synthetic_links(rng.uniform(0, 300, (4, 3)), device, place_m[place], level_db=level_db, **times)
+    assert list(shared_names(links)) == [3]
+    (note,) = [each for each in end_notes(links) if "two transmitters" in each]
+    assert note.startswith("device d3 may be two transmitters") and f"at one {'time' if timed else 'place'}" in note
+    assert noise_floor_db(links, SelectionCriteria()) == pytest.approx(1.0, abs=0.1)
+    links.level_db[(device == 3) & (np.arange(480) % 2 == 1)] += 10.0
+    assert shared_names(links) == {}

@@ -9,6 +9,7 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.inference.dependence import Series, holm, levels_of, permutation_p_value
 from radiotwin.links import Links, residual_variables
+from radiotwin.links.sites import repeats_at_places, shared_names
 from radiotwin.runtime.pieces import kept
 
 MAX_LINKS = 20_000  # more are thinned to whole series
@@ -88,14 +89,8 @@ def _tested(links: Links, residual_db: np.ndarray, scale_db: np.ndarray, mean_db
 
 def noise_floor_db(links: Links, criteria: SelectionCriteria) -> float:
     """Return the standard deviation of one measurement [dB], from repeats at one position."""
-    place = np.round(np.column_stack([links.receiver_m, links.device, links.receiver]), 1)
-    group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
-    seen = np.isfinite(links.level_db)
-    count = np.bincount(group[seen], minlength=group.max() + 1)
-    sums = np.bincount(group[seen], weights=links.level_db[seen], minlength=len(count))
-    mean = sums / np.maximum(count, 1)
-    again = seen & (count[group] > 1)
-    freedom = int((count[count > 1] - 1).sum())
+    repeats = repeats_at_places(links).without(list(shared_names(links)))
+    freedom = round(float(repeats.freedom.sum()))
     if freedom < criteria.min_repeats_for_noise:
         return float("nan")
-    return float(np.sqrt(((links.level_db - mean[group])[again] ** 2).sum() / freedom))
+    return float(np.sqrt(repeats.squares_db2.sum() / freedom))
