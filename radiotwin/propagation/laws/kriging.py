@@ -344,12 +344,14 @@ def _sample(field: _Field, rng: np.random.Generator) -> _Field:
 
 def _fixed_receivers_m(links: LinkGeometry) -> np.ndarray:
     """Return places (k, 3) of receivers that stand still while devices move [m]; else none."""
-    cells, place, count = np.unique(np.round(links.receiver_m / SAME_PLACE_M), axis=0,
-                                    return_inverse=True, return_counts=True)
-    of_device = np.bincount(links.device)[links.device]
-    if np.median(count[place.ravel()]) <= np.median(of_device):
+    cells, place = np.unique(np.round(links.receiver_m / SAME_PLACE_M), axis=0,
+                             return_inverse=True)
+    place = place.ravel()
+    pairs = np.unique(np.column_stack([place, links.device]), axis=0)
+    devices, places = np.bincount(pairs[:, 0]), np.bincount(pairs[:, 1])
+    if np.median(devices[place]) <= np.median(places[links.device]):
         return np.zeros((0, 3))
-    return cells[count >= MIN_POINTS] * SAME_PLACE_M
+    return cells[devices >= MIN_POINTS] * SAME_PLACE_M
 
 
 class RegressionKriging(ChannelModel):
@@ -362,8 +364,8 @@ class RegressionKriging(ChannelModel):
     would fill a shadow with the detected levels around it.
 
     A device is its index in `LinkGeometry.device`: use the same indices to fit and to predict.
-    Where most links are of a place of receivers that has more links than their device, each of
-    these places has a process over the device's position.
+    Where most links are of a place of receivers that heard more devices than there are places that
+    heard their device, each of these places has a process over the device's position.
     """
 
     name = "regression_kriging"
