@@ -223,7 +223,7 @@ def path_powers(
 
 
 def _strongest_candidates(
-    candidates: Candidates, found: list[tuple[np.ndarray, ...]], total: np.ndarray,
+    candidates: Candidates, found: Sequence[tuple[np.ndarray, ...]], total: np.ndarray,
     over_seen_edge: np.ndarray,
 ) -> Candidates:
     """Return candidates (c,) that matter for a link, and one for each edge seen.
