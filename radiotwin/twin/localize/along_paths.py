@@ -142,6 +142,7 @@ class Relocation:
         with progress("looking for devices along paths", total=len(searches)) as advance:
             for number, (search, device, before) in searches.items():
                 found[number] = self._search(search, device, before)
+                search.strongest.clear()  # megabytes; no other search uses them
                 before.append((found[number].x_m, found[number].y_m))
                 advance()
         return found
