@@ -200,9 +200,11 @@ def _effect(report: dict) -> str:
             rest = "" if len(found) == 1 else " each" if min(known) == max(known) else " and more"
             sure = f" (probability {probability(min(known))}{rest})"
     before = error["before"]["rmse_db"]
-    falls = "falls" if after < before else "goes"
+    goes = f"{'falls' if after < before else 'goes'} from {number(before)} to {number(after)} dB"
+    if number(before) == number(after):
+        goes = f"stays at {number(after)} dB"
     text = (f"The model {lacked} {join_names(causes)}{sure}. With {it} the RMSE on held-out links "
-            f"{falls} from {number(before)} to {number(after)} dB.")
+            f"{goes}.")
     left = _unnamed_beside(report)
     if left is not None:
         text += (f" Beside {it} something is left that has no name (probability "

@@ -247,6 +247,8 @@ def test_a_step_between_flights_has_no_probability_and_is_called_probable(tmp_pa
     rising = report(effects=[DRIFT | {"probability": 0.7}])
     rising["error"]["after"] |= {"rmse_db": 3.01}
     assert "goes from 3.00 to 3.01 dB" in closeloop_summary(rising)
+    rising["error"]["after"] |= {"rmse_db": 2.999}
+    assert "stays at 3.00 dB" in closeloop_summary(rising)
 
 
 def test_what_was_not_looked_for_is_said_and_parts_of_the_error_are_no_larger_than_it():

@@ -85,7 +85,7 @@ class FaultyFlight(GainEffect):
     """One flight that disagrees with all others; a step finds the worst."""
 
     name = "faulty_flight"
-    in_words = "a fault of the receiver on that flight"
+    in_words = "a fault on that flight"
     settled_by = "repeat that flight with a receiver that was compared with another"
     figure = "links"
     of_receiver = True
