@@ -252,29 +252,30 @@ def _keep_best(state: SearchState, tried: list[Tried], hypotheses: Hypotheses | 
     beside an offset of each device.
     """
     criteria, step = inputs.criteria, state.step
-    passed = sorted(_passed(tried), key=lambda each: -each.trial.held_out_nats)
+    nats_of = _currency([each for each in tried if each.trial.passed])
+    passed = sorted(_passed(tried), key=lambda each: -nats_of(each.trial))
     # Of those that the data cannot tell apart the one with the least error.
-    most_nats = passed[0].trial.held_out_nats
-    close = [each for each in passed if _alike(most_nats, each.trial, criteria)]
+    most_nats = nats_of(passed[0].trial)
+    close = [each for each in passed if _alike(most_nats, nats_of(each.trial), criteria)]
     passed.sort(key=lambda each: each.trial.rmse_db if each in close else np.inf)
     first = passed[0]
-    kept, least = [first], first.trial.held_out_nats
+    kept, least = [first], nats_of(first.trial)
     rival = next((each for each in passed[1:] if each.effect.repeatable), None)
     if rival is None and not first.effect.repeatable:
         rival = max((each for each in tried if each.trial.passed and each.effect.repeatable
-                     and each.trial.held_out_nats >= MIN_RIVAL_SHARE * least),
-                    key=lambda each: each.trial.held_out_nats, default=None)
+                     and nats_of(each.trial) >= MIN_RIVAL_SHARE * least),
+                    key=lambda each: nats_of(each.trial), default=None)
     most = criteria.max_repeats if not first.effect.repeatable else _on_one_mast(first.model)
     if rival is not None and most > 1:
         inputs.on_progress(f"step {step + 1}: more of {rival.trial.name}")
-        several = _several(rival, hypotheses, least, most, inputs)
+        several = _several(rival, hypotheses, nats_of, least, most, inputs)
         if several and rival.trial.reason:
             several = _if_likelier(state, several, first.trial, criteria)
         kept = several or kept
-    best, nats = kept[0], sum(each.trial.held_out_nats for each in kept)
+    best, nats = kept[0], sum(nats_of(each.trial) for each in kept)
     name = best.trial.name
     rivals = tuple(each.trial.name for each in passed
-                   if each.trial.name != name and _alike(nats, each.trial, criteria))
+                   if each.trial.name != name and _alike(nats, nats_of(each.trial), criteria))
     less = f"{name} explains more"
     trials = [best.trial.keep(rivals=rivals) if each.effect is best.effect
               else each.trial.refuse(less) if each.trial.is_open else each.trial for each in tried]
@@ -313,9 +314,19 @@ def _beyond(passed: Tried, candidate: Candidate, model: CrossFit,
     return clear and not more and (passed.effect.repeatable or not candidate.effect.repeatable)
 
 
-def _alike(nats: float, other: Trial, criteria: SelectionCriteria) -> bool:
-    """Return whether an effect gains about as much on held-out links as others, `nats`."""
-    return nats - other.held_out_nats < criteria.indistinguishable_nats
+def _currency(tried: list[Tried]) -> Callable[[Trial], float]:
+    """Return by which nats candidates are compared: evidence, or gains where one has none.
+
+    A flexible effect always gains a little more on held-out links of the places that it has seen.
+    """
+    if all(np.isfinite(each.trial.evidence_nats) for each in tried):
+        return lambda trial: trial.evidence_nats
+    return lambda trial: trial.held_out_nats
+
+
+def _alike(nats: float, other_nats: float, criteria: SelectionCriteria) -> bool:
+    """Return whether the data cannot tell an effect with other nats from the best, `nats`."""
+    return nats - other_nats < criteria.indistinguishable_nats
 
 
 def _on_one_mast(model: CrossFit) -> int:
@@ -326,8 +337,8 @@ def _on_one_mast(model: CrossFit) -> int:
     return len(devices) if on_mast else 0
 
 
-def _several(rival: Tried, hypotheses: Hypotheses | None, min_nats: float, most: int,
-             inputs: SearchInputs) -> list[Tried]:
+def _several(rival: Tried, hypotheses: Hypotheses | None, nats_of: Callable[[Trial], float],
+             min_nats: float, most: int, inputs: SearchInputs) -> list[Tried]:
     """Add an effect of which a step finds one again and again, until all have more than `min_nats`.
 
     Such as groves or towers, each seen from few devices, against an offset for each device; or
@@ -342,7 +353,7 @@ def _several(rival: Tried, hypotheses: Hypotheses | None, min_nats: float, most:
             return []
         model, trial = extended, replace(trial, probability=rival.trial.probability)
         found.append(Tried(rival.effect, trial, model))
-        if sum(each.trial.held_out_nats for each in found) > min_nats:
+        if sum(nats_of(each.trial) for each in found) > min_nats:
             return found if _all_borne_out(model, len(found)) else []
     return []
 
