@@ -176,7 +176,8 @@ def test_each_kind_of_group_is_said_in_plain_words(group, sentence):
 
 
 def test_where_comes_before_why_and_a_named_cause_is_told_from_an_open_one():
-    named = with_members("effect", [LOW], effects=[DRIFT | {"name": "device_gain_offset", "probability": 0.95, "anomalies": [0]}])
+    named = with_members("effect", [LOW], effects=[DRIFT | {"name": "device_gain_offset", "probability": 0.95, "anomalies": [0],
+                                                             "indistinguishable_from": []}])
     text = closeloop_summary(named)
     assert text.startswith("Device d3 reads 5.6 dB (5.1 to 6.1) less than the seven others (0.99). Cause: power, cable or "
                            "antenna of the device (0.70); vegetation (0.25). The model lacked device gain offset.")
