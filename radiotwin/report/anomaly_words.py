@@ -65,18 +65,16 @@ def sentence(anomaly: dict, report: dict) -> str:
 
 def causes(anomaly: dict, named: Sequence[dict]) -> str:
     """Name the likeliest causes of a group: "Cause: …" if effects were named that explain it."""
-    found = _likely(anomaly)
+    found = [each for each in anomaly.get("causes", []) if (each["probability"] or 0) >= LIKELY]
     likely = {each["name"] for each in found}
     found = [*(each for each in named if each["name"] not in likely), *found]
+    same = {each["name"]: each.get("indistinguishable_from", []) for each in named}
     start = "Cause" if named else "Its cause is open"
-    words = "; ".join(cause(each["name"], anomaly["members"]) + (
-        "" if each["probability"] is None else f" ({probability(each['probability'])})")
+    words = "; ".join(" or ".join(cause(name, anomaly["members"]) for name in (
+        each["name"], *same.get(each["name"], []))) + (
+            "" if each["probability"] is None else f" ({probability(each['probability'])})")
         for each in found[:MAX_NAMED])
     return f"{start}: {words}." if words else f"{start}."
-
-
-def _likely(anomaly: dict) -> list[dict]:
-    return [each for each in anomaly.get("causes", []) if (each["probability"] or 0) >= LIKELY]
 
 
 def _named(index: int, report: dict) -> list[dict]:
@@ -101,9 +99,11 @@ def group(anomaly: dict) -> tuple[str, bool]:
     """Return a group in words, such as "device d3 on flight f2", and whether it is a plural."""
     members = {end: names for end in ENDS if (names := anomaly["members"].get(end))}
     text = ""
+    one = anomaly["family"] in ENDS and len(members) > 1  # they have the same links
     for end, names in members.items():
-        joined = f" {JOINED[end]} " if text else ""
+        joined = (" or " if one else f" {JOINED[end]} ") if text else ""
         text += f"{joined}{end}{'s' * (len(names) > 1)} {some_names(names)}"
+    text += " (they never part)" * one
     is_plural = bool(members) and len(next(iter(members.values()))) > 1
     ranges = [_range(name, *ends) for name, ends in _ranges(anomaly)]
     if not members:

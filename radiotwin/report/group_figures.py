@@ -115,8 +115,14 @@ def groups_figure(data: LoopData, report: dict) -> Figure:
             _write_numbers(ax, values, low, high)
             for anomaly in anomalies:
                 if anomaly["statistic"] in statistics:
-                    _frame(ax, each, anomaly["members"], bool(anomaly.get("ranges")))
+                    _frame(ax, each, _ends(anomaly), bool(anomaly.get("ranges")))
     return figure
+
+
+def _ends(anomaly: dict) -> dict[str, Sequence[str]]:
+    """Return the members of a group, without those of an end that has the same links."""
+    members, family = anomaly["members"], anomaly["family"]
+    return {family: members[family]} if family in members else members
 
 
 def _label(ax: Axes, found: Pivot, column: int) -> None:

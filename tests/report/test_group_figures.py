@@ -25,7 +25,8 @@ def campaign(devices, flights, receivers, links=6):
 
 
 def group(statistic="level", ranges=(), **members):
-    return {"members": members, "statistic": statistic, "ranges": dict(ranges)}
+    family = next(iter(members)) if len(members) == 1 else " x ".join(members)
+    return {"family": family, "members": members, "statistic": statistic, "ranges": dict(ranges)}
 
 
 def frames(figure):
@@ -48,6 +49,11 @@ def test_cells_are_those_of_a_pivot_table():
     (group(receiver=["u0"], flight=["f1"], ranges=[("time_s", (0.0, 9.0))]), [0, 0, 1, 0]), (group(), [0, 0, 0, 0])))
 def test_what_stands_out_is_framed_where_its_ends_are(anomaly, expected):
     assert frames(groups_figure(campaign(3, 4, 2), {"anomalies": [anomaly]})) == expected
+
+
+def test_an_end_that_never_parts_from_another_one_is_framed_as_itself():
+    both = group(device=[LONG + "1"], receiver=["u0"]) | {"family": "device"}
+    assert frames(groups_figure(campaign(3, 4, 2), {"anomalies": [both]})) == [1, 0, 0, 0]
 
 
 def test_of_many_members_those_that_stand_out_are_shown_and_long_names_stay_apart():
