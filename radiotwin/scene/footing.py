@@ -50,6 +50,16 @@ def footing(city: CityMap, point_m: np.ndarray) -> Footing | None:
     return min(found, key=lambda each: each.sds, default=None)
 
 
+def standing(city: CityMap, points_m: np.ndarray) -> np.ndarray:
+    """Return devices (n, 3) [m] where they stand; one that nothing explains stays inside."""
+    places_m = points_m.copy()
+    for row in np.flatnonzero(city.misplaced(points_m) != ""):
+        found = footing(city, points_m[row])
+        if found is not None:
+            places_m[row] = found.point_m
+    return places_m
+
+
 def _above(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | None:
     """Return the place just above the ground, or above the roof; None inside a building."""
     x_m, y_m, z_m = point_m.tolist()
