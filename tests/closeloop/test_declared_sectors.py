@@ -278,7 +278,7 @@ def test_trees_of_a_stored_blend_know_the_azimuths_and_nobody_need_tell_them_aga
     later = links.with_ends(boresight_deg=np.full(6, np.nan))  # a map's links declare nothing
     zero, one = np.zeros(len(links)), np.ones(len(links))
     expected_db = forest.predict(link_features(links, receivers=False))
-    np.testing.assert_allclose(again.apply(later, zero, one, zero)[0], expected_db, atol=1e-5)
+    np.testing.assert_allclose(again.apply(later, zero, one, 5.0, (zero, one))[0], expected_db, atol=1e-5)
     with pytest.raises(ValueError, match="belongs to no device"):
         Blend.from_state(arrays | {"boresights_deg": azimuths + [6, 0]}, settings, 6)
 

@@ -15,7 +15,8 @@ def held_out(n, sds_db, away_m, seed, limit_db=-np.inf, scale_db=4.0):
     level_db = rng.normal(-90.0, 8.0, n)
     members_db = level_db[:, None] + rng.normal(size=(n, len(sds_db))) * sds_db
     nothing = np.zeros(n)
-    return HeldOut(np.where(level_db < limit_db, np.nan, level_db), np.full(n, limit_db), members_db, np.full(n, scale_db), nothing,
+    return HeldOut(np.where(level_db < limit_db, np.nan, level_db), np.full(n, limit_db), members_db,
+                   np.full((n, len(sds_db)), scale_db), nothing,
                    np.full(n, float(away_m)), nothing, nothing, nothing, np.arange(n) % 5)
 
 

@@ -184,11 +184,11 @@ def _held_out(learnt: FittedModel, fit: Fit, test: np.ndarray, fold: np.ndarray)
     """Return rows (m,) of a fit's links, of folds (m,), and what members predict of them."""
     assert learnt.blend is not None
     own = fit.on_rows(test)
-    members_db, scale_db, unheard_db = learnt.members_on(own)
+    members_db, scales_db, unheard_db = learnt.members_on(own)
     losses = own.model.losses
     blank, drop, drop_db = (np.broadcast_to(np.asarray(each, dtype=float), len(test))
                             for each in (losses.blank, losses.drop, losses.drop_db))
-    return HeldOut(own.links.level_db, own.model.limit_db, members_db, scale_db, unheard_db,
+    return HeldOut(own.links.level_db, own.model.limit_db, members_db, scales_db, unheard_db,
                    learnt.blend.away_m(own.links), blank, drop, drop_db, fold)
 
 

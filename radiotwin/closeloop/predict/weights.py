@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from radiotwin.inference.held_out import combine, convex_weights
 from radiotwin.inference.student import Losses, ReadingLaw
-from radiotwin.twin.model.blend import NAMED, far_share, sd_factor
+from radiotwin.twin.model.blend import NAMED, blended, far_share, sd_factor
 
 HALF_M = 50.0  # distance at which near and far count the same, where no distance tells
 PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
@@ -37,7 +37,7 @@ class HeldOut:
         level_db: (n,) measured [dB]; NaN = not detected.
         limit_db: (n,) of detection [dB].
         members_db: (n, k) mean level by each member [dB]; NaN where there is none.
-        scale_db: (n,) error scale of named effects [dB].
+        scales_db: (n, k) of their errors [dB].
         unheard_db: (n,) standard deviation of what is unheard [dB].
         away_m: (n,) distance from what was learnt from [m].
         blank, drop, drop_db: (n,) losses whatever the level, see `Losses`.
@@ -47,7 +47,7 @@ class HeldOut:
     level_db: np.ndarray
     limit_db: np.ndarray
     members_db: np.ndarray
-    scale_db: np.ndarray
+    scales_db: np.ndarray
     unheard_db: np.ndarray
     away_m: np.ndarray
     blank: np.ndarray
@@ -62,10 +62,10 @@ class HeldOut:
         """Return some of the links (a mask or indices)."""
         return HeldOut(*(getattr(self, each.name)[rows] for each in fields(self)))
 
-    def law(self, mean_db: np.ndarray, factor: np.ndarray, dof: float) -> ReadingLaw:
-        """Return the distribution of the levels by means (n,) and factors of the scale (n,)."""
-        return ReadingLaw(mean_db, np.hypot(self.scale_db * factor, self.unheard_db),
-                          self.limit_db, dof, Losses(self.blank, self.drop, self.drop_db))
+    def law(self, mean_db: np.ndarray, scale_db: np.ndarray, dof: float) -> ReadingLaw:
+        """Return the distribution of the levels by means (n,) and error scales (n,) [dB]."""
+        return ReadingLaw(mean_db, np.hypot(scale_db, self.unheard_db), self.limit_db, dof,
+                          Losses(self.blank, self.drop, self.drop_db))
 
     @classmethod
     def join(cls, parts: list[HeldOut]) -> HeldOut:
@@ -81,7 +81,7 @@ class Combination:
     Attributes:
         weights: of each member that has one, near measurements and far from them.
         half_m: distance at which near and far count the same [m].
-        sd_ratio: error scale over that of named effects, near and far.
+        sd_ratio: error scale over that of the members, near and far.
     """
 
     weights: dict[str, tuple[float, float]]
@@ -135,7 +135,8 @@ def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[fl
         share = far_share(links.away_m, half_m)
         factor = sd_factor(share, sd_ratio)
         error_db = links.level_db[:, None] - np.column_stack(
-            [links.law(mean_db, factor, dof).reading_db for mean_db in links.members_db.T])
+            [links.law(mean_db, scale_db * factor, dof).reading_db
+             for mean_db, scale_db in zip(links.members_db.T, links.scales_db.T, strict=True)])
         best_db = np.sqrt(np.square(error_db).mean(axis=0).min()) if len(links) else 1.0
         sets.append((error_db / max(best_db, 1e-6), share, links.fold))
     (error, share, fold), (error_away, share_away, fold_away) = sets
@@ -164,7 +165,7 @@ def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[fl
 
 def _sd_ratio(held_out: HeldOut, away: HeldOut, weights: np.ndarray, half_m: float,
               dof: float) -> tuple[float, float]:
-    """Return the error scale over that of named effects, near and far, of highest likelihood.
+    """Return the error scale over that of the members, near and far, of highest likelihood.
 
     Of held-out links and of quadrants together: a map extrapolates, and links that lie near others
     do not tell what that costs.
@@ -172,11 +173,11 @@ def _sd_ratio(held_out: HeldOut, away: HeldOut, weights: np.ndarray, half_m: flo
     links = HeldOut.join([held_out, away])
     links = links.select(np.arange(0, len(links), max(len(links) // SD_LINKS, 1)))
     share = far_share(links.away_m, half_m)
-    mean_db = combine(links.members_db, share, weights)
+    mean_db, scale_db = blended(links.members_db, links.scales_db, share, weights, (1.0, 1.0))
 
     def objective(log_ratio: np.ndarray) -> float:
         near, far = np.exp(log_ratio)
-        law = links.law(mean_db, sd_factor(share, (near, far)), dof)
+        law = links.law(mean_db, scale_db * sd_factor(share, (near, far)), dof)
         return float(law.nll(links.level_db).mean()
                      + 0.5 * SAME_RATIO * (log_ratio[0] - log_ratio[1]) ** 2)
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from radiotwin.inference.held_out import combine
+from radiotwin.inference.student import sd_of_scale
 from radiotwin.links import Links
 from radiotwin.links.measurements import MAX_ANGLE_DEG
 from radiotwin.links.variables import feature_count, link_features
@@ -52,6 +53,21 @@ def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
     return np.sqrt((1 - share) * near + share * far)
 
 
+def blended(members_db: np.ndarray, scales_db: np.ndarray, share: np.ndarray,
+            weights: np.ndarray, sd_ratio: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and error scale (n,) of a combination [dB].
+
+    Args:
+        members_db: (n, k) levels by members [dB].
+        scales_db: (n, k) of their errors [dB].
+        share: (n,) of the far weights, see `far_share`.
+        weights: (2, k) near and far.
+        sd_ratio: as of `Blend`.
+    """
+    scale_db = np.sqrt(combine(np.square(scales_db), share, weights))
+    return combine(members_db, share, weights), scale_db * sd_factor(share, sd_ratio)
+
+
 @dataclass(frozen=True, eq=False)
 class Blend:
     """Members beside named effects, and the weights of all.
@@ -59,7 +75,8 @@ class Blend:
     Attributes:
         weights: of each member, near measurements and far from them; both sum to one.
         half_m: as of `far_share` [m].
-        sd_ratio: standard deviation of the error over that of named effects, near and far.
+        sd_ratio: scale of the error over the root mean square of the members' scales, by weight,
+            near and far.
         receivers_move: whether devices stand still and receivers move, or the other way round.
         measured_m: (p, 3) positions of the end that moves [m], and
         measured_other: (p,) the end that stands still and was measured with it there.
@@ -92,17 +109,22 @@ class Blend:
                 away_m[own] = cKDTree(known_m).query(moving_m[own])[0]
         return away_m
 
-    def members_db(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray,
-                   rest: np.ndarray) -> np.ndarray:
-        """Return the level (n, k) by each member, in the order of the weights [dB].
+    def members_db(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
+                   rest: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Return level and error scale (n, k) of each member, in the order of the weights [dB].
+
+        Kriging is surer near measurements than far from them; trees do not tell.
 
         Args:
             links: n links.
             mean_db: (n,) by named effects [dB].
             scale_db: (n,) of their errors [dB].
-            rest: (n,) what is interpolated [error scales]; 0 without it.
+            dof: degrees of freedom of the errors.
+            rest: (n,) what is interpolated [error scales], 0 without it; and (n,) the share that it
+                leaves of the scale.
         """
-        members = {NAMED: mean_db, REST: mean_db + rest * scale_db}
+        members = {NAMED: mean_db, REST: mean_db + rest[0] * scale_db}
+        scales = dict.fromkeys(self.weights, scale_db) | {REST: rest[1] * scale_db}
         if self.forests:
             features = link_features(self._declared(links), receivers=False)
             for name, forest in self.forests.items():
@@ -110,19 +132,21 @@ class Blend:
                 members[name] = predicted if name in LEVEL_FORESTS \
                     else mean_db + predicted * scale_db
         for name, law in self.laws.items():
-            members[name] = law.predict(links.geometry)[0] + law.declared_db(links)
-        return np.column_stack([members[name] for name in self.weights])
+            law_db, sd_db = law.predict(links.geometry)
+            members[name] = law_db + law.declared_db(links)
+            scales[name] = sd_db / sd_of_scale(dof)
+        return (np.column_stack([members[name] for name in self.weights]),
+                np.column_stack([scales[name] for name in self.weights]))
 
-    def apply(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray,
-              rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def apply(self, links: Links, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
+              rest: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and error scale (n,) of the combination [dB], before any limit of detection.
 
         Arguments as of `members_db`.
         """
         share = far_share(self.away_m(links), self.half_m)
-        blended_db = combine(self.members_db(links, mean_db, scale_db, rest), share,
-                             np.transpose(list(self.weights.values())))
-        return blended_db, scale_db * sd_factor(share, self.sd_ratio)
+        return blended(*self.members_db(links, mean_db, scale_db, dof, rest), share,
+                       np.transpose(list(self.weights.values())), self.sd_ratio)
 
     def weighted(self, weights: dict[str, tuple[float, float]], half_m: float,
                  sd_ratio: tuple[float, float]) -> Blend:

@@ -500,9 +500,9 @@ class FittedModel:
             fit: of these coefficients to n links; `on_links` makes one for any links.
         """
         mean_db, scale_db, unheard_db = self._named(fit)
-        shift, left = self._rest_at(fit.links)
+        shift, left = rest = self._rest_at(fit.links)
         if self.blend is not None:
-            mean_db, scale_db = self.blend.apply(fit.links, mean_db, scale_db, shift)
+            mean_db, scale_db = self.blend.apply(fit.links, mean_db, scale_db, self.dof, rest)
         else:
             mean_db, scale_db = mean_db + shift * scale_db, scale_db * left
         return ReadingLaw(mean_db, np.hypot(scale_db, unheard_db), fit.model.limit_db, self.dof,
@@ -512,14 +512,13 @@ class FittedModel:
         """Return what `law_on` combines, of a fit's n links.
 
         Returns:
-            (n, k) level by each member of the blend [dB], (n,) error scale of named effects, and
-            (n,) standard deviation of what is unheard [dB].
+            (n, k) level and (n, k) error scale of each member of the blend, and (n,) standard
+            deviation of what is unheard [dB].
         """
         assert self.blend is not None
         mean_db, scale_db, unheard_db = self._named(fit)
-        members_db = self.blend.members_db(fit.links, mean_db, scale_db,
-                                           self._rest_at(fit.links)[0])
-        return members_db, scale_db, unheard_db
+        return *self.blend.members_db(fit.links, mean_db, scale_db, self.dof,
+                                      self._rest_at(fit.links)), unheard_db
 
     def _named(self, fit: Fit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return `Fit.reading_parts`, with what is known of devices without a reading."""
