@@ -13,15 +13,17 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import expit, ndtr
+from scipy.special import expit, logit, ndtr
 
 from radiotwin.closeloop.crossfit import CrossFit
+from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.effects.params import QUANTILE_90, Parameter
 from radiotwin.inference.groups import (
     HUBER,
     MAX_SCALES,
     Apart,
     Groups,
+    Lasting,
     Statistic,
     Units,
     apart,
@@ -36,12 +38,15 @@ from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.sites import never_part
 
 PASSING_M, LASTING_M = 25.0, 75.0  # errors of one flight, and of the map, are alike within
-TOLERANCE_DB = 0.4  # spread of levels of peers: instruments, antennas, cables
-ALIKE_SHARE = 0.1  # of a base's scatter, that a whole group may share by errors of the map
-SCATTER_SPREAD, BLANKS_SPREAD = 0.2, 0.05  # of peers: logarithm of the scatter; share
+TOLERANCE_DB = 0.3  # spread of levels of peers: instruments, antennas, cables
+# Share of a base's scatter with line of sight, and without, in which whole groups differ.
+LOS_SHARE, NLOS_SHARE = 0.1, 0.4
+BOTH_SHARE = 0.8  # of what stands out does so with line of sight and without
+SCATTER_SPREAD = 0.2  # of peers: logarithm of the scatter
+LOS_BLANKS_SPREAD, NLOS_BLANKS_SPREAD = 0.05, 0.15  # of peers: share of blanks
 ANYWHERE_DB, ANYWHERE_LOG, ANYWHERE_SHARE = 5.0, 0.8, 0.3  # scale of what stands out
 # Odds that something of a family stands out in one way: a device, receiver or flight; others.
-END_ODDS, FAMILY_ODDS = 0.1, 0.02
+END_ODDS, FAMILY_ODDS = 0.4, 0.03
 LEAST_SCALE_DB = 0.5  # half a step of coarse readings
 MAX_ANOMALIES = 10
 MAX_RIVALS = 4  # groups of which the one that explains most is taken
@@ -263,7 +268,9 @@ def _compare(readings: Readings, families: list[Family],
                        "blanks": ANYWHERE_SHARE}[statistic]
             for name, part in parts.items():
                 odds = END_ODDS if family.name in ENDS else FAMILY_ODDS
-                log_odds = part.log_odds(outlier, odds / len(parts))
+                if len(parts) > 1:
+                    odds *= BOTH_SHARE if name == "all" else (1 - BOTH_SHARE) / 2
+                log_odds = part.log_odds(outlier, odds)
                 if statistic == "scatter":  # a group that scatters less is no fault
                     log_odds = np.where(part.size > 0, log_odds, -np.inf)
                 found.append(_Compared(family, statistic, name, part, log_odds))
@@ -287,24 +294,27 @@ def _distances(readings: Readings, family: Family, statistic: str, rows: np.ndar
         own = label >= 0
         values = values.copy()
         values[own] = without_shared(values[own], label[own], units.lasting[own])
+    is_los = bool(readings.los[groups.row[0]])
     if statistic == "level":
         # A level gives way to outliers; so much of a unit's error as it follows counts.
-        limit_db = HUBER * scale_db
-        lasting_sd = units.spread(np.clip(values - np.median(values[rows]), -limit_db, limit_db),
-                                  rows) / (np.abs(values[rows]) < limit_db).mean()
-        found = levels(values, groups, units, lasting_sd, LEAST_SCALE_DB)
-        prior = np.hypot(TOLERANCE_DB, ALIKE_SHARE * scale_db)
+        limit_db, most_db = HUBER * scale_db, MAX_SCALES * scale_db
+        centred = values - np.median(values[rows])
+        clipped = units.means(np.clip(centred, -limit_db, limit_db), rows)
+        lasting = Lasting.of(units.means(np.clip(centred, -most_db, most_db), rows),
+                             float(np.std(clipped) / (np.abs(centred[rows]) < limit_db).mean()))
+        found = levels(values, groups, units, lasting, LEAST_SCALE_DB)
+        prior = np.hypot(TOLERANCE_DB, (LOS_SHARE if is_los else NLOS_SHARE) * scale_db)
     elif statistic == "scatter":
         size = np.minimum(np.abs(values) / usual, MAX_SCALES)
-        lasting_sd = units.spread(size / size[rows].mean(), rows)
-        found, prior = log_scatters(values, groups, units, lasting_sd, usual), SCATTER_SPREAD
-        if family.pairs:
-            found = _additive(found, family.pairs)
+        lasting = Lasting.of(units.means(size / size[rows].mean(), rows))
+        found, prior = log_scatters(values, groups, units, lasting, usual), SCATTER_SPREAD
     else:
-        found = means(values, groups, units, units.spread(values, rows))
-        prior = BLANKS_SPREAD
+        found = means(values, groups, units, Lasting.of(units.means(values, rows)))
+        prior = LOS_BLANKS_SPREAD if is_los else NLOS_BLANKS_SPREAD
     if np.isfinite(found.value).sum() < 2:
         return None
+    if family.pairs:
+        found = _additive(found, family.pairs)
     return apart(found, float(prior))
 
 
@@ -334,7 +344,7 @@ def _scale(values: np.ndarray) -> float:
 def _likeliest(compared: list[_Compared]) -> list[_Found]:
     """Return the most probable groups, at most `MAX_RIVALS`, of each group only once."""
     found = [_Found(each, int(group)) for each in compared
-             for group in np.flatnonzero(each.log_odds > np.log(LIKELY / (1 - LIKELY)))]
+             for group in np.flatnonzero(each.log_odds > logit(LIKELY))]
     found.sort(key=lambda each: -each.log_odds)
     seen, rivals = set(), []
     for each in found:
@@ -345,7 +355,9 @@ def _likeliest(compared: list[_Compared]) -> list[_Found]:
     best: dict[str, _Found] = {}
     for each in rivals:
         best.setdefault(each.compared.family.name, each)
-    return sorted(best.values(), key=lambda each: -each.log_odds)[:MAX_RIVALS]
+    # What is sure comes before what may explain more: a receiver that scatters covers its flights.
+    sure = [each for each in best.values() if each.log_odds > logit(MIN_SURE)]
+    return (sure or list(best.values()))[:MAX_RIVALS]
 
 
 def _evidence(compared: list[_Compared]) -> float:
@@ -399,7 +411,11 @@ def _families(readings: Readings) -> Iterator[Family]:
     for name, label in several.items():
         def describe(group: int, name: str = name) -> Words:
             return {name: (readings.names[name][group],)}, {}
-        yield Family(name, Groups.of_labels(label), describe, is_crossing=name != "device")
+        within: tuple[np.ndarray, ...] = ()
+        if name == "flight" and "receiver" in several and _is_nested(label, readings.receiver):
+            within = (readings.receiver,)  # flights of one receiver share its level
+        yield Family(name, Groups.of_labels(label), describe, is_crossing=name != "device",
+                     pairs=tuple(end[_examples(label)] for end in within))
     for first, second in (("device", "flight"), ("receiver", "flight"), ("device", "receiver")):
         if first in several and second in several:
             yield from _pairs(readings, first, second, labels)
@@ -416,16 +432,28 @@ def _pairs(readings: Readings, first: str, second: str,
     count = int(code.max()) + 1
     if count in (len(np.unique(one)), len(np.unique(other))):
         return  # the two never part
-    example = np.zeros(count, dtype=np.int64)
-    example[code] = np.arange(len(code))
+    example = _examples(code)
 
     def describe(group: int) -> Words:
         row = example[group]
         return {first: (readings.names[first][one[row]],),
                 second: (readings.names[second][other[row]],)}, {}
 
-    yield Family(f"{first} x {second}", Groups.of_labels(code), describe, (one, other),
+    yield Family(f"{first} x {second}", Groups.of_labels(code), describe,
                  pairs=(one[example], other[example]), is_crossing=True)
+
+
+def _is_nested(label: np.ndarray, within: np.ndarray) -> bool:
+    """Return whether links of each label (n,) share one of fewer labels within (n,)."""
+    pairs = len(np.unique(_codes(label, within)))
+    return pairs == len(np.unique(label)) and pairs > len(np.unique(within))
+
+
+def _examples(label: np.ndarray) -> np.ndarray:
+    """Return one row of each label from 0 on; row 0 for one that no link has."""
+    example = np.zeros(int(label.max()) + 1, dtype=np.int64)
+    example[label] = np.arange(len(label))
+    return example
 
 
 def _windows(readings: Readings) -> Iterator[Family]:
@@ -544,4 +572,4 @@ def _squares(link: np.ndarray, cell: np.ndarray, width_m: float, readings: Readi
         return {}, {name: (float(low), float(low + width_m))
                     for name, low in zip(("x_m", "y_m"), low_m, strict=True)}
     return Family("place", Groups(pairs[:, 0], pairs[:, 1], len(squares)), describe,
-                  (readings.device,), ("level",))
+                  (readings.device, _codes(readings.receiver, readings.flight)), ("level",))

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import kurtosis
 from scipy.stats import t as student_t
 
 MIN_VALUES, MIN_UNITS = 12, 4  # of a group, to be judged
@@ -20,10 +21,10 @@ HUBER = 1.345  # scales, beyond which a value pulls no further (95 % efficient f
 MAX_SCALES = 8.0  # a single value counts as this far away at most
 LEAVE_OUT = 64  # groups up to which each is left out of its own peers
 PEER_WEIGHT = 4.0  # peers that the prior spread counts as
-PRIOR_DOF = 8.0  # of that prior
+PRIOR_DOF = 12.0  # of that prior
 MIN_ALIKE = 3  # values of a unit, to tell how much units differ
 OUTLIER_DOF = 2.0  # of sizes of what stands out: heavy tails
-POLISH_ROUNDS = 3
+POLISH_ROUNDS, SHARED_ROUNDS = 3, 10
 TINY = 1e-12
 
 
@@ -71,18 +72,36 @@ class Units:
     passing: np.ndarray
     lasting: np.ndarray
 
-    def spread(self, values: np.ndarray, rows: np.ndarray) -> float:
-        """Return the standard deviation of lasting units' means, of values (n,) in a mask (n,).
+    def means(self, values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return the means (u,) of lasting units, of values (n,) in a mask (n,).
 
-        Not a robust one: how heavy its tails are is what makes a small group stand out by chance.
+        Where hardly any unit has several values, the values themselves.
         """
         label = np.unique(self.lasting[rows], return_inverse=True)[1].ravel()
         number = np.bincount(label)
-        mean = np.bincount(label, values[rows]) / number
         several = number >= MIN_ALIKE
         if several.sum() < MIN_UNITS:
-            return float(np.std(values[rows]))
-        return float(np.std(mean[several]))
+            return values[rows]
+        return (np.bincount(label, values[rows]) / number)[several]
+
+
+@dataclass(frozen=True)
+class Lasting:
+    """Errors of lasting units.
+
+    Attributes:
+        sd: standard deviation.
+        kurtosis: excess, at least 0: how heavy the tails are.
+    """
+
+    sd: float
+    kurtosis: float
+
+    @classmethod
+    def of(cls, means: np.ndarray, sd: float | None = None) -> Lasting:
+        """Return what means (u,) of units show; with another standard deviation if one is given."""
+        found = float(kurtosis(means)) if np.ptp(means) > TINY else 0.0
+        return cls(float(np.std(means)) if sd is None else sd, max(found, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +111,12 @@ class Statistic:
     Attributes:
         value: (k,).
         error: (k,) its standard error, units counted once.
-        units: (k,) effective number of lasting units.
+        kurtosis: (k,) excess of its error: that of one unit over their effective number.
     """
 
     value: np.ndarray
     error: np.ndarray
-    units: np.ndarray
+    kurtosis: np.ndarray
 
 
 def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
@@ -112,7 +131,7 @@ def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     return found
 
 
-def levels(values: np.ndarray, groups: Groups, units: Units, lasting_sd: float,
+def levels(values: np.ndarray, groups: Groups, units: Units, lasting: Lasting,
            least_scale: float) -> Statistic:
     """Return the level of each group: Huber's estimate, one step from the median.
 
@@ -120,7 +139,7 @@ def levels(values: np.ndarray, groups: Groups, units: Units, lasting_sd: float,
         values: (n,) without NaN among the members.
         groups: of them.
         units: of the values.
-        lasting_sd: standard deviation of lasting units' means.
+        lasting: errors of its lasting units.
         least_scale: of a group's values, such as the step that they are rounded to.
     """
     x, group, count = values[groups.row], groups.group, groups.count
@@ -130,10 +149,10 @@ def levels(values: np.ndarray, groups: Groups, units: Units, lasting_sd: float,
     inside = np.maximum(np.bincount(group, np.abs(deviation) < HUBER, count), 1.0)
     value = middle + scale * np.bincount(group, np.clip(deviation, -HUBER, HUBER), count) / inside
     pull = np.clip((x - value[group]) / scale[group], -HUBER, HUBER)
-    return _judged(value, scale / inside, pull, groups, units, lasting_sd)
+    return _judged(value, scale / inside, pull, groups, units, lasting)
 
 
-def log_scatters(values: np.ndarray, groups: Groups, units: Units, lasting_sd: float,
+def log_scatters(values: np.ndarray, groups: Groups, units: Units, lasting: Lasting,
                  scale: np.ndarray) -> Statistic:
     """Return the logarithm of each group's mean absolute deviation from its own median.
 
@@ -141,7 +160,7 @@ def log_scatters(values: np.ndarray, groups: Groups, units: Units, lasting_sd: f
         values: (n,) without NaN among the members.
         groups: of them.
         units: as of `levels`.
-        lasting_sd: of the logarithm's lasting units' means.
+        lasting: of the logarithm.
         scale: (n,) usual scale of each value, of which one counts `MAX_SCALES` at most.
     """
     x, group, count = values[groups.row], groups.group, groups.count
@@ -149,19 +168,19 @@ def log_scatters(values: np.ndarray, groups: Groups, units: Units, lasting_sd: f
     size = np.minimum(np.abs(x - middle[group]) / scale[groups.row], MAX_SCALES)
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.maximum(np.bincount(group, size, count) / number, 1e-3)
-    return _judged(np.log(mean), 1 / (number * mean), size - mean[group], groups, units, lasting_sd)
+    return _judged(np.log(mean), 1 / (number * mean), size - mean[group], groups, units, lasting)
 
 
-def means(values: np.ndarray, groups: Groups, units: Units, lasting_sd: float) -> Statistic:
+def means(values: np.ndarray, groups: Groups, units: Units, lasting: Lasting) -> Statistic:
     """Return the mean of each group, such as a share; arguments as of `levels`."""
     x, group, count = values[groups.row], groups.group, groups.count
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.bincount(group, x, count) / number
-    return _judged(mean, 1 / number, x - mean[group], groups, units, lasting_sd)
+    return _judged(mean, 1 / number, x - mean[group], groups, units, lasting)
 
 
 def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Groups,
-            units: Units, lasting_sd: float) -> Statistic:
+            units: Units, lasting: Lasting) -> Statistic:
     """Return a statistic with the larger of two errors.
 
     They are the sandwich over passing units, whose influences are `pull` (m,) times `step`, and
@@ -175,10 +194,12 @@ def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Group
     pair, of_pair = _pairs(group, units.lasting[groups.row])
     share = np.bincount(pair)
     number = np.bincount(group, minlength=count)
-    lasting = number**2 / np.maximum(np.bincount(of_pair, share.astype(float) ** 2, count), 1)
-    error = np.maximum(sandwich, lasting_sd / np.sqrt(np.maximum(lasting, 1.0)))
+    size = np.bincount(of_pair, share.astype(float) ** 2, count)
+    effective = np.maximum(number**2 / np.maximum(size, 1), 1.0)
+    error = np.maximum(sandwich, lasting.sd / np.sqrt(effective))
     enough = (number >= MIN_VALUES) & (several >= MIN_UNITS)
-    return Statistic(*(np.where(enough, each, np.nan) for each in (value, error, lasting)))
+    return Statistic(*(np.where(enough, each, np.nan) for each in
+                       (value, error, lasting.kurtosis / effective)))
 
 
 def _pairs(group: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -223,13 +244,18 @@ class Apart:
 
 
 def apart(found: Statistic, prior_spread: float) -> Apart:
-    """Return how far each group is from its peers, whose spread is shrunk to a prior."""
+    """Return how far each group is from its peers, whose spread is shrunk to a prior.
+
+    Args:
+        found: statistic of each group.
+        prior_spread: standard deviation of peers.
+    """
     value, error = found.value, found.error
     size, total = np.full(len(value), np.nan), np.full(len(value), np.nan)
-    spread, dof = total.copy(), total.copy()
+    spread, tails = total.copy(), total.copy()
     judged = np.flatnonzero(np.isfinite(value))
     if len(judged) < 2:
-        return Apart(size, total, spread, dof)
+        return Apart(size, total, spread, tails)
     own, squares = value[judged], error[judged] ** 2
     if len(judged) <= LEAVE_OUT:
         others = ~np.eye(len(judged), dtype=bool)
@@ -247,9 +273,10 @@ def apart(found: Statistic, prior_spread: float) -> Apart:
     size[judged] = own - centre
     total[judged] = np.sqrt(squares * np.minimum(usual / noise, 1.0) + 1.57 / peers * usual)
     spread[judged] = np.sqrt(np.maximum(usual - noise, 0.0))
-    # A mean of few units has the tails of one unit.
-    dof[judged] = 1 / (1 / (weight + PRIOR_DOF) + 0.5 / found.units[judged])
-    return Apart(size, total, spread, dof)
+    # Of Student's t with the kurtosis of the error, and of a spread that is not known exactly.
+    tails[judged] = 1 / (found.kurtosis[judged] / (4 * found.kurtosis[judged] + 6)
+                         + 1 / (weight + PRIOR_DOF))
+    return Apart(size, total, spread, tails)
 
 
 def together(parts: list[Apart]) -> Apart:
@@ -303,7 +330,7 @@ def without_shared(values: np.ndarray, label: np.ndarray, unit: np.ndarray) -> n
     visits = np.bincount(of_unit)
     shrink = np.where(visits > 1, visits / (visits + 1.0), 0.0)
     shared = np.zeros(len(visits))
-    for _ in range(POLISH_ROUNDS):
+    for _ in range(SHARED_ROUNDS):
         level = medians(middle - shared[of_unit], of_group, int(of_group.max(initial=0)) + 1)
         shared = shrink * medians(middle - level[of_group], of_unit, len(visits))
     return values - shared[of_unit[cell_of]]
