@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import expit, logit, ndtr
@@ -30,6 +31,7 @@ from radiotwin.inference.groups import (
     levels,
     log_scatters,
     means,
+    medians,
     polished,
     together,
     without_shared,
@@ -41,8 +43,9 @@ PASSING_M, LASTING_M = 25.0, 75.0  # errors of one flight, and of the map, are a
 TOLERANCE_DB = 0.3  # spread of levels of peers: instruments, antennas, cables
 # Share of a base's scatter with line of sight, and without, in which whole groups differ.
 LOS_SHARE, NLOS_SHARE = 0.1, 0.4
+LOS_DOF, NLOS_DOF = 40.0, 6.0  # tails of these differences of levels, Student's t
 BOTH_SHARE = 0.8  # of what stands out does so with line of sight and without
-SCATTER_SPREAD = 0.2  # of peers: logarithm of the scatter
+SCATTER_SPREAD, NOISE_SPREAD = 0.2, 0.3  # of peers: logarithm
 LOS_BLANKS_SPREAD, NLOS_BLANKS_SPREAD = 0.05, 0.15  # of peers: share of blanks
 ANYWHERE_DB, ANYWHERE_LOG, ANYWHERE_SHARE = 5.0, 0.8, 0.3  # scale of what stands out
 # Odds that something of a family stands out in one way: a device, receiver or flight; others.
@@ -55,7 +58,9 @@ MIN_LINKS = 60  # of a class of line of sight
 SECTORS, BANDS, WINDOWS = 8, 8, (2, 4, 8, 16, 32)
 RAY_SAMPLES, LOW_M, GRID_M = 24, 40.0, (50.0, 100.0)  # of links that pass through a place
 ENDS = "device", "receiver", "flight"
-UNITS = {"level": "dB", "scatter": "times", "blanks": "share"}
+BASE_ERRORS, BASE_ERRORS_DB = ("distance", "altitude", "level"), 2.0  # which every base has
+HEIGHTS_M, QUARTERS = (5.0, 20.0, 60.0), 4  # at which a base errs otherwise: street, roofs, above
+UNITS = {"level": "dB", "scatter": "times", "noise": "times", "blanks": "share"}
 Words = tuple[dict[str, tuple[str, ...]], dict[str, tuple[float, float]]]
 """Members and ranges of a group."""
 
@@ -121,6 +126,26 @@ class Readings:
     predicted_db: np.ndarray
     names: Mapping[str, list[str]]
 
+    @cached_property
+    def previous(self) -> np.ndarray:
+        """(n,) row of the reading before, of the same ends and flight; -1 where there is none."""
+        series = _codes(self.device, self.receiver, self.flight)
+        order = np.lexsort((np.arange(len(self)), self.time_s, series))
+        found = np.full(len(self), -1)
+        follows = series[order[1:]] == series[order[:-1]]
+        found[order[1:][follows]] = order[:-1][follows]
+        return found
+
+    @property
+    def step_db(self) -> np.ndarray:
+        """(n,) change since the reading before over the square root of 2; NaN = none.
+
+        What a map has wrong changes slowly along a track; an instrument's noise does not.
+        """
+        before = self.previous
+        alike = (before >= 0) & (self.los == self.los[before])
+        return np.where(alike, (self.residual_db - self.residual_db[before]) / np.sqrt(2), np.nan)
+
     @classmethod
     def of(cls, model: CrossFit) -> Readings:
         """Return the readings of a model's links, held out."""
@@ -160,7 +185,7 @@ class Family:
     groups: Groups
     describe: Callable[[int], Words]
     ends: tuple[np.ndarray, ...] = ()
-    statistics: tuple[str, ...] = ("level", "scatter", "blanks")
+    statistics: tuple[str, ...] = ("level", "noise", "scatter", "blanks")
     pairs: tuple[np.ndarray, ...] = ()
     is_crossing: bool = False
 
@@ -247,7 +272,10 @@ def _packed(label: np.ndarray, known: np.ndarray) -> np.ndarray:
 def _compare(readings: Readings, families: list[Family],
              units: Units) -> list[_Compared]:
     found = []
-    heard, judged = np.isfinite(readings.residual_db), np.isfinite(readings.blank_excess)
+    usual_db = _usual_errors(readings)
+    values = {"level": readings.residual_db - usual_db, "scatter": readings.residual_db - usual_db,
+              "noise": readings.step_db, "blanks": readings.blank_excess}
+    heard = np.isfinite(readings.residual_db)
     classes = {name: rows for name, rows in (("los", readings.los), ("nlos", ~readings.los))
                if (rows & heard).sum() >= MIN_LINKS}
     scale = {name: _scale(readings.residual_db[rows & heard]) for name, rows in classes.items()}
@@ -256,66 +284,91 @@ def _compare(readings: Readings, families: list[Family],
         for statistic in family.statistics:
             parts = {}
             for name, rows in classes.items():
-                rows = rows & (judged if statistic == "blanks" else heard)
-                part = _distances(readings, family, statistic, rows, units, usual, scale[name])
+                rows = rows & np.isfinite(values[statistic])
+                of_family = readings.residual_db if family.name in BASE_ERRORS and \
+                    statistic == "level" else values[statistic]
+                part = _distances(of_family, family, statistic, rows, units, usual, readings.los)
                 if part is not None:
                     parts[name] = part
             if len(parts) > 1:
                 parts["all"] = together(list(parts.values()))
             elif len(classes) == 1 and parts:
                 parts["all"] = parts.popitem()[1]
-            outlier = {"level": ANYWHERE_DB, "scatter": ANYWHERE_LOG,
-                       "blanks": ANYWHERE_SHARE}[statistic]
+            outlier = {"level": ANYWHERE_DB, "blanks": ANYWHERE_SHARE}.get(statistic, ANYWHERE_LOG)
             for name, part in parts.items():
                 odds = END_ODDS if family.name in ENDS else FAMILY_ODDS
                 if len(parts) > 1:
                     odds *= BOTH_SHARE if name == "all" else (1 - BOTH_SHARE) / 2
                 log_odds = part.log_odds(outlier, odds)
-                if statistic == "scatter":  # a group that scatters less is no fault
+                if statistic in ("scatter", "noise"):  # a group that scatters less is no fault
                     log_odds = np.where(part.size > 0, log_odds, -np.inf)
                 found.append(_Compared(family, statistic, name, part, log_odds))
     return found
 
 
-def _distances(readings: Readings, family: Family, statistic: str, rows: np.ndarray,
-               units: Units, usual: np.ndarray, scale_db: float) -> Apart | None:
+def _usual_errors(readings: Readings) -> np.ndarray:
+    """Return the median residual (n,) at like height and distance, of one class of sight [dB].
+
+    A base errs otherwise in a street than above the roofs, which is no fault of a flight there.
+    """
+    heard = np.isfinite(readings.residual_db)
+    height = np.searchsorted(HEIGHTS_M, readings.moving_m[:, 2])
+    distance_m = np.linalg.norm(readings.receiver_m - readings.device_m, axis=1)
+    cell = _codes(readings.los.astype(int), height)
+    quarter = np.zeros(len(readings), dtype=np.int64)
+    for each in np.unique(cell[heard]):
+        rows = heard & (cell == each)
+        edges = np.quantile(distance_m[rows], np.linspace(0, 1, QUARTERS + 1)[1:-1])
+        quarter[rows] = np.searchsorted(edges, distance_m[rows])
+    cell = _codes(cell, quarter)
+    found = np.zeros(len(readings))
+    found[heard] = medians(readings.residual_db[heard], cell[heard], int(cell.max()) + 1)[
+        cell[heard]]
+    return found
+
+
+def _distances(values: np.ndarray, family: Family, statistic: str, rows: np.ndarray,
+               units: Units, usual: np.ndarray, los: np.ndarray) -> Apart | None:
     """Return how far the groups of one class are from their peers; None if too few are judged."""
     groups = family.groups.among(rows)
     if not len(groups.row):
         return None
-    values = readings.blank_excess if statistic == "blanks" else readings.residual_db
+    is_los = bool(los[groups.row[0]])
+    scale = float(usual[groups.row[0]])
     if family.ends:
         values = values.copy()
         take_off = _centred if statistic == "blanks" else polished
         values[rows] = take_off(values[rows], [label[rows] for label in family.ends])
-    if family.is_crossing and statistic != "blanks":
+    if family.is_crossing and statistic in ("level", "scatter"):
         label = np.full(len(values), -1)
         label[groups.row] = groups.group
         own = label >= 0
         values = values.copy()
         values[own] = without_shared(values[own], label[own], units.lasting[own])
-    is_los = bool(readings.los[groups.row[0]])
     if statistic == "level":
         # A level gives way to outliers; so much of a unit's error as it follows counts.
-        limit_db, most_db = HUBER * scale_db, MAX_SCALES * scale_db
+        limit_db, most_db = HUBER * scale, MAX_SCALES * scale
         centred = values - np.median(values[rows])
-        clipped = units.means(np.clip(centred, -limit_db, limit_db), rows)
-        lasting = Lasting.of(units.means(np.clip(centred, -most_db, most_db), rows),
-                             float(np.std(clipped) / (np.abs(centred[rows]) < limit_db).mean()))
+        followed = units.errors(np.clip(centred, -limit_db, limit_db), rows).sd
+        lasting = Lasting(followed / float((np.abs(centred[rows]) < limit_db).mean()),
+                          units.errors(np.clip(centred, -most_db, most_db), rows).kurtosis)
         found = levels(values, groups, units, lasting, LEAST_SCALE_DB)
-        prior = np.hypot(TOLERANCE_DB, (LOS_SHARE if is_los else NLOS_SHARE) * scale_db)
-    elif statistic == "scatter":
+        prior = BASE_ERRORS_DB if family.name in BASE_ERRORS else TOLERANCE_DB
+        prior = np.hypot(prior, (LOS_SHARE if is_los else NLOS_SHARE) * scale)
+    elif statistic in ("scatter", "noise"):
         size = np.minimum(np.abs(values) / usual, MAX_SCALES)
-        lasting = Lasting.of(units.means(size / size[rows].mean(), rows))
-        found, prior = log_scatters(values, groups, units, lasting, usual), SCATTER_SPREAD
+        lasting = units.errors(size / size[rows].mean(), rows)
+        found = log_scatters(values, groups, units, lasting, usual)
+        prior = NOISE_SPREAD if statistic == "noise" else SCATTER_SPREAD
     else:
-        found = means(values, groups, units, Lasting.of(units.means(values, rows)))
+        found = means(values, groups, units, units.errors(values, rows))
         prior = LOS_BLANKS_SPREAD if is_los else NLOS_BLANKS_SPREAD
     if np.isfinite(found.value).sum() < 2:
         return None
     if family.pairs:
         found = _additive(found, family.pairs)
-    return apart(found, float(prior))
+    heavy = statistic == "level" and not is_los
+    return apart(found, float(prior), NLOS_DOF if heavy else LOS_DOF)
 
 
 def _centred(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
@@ -330,10 +383,11 @@ def _centred(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
 def _additive(found: Statistic, ends: tuple[np.ndarray, ...]) -> Statistic:
     """Return the statistic of pairs less the medians of both ends' pairs."""
     judged = np.isfinite(found.value)
-    value = found.value.copy()
-    if judged.any():
-        value[judged] = polished(value[judged], [end[judged] for end in ends])
-    return replace(found, value=value)
+    value, error = found.value.copy(), found.error.copy()
+    own = [end[judged] for end in ends]
+    value[judged] = polished(value[judged], own)
+    error[judged] *= np.sqrt(1 + sum(1.57 / np.bincount(end)[end] for end in own))
+    return replace(found, value=value, error=error)
 
 
 def _scale(values: np.ndarray) -> float:
@@ -398,9 +452,10 @@ def _anomaly(found: _Found, readings: Readings) -> Anomaly:
                 members = {**members, other: (readings.names[other][same[found.group]],)}
     error = QUANTILE_90 * float(compared.distance.error[found.group])
     value, low, high = found.size, found.size - error, found.size + error
-    if compared.statistic == "scatter":
+    if compared.statistic in ("scatter", "noise"):
         value, low, high = np.exp([value, low, high]).tolist()
-    return Anomaly(compared.family.name, members, ranges, compared.sight, compared.statistic,
+    return Anomaly(compared.family.name, members, ranges, compared.sight,
+                   "scatter" if compared.statistic == "noise" else compared.statistic,
                    Parameter(value, low, high, UNITS[compared.statistic]),
                    float(expit(found.log_odds)), _rows(found, readings))
 

@@ -72,17 +72,25 @@ class Units:
     passing: np.ndarray
     lasting: np.ndarray
 
-    def means(self, values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Return the means (u,) of lasting units, of values (n,) in a mask (n,).
+    def errors(self, values: np.ndarray, rows: np.ndarray) -> Lasting:
+        """Return how far lasting units differ, of values (n,) in a mask (n,).
 
-        Where hardly any unit has several values, the values themselves.
+        Analysis of variance of passing units within lasting ones: the part that lasts is what the
+        units' means differ by beyond what their passing parts explain.
         """
-        label = np.unique(self.lasting[rows], return_inverse=True)[1].ravel()
-        number = np.bincount(label)
-        several = number >= MIN_ALIKE
+        lasting = np.unique(self.lasting[rows], return_inverse=True)[1].ravel()
+        part, of_part = _pairs(lasting, self.passing[rows])
+        mean = np.bincount(part, values[rows]) / np.bincount(part)
+        parts = np.bincount(of_part)
+        middle = np.bincount(of_part, mean) / parts
+        several = parts >= MIN_ALIKE
         if several.sum() < MIN_UNITS:
-            return values[rows]
-        return (np.bincount(label, values[rows]) / number)[several]
+            return Lasting(0.0, 0.0)
+        freedom = (parts[several] - 1).sum()
+        within = ((mean - middle[of_part]) ** 2)[several[of_part]].sum() / freedom
+        between = np.var(middle[several]) - within * np.mean(1 / parts[several])
+        tails = float(kurtosis(middle[several])) if np.ptp(middle[several]) > TINY else 0.0
+        return Lasting(float(np.sqrt(max(between, 0.0))), max(tails, 0.0))
 
 
 @dataclass(frozen=True)
@@ -96,12 +104,6 @@ class Lasting:
 
     sd: float
     kurtosis: float
-
-    @classmethod
-    def of(cls, means: np.ndarray, sd: float | None = None) -> Lasting:
-        """Return what means (u,) of units show; with another standard deviation if one is given."""
-        found = float(kurtosis(means)) if np.ptp(means) > TINY else 0.0
-        return cls(float(np.std(means)) if sd is None else sd, max(found, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,10 +183,10 @@ def means(values: np.ndarray, groups: Groups, units: Units, lasting: Lasting) ->
 
 def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Groups,
             units: Units, lasting: Lasting) -> Statistic:
-    """Return a statistic with the larger of two errors.
+    """Return a statistic with its error.
 
-    They are the sandwich over passing units, whose influences are `pull` (m,) times `step`, and
-    what the lasting units leave.
+    That of passing units is a sandwich, whose influences are `pull` (m,) times `step`. What lasts
+    in lasting units is added.
     """
     group, count = groups.group, groups.count
     pair, of_pair = _pairs(group, units.passing[groups.row])
@@ -196,7 +198,7 @@ def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Group
     number = np.bincount(group, minlength=count)
     size = np.bincount(of_pair, share.astype(float) ** 2, count)
     effective = np.maximum(number**2 / np.maximum(size, 1), 1.0)
-    error = np.maximum(sandwich, lasting.sd / np.sqrt(effective))
+    error = np.hypot(sandwich, lasting.sd / np.sqrt(effective))
     enough = (number >= MIN_VALUES) & (several >= MIN_UNITS)
     return Statistic(*(np.where(enough, each, np.nan) for each in
                        (value, error, lasting.kurtosis / effective)))
@@ -243,12 +245,13 @@ class Apart:
         return anywhere - like_peers + np.log(prior_odds / max(judged.sum(), 1))
 
 
-def apart(found: Statistic, prior_spread: float) -> Apart:
+def apart(found: Statistic, prior_spread: float, dof: float) -> Apart:
     """Return how far each group is from its peers, whose spread is shrunk to a prior.
 
     Args:
         found: statistic of each group.
         prior_spread: standard deviation of peers.
+        dof: degrees of freedom of peers' distribution, Student's t.
     """
     value, error = found.value, found.error
     size, total = np.full(len(value), np.nan), np.full(len(value), np.nan)
@@ -275,7 +278,7 @@ def apart(found: Statistic, prior_spread: float) -> Apart:
     spread[judged] = np.sqrt(np.maximum(usual - noise, 0.0))
     # Of Student's t with the kurtosis of the error, and of a spread that is not known exactly.
     tails[judged] = 1 / (found.kurtosis[judged] / (4 * found.kurtosis[judged] + 6)
-                         + 1 / (weight + PRIOR_DOF))
+                         + 1 / (weight + PRIOR_DOF) + 1 / dof)
     return Apart(size, total, spread, tails)
 
 
