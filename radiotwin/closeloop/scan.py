@@ -9,22 +9,23 @@ residuals, and looks again: one flight is said, not its twenty-four pairs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
-from scipy.special import expit, logit, ndtr
+from scipy.special import expit, logit
 
 from radiotwin.closeloop.crossfit import CrossFit
+from radiotwin.closeloop.families import Family, Readings, codes_of, families_of, units_of
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.effects.params import QUANTILE_90, Parameter
 from radiotwin.inference.groups import (
     HUBER,
     MAX_SCALES,
+    TINY,
     Apart,
     Groups,
-    Lasting,
+    Nested,
     Statistic,
     Units,
     apart,
@@ -36,14 +37,12 @@ from radiotwin.inference.groups import (
     together,
     without_shared,
 )
-from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.sites import never_part
 
-PASSING_M, LASTING_M = 25.0, 75.0  # errors of one flight, and of the map, are alike within
 TOLERANCE_DB = 0.3  # spread of levels of peers: instruments, antennas, cables
 # Share of a base's scatter with line of sight, and without, in which whole groups differ.
 LOS_SHARE, NLOS_SHARE = 0.1, 0.4
-LOS_DOF, NLOS_DOF = 40.0, 6.0  # tails of these differences of levels, Student's t
+LOS_DOF, NLOS_DOF = 16.0, 6.0  # tails of these differences of levels, Student's t
 BOTH_SHARE = 0.8  # of what stands out does so with line of sight and without
 SCATTER_SPREAD, NOISE_SPREAD = 0.2, 0.3  # of peers: logarithm
 LOS_BLANKS_SPREAD, NLOS_BLANKS_SPREAD = 0.05, 0.15  # of peers: share of blanks
@@ -55,14 +54,10 @@ MAX_ANOMALIES = 10
 MAX_RIVALS = 4  # groups of which the one that explains most is taken
 LIKELY = 0.5  # groups less probable than this are not said
 MIN_LINKS = 60  # of a class of line of sight
-SECTORS, BANDS, WINDOWS = 8, 8, (2, 4, 8, 16, 32)
-RAY_SAMPLES, LOW_M, GRID_M = 24, 40.0, (50.0, 100.0)  # of links that pass through a place
 ENDS = "device", "receiver", "flight"
 BASE_ERRORS, BASE_ERRORS_DB = ("distance", "altitude", "level"), 2.0  # which every base has
 HEIGHTS_M, QUARTERS = (5.0, 20.0, 60.0), 4  # at which a base errs otherwise: street, roofs, above
 UNITS = {"level": "dB", "scatter": "times", "noise": "times", "blanks": "share"}
-Words = tuple[dict[str, tuple[str, ...]], dict[str, tuple[float, float]]]
-"""Members and ranges of a group."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,102 +87,6 @@ class Anomaly:
     probability: float
     rows: np.ndarray
     causes: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """n readings with what a model that has not seen them predicts.
-
-    Attributes:
-        residual_db: (n,) measured minus predicted; NaN where nothing was heard or predicted.
-        blank_excess: (n,) 1 for a blank, 0 for a level, less the probability of a blank.
-        los: (n,) bool.
-        device, receiver, flight: (n,) int.
-        time_s: (n,) NaN where unknown.
-        moving_m: (n, 3) end of the link that moves [m].
-        device_m, receiver_m: (n, 3) both ends [m].
-        angles_deg: azimuth and elevation at the device, and azimuth in the receiver's body, (n,)
-            each [degree]; NaN where unknown.
-        predicted_db: (n,) level.
-        names: of devices, receivers and flights.
-    """
-
-    residual_db: np.ndarray
-    blank_excess: np.ndarray
-    los: np.ndarray
-    device: np.ndarray
-    receiver: np.ndarray
-    flight: np.ndarray
-    time_s: np.ndarray
-    moving_m: np.ndarray
-    device_m: np.ndarray
-    receiver_m: np.ndarray
-    angles_deg: Mapping[str, np.ndarray]
-    predicted_db: np.ndarray
-    names: Mapping[str, list[str]]
-
-    @cached_property
-    def previous(self) -> np.ndarray:
-        """(n,) row of the reading before, of the same ends and flight; -1 where there is none."""
-        series = _codes(self.device, self.receiver, self.flight)
-        order = np.lexsort((np.arange(len(self)), self.time_s, series))
-        found = np.full(len(self), -1)
-        follows = series[order[1:]] == series[order[:-1]]
-        found[order[1:][follows]] = order[:-1][follows]
-        return found
-
-    @property
-    def step_db(self) -> np.ndarray:
-        """(n,) change since the reading before over the square root of 2; NaN = none.
-
-        What a map has wrong changes slowly along a track; an instrument's noise does not.
-        """
-        before = self.previous
-        alike = (before >= 0) & (self.los == self.los[before])
-        return np.where(alike, (self.residual_db - self.residual_db[before]) / np.sqrt(2), np.nan)
-
-    @classmethod
-    def of(cls, model: CrossFit) -> Readings:
-        """Return the readings of a model's links, held out."""
-        links, level_db = model.links, model.links.level_db
-        mean_db, scale_db = model.held_out_reading
-        predicted_db = model.held_out_mean_db
-        with np.errstate(invalid="ignore"):
-            blank = ndtr((links.limit_db - mean_db) / scale_db)
-        blank_excess = np.where(np.isnan(level_db), 1.0, 0.0) - blank
-        return cls(level_db - predicted_db, blank_excess, links.los, links.device, links.receiver,
-                   links.flight, links.time_s, moving_end_m(links),
-                   links.device_m[links.device], links.receiver_m,
-                   {"azimuth": links.azimuth_deg, "elevation": links.elevation_deg,
-                    "body azimuth": links.body_azimuth_deg}, mean_db,
-                   {"device": list(links.device_names), "receiver": list(links.receiver_names),
-                    "flight": list(links.flight_names)})
-
-    def __len__(self) -> int:
-        return len(self.los)
-
-
-@dataclass(frozen=True, eq=False)
-class Family:
-    """Groups that are each other's peers.
-
-    Attributes:
-        name: of the family.
-        groups: of links.
-        describe: members and ranges of a group.
-        ends: labels (n,) whose levels are taken off first, as they are families of their own.
-        statistics: that are compared.
-        pairs: label of both ends (k,) each, of groups that are pairs.
-        is_crossing: whether several groups may have read one device at one place.
-    """
-
-    name: str
-    groups: Groups
-    describe: Callable[[int], Words]
-    ends: tuple[np.ndarray, ...] = ()
-    statistics: tuple[str, ...] = ("level", "noise", "scatter", "blanks")
-    pairs: tuple[np.ndarray, ...] = ()
-    is_crossing: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,70 +128,129 @@ def scan(model: CrossFit) -> list[Anomaly]:
 
 def scan_readings(readings: Readings) -> list[Anomaly]:
     """Return the groups of readings that stand out, see `scan`."""
-    families = list(_families(readings))
-    units = _units(readings)
+    units = units_of(readings)
+    families = list(families_of(readings, units))
+    few = [family for family in families if family.name in ENDS or family.pairs]
     found: list[Anomaly] = []
     left = readings
-    compared = _compare(left, families, units)
     while len(found) < MAX_ANOMALIES:
-        rivals = _likeliest(compared)
+        rivals = _likeliest(_compare(left, families, units))
         if not rivals:
             break
         after = [(each, _without(left, each)) for each in rivals]
-        tables = [_compare(rest, families, units) for _, rest in after] if len(after) > 1 else []
-        best = int(np.argmin([_evidence(table) for table in tables])) if tables else 0
+        best = 0
+        if len(after) > 1:  # what explains most of what ends, flights and their pairs show
+            best = int(np.argmin([_evidence(_compare(rest, few, units)) for _, rest in after]))
         chosen, left = after[best]
-        compared = tables[best] if tables else _compare(left, families, units)
         found.append(_anomaly(chosen, readings))
     return found
 
 
-def _units(readings: Readings) -> Units:
-    """Return which readings err alike: of one flight nearby; of one device, in a larger place."""
-    passing, lasting = (np.floor(readings.moving_m[:, :2] / width_m).astype(np.int64)
-                        for width_m in (PASSING_M, LASTING_M))
-    return Units(_codes(*passing.T, readings.flight), _codes(*lasting.T, readings.device))
+@dataclass(frozen=True, eq=False)
+class _Class:
+    """Values of one statistic, of the links of one class of line of sight.
+
+    Attributes:
+        values: (n,), NaN outside `rows`.
+        rows: (n,) bool.
+        statistic: `level`, `scatter`, `noise` or `blanks`.
+        is_los: whether the class is that with line of sight.
+        scale_db: of its residuals.
+        units: of the n values.
+        nested: of those in `rows`.
+        taken_off: values less the levels of ends that were asked for, kept.
+    """
+
+    values: np.ndarray
+    rows: np.ndarray
+    statistic: str
+    is_los: bool
+    scale_db: float
+    units: Units
+    nested: Nested
+    taken_off: dict[tuple[int, ...], np.ndarray] = field(default_factory=dict)
+
+    def of(self, family: Family, groups: Groups) -> np.ndarray:
+        """Return values (n,) in which a family's groups can be compared."""
+        key = tuple(id(end) for end in family.ends)
+        if key not in self.taken_off:
+            values, ends = self.values.copy(), [end[self.rows] for end in family.ends]
+            take_off = _centred if self.statistic == "blanks" else polished
+            values[self.rows] = take_off(values[self.rows], ends)
+            self.taken_off[key] = values
+        values = self.taken_off[key]
+        if not family.is_crossing or self.statistic != "level":
+            return values
+        values = values.copy()
+        values[groups.row] = without_shared(values[groups.row], groups.group,
+                                            self.units.lasting[groups.row])
+        return values
+
+    def compare(self, family: Family) -> Apart | None:
+        """Return how far a family's groups are from their peers; None if too few are judged."""
+        groups = family.groups.among(self.rows)
+        if not len(groups.row):
+            return None
+        values = self.of(family, groups)
+        own, scale_db = values[self.rows], self.scale_db
+        if self.statistic == "level":
+            # A level gives way to outliers; so much of a unit's error as it follows counts.
+            own, limit_db = own - np.median(own), HUBER * scale_db
+            followed_db = self.nested.error(np.clip(own, -limit_db, limit_db))
+            lasting_db = followed_db / float((np.abs(own) < limit_db).mean())
+            found = levels(values, groups, lasting_db, LEAST_SCALE_DB)
+            prior = BASE_ERRORS_DB if family.name in BASE_ERRORS else TOLERANCE_DB
+            prior = float(np.hypot(prior, (LOS_SHARE if self.is_los else NLOS_SHARE) * scale_db))
+        elif self.statistic == "blanks":
+            found = means(values, groups, self.nested.error(own))
+            prior = LOS_BLANKS_SPREAD if self.is_los else NLOS_BLANKS_SPREAD
+        else:
+            size = np.minimum(np.abs(own) / scale_db, MAX_SCALES)
+            lasting_sd = self.nested.error(size / max(size.mean(), TINY))
+            found = log_scatters(values, groups, lasting_sd, np.full(len(values), scale_db))
+            prior = NOISE_SPREAD if self.statistic == "noise" else SCATTER_SPREAD
+        if np.isfinite(found.value).sum() < 2:
+            return None
+        if family.pairs:
+            found = _additive(found, family.pairs)
+        heavy = self.statistic == "level" and not self.is_los
+        return apart(found, prior, NLOS_DOF if heavy else LOS_DOF)
 
 
-def _codes(*labels: np.ndarray) -> np.ndarray:
-    """Return one label (n,) for each combination of labels (n,)."""
-    code = np.zeros(len(labels[0]), dtype=np.int64)
-    for label in labels:
-        code = code * (int(np.ptp(label)) + 1 if len(label) else 1) + (label - label.min(initial=0))
-    return np.unique(code, return_inverse=True)[1].ravel()
-
-
-def _packed(label: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return labels (n,) without gaps; -1 where a mask (n,) is not set."""
-    code = np.full(len(label), -1)
-    code[known] = np.unique(label[known], return_inverse=True)[1].ravel()
-    return code
-
-
-def _compare(readings: Readings, families: list[Family],
-             units: Units) -> list[_Compared]:
-    found = []
+def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _Class]]:
+    """Return the values of each statistic, in each class that has enough links."""
     usual_db = _usual_errors(readings)
     values = {"level": readings.residual_db - usual_db, "scatter": readings.residual_db - usual_db,
-              "noise": readings.step_db, "blanks": readings.blank_excess}
+              "noise": readings.step_db, "blanks": readings.blank_excess,
+              "base": readings.residual_db}
+    found: dict[str, dict[str, _Class]] = {name: {} for name in values}
     heard = np.isfinite(readings.residual_db)
-    classes = {name: rows for name, rows in (("los", readings.los), ("nlos", ~readings.los))
-               if (rows & heard).sum() >= MIN_LINKS}
-    scale = {name: _scale(readings.residual_db[rows & heard]) for name, rows in classes.items()}
-    usual = np.where(readings.los, scale.get("los", 1.0), scale.get("nlos", 1.0))
+    for sight, is_los in (("los", True), ("nlos", False)):
+        of_class = readings.los if is_los else ~readings.los
+        if (of_class & heard).sum() < MIN_LINKS:
+            continue
+        scale_db = _scale(readings.residual_db[of_class & heard])
+        for name, each in values.items():
+            rows = of_class & np.isfinite(each)
+            found[name][sight] = _Class(each, rows, "level" if name == "base" else name, is_los,
+                                        scale_db, units, Nested(units, rows))
+    return found
+
+
+def _compare(readings: Readings, families: list[Family], units: Units) -> list[_Compared]:
+    """Return all statistics of families, in each class and in both together."""
+    found, classes = [], _classes(readings, units)
     for family in families:
         for statistic in family.statistics:
+            is_base = family.name in BASE_ERRORS and statistic == "level"
             parts = {}
-            for name, rows in classes.items():
-                rows = rows & np.isfinite(values[statistic])
-                of_family = readings.residual_db if family.name in BASE_ERRORS and \
-                    statistic == "level" else values[statistic]
-                part = _distances(of_family, family, statistic, rows, units, usual, readings.los)
+            for name, each in classes["base" if is_base else statistic].items():
+                part = each.compare(family)
                 if part is not None:
                     parts[name] = part
             if len(parts) > 1:
                 parts["all"] = together(list(parts.values()))
-            elif len(classes) == 1 and parts:
+            elif len(classes["level"]) == 1 and parts:
                 parts["all"] = parts.popitem()[1]
             outlier = {"level": ANYWHERE_DB, "blanks": ANYWHERE_SHARE}.get(statistic, ANYWHERE_LOG)
             for name, part in parts.items():
@@ -314,61 +272,17 @@ def _usual_errors(readings: Readings) -> np.ndarray:
     heard = np.isfinite(readings.residual_db)
     height = np.searchsorted(HEIGHTS_M, readings.moving_m[:, 2])
     distance_m = np.linalg.norm(readings.receiver_m - readings.device_m, axis=1)
-    cell = _codes(readings.los.astype(int), height)
+    cell = codes_of(readings.los.astype(int), height)
     quarter = np.zeros(len(readings), dtype=np.int64)
     for each in np.unique(cell[heard]):
         rows = heard & (cell == each)
         edges = np.quantile(distance_m[rows], np.linspace(0, 1, QUARTERS + 1)[1:-1])
         quarter[rows] = np.searchsorted(edges, distance_m[rows])
-    cell = _codes(cell, quarter)
+    cell = codes_of(cell, quarter)
     found = np.zeros(len(readings))
     found[heard] = medians(readings.residual_db[heard], cell[heard], int(cell.max()) + 1)[
         cell[heard]]
     return found
-
-
-def _distances(values: np.ndarray, family: Family, statistic: str, rows: np.ndarray,
-               units: Units, usual: np.ndarray, los: np.ndarray) -> Apart | None:
-    """Return how far the groups of one class are from their peers; None if too few are judged."""
-    groups = family.groups.among(rows)
-    if not len(groups.row):
-        return None
-    is_los = bool(los[groups.row[0]])
-    scale = float(usual[groups.row[0]])
-    if family.ends:
-        values = values.copy()
-        take_off = _centred if statistic == "blanks" else polished
-        values[rows] = take_off(values[rows], [label[rows] for label in family.ends])
-    if family.is_crossing and statistic in ("level", "scatter"):
-        label = np.full(len(values), -1)
-        label[groups.row] = groups.group
-        own = label >= 0
-        values = values.copy()
-        values[own] = without_shared(values[own], label[own], units.lasting[own])
-    if statistic == "level":
-        # A level gives way to outliers; so much of a unit's error as it follows counts.
-        limit_db, most_db = HUBER * scale, MAX_SCALES * scale
-        centred = values - np.median(values[rows])
-        followed = units.errors(np.clip(centred, -limit_db, limit_db), rows).sd
-        lasting = Lasting(followed / float((np.abs(centred[rows]) < limit_db).mean()),
-                          units.errors(np.clip(centred, -most_db, most_db), rows).kurtosis)
-        found = levels(values, groups, units, lasting, LEAST_SCALE_DB)
-        prior = BASE_ERRORS_DB if family.name in BASE_ERRORS else TOLERANCE_DB
-        prior = np.hypot(prior, (LOS_SHARE if is_los else NLOS_SHARE) * scale)
-    elif statistic in ("scatter", "noise"):
-        size = np.minimum(np.abs(values) / usual, MAX_SCALES)
-        lasting = units.errors(size / size[rows].mean(), rows)
-        found = log_scatters(values, groups, units, lasting, usual)
-        prior = NOISE_SPREAD if statistic == "noise" else SCATTER_SPREAD
-    else:
-        found = means(values, groups, units, units.errors(values, rows))
-        prior = LOS_BLANKS_SPREAD if is_los else NLOS_BLANKS_SPREAD
-    if np.isfinite(found.value).sum() < 2:
-        return None
-    if family.pairs:
-        found = _additive(found, family.pairs)
-    heavy = statistic == "level" and not is_los
-    return apart(found, float(prior), NLOS_DOF if heavy else LOS_DOF)
 
 
 def _centred(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
@@ -460,171 +374,3 @@ def _anomaly(found: _Found, readings: Readings) -> Anomaly:
                    float(expit(found.log_odds)), _rows(found, readings))
 
 
-def _families(readings: Readings) -> Iterator[Family]:
-    labels = {"device": readings.device, "receiver": readings.receiver, "flight": readings.flight}
-    several = {name: label for name, label in labels.items() if len(np.unique(label)) > 1}
-    for name, label in several.items():
-        def describe(group: int, name: str = name) -> Words:
-            return {name: (readings.names[name][group],)}, {}
-        within: tuple[np.ndarray, ...] = ()
-        if name == "flight" and "receiver" in several and _is_nested(label, readings.receiver):
-            within = (readings.receiver,)  # flights of one receiver share its level
-        yield Family(name, Groups.of_labels(label), describe, is_crossing=name != "device",
-                     pairs=tuple(end[_examples(label)] for end in within))
-    for first, second in (("device", "flight"), ("receiver", "flight"), ("device", "receiver")):
-        if first in several and second in several:
-            yield from _pairs(readings, first, second, labels)
-    yield from _windows(readings)
-    yield from _directions(readings)
-    yield from _bands(readings)
-    yield from _places(readings)
-
-
-def _pairs(readings: Readings, first: str, second: str,
-           labels: Mapping[str, np.ndarray]) -> Iterator[Family]:
-    one, other = labels[first], labels[second]
-    code = _codes(one, other)
-    count = int(code.max()) + 1
-    if count in (len(np.unique(one)), len(np.unique(other))):
-        return  # the two never part
-    example = _examples(code)
-
-    def describe(group: int) -> Words:
-        row = example[group]
-        return {first: (readings.names[first][one[row]],),
-                second: (readings.names[second][other[row]],)}, {}
-
-    yield Family(f"{first} x {second}", Groups.of_labels(code), describe,
-                 pairs=(one[example], other[example]), is_crossing=True)
-
-
-def _is_nested(label: np.ndarray, within: np.ndarray) -> bool:
-    """Return whether links of each label (n,) share one of fewer labels within (n,)."""
-    pairs = len(np.unique(_codes(label, within)))
-    return pairs == len(np.unique(label)) and pairs > len(np.unique(within))
-
-
-def _examples(label: np.ndarray) -> np.ndarray:
-    """Return one row of each label from 0 on; row 0 for one that no link has."""
-    example = np.zeros(int(label.max()) + 1, dtype=np.int64)
-    example[label] = np.arange(len(label))
-    return example
-
-
-def _windows(readings: Readings) -> Iterator[Family]:
-    """Yield windows of time within flights, of all receivers and of one."""
-    timed = np.isfinite(readings.time_s)
-    if timed.mean() < 0.5:
-        return
-    track = _codes(readings.receiver, readings.flight)
-    scopes = [("flight", readings.flight)]
-    if len(np.unique(track)) > len(np.unique(readings.flight)):
-        scopes.append(("receiver", track))
-    for scope, label in scopes:
-        begin, end = _extremes(readings.time_s, label)
-        lasts = np.maximum(end - begin, 1e-9)
-        for number in WINDOWS:
-            for shift in (0.0, 0.5):
-                share = (readings.time_s - begin[label]) / lasts[label]
-                window = np.floor(np.clip(np.where(timed, share, 0.0), 0, 1 - 1e-9) * number
-                                  + shift).astype(np.int64)
-                code = _packed(label * (number + 1) + window, timed)
-                yield Family("time", Groups.of_labels(code), _time_words(readings, scope, code),
-                             (readings.device, track), ("level", "blanks"), is_crossing=True)
-
-
-def _extremes(values: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.full(label.max() + 1, np.inf), np.full(label.max() + 1, -np.inf)
-    known = np.isfinite(values)
-    np.minimum.at(low, label[known], values[known])
-    np.maximum.at(high, label[known], values[known])
-    return low, high
-
-
-def _time_words(readings: Readings, scope: str, code: np.ndarray) -> Callable:
-    def describe(group: int) -> Words:
-        rows = code == group
-        flight = readings.flight[rows][0]
-        members: dict[str, tuple[str, ...]] = {"flight": (readings.names["flight"][flight],)}
-        if scope == "receiver":
-            members["receiver"] = (readings.names["receiver"][readings.receiver[rows][0]],)
-        time_s = readings.time_s[rows]
-        return members, {"time_s": (float(time_s.min()), float(time_s.max()))}
-    return describe
-
-
-def _directions(readings: Readings) -> Iterator[Family]:
-    """Yield directions at each device, and in the body of each receiver."""
-    for angle, end, names in (("azimuth", readings.device, "device"),
-                              ("elevation", readings.device, "device"),
-                              ("body azimuth", readings.receiver, "receiver")):
-        values = readings.angles_deg[angle]
-        known = np.isfinite(values)
-        if known.mean() < 0.5:
-            continue
-        width = 360 / SECTORS if angle != "elevation" else 180 / SECTORS
-        for shift in (0.0, 0.5):
-            sector = np.floor(np.where(known, values, 0.0) / width + shift).astype(np.int64)
-            if angle != "elevation":
-                sector %= SECTORS
-            sector -= sector.min()
-            code = _packed(_codes(end, sector), known)
-
-            def describe(group: int, code: np.ndarray = code, end: np.ndarray = end,
-                         names: str = names, angle: str = angle, shift: float = shift,
-                         width: float = width, values: np.ndarray = values
-                         ) -> Words:
-                row = np.flatnonzero(code == group)[0]
-                low = (np.floor(values[row] / width + shift) - shift) * width
-                return ({names: (readings.names[names][end[row]],)},
-                        {f"{angle.replace(' ', '_')}_deg": (float(low), float(low + width))})
-            yield Family("direction", Groups.of_labels(code), describe, (end, sector), ("level",))
-
-
-def _bands(readings: Readings) -> Iterator[Family]:
-    """Yield bands of distance, altitude and level, of all links."""
-    distance_m = np.linalg.norm(readings.receiver_m - readings.device_m, axis=1)
-    for name, values, key in (("distance", distance_m, "distance_m"),
-                              ("altitude", readings.moving_m[:, 2], "height_m"),
-                              ("level", readings.predicted_db, "predicted_db")):
-        known = np.isfinite(values)
-        edges = np.unique(np.quantile(values[known], np.linspace(0, 1, BANDS + 1)[1:-1])) \
-            if known.any() else np.zeros(0)
-        if len(edges) < 2:
-            continue
-        code = _packed(np.searchsorted(edges, values), known)
-
-        def describe(group: int, code: np.ndarray = code, values: np.ndarray = values,
-                     key: str = key
-                     ) -> Words:
-            rows = code == group
-            return {}, {key: (float(values[rows].min()), float(values[rows].max()))}
-        yield Family(name, Groups.of_labels(code), describe, (readings.device,),
-                     ("level", "scatter"))
-
-
-def _places(readings: Readings) -> Iterator[Family]:
-    """Yield squares of ground that links end in, or pass low above."""
-    share = (np.arange(RAY_SAMPLES) + 0.5) / RAY_SAMPLES
-    along_m = readings.device_m[:, None] + share[:, None] * (
-        readings.receiver_m - readings.device_m)[:, None]
-    low = along_m[..., 2] < LOW_M
-    link = np.broadcast_to(np.arange(len(readings))[:, None], low.shape)[low]
-    for width_m in GRID_M:
-        end = np.floor(readings.moving_m[:, :2] / width_m).astype(np.int64)
-        yield _squares(np.arange(len(readings)), end, width_m, readings)
-        cell = np.floor(along_m[low][:, :2] / width_m).astype(np.int64)
-        if len(cell):
-            yield _squares(link, cell, width_m, readings)
-
-
-def _squares(link: np.ndarray, cell: np.ndarray, width_m: float, readings: Readings) -> Family:
-    squares, group = np.unique(cell, axis=0, return_inverse=True)
-    pairs = np.unique(np.column_stack([link, group.ravel()]), axis=0)
-
-    def describe(group: int) -> Words:
-        low_m = squares[group] * width_m
-        return {}, {name: (float(low), float(low + width_m))
-                    for name, low in zip(("x_m", "y_m"), low_m, strict=True)}
-    return Family("place", Groups(pairs[:, 0], pairs[:, 1], len(squares)), describe,
-                  (readings.device, _codes(readings.receiver, readings.flight)), ("level",))

@@ -10,13 +10,12 @@ as Student's t with that spread allows, or it may be anywhere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import kurtosis
 from scipy.stats import t as student_t
 
-MIN_VALUES, MIN_UNITS = 12, 4  # of a group, to be judged
+MIN_VALUES, MIN_UNITS, MIN_LASTING = 12, 4, 3.0  # of a group, to be judged
 HUBER = 1.345  # scales, beyond which a value pulls no further (95 % efficient for normal errors)
 MAX_SCALES = 8.0  # a single value counts as this far away at most
 LEAVE_OUT = 64  # groups up to which each is left out of its own peers
@@ -26,38 +25,6 @@ MIN_ALIKE = 3  # values of a unit, to tell how much units differ
 OUTLIER_DOF = 2.0  # of sizes of what stands out: heavy tails
 POLISH_ROUNDS, SHARED_ROUNDS = 3, 10
 TINY = 1e-12
-
-
-@dataclass(frozen=True, eq=False)
-class Groups:
-    """Members of groups, which may overlap.
-
-    Attributes:
-        row: (m,) value of each membership.
-        group: (m,) group of each membership.
-        count: number of groups k.
-    """
-
-    row: np.ndarray
-    group: np.ndarray
-    count: int
-
-    @classmethod
-    def of_labels(cls, label: np.ndarray) -> Groups:
-        """Return the groups of equal labels (n,); negative labels are in none."""
-        row = np.flatnonzero(label >= 0)
-        return cls(row, label[row], int(label.max(initial=-1)) + 1)
-
-    def among(self, rows: np.ndarray) -> Groups:
-        """Return the groups with members from a mask (n,) only."""
-        kept = rows[self.row]
-        return Groups(self.row[kept], self.group[kept], self.count)
-
-    def members(self, group: int, n: int) -> np.ndarray:
-        """Return the mask (n,) of a group's members."""
-        rows = np.zeros(n, dtype=bool)
-        rows[self.row[self.group == group]] = True
-        return rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,38 +39,77 @@ class Units:
     passing: np.ndarray
     lasting: np.ndarray
 
-    def errors(self, values: np.ndarray, rows: np.ndarray) -> Lasting:
-        """Return how far lasting units differ, of values (n,) in a mask (n,).
 
-        Analysis of variance of passing units within lasting ones: the part that lasts is what the
-        units' means differ by beyond what their passing parts explain.
-        """
-        lasting = np.unique(self.lasting[rows], return_inverse=True)[1].ravel()
-        part, of_part = _pairs(lasting, self.passing[rows])
-        mean = np.bincount(part, values[rows]) / np.bincount(part)
-        parts = np.bincount(of_part)
-        middle = np.bincount(of_part, mean) / parts
-        several = parts >= MIN_ALIKE
-        if several.sum() < MIN_UNITS:
-            return Lasting(0.0, 0.0)
-        freedom = (parts[several] - 1).sum()
-        within = ((mean - middle[of_part]) ** 2)[several[of_part]].sum() / freedom
-        between = np.var(middle[several]) - within * np.mean(1 / parts[several])
-        tails = float(kurtosis(middle[several])) if np.ptp(middle[several]) > TINY else 0.0
-        return Lasting(float(np.sqrt(max(between, 0.0))), max(tails, 0.0))
-
-
-@dataclass(frozen=True)
-class Lasting:
-    """Errors of lasting units.
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Members of groups, which may overlap.
 
     Attributes:
-        sd: standard deviation.
-        kurtosis: excess, at least 0: how heavy the tails are.
+        row: (m,) value of each membership.
+        group: (m,) group of each membership.
+        count: number of groups k.
+        passing, lasting: (m,) number of each membership's pair of group and unit.
+        of_passing, of_lasting: group of each such pair.
     """
 
-    sd: float
-    kurtosis: float
+    row: np.ndarray
+    group: np.ndarray
+    count: int
+    passing: np.ndarray
+    of_passing: np.ndarray
+    lasting: np.ndarray
+    of_lasting: np.ndarray
+
+    @classmethod
+    def of_members(cls, row: np.ndarray, group: np.ndarray, count: int, units: Units) -> Groups:
+        """Return groups (m,) of rows (m,), some of which may be in several."""
+        return cls(row, group, count, *_pairs(group, units.passing[row]),
+                   *_pairs(group, units.lasting[row]))
+
+    @classmethod
+    def of_labels(cls, label: np.ndarray, units: Units) -> Groups:
+        """Return the groups of equal labels (n,); negative labels are in none."""
+        row = np.flatnonzero(label >= 0)
+        return cls.of_members(row, label[row], int(label.max(initial=-1)) + 1, units)
+
+    def among(self, rows: np.ndarray) -> Groups:
+        """Return the groups with members from a mask (n,) only."""
+        kept = rows[self.row]
+        return replace(self, row=self.row[kept], group=self.group[kept],
+                       passing=self.passing[kept], lasting=self.lasting[kept])
+
+    def members(self, group: int, n: int) -> np.ndarray:
+        """Return the mask (n,) of a group's members."""
+        rows = np.zeros(n, dtype=bool)
+        rows[self.row[self.group == group]] = True
+        return rows
+
+
+class Nested:
+    """Passing units within lasting ones, of some rows: how much of their errors lasts."""
+
+    def __init__(self, units: Units, rows: np.ndarray) -> None:
+        lasting = np.unique(units.lasting[rows], return_inverse=True)[1].ravel()
+        self._part, self._of_part = _pairs(lasting, units.passing[rows])
+        self._size = np.bincount(self._part)
+        self._parts = np.bincount(self._of_part)
+        self._several = self._parts >= MIN_ALIKE
+
+    def error(self, values: np.ndarray) -> float:
+        """Return the standard deviation of lasting units, of the rows' values (r,).
+
+        Analysis of variance: the part that lasts is what the units' means differ by beyond what
+        their passing parts explain.
+        """
+        several, parts = self._several, self._parts
+        if several.sum() < MIN_UNITS:
+            return 0.0
+        mean = np.bincount(self._part, values) / self._size
+        middle = np.bincount(self._of_part, mean) / parts
+        spread = ((mean - middle[self._of_part]) ** 2)[several[self._of_part]].sum()
+        within = spread / (parts[several] - 1).sum()
+        between = np.var(middle[several]) - within * np.mean(1 / parts[several])
+        return float(np.sqrt(max(between, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +119,10 @@ class Statistic:
     Attributes:
         value: (k,).
         error: (k,) its standard error, units counted once.
-        kurtosis: (k,) excess of its error: that of one unit over their effective number.
     """
 
     value: np.ndarray
     error: np.ndarray
-    kurtosis: np.ndarray
 
 
 def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
@@ -133,15 +137,14 @@ def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     return found
 
 
-def levels(values: np.ndarray, groups: Groups, units: Units, lasting: Lasting,
+def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
            least_scale: float) -> Statistic:
     """Return the level of each group: Huber's estimate, one step from the median.
 
     Args:
         values: (n,) without NaN among the members.
         groups: of them.
-        units: of the values.
-        lasting: errors of its lasting units.
+        lasting_sd: standard deviation of lasting units.
         least_scale: of a group's values, such as the step that they are rounded to.
     """
     x, group, count = values[groups.row], groups.group, groups.count
@@ -151,18 +154,17 @@ def levels(values: np.ndarray, groups: Groups, units: Units, lasting: Lasting,
     inside = np.maximum(np.bincount(group, np.abs(deviation) < HUBER, count), 1.0)
     value = middle + scale * np.bincount(group, np.clip(deviation, -HUBER, HUBER), count) / inside
     pull = np.clip((x - value[group]) / scale[group], -HUBER, HUBER)
-    return _judged(value, scale / inside, pull, groups, units, lasting)
+    return _judged(value, scale / inside, pull, groups, lasting_sd)
 
 
-def log_scatters(values: np.ndarray, groups: Groups, units: Units, lasting: Lasting,
+def log_scatters(values: np.ndarray, groups: Groups, lasting_sd: float,
                  scale: np.ndarray) -> Statistic:
     """Return the logarithm of each group's mean absolute deviation from its own median.
 
     Args:
         values: (n,) without NaN among the members.
         groups: of them.
-        units: as of `levels`.
-        lasting: of the logarithm.
+        lasting_sd: as of `levels`, of the logarithm.
         scale: (n,) usual scale of each value, of which one counts `MAX_SCALES` at most.
     """
     x, group, count = values[groups.row], groups.group, groups.count
@@ -170,38 +172,44 @@ def log_scatters(values: np.ndarray, groups: Groups, units: Units, lasting: Last
     size = np.minimum(np.abs(x - middle[group]) / scale[groups.row], MAX_SCALES)
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.maximum(np.bincount(group, size, count) / number, 1e-3)
-    return _judged(np.log(mean), 1 / (number * mean), size - mean[group], groups, units, lasting)
+    return _judged(np.log(mean), 1 / (number * mean), size - mean[group], groups, lasting_sd)
 
 
-def means(values: np.ndarray, groups: Groups, units: Units, lasting: Lasting) -> Statistic:
-    """Return the mean of each group, such as a share; arguments as of `levels`."""
+def means(values: np.ndarray, groups: Groups, lasting_sd: float) -> Statistic:
+    """Return the mean of each group, such as a share; arguments as of `levels`.
+
+    Values are taken as at least as uncertain as if they were independent, with the variance of
+    their group, or of all values where that is larger.
+    """
     x, group, count = values[groups.row], groups.group, groups.count
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.bincount(group, x, count) / number
-    return _judged(mean, 1 / number, x - mean[group], groups, units, lasting)
+    found = _judged(mean, 1 / number, x - mean[group], groups, lasting_sd)
+    variance = np.bincount(group, (x - mean[group]) ** 2, count) / number
+    least = np.sqrt(np.maximum(variance, np.var(x)) / number)
+    return replace(found, error=np.maximum(found.error, least))
 
 
 def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Groups,
-            units: Units, lasting: Lasting) -> Statistic:
+            lasting_sd: float) -> Statistic:
     """Return a statistic with its error.
 
     That of passing units is a sandwich, whose influences are `pull` (m,) times `step`. What lasts
     in lasting units is added.
     """
-    group, count = groups.group, groups.count
-    pair, of_pair = _pairs(group, units.passing[groups.row])
-    several = np.bincount(of_pair, minlength=count)
-    squares = np.bincount(of_pair, np.bincount(pair, pull) ** 2, count)
+    count = groups.count
+    number = np.bincount(groups.group, minlength=count)
+    filled = np.bincount(groups.passing, minlength=len(groups.of_passing)) > 0
+    several = np.bincount(groups.of_passing, filled, count)
+    pulls = np.bincount(groups.passing, pull, len(groups.of_passing))
+    squares = np.bincount(groups.of_passing, pulls**2, count)
     sandwich = step * np.sqrt(squares * several / np.maximum(several - 1, 1))
-    pair, of_pair = _pairs(group, units.lasting[groups.row])
-    share = np.bincount(pair)
-    number = np.bincount(group, minlength=count)
-    size = np.bincount(of_pair, share.astype(float) ** 2, count)
-    effective = np.maximum(number**2 / np.maximum(size, 1), 1.0)
-    error = np.hypot(sandwich, lasting.sd / np.sqrt(effective))
-    enough = (number >= MIN_VALUES) & (several >= MIN_UNITS)
-    return Statistic(*(np.where(enough, each, np.nan) for each in
-                       (value, error, lasting.kurtosis / effective)))
+    share = np.bincount(groups.lasting, minlength=len(groups.of_lasting)).astype(float)
+    effective = np.maximum(
+        number**2 / np.maximum(np.bincount(groups.of_lasting, share**2, count), 1), 1.0)
+    error = np.hypot(sandwich, lasting_sd / np.sqrt(effective))
+    enough = (number >= MIN_VALUES) & (several >= MIN_UNITS) & (effective >= MIN_LASTING)
+    return Statistic(np.where(enough, value, np.nan), np.where(enough, error, np.nan))
 
 
 def _pairs(group: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -276,9 +284,7 @@ def apart(found: Statistic, prior_spread: float, dof: float) -> Apart:
     size[judged] = own - centre
     total[judged] = np.sqrt(squares * np.minimum(usual / noise, 1.0) + 1.57 / peers * usual)
     spread[judged] = np.sqrt(np.maximum(usual - noise, 0.0))
-    # Of Student's t with the kurtosis of the error, and of a spread that is not known exactly.
-    tails[judged] = 1 / (found.kurtosis[judged] / (4 * found.kurtosis[judged] + 6)
-                         + 1 / (weight + PRIOR_DOF) + 1 / dof)
+    tails[judged] = 1 / (1 / (weight + PRIOR_DOF) + 1 / dof)  # the spread is not known exactly
     return Apart(size, total, spread, tails)
 
 
@@ -335,5 +341,5 @@ def without_shared(values: np.ndarray, label: np.ndarray, unit: np.ndarray) -> n
     shared = np.zeros(len(visits))
     for _ in range(SHARED_ROUNDS):
         level = medians(middle - shared[of_unit], of_group, int(of_group.max(initial=0)) + 1)
-        shared = shrink * medians(middle - level[of_group], of_unit, len(visits))
+        shared = shrink * np.bincount(of_unit, middle - level[of_group]) / visits
     return values - shared[of_unit[cell_of]]

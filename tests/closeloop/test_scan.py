@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.scan import Readings, scan_readings
+from radiotwin.closeloop.families import Readings
+from radiotwin.closeloop.scan import scan_readings
 
 SIDE_M, PLACE_M = 400.0, 60.0
 DEVICES, RECEIVERS, FLIGHTS, STOPS = 8, 3, 5, 60

@@ -6,7 +6,6 @@ from scipy import stats
 
 from radiotwin.inference.groups import (
     Groups,
-    Lasting,
     Statistic,
     Units,
     apart,
@@ -36,7 +35,7 @@ def test_the_error_of_a_level_is_that_of_its_units():
     label = unit // 25
     for _ in range(30):
         values = rng.normal(size=1000)[unit] + 0.2 * rng.normal(size=len(unit))
-        level = levels(values, Groups.of_labels(label), Units(unit, unit), Lasting(0.0, 0.0), 0.1)
+        level = levels(values, Groups.of_labels(label, Units(unit, unit)), 0.0, 0.1)
         found.append(level.value / level.error)
     assert np.std(found) == pytest.approx(1.0, abs=0.12)  # twenty times as many values would be 4.5
 
@@ -45,7 +44,7 @@ def test_a_scatter_is_relative_and_ignores_the_level():
     rng = np.random.default_rng(2)
     label = np.repeat(np.arange(2), 4000)
     values = np.where(label == 0, 2.0, 5.0) * rng.normal(size=8000) + 30 * label
-    found = log_scatters(values, Groups.of_labels(label), alone(8000), Lasting(0.0, 0.0), np.full(8000, 10.0))
+    found = log_scatters(values, Groups.of_labels(label, alone(8000)), 0.0, np.full(8000, 10.0))
     assert np.exp(np.diff(found.value)) == pytest.approx(2.5, rel=0.05)
 
 
@@ -53,21 +52,21 @@ def test_scores_of_peers_are_as_large_as_chance_makes_them():
     rng, scores = np.random.default_rng(3), []
     for _ in range(400):
         spread, error = 0.4, np.full(9, 0.3)
-        found = apart(Statistic(rng.normal(scale=np.hypot(spread, error)), error, np.zeros(9)), spread, 40.0)
+        found = apart(Statistic(rng.normal(scale=np.hypot(spread, error)), error), spread, 40.0)
         scores.append(found.score)
     assert np.std(scores) == pytest.approx(1.0, abs=0.2)
 
 
 def test_one_that_is_off_does_not_widen_the_spread_that_it_is_judged_by():
     value = np.array([0.1, -0.2, 0.0, 0.2, -0.1, -6.0, 0.1, 0.05])
-    found = apart(Statistic(value, np.full(8, 0.1), np.zeros(8)), 0.3, 40.0)
+    found = apart(Statistic(value, np.full(8, 0.1)), 0.3, 40.0)
     assert found.spread[5] < 0.35 and found.size[5] == pytest.approx(-6.05, abs=0.1)
     log_odds = found.log_odds(5.0, 0.1)
     assert log_odds[5] > 10 and (np.delete(log_odds, 5) < -2).all()
 
 
 def test_log_odds_are_those_of_the_two_densities():
-    found = apart(Statistic(np.array([0.0, 1.0, 0.5, 0.4]), np.full(4, 0.2), np.zeros(4)), 0.5, np.inf)
+    found = apart(Statistic(np.array([0.0, 1.0, 0.5, 0.4]), np.full(4, 0.2)), 0.5, np.inf)
     total = np.hypot(found.error, found.spread)
     expected = (stats.t(2, scale=np.hypot(total, 5)).logpdf(found.size)
                 - stats.t(14, scale=total).logpdf(found.size) + np.log(0.1 / 4))
@@ -76,8 +75,8 @@ def test_log_odds_are_those_of_the_two_densities():
 
 def test_two_parts_of_the_data_are_weighted_by_precision():
     error = np.array([0.2, 0.2, 0.2])
-    sure = apart(Statistic(np.array([0.0, 0.0, 3.0]), error, np.zeros(3)), 0.1, 40.0)
-    vague = apart(Statistic(np.array([0.0, np.nan, -3.0]), 20 * error, np.zeros(3)), 0.1, 40.0)
+    sure = apart(Statistic(np.array([0.0, 0.0, 3.0]), error), 0.1, 40.0)
+    vague = apart(Statistic(np.array([0.0, np.nan, -3.0]), 20 * error), 0.1, 40.0)
     both = together([sure, vague])
     assert both.size[2] == pytest.approx(sure.size[2], abs=0.1) and both.error[2] <= sure.error[2]
     assert both.size[1] == sure.size[1]
