@@ -42,10 +42,10 @@ from radiotwin.links.sites import never_part
 TOLERANCE_DB = 0.3  # spread of levels of peers: instruments, antennas, cables
 # Share of a base's scatter with line of sight, and without, in which whole groups differ.
 LOS_SHARE, NLOS_SHARE = 0.1, 0.4
-LOS_DOF, NLOS_DOF = 16.0, 6.0  # tails of these differences of levels, Student's t
+LOS_DOF, NLOS_DOF = 25.0, 6.0  # tails of these differences of levels, Student's t
 BOTH_SHARE = 0.8  # of what stands out does so with line of sight and without
 SCATTER_SPREAD, NOISE_SPREAD = 0.2, 0.3  # of peers: logarithm
-LOS_BLANKS_SPREAD, NLOS_BLANKS_SPREAD = 0.05, 0.15  # of peers: share of blanks
+LOS_BLANKS_SPREAD, NLOS_BLANKS_SPREAD = 0.03, 0.12  # of peers: share of blanks
 ANYWHERE_DB, ANYWHERE_LOG, ANYWHERE_SHARE = 5.0, 0.8, 0.3  # scale of what stands out
 # Odds that something of a family stands out in one way: a device, receiver or flight; others.
 END_ODDS, FAMILY_ODDS = 0.4, 0.03

@@ -69,7 +69,7 @@ def test_log_odds_are_those_of_the_two_densities():
     found = apart(Statistic(np.array([0.0, 1.0, 0.5, 0.4]), np.full(4, 0.2)), 0.5, np.inf)
     total = np.hypot(found.error, found.spread)
     expected = (stats.t(2, scale=np.hypot(total, 5)).logpdf(found.size)
-                - stats.t(14, scale=total).logpdf(found.size) + np.log(0.1 / 4))
+                - stats.t(22, scale=total).logpdf(found.size) + np.log(0.1 / 4))
     assert found.log_odds(5.0, 0.1) == pytest.approx(expected)
 
 
