@@ -26,9 +26,9 @@ from radiotwin.inference.groups import (
     Apart,
     Groups,
     Nested,
-    Statistic,
     Units,
     apart,
+    less_ends,
     levels,
     log_scatters,
     means,
@@ -39,10 +39,13 @@ from radiotwin.inference.groups import (
 )
 from radiotwin.links.sites import never_part
 
-TOLERANCE_DB = 0.3  # spread of levels of peers: instruments, antennas, cables
+# Spread of levels of peers. Of ends it is that of instruments, antennas and cables. By direction,
+# place, distance and height every base errs.
+PAIR_SPREAD_DB, SPREAD_DB = 0.6, {"device": 0.3, "receiver": 0.3, "flight": 0.3, "direction": 1.0,
+                                  "place": 1.0, "distance": 2.0, "altitude": 2.0, "level": 2.0}
 # Share of a base's scatter with line of sight, and without, in which whole groups differ.
 LOS_SHARE, NLOS_SHARE = 0.1, 0.4
-LOS_DOF, NLOS_DOF = 25.0, 6.0  # tails of these differences of levels, Student's t
+LOS_DOF, NLOS_DOF = 60.0, 6.0  # tails of these differences of levels, Student's t
 BOTH_SHARE = 0.8  # of what stands out does so with line of sight and without
 SCATTER_SPREAD, NOISE_SPREAD = 0.2, 0.3  # of peers: logarithm
 LOS_BLANKS_SPREAD, NLOS_BLANKS_SPREAD = 0.03, 0.12  # of peers: share of blanks
@@ -55,7 +58,7 @@ MAX_RIVALS = 4  # groups of which the one that explains most is taken
 LIKELY = 0.5  # groups less probable than this are not said
 MIN_LINKS = 60  # of a class of line of sight
 ENDS = "device", "receiver", "flight"
-BASE_ERRORS, BASE_ERRORS_DB = ("distance", "altitude", "level"), 2.0  # which every base has
+BASE_ERRORS = "distance", "altitude", "level"  # in which a base's usual errors differ
 HEIGHTS_M, QUARTERS = (5.0, 20.0, 60.0), 4  # at which a base errs otherwise: street, roofs, above
 UNITS = {"level": "dB", "scatter": "times", "noise": "times", "blanks": "share"}
 
@@ -199,20 +202,24 @@ class _Class:
             followed_db = self.nested.error(np.clip(own, -limit_db, limit_db))
             lasting_db = followed_db / float((np.abs(own) < limit_db).mean())
             found = levels(values, groups, lasting_db, LEAST_SCALE_DB)
-            prior = BASE_ERRORS_DB if family.name in BASE_ERRORS else TOLERANCE_DB
+            prior = SPREAD_DB.get(family.name, PAIR_SPREAD_DB)
             prior = float(np.hypot(prior, (LOS_SHARE if self.is_los else NLOS_SHARE) * scale_db))
         elif self.statistic == "blanks":
             found = means(values, groups, self.nested.error(own))
             prior = LOS_BLANKS_SPREAD if self.is_los else NLOS_BLANKS_SPREAD
+            prior *= 1 if family.name in ENDS else 2
         else:
             size = np.minimum(np.abs(own) / scale_db, MAX_SCALES)
-            lasting_sd = self.nested.error(size / max(size.mean(), TINY))
-            found = log_scatters(values, groups, lasting_sd, np.full(len(values), scale_db))
+            # What an instrument adds is another at each reading.
+            lasting_sd = None if self.statistic == "noise" else \
+                self.nested.error(size / max(size.mean(), TINY))
+            found = log_scatters(values, groups, lasting_sd, scale_db)
             prior = NOISE_SPREAD if self.statistic == "noise" else SCATTER_SPREAD
+            prior *= 1 if family.name in ENDS else 1.5
         if np.isfinite(found.value).sum() < 2:
             return None
         if family.pairs:
-            found = _additive(found, family.pairs)
+            found = less_ends(found, family.pairs)
         heavy = self.statistic == "level" and not self.is_los
         return apart(found, prior, NLOS_DOF if heavy else LOS_DOF)
 
@@ -258,7 +265,7 @@ def _compare(readings: Readings, families: list[Family], units: Units) -> list[_
                 if len(parts) > 1:
                     odds *= BOTH_SHARE if name == "all" else (1 - BOTH_SHARE) / 2
                 log_odds = part.log_odds(outlier, odds)
-                if statistic in ("scatter", "noise"):  # a group that scatters less is no fault
+                if statistic != "level":  # less scatter, or fewer blanks, is no fault
                     log_odds = np.where(part.size > 0, log_odds, -np.inf)
                 found.append(_Compared(family, statistic, name, part, log_odds))
     return found
@@ -292,16 +299,6 @@ def _centred(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
             number = np.maximum(np.bincount(label), 1)
             values = values - (np.bincount(label, values) / number)[label]
     return values
-
-
-def _additive(found: Statistic, ends: tuple[np.ndarray, ...]) -> Statistic:
-    """Return the statistic of pairs less the medians of both ends' pairs."""
-    judged = np.isfinite(found.value)
-    value, error = found.value.copy(), found.error.copy()
-    own = [end[judged] for end in ends]
-    value[judged] = polished(value[judged], own)
-    error[judged] *= np.sqrt(1 + sum(1.57 / np.bincount(end)[end] for end in own))
-    return replace(found, value=value, error=error)
 
 
 def _scale(values: np.ndarray) -> float:

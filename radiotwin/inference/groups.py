@@ -17,10 +17,10 @@ from scipy.stats import t as student_t
 
 MIN_VALUES, MIN_UNITS, MIN_LASTING = 12, 4, 3.0  # of a group, to be judged
 HUBER = 1.345  # scales, beyond which a value pulls no further (95 % efficient for normal errors)
-MAX_SCALES = 8.0  # a single value counts as this far away at most
+MAX_SCALES = 6.0  # a single value counts as this far away at most
 LEAVE_OUT = 64  # groups up to which each is left out of its own peers
 PEER_WEIGHT = 4.0  # peers that the prior spread counts as
-PRIOR_DOF = 20.0  # of that prior
+PRIOR_DOF = 60.0  # of that prior
 MIN_ALIKE = 3  # values of a unit, to tell how much units differ
 OUTLIER_DOF = 2.0  # of sizes of what stands out: heavy tails
 POLISH_ROUNDS, SHARED_ROUNDS = 3, 10
@@ -99,16 +99,17 @@ class Nested:
         """Return the standard deviation of lasting units, of the rows' values (r,).
 
         Analysis of variance: the part that lasts is what the units' means differ by beyond what
-        their passing parts explain.
+        their passing parts explain. Robust, as groups that stand out must not hide themselves.
         """
         several, parts = self._several, self._parts
         if several.sum() < MIN_UNITS:
             return 0.0
         mean = np.bincount(self._part, values) / self._size
         middle = np.bincount(self._of_part, mean) / parts
-        spread = ((mean - middle[self._of_part]) ** 2)[several[self._of_part]].sum()
-        within = spread / (parts[several] - 1).sum()
-        between = np.var(middle[several]) - within * np.mean(1 / parts[several])
+        own = several[self._of_part]
+        freedom = np.sqrt(1 - 1 / parts[self._of_part[own]])
+        within = robust_sd((mean - middle[self._of_part])[own] / freedom, centred=True)
+        between = robust_sd(middle[several]) ** 2 - within**2 * np.mean(1 / parts[several])
         return float(np.sqrt(max(between, 0.0)))
 
 
@@ -123,6 +124,12 @@ class Statistic:
 
     value: np.ndarray
     error: np.ndarray
+
+
+def robust_sd(values: np.ndarray, centred: bool = False) -> float:
+    """Return the standard deviation of values (n,) from the median of their distances."""
+    middle = 0.0 if centred else np.median(values)
+    return 1.4826 * float(np.median(np.abs(values - middle)))
 
 
 def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
@@ -157,19 +164,19 @@ def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
     return _judged(value, scale / inside, pull, groups, lasting_sd)
 
 
-def log_scatters(values: np.ndarray, groups: Groups, lasting_sd: float,
-                 scale: np.ndarray) -> Statistic:
+def log_scatters(values: np.ndarray, groups: Groups, lasting_sd: float | None,
+                 scale: float) -> Statistic:
     """Return the logarithm of each group's mean absolute deviation from its own median.
 
     Args:
         values: (n,) without NaN among the members.
         groups: of them.
-        lasting_sd: as of `levels`, of the logarithm.
-        scale: (n,) usual scale of each value, of which one counts `MAX_SCALES` at most.
+        lasting_sd: as of `levels`, of the logarithm; None: values are independent.
+        scale: usual one, of which a value counts `MAX_SCALES` at most.
     """
     x, group, count = values[groups.row], groups.group, groups.count
     middle = medians(x, group, count)
-    size = np.minimum(np.abs(x - middle[group]) / scale[groups.row], MAX_SCALES)
+    size = np.minimum(np.abs(x - middle[group]) / scale, MAX_SCALES)
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.maximum(np.bincount(group, size, count) / number, 1e-3)
     return _judged(np.log(mean), 1 / (number * mean), size - mean[group], groups, lasting_sd)
@@ -191,11 +198,11 @@ def means(values: np.ndarray, groups: Groups, lasting_sd: float) -> Statistic:
 
 
 def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Groups,
-            lasting_sd: float) -> Statistic:
+            lasting_sd: float | None) -> Statistic:
     """Return a statistic with its error.
 
     That of passing units is a sandwich, whose influences are `pull` (m,) times `step`. What lasts
-    in lasting units is added.
+    in lasting units is added. Without it each value is a unit.
     """
     count = groups.count
     number = np.bincount(groups.group, minlength=count)
@@ -207,7 +214,10 @@ def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Group
     share = np.bincount(groups.lasting, minlength=len(groups.of_lasting)).astype(float)
     effective = np.maximum(
         number**2 / np.maximum(np.bincount(groups.of_lasting, share**2, count), 1), 1.0)
-    error = np.hypot(sandwich, lasting_sd / np.sqrt(effective))
+    if lasting_sd is None:
+        error = step * np.sqrt(np.bincount(groups.group, pull**2, count))
+    else:
+        error = np.hypot(sandwich, lasting_sd / np.sqrt(effective))
     enough = (number >= MIN_VALUES) & (several >= MIN_UNITS) & (effective >= MIN_LASTING)
     return Statistic(np.where(enough, value, np.nan), np.where(enough, error, np.nan))
 
@@ -318,6 +328,26 @@ def polished(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
         for label in labels:
             left = left - medians(left, label, int(label.max(initial=0)) + 1)[label]
     return left
+
+
+def less_ends(found: Statistic, ends: tuple[np.ndarray, ...]) -> Statistic:
+    """Return a statistic of k pairs less the levels of both ends (k,).
+
+    These have families of their own. An end's level is the median of its pairs and a zero: of two
+    pairs of which one is off, the end is not; where both are, it is.
+    """
+    judged = np.isfinite(found.value)
+    value, error = found.value.copy(), found.error.copy()
+    own = [np.unique(end[judged], return_inverse=True)[1].ravel() for end in ends]
+    left = value[judged] - np.median(value[judged])
+    for _ in range(POLISH_ROUNDS):
+        for end in own:
+            count = int(end.max()) + 1
+            left = left - medians(np.append(left, np.zeros(count)),
+                                  np.append(end, np.arange(count)), count)[end]
+    value[judged] = left
+    error[judged] *= np.sqrt(1 + sum(1.57 / (np.bincount(end)[end] + 1) for end in own))
+    return Statistic(value, error)
 
 
 def without_shared(values: np.ndarray, label: np.ndarray, unit: np.ndarray) -> np.ndarray:

@@ -108,7 +108,7 @@ def test_a_minute_of_one_receiver_is_found_as_a_time():
 def test_blanks_of_one_receiver_stand_out():
     readings, rng = made(3), np.random.default_rng(0)
     lost = (readings.receiver == 0) & (rng.uniform(size=len(readings)) < 0.3)
-    (found,) = sure(replace(readings, blank_excess=np.where(lost, 1.0, readings.blank_excess),
+    found, *_ = sure(replace(readings, blank_excess=np.where(lost, 1.0, readings.blank_excess),
                             residual_db=np.where(lost, np.nan, readings.residual_db)))
     assert (found.family, found.statistic, found.members["receiver"]) == ("receiver", "blanks", ("u0",))
     assert found.size.value == pytest.approx(0.3, abs=0.1)
