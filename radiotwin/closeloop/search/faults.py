@@ -226,7 +226,8 @@ def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
             continue
         others = _without(whole.model, number).fit()
         gain = others.objective - whole.objective
-        if gain >= inputs.criteria.min_training_gain_nats and _is_found(whole, number, others):
+        is_found = _is_cause_of_anomaly(state, number) or _is_found(whole, number, others)
+        if gain >= inputs.criteria.min_training_gain_nats and is_found:
             continue
         folds = [_without(each.model, same_effects(whole, each)[number]).fit()
                  for each in model.folds]
@@ -234,6 +235,14 @@ def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
         state = replace(state, model=model.extended(others, folds),
                         log=state.log.supersede(taken_back))
     return state
+
+
+def _is_cause_of_anomaly(state: SearchState, number: int) -> bool:
+    """Return whether an effect is the likeliest cause of a group that stands out."""
+    effect, acts = state.model.whole.effects[number], state.model.whole.model.terms[number].acts
+    return any(max(each.causes, key=lambda name: each.causes[name]) == effect.name
+               and acts[each.rows].mean() >= MIN_SHARED
+               for each in state.anomalies if each.causes)
 
 
 def _is_found(fit: Fit, number: int, without: Fit) -> bool:

@@ -34,7 +34,6 @@ NEIGHBOURS = 9
 LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # of a class of line of sight, at 100 m and per decade
 # Usual spread of the levels of a kind of ends before any is seen, and how many ends it counts for.
 SPREAD_DB, SPREAD_ENDS = 0.5, 4
-ANY_LEVEL_DB = 10.0  # prior standard deviation of a level whose spread is not known yet
 MAX_ENDS = 40  # devices or receivers that have terms of their own
 CURVE_KNOTS, NUISANCE_SD_DB = 6, 2.0  # of the base's errors over its prediction and elevation
 KNOTS = 8  # of a curve over a variable
@@ -328,7 +327,7 @@ def _with_usual_spreads(evidence: CorrelatedEvidence, z: np.ndarray, nuisance: C
     """
     for family in families:
         prior_sd = nuisance.prior_sd.copy()
-        prior_sd[family] = ANY_LEVEL_DB
+        prior_sd[family] = LEVEL_SD_DB
         level_db, error_db = evidence.coefficients(z, Columns(nuisance.values, prior_sd))
         level_db, error_db = level_db[family], error_db[family]
         freedom = len(level_db) - 2

@@ -56,7 +56,6 @@ MIN_SCATTER_DB = 1e-3
 # median, of 0.78 in one of ten and more; this prior has 0.68 and 1.4, as other worlds are others.
 PRIOR_LEVEL_SD_DB, PRIOR_LOG_SD, PRIOR_FREEDOM = 0.6, (0.35, 0.25), 3
 STATISTICS = 4  # that are tested
-MIN_GROUP = 0.5  # share of a flight's links in a group that stands out, to be one of its flights
 MAX_P_VALUE = 0.02  # corrected for the number of flights
 PRIOR_SD_DB = 15.0
 RELATION_SD = 0.5  # of the slope that is lost or gained
@@ -126,7 +125,7 @@ class FaultyFlight(GainEffect):
             if (each.receiver, name) in known or (None, name) in known:
                 continue
             p_value, scatter_db = _disagreement(each, flights, view.links)
-            stands_out = view.group is not None and view.group[each.rows].mean() > MIN_GROUP
+            stands_out = view.group is not None and view.group[each.rows].any()
             if stands_out or (view.group is None and p_value * len(flights) <= MAX_P_VALUE):
                 found.setdefault(each.flight, []).append((p_value, scatter_db, each))
         if not found:
