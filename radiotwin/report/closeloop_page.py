@@ -24,10 +24,9 @@ from radiotwin.report.labels import (
 )
 
 FIGURES = (
-    ("groups.png", "Where the residual stands out",
+    ("groups.png", "Residual by device, receiver and flight",
      "Median of the held-out residual of the base (measured minus predicted; red: less was "
-     "measured) and its scatter, by device, receiver and flight. Framed: the groups that stand "
-     "out."),
+     "measured) and its scatter. Framed: groups that stand out; dashed: part of their links."),
     ("waterfall.png", "Error step by step",
      "RMSE on held-out links, which were used neither to choose nor to fit the model: the base "
      "alone, the change by each effect, and the result. Horizontal lines: other models, held out "
