@@ -11,14 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from radiotwin.closeloop.crossfit import CrossFit
-from radiotwin.closeloop.scan import (
-    UNITS,
-    Readings,
-    _compare,
-    _Compared,
-    _families,
-    _units,
-)
+from radiotwin.closeloop.families import Readings, families_of, units_of
+from radiotwin.closeloop.scan import UNITS, _compare, _Compared
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.inference.groups import Units
 
@@ -51,9 +45,9 @@ def seen_from(model: CrossFit) -> list[Seen]:
         model: in whose held-out links no group stands out.
     """
     readings = Readings.of(model)
-    units = _units(readings)
+    units = units_of(readings)
     families = [replace(each, statistics=tuple({*each.statistics} & {*STATISTICS}))
-                for each in _families(readings)]
+                for each in families_of(readings, units)]
     sharpest: dict[tuple[str, str], _Compared] = {}
     for each in _compare(readings, families, units):
         key = each.family.name, each.statistic

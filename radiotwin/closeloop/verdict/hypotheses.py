@@ -184,7 +184,8 @@ class Hypotheses:
     def of_group(self, group: np.ndarray) -> float:
         """Return the evidence for a cause without a name that acts on a group of links (n,) only.
 
-        It is a curve over any one variable, which is as probable as any other.
+        It is a curve over any one variable, which is as probable as any other; or none of them, as
+        what stands out need not be a curve.
         """
         found = []
         for value, knots, is_angle in self._variables().values():
@@ -192,7 +193,7 @@ class Hypotheses:
             columns = Columns(basis / self.scale_db[:, None],
                               np.full(basis.shape[1], CURVE_SD_DB))
             found.append(self.gain_nats(self.base_z, columns))
-        return float(logsumexp(found)) - log(len(found))
+        return max(float(logsumexp(found)) - log(len(found)), 0.0)
 
     @cached_property
     def unnamed_nats(self) -> dict[str, float]:
