@@ -101,7 +101,7 @@ def antenna_swap(at: Scenario, rng: np.random.Generator) -> Hidden:
     whip_db = 10 * np.log10(1.5 * np.cos(elevation)**2 + 0.02)
     mine = (at.of_links("receiver") == number)[at.paths.link]
     is_patch = np.isin(at.of_links("flight"), patch)[at.paths.link]
-    return Hidden("antenna_swap", False, {"receiver": name, "flights": [f"f{number}" for number in sorted(patch)]},
+    return Hidden("antenna_swap", False, {"receiver": name, "flights": [f"f{number + 1}" for number in sorted(patch)]},
                   path_db=np.where(mine, np.where(is_patch, patch_db, whip_db), 0.0))
 
 
