@@ -5,9 +5,9 @@ that it changes at all; of an effect of nearly all links (rain), by what it chan
 than in the median. Where a position, a clock or a track is wrong, it acts on all links of that end.
 
 A group that is said *is there* if one of these holds for some hidden effect:
-- its ends are the effect's: each device, receiver and flight that it names is one of those in the
-  answer, of the kinds that the answer names (d3 x f2 for device d3, not r1 x f2 for r1 x f4). Where
-  there are two of a kind, "the other one reads more" is the same statement;
+- its ends are the effect's: all of its links have the device, receiver and flight of the answer, as
+  far as it names them (d3 x f2 for device d3, a flight that r1 flew alone for r1; not r1 x f2 for
+  r1 x f4). Where there are two of a kind, "the other one reads more" is the same statement;
 - at least half of the heard links in it are links that the effect acts on, and half as many again
   as of all links (a device whose links mostly pass the missing building);
 - it is a disc that reaches within 30 m of the effect's place, or a band of the variable that the
@@ -70,6 +70,7 @@ class Truth:
         name: of the effect.
         ends: names of its device, receiver and flights, by kind.
         places_m: (k, 4) rectangles x, x, y, y on the ground [m].
+        of_ends: (n,) bool, links of its ends.
         acts: (n,) bool, links that it acts on.
         change_db: (n,) what it changes [dB]; NaN where unknown or where it takes the reading away.
         size_db: RMS of that on the heard links that it acts on, less what all links have in common.
@@ -78,6 +79,7 @@ class Truth:
     name: str
     ends: dict[str, set[str]]
     places_m: np.ndarray
+    of_ends: np.ndarray
     acts: np.ndarray
     change_db: np.ndarray
     size_db: float
@@ -142,7 +144,7 @@ def _truth(effect: dict, change_db: np.ndarray, links: Links) -> Truth:
         names = set(getattr(links, f"{end}_names"))
         if len(names) == 2:
             others[end] = names
-    return Truth(effect["name"], ends, _places_m(effect), acts, change_db, size_db, others)
+    return Truth(effect["name"], ends, _places_m(effect), of_ends, acts, change_db, size_db, others)
 
 
 def _places_m(effect: dict) -> np.ndarray:
@@ -200,8 +202,8 @@ def where_is_right(groups: Sequence[Group], truth: Truth, heard: np.ndarray) -> 
         return True
     if truth.name not in CONSTANT and any(_has_its_ends(group, truth) for group in there):
         return True
-    if any(set(group.members) == set(truth.ends) and _has_its_ends(group, truth)
-           for group in there):
+    if any(set(group.members) == set(truth.ends) and getattr(group, "ranges", {}) == {}
+           and _has_its_ends(group, truth) for group in there):
         return True
     union = np.zeros(len(heard), dtype=bool)
     for group in there:
@@ -219,15 +221,12 @@ def holds_mostly(group: Group, acts: np.ndarray, heard: np.ndarray) -> bool:
 
 
 def _has_its_ends(group: Group, truth: Truth) -> bool:
-    if not truth.ends or not set(group.members) & set(truth.ends) - {"flight"}:
-        return False
-    if "flight" in truth.ends and "flight" not in group.members:
+    if not truth.ends:
         return False
     if len(group.members) == 1 and all(set(names) <= truth.others.get(end, set())
                                        for end, names in group.members.items()):
         return True
-    return all(set(names) <= truth.ends[end] for end, names in group.members.items()
-               if end in truth.ends)
+    return bool(truth.of_ends[group.rows].all())
 
 
 def _is_its_place_or_band(group: Group, truth: Truth) -> bool:

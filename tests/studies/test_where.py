@@ -17,9 +17,9 @@ def group(family, rows, ranges=None, **members):
                            members={end: (name,) for end, name in members.items()})
 
 
-def truth(name, acts, places=(), **ends):
-    return Truth(name, {end: {its} for end, its in ends.items()}, np.array(places, dtype=float).reshape(-1, 4), acts,
-                 np.where(acts, -4.0, 0.0), 4.0)
+def truth(name, acts, places=(), others=None, **ends):
+    return Truth(name, {end: {its} for end, its in ends.items()}, np.array(places, dtype=float).reshape(-1, 4),
+                 acts if ends else HEARD, acts, np.where(acts, -4.0, 0.0), 4.0, others or {})
 
 
 def test_the_right_device_is_right_and_its_flights_together_are():
@@ -30,12 +30,13 @@ def test_the_right_device_is_right_and_its_flights_together_are():
     assert where_is_right([whole], one, HEARD) and where_is_right(flights[:2], one, HEARD)
     assert is_there(flights[0], one, HEARD) and not where_is_right(flights[:1], one, HEARD)
     assert not is_there(group("device", DEVICE == 2, device="d2"), one, HEARD)
+    drift = truth("device_drift", its, device="d1")
+    assert where_is_right(flights[:1], drift, HEARD) and not where_is_right([group("flight", FLIGHT == 2)], drift, HEARD)
     assert not is_there(group("flight", FLIGHT == 2, flight="f2"), one, HEARD)
 
 
 def test_of_two_receivers_the_other_one_is_the_same_statement():
-    one = Truth("receiver_gain_offset", {"receiver": {"r1"}}, np.zeros((0, 4)), DEVICE < 2, np.zeros(N), 4.0,
-                {"receiver": {"r1", "r2"}})
+    one = truth("receiver_gain_offset", DEVICE < 2, others={"receiver": {"r1", "r2"}}, receiver="r1")
     assert where_is_right([group("receiver", DEVICE >= 2, receiver="r2")], one, HEARD)
 
 
