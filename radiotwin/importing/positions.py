@@ -362,7 +362,8 @@ def _by_carrier(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list
     hz = links["frequency_hz"].to_numpy(dtype=float)
     by_device = links.groupby("device", sort=False)["frequency_hz"]
     wide = by_device.transform("max").to_numpy() > SAME_BAND * by_device.transform("min").to_numpy()
-    names, before = links["device"].astype(object).to_numpy(copy=True), {}
+    names = links["device"].astype(object).to_numpy(copy=True)
+    before: dict[str, str] = {}
     for device in pd.unique(names[wide]):
         rows = np.flatnonzero((names == device) & np.isfinite(hz))
         known_hz = np.unique(hz[rows])

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, place
 from radiotwin.io.forms import MAX_POSITION_M, Origin
-from radiotwin.links.checks import map_corners_m, outside_map
+from radiotwin.links.checks import SURE, chance_inside, map_corners_m, outside_map
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.scene.footing import MAX_SDS, WALL_SD_M
@@ -114,10 +114,11 @@ def _require_fit(measurements: Measurements, scene: Scene) -> None:
     odd = (f"{inside:.1%} of the receivers are inside buildings{ground} and {outside:.1%} outside "
            "the 3D map")
     search = _search(scene, receiver_m)
-    if search is not None and search.agrees:
-        warnings.warn(f"{odd}. Measurements and scene are taken to be in one frame: receivers keep "
-                      "clear of the buildings, and no translation fits clearly better than none",
-                      stacklevel=3)
+    surely = (chance_inside(scene.city, receiver_m) >= SURE).mean()
+    if surely <= MAX_MISPLACED and search is not None and search.agrees:
+        warnings.warn(f"{odd}. Measurements and scene are taken to be in one frame: {surely:.1%} "
+                      "are inside even if positions are off by metres, and no translation fits "
+                      "clearly better than none", stacklevel=3)
         return
     proposed = None if search is None else search.proposed
     unknown = [what for what, origin in (("the measurements", measurements.origin),

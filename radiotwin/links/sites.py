@@ -115,7 +115,8 @@ def shared_names(links: Links) -> dict[int, str]:
     Cells share an identity, or the carriers of a cell a name. Then a receiver reads two levels at
     one time, or at one place, that differ by more than readings of other devices do.
     """
-    timed, found = links.select(np.isfinite(links.time_s)), {}
+    found: dict[int, str] = {}
+    timed = links.select(np.isfinite(links.time_s))
     for when, repeats in (("at one time", Repeats.of(timed, timed.time_s)),
                           ("at one place", repeats_at_places(links))):
         own_db = repeats.sd_db()

@@ -359,7 +359,8 @@ class _Readings(NamedTuple):
         A mixture: each azimuth has the common turn, or, rarely, any. So one that is wrong does not
         turn the others. Levels are each device's own, and patterns flat in elevation.
         """
-        found, view = (0.0, {}), self.view
+        found: tuple[float, dict[int, OwnTurn]] = (0.0, {})
+        view = self.view
         for _ in range(ROUNDS):
             common_deg, nats, shape = max((self._replace(view=view)._mixture(*numbers) for numbers
                                            in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
