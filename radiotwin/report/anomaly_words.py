@@ -200,8 +200,9 @@ def _peers(anomaly: dict, report: dict, is_plural: bool) -> str:
     family = anomaly["family"]
     if family in PEERS:
         return PEERS[family].format(its="their" if is_plural else "its")
-    known = report["error"].get(f"by_{family}") or {}
-    others = len(set(known) - set(anomaly["members"].get(family, ())))
+    groups = report["error"].get(f"by_{family}") or {}
+    known = {name for name, both in groups.items() if both["before"]["n"]}
+    others = len(known - set(anomaly["members"].get(family, ())))
     if others == 1:
         return f"the other {family}"
     return f"the {COUNTS[others] if 1 < others < len(COUNTS) else others} others" \

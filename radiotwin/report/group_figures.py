@@ -115,8 +115,13 @@ def groups_figure(data: LoopData, report: dict) -> Figure:
             _write_numbers(ax, values, low, high)
             for anomaly in anomalies:
                 if anomaly["statistic"] in statistics:
-                    _frame(ax, each, _ends(anomaly), bool(anomaly.get("ranges")))
+                    _frame(ax, each, _ends(anomaly), _is_part(anomaly))
     return figure
+
+
+def _is_part(anomaly: dict) -> bool:
+    """Return whether a group has not all links of its members."""
+    return bool(anomaly.get("ranges")) or anomaly.get("sight", "all") != "all"
 
 
 def _ends(anomaly: dict) -> dict[str, Sequence[str]]:
@@ -127,7 +132,7 @@ def _ends(anomaly: dict) -> dict[str, Sequence[str]]:
 
 def _label(ax: Axes, found: Pivot, column: int) -> None:
     rows, columns = found.names
-    crowded = len(columns) > 5 or max(map(len, columns)) > 8
+    crowded = len(columns) * max(map(len, columns)) > 40
     ax.set_xticks(range(len(columns)), [_cut(name, 14) for name in columns],
                   rotation=90 if crowded else 0, fontsize=8)
     ax.set_yticks(range(len(rows)), [_cut(name, 20) for name in rows] if column == 0 else [],

@@ -76,7 +76,7 @@ def page(content, folder):
      "one height. Of the base&#39;s 3.00 dB, roughly 2.68 dB belong to places, as shadowing does, and 1.34 dB to single readings "
      "(squares add up). That much at places is not said to be nothing.", "undecided"),
     ("located",
-     "Device d3 reads 5.6 dB (5.1 to 6.1) less than the two others (0.99). Its cause is open: power, cable or antenna of the "
+     "Device d3 reads 5.6 dB (5.1 to 6.1) less than the other device (0.99). Its cause is open: power, cable or antenna of the "
      "device (0.70); vegetation (0.25). The residual is 3.00 dB RMSE and depends on time in flight.",
      "located: device d3; cause open")])
 def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
