@@ -392,11 +392,16 @@ class RegressionKriging(ChannelModel):
 
     def _residual(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fit the law; return series, positions and residual of the links that a fit can use."""
+        """Fit the law; return series, positions and residual of the links that a fit can use.
+
+        Those of a receiver that moves, where most stand still, are of no series.
+        """
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         mean_db, sd_db = self.law.predict(links)
-        return *self._ends(links), standardised(level_db, mean_db, sd_db, limit_db)
+        series, position_m = self._ends(links)
+        residual, known = standardised(level_db, mean_db, sd_db, limit_db), series >= 0
+        return series[known], position_m[known], residual[known]
 
     def _ends(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Return series (n,), -1 of an unknown one, and positions (n, 3) [m]."""
