@@ -179,6 +179,7 @@ def _pairs(readings: Readings, first: str, second: str,
                 second: (readings.names[second][other[row]],)}, {}
 
     yield Family(f"{first} x {second}", Groups.of_labels(code, units), describe,
+                 statistics=("level", "noise", "scatter"),
                  pairs=(one[example], other[example]), is_crossing=True)
 
 

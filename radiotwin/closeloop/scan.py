@@ -9,6 +9,7 @@ residuals, and looks again: one flight is said, not its twenty-four pairs.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -54,6 +55,7 @@ ANYWHERE_DB, ANYWHERE_LOG, ANYWHERE_SHARE = 5.0, 0.8, 0.3  # scale of what stand
 END_ODDS, FAMILY_ODDS = 0.4, 0.03
 LEAST_SCALE_DB = 0.5  # half a step of coarse readings
 MAX_ANOMALIES = 10
+ECHO = 1 / 3  # of the first size, below which a later find may be what the first left on others
 MAX_RIVALS = 4  # groups of which the one that explains most is taken
 LIKELY = 0.5  # groups less probable than this are not said
 MIN_LINKS = 60  # of a class of line of sight
@@ -102,6 +104,11 @@ class _Compared:
     distance: Apart
     log_odds: np.ndarray
 
+    @property
+    def key(self) -> tuple[int, str, str]:
+        """What tells it from the others of one comparison."""
+        return id(self.family), self.statistic, self.sight
+
 
 @dataclass(frozen=True)
 class _Found:
@@ -135,16 +142,21 @@ def scan_readings(readings: Readings) -> list[Anomaly]:
     families = list(families_of(readings, units))
     few = [family for family in families if family.name in ENDS or family.pairs]
     found: list[Anomaly] = []
-    left = readings
+    taken: list[_Found] = []
+    left, first = readings, None
     while len(found) < MAX_ANOMALIES:
-        rivals = _likeliest(_compare(left, families, units))
+        compared = _compare(left, families, units)
+        first = first or compared
+        rivals = _likeliest(compared, first, taken)
         if not rivals:
             break
         after = [(each, _without(left, each)) for each in rivals]
         best = 0
         if len(after) > 1:  # what explains most of what ends, flights and their pairs show
-            best = int(np.argmin([_evidence(_compare(rest, few, units)) for _, rest in after]))
+            best = int(np.argmin([_evidence(_compare(rest, few, units)) - each.log_odds
+                                  for each, rest in after]))
         chosen, left = after[best]
+        taken.append(chosen)
         found.append(_anomaly(chosen, readings))
     return found
 
@@ -247,6 +259,7 @@ def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _Class]]:
 def _compare(readings: Readings, families: list[Family], units: Units) -> list[_Compared]:
     """Return all statistics of families, in each class and in both together."""
     found, classes = [], _classes(readings, units)
+    alike = Counter(family.name for family in families)
     for family in families:
         for statistic in family.statistics:
             is_base = family.name in BASE_ERRORS and statistic == "level"
@@ -262,6 +275,7 @@ def _compare(readings: Readings, families: list[Family], units: Units) -> list[_
             outlier = {"level": ANYWHERE_DB, "blanks": ANYWHERE_SHARE}.get(statistic, ANYWHERE_LOG)
             for name, part in parts.items():
                 odds = END_ODDS if family.name in ENDS else FAMILY_ODDS
+                odds /= alike[family.name]
                 if len(parts) > 1:
                     odds *= BOTH_SHARE if name == "all" else (1 - BOTH_SHARE) / 2
                 log_odds = part.log_odds(outlier, odds)
@@ -286,10 +300,19 @@ def _usual_errors(readings: Readings) -> np.ndarray:
         edges = np.quantile(distance_m[rows], np.linspace(0, 1, QUARTERS + 1)[1:-1])
         quarter[rows] = np.searchsorted(edges, distance_m[rows])
     cell = codes_of(cell, quarter)
+    receivers, flights = (_members(cell[heard], end[heard], int(cell.max()) + 1)
+                          for end in (readings.receiver, readings.track))
+    # What several flights of one receiver share may be its own level.
+    own = heard & ~((receivers == 1) & (flights > 1))[cell]
     found = np.zeros(len(readings))
-    found[heard] = medians(readings.residual_db[heard], cell[heard], int(cell.max()) + 1)[
-        cell[heard]]
+    found[own] = medians(readings.residual_db[own], cell[own], int(cell.max()) + 1)[cell[own]]
     return found
+
+
+def _members(cell: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
+    """Return how many different ends (n,) each of some cells (n,) has, (count,)."""
+    size = int(end.max(initial=0)) + 1
+    return np.bincount(np.unique(cell * np.int64(size) + end) // size, minlength=count)
 
 
 def _centred(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
@@ -306,10 +329,24 @@ def _scale(values: np.ndarray) -> float:
     return max(1.4826 * float(np.median(np.abs(values - middle))), LEAST_SCALE_DB)
 
 
-def _likeliest(compared: list[_Compared]) -> list[_Found]:
-    """Return the most probable groups, at most `MAX_RIVALS`, of each group only once."""
-    found = [_Found(each, int(group)) for each in compared
-             for group in np.flatnonzero(each.log_odds > logit(LIKELY))]
+def _likeliest(compared: list[_Compared], first: list[_Compared],
+               taken: list[_Found]) -> list[_Found]:
+    """Return the most probable groups, at most `MAX_RIVALS`, of each group only once.
+
+    No group is taken twice. Beside what was taken first, one that did not stand out then and is
+    much smaller is its echo.
+    """
+    found, before = [], {each.key: each.log_odds for each in first}
+    for each in compared:
+        likely = each.log_odds > logit(LIKELY)
+        for other in taken:
+            if other.compared.family is each.family and each.statistic == other.compared.statistic:
+                likely[other.group] = False
+        for other in taken[:1]:
+            if other.compared.statistic == each.statistic:
+                likely &= (before.get(each.key, each.log_odds) > logit(LIKELY)) | (
+                    np.abs(each.distance.size) > ECHO * abs(other.size))
+        found += [_Found(each, int(group)) for group in np.flatnonzero(likely)]
     found.sort(key=lambda each: -each.log_odds)
     seen, rivals = set(), []
     for each in found:

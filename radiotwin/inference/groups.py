@@ -133,14 +133,24 @@ def robust_sd(values: np.ndarray, centred: bool = False) -> float:
 
 
 def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """Return the median (count,) of the values (m,) of each group (m,); NaN of an empty one."""
-    order = np.lexsort((values, group))
-    ordered, begin = values[order], np.searchsorted(group[order], np.arange(count + 1))
-    size = np.diff(begin)
+    """Return the median (count,) of the values (m,) of each group (m,); NaN of an empty one.
+
+    Exact to the span of the values over 2³²: group and value are sorted as one integer, which is
+    ten times as fast as sorting by both.
+    """
     found = np.full(count, np.nan)
+    if not len(values):
+        return found
+    least = values.min()
+    step = max(float(values.max() - least), TINY) / (2**32 - 1)
+    key = (group.astype(np.int64) << 32) | np.rint((values - least) / step).astype(np.int64)
+    key.sort()
+    begin = np.searchsorted(key, np.arange(count + 1, dtype=np.int64) << 32)
+    size = np.diff(begin)
     some = size > 0
     low, high = begin[:-1] + (size - 1) // 2, begin[:-1] + size // 2
-    found[some] = 0.5 * (ordered[low[some]] + ordered[high[some]])
+    middle = (key[low[some]] & (2**32 - 1)) + (key[high[some]] & (2**32 - 1))
+    found[some] = least + 0.5 * step * middle
     return found
 
 
