@@ -365,7 +365,8 @@ class RegressionKriging(ChannelModel):
 
     A device is its index in `LinkGeometry.device`: use the same indices to fit and to predict.
     Where most links are of a place of receivers that heard more devices than there are places that
-    heard their device, each of these places has a process over the device's position.
+    heard their device, each of these places has a process over the device's position, and all
+    other receivers have one together.
     """
 
     name = "regression_kriging"
@@ -392,23 +393,18 @@ class RegressionKriging(ChannelModel):
 
     def _residual(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Fit the law; return series, positions and residual of the links that a fit can use.
-
-        Those of a receiver that moves, where most stand still, are of no series.
-        """
+        """Fit the law; return series, positions and residual of the links that a fit can use."""
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         mean_db, sd_db = self.law.predict(links)
-        series, position_m = self._ends(links)
-        residual, known = standardised(level_db, mean_db, sd_db, limit_db), series >= 0
-        return series[known], position_m[known], residual[known]
+        return *self._ends(links), standardised(level_db, mean_db, sd_db, limit_db)
 
     def _ends(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return series (n,), -1 of an unknown one, and positions (n, 3) [m]."""
+        """Return series (n,) and positions (n, 3) [m]; receivers elsewhere share a series."""
         if not len(self.fixed_m):
             return links.device, links.receiver_m
         away_m, nearest = cKDTree(self.fixed_m).query(links.receiver_m)
-        return np.where(away_m <= SAME_PLACE_M, nearest, -1), links.device_m
+        return np.where(away_m <= SAME_PLACE_M, nearest, len(self.fixed_m)), links.device_m
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:

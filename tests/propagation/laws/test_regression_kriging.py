@@ -118,8 +118,10 @@ def test_where_devices_move_each_receiver_has_a_field(world):
     off_db = there.predict(exchanged(probe.links))[0] - expected_db
     assert np.sqrt(np.mean(off_db**2)) < 1.0 < np.abs(there.law.predict(exchanged(probe.links))[0] - expected_db).mean()
     np.testing.assert_allclose(again.predict(exchanged(probe.links)), there.predict(exchanged(probe.links)), atol=1e-9)
+    assert len(there.field.fields) == len(there.fixed_m) + 1  # what moves has one together
+    unmoved = RegressionKriging().fit(exchanged(data.links), level_db, None, seed=1)
     strange = exchanged(probe.links, moved=200)
-    np.testing.assert_array_equal(there.predict(strange)[0][1:], there.law.predict(strange)[0][1:])
+    np.testing.assert_array_equal(unmoved.predict(strange)[0][1:], unmoved.law.predict(strange)[0][1:])
 
 
 def test_repeated_visits_become_one_point(world):
