@@ -95,7 +95,7 @@ class Anomaly:
 
 
 @dataclass(frozen=True, eq=False)
-class _Compared:
+class Compared:
     """One statistic of a family, in one class of line of sight or both together."""
 
     family: Family
@@ -112,7 +112,7 @@ class _Compared:
 
 @dataclass(frozen=True)
 class _Found:
-    compared: _Compared
+    compared: Compared
     group: int
 
     @property
@@ -145,7 +145,7 @@ def scan_readings(readings: Readings) -> list[Anomaly]:
     taken: list[_Found] = []
     left, first = readings, None
     while len(found) < MAX_ANOMALIES:
-        compared = _compare(left, families, units)
+        compared = compare(left, families, units)
         first = first or compared
         rivals = _likeliest(compared, first, taken)
         if not rivals:
@@ -153,7 +153,7 @@ def scan_readings(readings: Readings) -> list[Anomaly]:
         after = [(each, _without(left, each)) for each in rivals]
         best = 0
         if len(after) > 1:  # what explains most of what ends, flights and their pairs show
-            best = int(np.argmin([_evidence(_compare(rest, few, units)) - each.log_odds
+            best = int(np.argmin([_evidence(compare(rest, few, units)) - each.log_odds
                                   for each, rest in after]))
         chosen, left = after[best]
         taken.append(chosen)
@@ -256,7 +256,7 @@ def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _Class]]:
     return found
 
 
-def _compare(readings: Readings, families: list[Family], units: Units) -> list[_Compared]:
+def compare(readings: Readings, families: list[Family], units: Units) -> list[Compared]:
     """Return all statistics of families, in each class and in both together."""
     found, classes = [], _classes(readings, units)
     alike = Counter(family.name for family in families)
@@ -281,7 +281,7 @@ def _compare(readings: Readings, families: list[Family], units: Units) -> list[_
                 log_odds = part.log_odds(outlier, odds)
                 if statistic != "level":  # less scatter, or fewer blanks, is no fault
                     log_odds = np.where(part.size > 0, log_odds, -np.inf)
-                found.append(_Compared(family, statistic, name, part, log_odds))
+                found.append(Compared(family, statistic, name, part, log_odds))
     return found
 
 
@@ -329,24 +329,24 @@ def _scale(values: np.ndarray) -> float:
     return max(1.4826 * float(np.median(np.abs(values - middle))), LEAST_SCALE_DB)
 
 
-def _likeliest(compared: list[_Compared], first: list[_Compared],
+def _likeliest(compared: list[Compared], first: list[Compared],
                taken: list[_Found]) -> list[_Found]:
     """Return the most probable groups, at most `MAX_RIVALS`, of each group only once.
 
     No group is taken twice. Beside what was taken first, one that did not stand out then and is
     much smaller is its echo.
     """
-    found, before = [], {each.key: each.log_odds for each in first}
-    for each in compared:
-        likely = each.log_odds > logit(LIKELY)
+    found, before = [], {table.key: table.log_odds for table in first}
+    for table in compared:
+        likely = table.log_odds > logit(LIKELY)
         for other in taken:
-            if other.compared.family is each.family and each.statistic == other.compared.statistic:
+            if other.compared.key[:2] == table.key[:2]:
                 likely[other.group] = False
         for other in taken[:1]:
-            if other.compared.statistic == each.statistic:
-                likely &= (before.get(each.key, each.log_odds) > logit(LIKELY)) | (
-                    np.abs(each.distance.size) > ECHO * abs(other.size))
-        found += [_Found(each, int(group)) for group in np.flatnonzero(likely)]
+            if other.compared.statistic == table.statistic:
+                likely &= (before.get(table.key, table.log_odds) > logit(LIKELY)) | (
+                    np.abs(table.distance.size) > ECHO * abs(other.size))
+        found += [_Found(table, int(group)) for group in np.flatnonzero(likely)]
     found.sort(key=lambda each: -each.log_odds)
     seen, rivals = set(), []
     for each in found:
@@ -362,7 +362,7 @@ def _likeliest(compared: list[_Compared], first: list[_Compared],
     return (sure or list(best.values()))[:MAX_RIVALS]
 
 
-def _evidence(compared: list[_Compared]) -> float:
+def _evidence(compared: list[Compared]) -> float:
     """Return how much stands out in all [nats]."""
     return float(sum(np.nansum(np.maximum(each.log_odds, 0.0)) for each in compared))
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Readings, families_of, units_of
-from radiotwin.closeloop.scan import UNITS, _compare, _Compared
+from radiotwin.closeloop.scan import UNITS, Compared, compare
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.inference.groups import Units
 
@@ -48,8 +48,8 @@ def seen_from(model: CrossFit) -> list[Seen]:
     units = units_of(readings)
     families = [replace(each, statistics=tuple({*each.statistics} & {*STATISTICS}))
                 for each in families_of(readings, units)]
-    sharpest: dict[tuple[str, str], _Compared] = {}
-    for each in _compare(readings, families, units):
+    sharpest: dict[tuple[str, str], Compared] = {}
+    for each in compare(readings, families, units):
         key = each.family.name, each.statistic
         if key not in sharpest or _typical(each)[1] < _typical(sharpest[key])[1]:
             sharpest[key] = each
@@ -62,7 +62,7 @@ def seen_from(model: CrossFit) -> list[Seen]:
     return found
 
 
-def _typical(compared: _Compared) -> tuple[int, float]:
+def _typical(compared: Compared) -> tuple[int, float]:
     """Return the group whose error and spread together are the median, and what they are."""
     judged = np.isfinite(compared.distance.size)
     total = np.where(judged, np.hypot(compared.distance.error, compared.distance.spread), np.inf)
@@ -70,14 +70,14 @@ def _typical(compared: _Compared) -> tuple[int, float]:
     return group, float(total[group])
 
 
-def _least_size(compared: _Compared, readings: Readings, units: Units) -> float:
+def _least_size(compared: Compared, readings: Readings, units: Units) -> float:
     """Return the size from which a typical group is surely said; inf if there is none."""
     (group, total), statistic = _typical(compared), compared.statistic
     family = replace(compared.family, statistics=(statistic,))
     rows, sure = family.groups.members(group, len(readings)), np.log(MIN_SURE / (1 - MIN_SURE))
     size = FIRST * total
     while size <= MOST[statistic]:
-        tables = _compare(_moved(readings, rows, statistic, size), [family], units)
+        tables = compare(_moved(readings, rows, statistic, size), [family], units)
         if max(each.log_odds[group] for each in tables) >= sure:
             return size
         size *= STEP

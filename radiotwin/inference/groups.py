@@ -110,7 +110,7 @@ class Nested:
         freedom = np.sqrt(1 - 1 / parts[self._of_part[own]])
         within = robust_sd((mean - middle[self._of_part])[own] / freedom, centred=True)
         between = robust_sd(middle[several]) ** 2 - within**2 * np.mean(1 / parts[several])
-        return float(np.sqrt(max(between, 0.0)))
+        return float(np.sqrt(np.maximum(between, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,7 +122,7 @@ class Hypotheses:
         if widening is not None:
             nuisance = self.evidence.rotated(self.nuisance.values / widening[:, None])
             widened = np.log(widening[self.evidence.rows])
-            base += widened.sum() + 0.5 * np.log(max(np.count_nonzero(widened), 1))
+            base += widened.sum() + 0.5 * np.log(np.maximum(np.count_nonzero(widened), 1))
         both = np.hstack([nuisance, self.evidence.rotated(columns.values)])
         sd = np.concatenate([self.nuisance.prior_sd, columns.prior_sd])
         return self.evidence.of_rotated(self.evidence.rotated(z), both, sd, theta)[0] - base
