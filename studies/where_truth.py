@@ -120,7 +120,7 @@ def truths(effects: Sequence[dict], changes_db: Sequence[np.ndarray], links: Lin
 
 def _truth(effect: dict, change_db: np.ndarray, links: Links) -> Truth:
     ends = {end: {effect[end]} for end in ENDS if effect.get(end) not in (None, "all")}
-    if "flights" in effect:
+    if "flights" in effect and effect["name"] != "antenna_swap":  # its other flights differ as much
         ends["flight"] = set(effect["flights"])
     of_ends = np.ones(len(links), dtype=bool)
     for end, names in ends.items():
