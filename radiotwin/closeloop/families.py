@@ -123,9 +123,14 @@ class Family:
 
 def units_of(readings: Readings) -> Units:
     """Return which readings err alike: of one flight nearby; of one device, in a larger place."""
-    passing, lasting = (np.floor(readings.moving_m[:, :2] / width_m).astype(np.int64)
+    passing, lasting = (_squares_of(readings.moving_m, width_m)
                         for width_m in (PASSING_M, LASTING_M))
     return Units(codes_of(*passing.T, readings.flight), codes_of(*lasting.T, readings.device))
+
+
+def _squares_of(position_m: np.ndarray, width_m: float) -> np.ndarray:
+    """Return the square (n, 2) of each position (n, 3); 0 of one that is not known."""
+    return np.floor(np.nan_to_num(position_m[:, :2]) / width_m).astype(np.int64)
 
 
 def codes_of(*labels: np.ndarray) -> np.ndarray:
@@ -300,9 +305,9 @@ def _places(readings: Readings, units: Units) -> Iterator[Family]:
     link = np.broadcast_to(np.arange(len(readings))[:, None], low.shape)[low]
     ends = readings.device, readings.track
     for width_m in GRID_M:
-        end = np.floor(readings.moving_m[:, :2] / width_m).astype(np.int64)
+        end = _squares_of(readings.moving_m, width_m)
         yield _squares(np.arange(len(readings)), end, width_m, ends, units)
-        cell = np.floor(along_m[low][:, :2] / width_m).astype(np.int64)
+        cell = _squares_of(along_m[low], width_m)
         if len(cell):
             yield _squares(link, cell, width_m, ends, units)
 
