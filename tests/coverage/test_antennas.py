@@ -110,10 +110,14 @@ def test_positions_that_are_tried_are_heard_through_both_antennas(plain):
     azimuth_deg, paths = rays_by_hand(receiver_m)
     declared = Declared((Radio(antenna=antenna_of(downtilted_sector_dbi)), Radio()), FREQUENCY_HZ, False, antenna_of(dipole_dbi))
     relocation = Relocation((-600, 600, -600, 600), 100.0)
+    ends = Ends(device_m=np.array([MAST_M, MAST_M]), device_names=["with", "without"], receiver_names=["uav"],
+                flight_names=["f"], anchors=frozenset({0, 1}), declared=declared)
+    world = World(frequency_hz=FREQUENCY_HZ, city=plain.city, is_gain=True)
     for device, of_device in enumerate((downtilted_sector_dbi, lambda azimuth_deg, elevation_deg: 0.0)):
         expected = sum(power * 10 ** ((of_device(azimuth_deg - BORESIGHT_DEG, leaving_deg) + dipole_dbi(0.0, arriving_deg)) / 10)
                        for leaving_deg, arriving_deg, power in paths)
-        power = relocation.follow(plain.city, tuple(MAST_M), receiver_m, FREQUENCY_HZ, declared, device)
+        links = Links(columns=Columns.unmeasured(receiver_m, np.full(len(receiver_m), device)), ends=ends, world=world)
+        power, _ = relocation.follow(links, device)
         np.testing.assert_allclose(10 * np.log10(power), 10 * np.log10(expected), atol=0.03)
 
 

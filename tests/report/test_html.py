@@ -30,7 +30,7 @@ ATTACK = ("""</script></title></style></textarea>--><script>window.pwned=1</scri
 # A name of a device, a flight or a receiver has at most 200 characters, and none that is not seen.
 IN_NAMES = ("""</script></textarea>--><script>pwned=1</script><img src=x onerror="pwned=2"><svg onload=pwned=3>"""
             """'"onmouseover=pwned=5 {{7*7}}<link rel=stylesheet href=URL/a>""")
-KEPT = {"schema", "verdict", "links", "positions", "role", "level", "model", "file", "los", "nlos", "effect", "name"}
+KEPT = {"schema", "verdict", "sight", "statistic", "links", "positions", "role", "level", "model", "file", "los", "nlos", "effect", "name"}
 
 
 @pytest.fixture(scope="module")
