@@ -34,6 +34,9 @@ def kill_after(monkeypatch):
     return after
 
 
+KILLED_AFTER = 15  # pieces of work
+
+
 @pytest.fixture
 def searches(monkeypatch):
     """Count the searches for an effect's parameters."""
@@ -64,7 +67,7 @@ def test_a_killed_loop_goes_on_and_ends_equal_to_the_bit(measured, kill_after, s
     whole = everything(measured)
     total = len(searches)
     searches.clear()
-    kill_after(30)
+    kill_after(KILLED_AFTER)
     with keep_pieces(), pytest.raises(Killed):
         everything(measured)
     before = len(searches)
@@ -73,7 +76,7 @@ def test_a_killed_loop_goes_on_and_ends_equal_to_the_bit(measured, kill_after, s
     with keep_pieces() as store:
         assert everything(measured) == whole
     assert 0 < before < total and len(searches) <= total - before + 1
-    assert store.earlier >= 30  # some are asked for twice
+    assert store.earlier >= KILLED_AFTER  # some are asked for twice
     for number, (_, _, path) in enumerate(sorted(store.files())):
         if number % 4 == 0:  # damaged
             path.write_bytes(path.read_bytes()[:-number - 1])

@@ -39,9 +39,7 @@ def test_a_receiver_that_reads_too_much_is_named_and_measured(open_ground):
     world.gain_db[world.receiver == 1] += 5.0
     report = run(open_ground.measured(world))
     assert named(report) == ["receiver_gain_offset"]
-    difference = value(report, "receiver_gain_offset", "offset_db[r1]") - \
-        value(report, "receiver_gain_offset", "offset_db[r0]")
-    assert difference == pytest.approx(5.0, abs=0.5)
+    assert value(report, "receiver_gain_offset", "offset_db[r1]") == pytest.approx(5.0, abs=0.5)  # of all others
     assert report["error"]["after"]["rmse_db"] < 1.05 * 2.0 < report["error"]["before"]["rmse_db"]
 
 
