@@ -34,7 +34,8 @@ def test_an_offset_that_no_fold_has_links_enough_for_is_not_kept(open_ground):
     few = (world.receiver == 0) & (world.device < 2) & (world.slot % 11 == 5)
     assert np.bincount(world.device[few]).tolist() == [30, 30]
     loop = close_loop(open_ground.measured(world).select(few), base="log-distance")
-    (offset,) = [score for score in loop.found.log.trials if score.name == "device_gain_offset"]
+    *offsets, offset = [score for score in loop.found.log.trials if score.name == "device_gain_offset"]
+    assert not any(each.kept for each in offsets)
     assert not offset.kept and "gains 0 nats on held-out links" in offset.reason
 
 
@@ -90,6 +91,7 @@ def test_what_an_improbable_candidate_has_outdone_is_asked_as_well(open_ground, 
     world.gain_db[world.receiver == 1] += 6.0
     measurements = open_ground.measured(world)
     only_effects("receiver_gain_offset", "noise_floor_censoring", "excess_attenuation", "receiver_drift")
+    monkeypatch.setattr("radiotwin.closeloop.run.scan", lambda _: [])  # or it is named before
     loop = close_loop(measurements, base="log-distance")
     assert [each.name for each in loop.after.whole.effects][:1] == ["receiver_gain_offset"]
     outdone = {score.name for score in loop.found.log.trials if score.step == 0 and "gains more on" in score.reason}

@@ -21,6 +21,7 @@ from radiotwin.closeloop.search.scoring import Candidate, fit_candidate, score_c
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import MIN_RIVAL_SHARE, MIN_SHARED, MIN_SURE
+from radiotwin.closeloop.verdict.intervals import why_not_borne_out
 from radiotwin.effects.base import Effect
 
 ANOTHER = "another"  # name of a cause that the catalogue does not have
@@ -75,6 +76,10 @@ def _with_cause(state: SearchState, anomaly: Anomaly, inputs: SearchInputs
         return state, causes
     trial, extended = _held_out(model, best, inputs)
     trial = replace(trial, probability=causes[best.effect.name])
+    if extended is not None and not best.effect.within_flights:
+        why = why_not_borne_out(extended, state.step)
+        if why:
+            trial, extended = trial.refuse(why, passed=False), None
     return (state.refuse(trial) if extended is None else state.keep(trial, extended)), causes
 
 
