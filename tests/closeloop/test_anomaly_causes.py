@@ -66,6 +66,7 @@ def test_a_flight_that_is_garbage_is_one_effect_of_all_receivers():
     assert effect.params.noise_sd_db == pytest.approx(11, abs=2)
 
 
+@pytest.mark.slow
 def test_a_device_that_was_moved_is_found_where_it_went():
     loop = rt.close_loop(campaign(3, moved_m=(70.0, -40.0)), base="log-distance")
     (effect,) = named(loop)
@@ -75,6 +76,7 @@ def test_a_device_that_was_moved_is_found_where_it_went():
     assert all(each.causes["device_moved"] > 0.5 for each in loop.anomalies if each.probability >= 0.9)
 
 
+@pytest.mark.slow
 def test_two_faults_are_told_apart():
     loop = rt.close_loop(campaign(4, weak_db=6.0, garbage_db=11.0), base="log-distance")
     assert {each.name for each in named(loop)} == {"device_gain_offset", "faulty_flight"}
