@@ -20,6 +20,7 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Family, Readings, codes_of, families_of, units_of
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.effects.params import QUANTILE_90, Parameter
+from radiotwin.inference.gaussian import robust_sd
 from radiotwin.inference.groups import (
     HUBER,
     MAX_SCALES,
@@ -325,8 +326,7 @@ def _centred(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
 
 
 def _scale(values: np.ndarray) -> float:
-    middle = np.median(values)
-    return max(1.4826 * float(np.median(np.abs(values - middle))), LEAST_SCALE_DB)
+    return max(robust_sd(values), LEAST_SCALE_DB)
 
 
 def _likeliest(compared: list[Compared], first: list[Compared],

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import logit
 
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Readings, families_of, units_of
@@ -74,7 +75,7 @@ def _least_size(compared: Compared, readings: Readings, units: Units) -> float:
     """Return the size from which a typical group is surely said; inf if there is none."""
     (group, total), statistic = _typical(compared), compared.statistic
     family = replace(compared.family, statistics=(statistic,))
-    rows, sure = family.groups.members(group, len(readings)), np.log(MIN_SURE / (1 - MIN_SURE))
+    rows, sure = family.groups.members(group, len(readings)), logit(MIN_SURE)
     size = FIRST * total
     while size <= MOST[statistic]:
         tables = compare(_moved(readings, rows, statistic, size), [family], units)

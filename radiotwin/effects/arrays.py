@@ -10,7 +10,6 @@ from radiotwin.errors import BadInput
 from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
 
-MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
 NEPERS = np.log(10) / 10  # of power in a decibel
 MIN_POWER = 1e-290  # of which a logarithm is taken
 
@@ -98,11 +97,6 @@ def frequent_labels(index: np.ndarray, minimum: int) -> list[int]:
     """Return the labels of (n,) that occur at least `minimum` times, in order."""
     values, counts = np.unique(index, return_counts=True)
     return [int(value) for value, count in zip(values, counts, strict=True) if count >= minimum]
-
-
-def robust_sd(values: np.ndarray) -> float:
-    """Return the standard deviation of normal values (n,) among which there may be outliers."""
-    return MAD_SD * float(np.median(np.abs(values - np.median(values))))
 
 
 def squares_about_mean(values: np.ndarray, weight: np.ndarray) -> float:

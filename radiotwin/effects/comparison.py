@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
-from radiotwin.effects.arrays import robust_sd
 from radiotwin.effects.base import ResidualView
+from radiotwin.inference.gaussian import robust_sd
 from radiotwin.links import Links, correlation_length_m
 from radiotwin.links.correlation import devices_move, step_m
 

@@ -15,12 +15,18 @@ from scipy.special import log_ndtr
 if TYPE_CHECKING:
     import torch
 
+MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
 HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
 Limit = float | np.ndarray | None
 """Level below which nothing is detected [dB], for all links or each (n,); None or -inf: unknown."""
 MIN_SD_DB, MAX_SD_DB = 0.1, 100.0  # of a fitted standard deviation: far outside what is measured
 # Mean and sd of a normal prior: it decides only where the distances hardly differ.
 EXPONENT_PRIOR = (-3.0, 2.0)
+
+
+def robust_sd(values: np.ndarray) -> float:
+    """Return the standard deviation of normal values (n,) among which there may be outliers."""
+    return MAD_SD * float(np.median(np.abs(values - np.median(values))))
 
 
 def limits_of(limit_db: Limit, n: int) -> np.ndarray:

@@ -15,6 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import t as student_t
 
+from radiotwin.inference.gaussian import MAD_SD, robust_sd
+
 MIN_VALUES, MIN_UNITS, MIN_LASTING = 12, 4, 3.0  # of a group, to be judged
 HUBER = 1.345  # scales, beyond which a value pulls no further (95 % efficient for normal errors)
 MAX_SCALES = 6.0  # a single value counts as this far away at most
@@ -108,7 +110,7 @@ class Nested:
         middle = np.bincount(self._of_part, mean) / parts
         own = several[self._of_part]
         freedom = np.sqrt(1 - 1 / parts[self._of_part[own]])
-        within = robust_sd((mean - middle[self._of_part])[own] / freedom, centred=True)
+        within = MAD_SD * np.median(np.abs(mean - middle[self._of_part])[own] / freedom)
         between = robust_sd(middle[several]) ** 2 - within**2 * np.mean(1 / parts[several])
         return float(np.sqrt(np.maximum(between, 0.0)))
 
@@ -124,12 +126,6 @@ class Statistic:
 
     value: np.ndarray
     error: np.ndarray
-
-
-def robust_sd(values: np.ndarray, centred: bool = False) -> float:
-    """Return the standard deviation of values (n,) from the median of their distances."""
-    middle = 0.0 if centred else np.median(values)
-    return 1.4826 * float(np.median(np.abs(values - middle)))
 
 
 def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
@@ -166,7 +162,7 @@ def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
     """
     x, group, count = values[groups.row], groups.group, groups.count
     middle = medians(x, group, count)
-    scale = np.maximum(1.4826 * medians(np.abs(x - middle[group]), group, count), least_scale)
+    scale = np.maximum(MAD_SD * medians(np.abs(x - middle[group]), group, count), least_scale)
     deviation = (x - middle[group]) / scale[group]
     inside = np.maximum(np.bincount(group, np.abs(deviation) < HUBER, count), 1.0)
     value = middle + scale * np.bincount(group, np.clip(deviation, -HUBER, HUBER), count) / inside
@@ -297,7 +293,7 @@ def apart(found: Statistic, prior_spread: float, dof: float) -> Apart:
     peers = own_peers.shape[1]
     centre = np.median(own_peers, axis=1)
     noise = np.maximum(np.median(of_peers, axis=1), TINY)
-    seen = (1.4826 * np.median(np.abs(own_peers - centre[:, None]), axis=1)) ** 2
+    seen = (MAD_SD * np.median(np.abs(own_peers - centre[:, None]), axis=1)) ** 2
     # Peers may be closer together than their errors say, which are of the worst case.
     weight = peers - 1.0
     usual = (weight * seen + PEER_WEIGHT * (prior_spread**2 + noise)) / (weight + PEER_WEIGHT)

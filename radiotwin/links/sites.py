@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import t as student
 
 from radiotwin.display import some
+from radiotwin.inference.gaussian import MAD_SD
 from radiotwin.links.correlation import devices_move
 from radiotwin.links.links import Links
 
@@ -34,7 +35,6 @@ MIN_DEVICES = 3  # of which differences may scatter, too
 MAX_RECEIVERS = 40  # bounds the number of differences to 780
 ABOVE_LIMIT_DB = 10.0  # pairs are this far above the limits, in the mean: so blanks choose none
 MAX_Z = 3.0  # places farther off count as this many robust standard deviations
-MAD_SD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
 MIN_SD_DB = 0.1
 QUANTILE = 0.95  # upper end of a 90 % interval
 

@@ -10,6 +10,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 
 from radiotwin.display import RESIDUAL_COLOURS, plain, residual_range_db
+from radiotwin.inference.gaussian import MAD_SD
 from radiotwin.report.closeloop_data import DrawnLinks, LoopData
 from radiotwin.report.labels import FITTED, new_figure, signed
 
@@ -17,7 +18,6 @@ MAX_MEMBERS = 40  # of an end; more would be too small to be read
 MIN_LINKS = 3  # of a cell
 MAX_NUMBERS = 12  # columns up to which each cell has its number
 SCATTER_COLOURS = "YlGnBu"
-SCATTER_OF_MEDIAN = 1.4826  # standard deviation over median absolute deviation, normal errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ def pivot(links: DrawnLinks, residual_db: np.ndarray, ends: tuple[str, str],
             if len(group) >= MIN_LINKS:
                 values_db = residual_db[group]
                 median_db[i, j] = np.median(values_db)
-                scatter_db[i, j] = SCATTER_OF_MEDIAN * np.median(
+                scatter_db[i, j] = MAD_SD * np.median(
                     np.abs(values_db - median_db[i, j]))
     shown = [[links.names[end][each] for each in members]
              for end, members in zip(ends, kept, strict=True)]

@@ -21,10 +21,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import logsumexp
 
-from radiotwin.effects.arrays import MAD_SD, curve_columns, one_hot, robust_sd
+from radiotwin.effects.arrays import curve_columns, one_hot
 from radiotwin.effects.base import Effect
 from radiotwin.effects.params import NEAR_SHARE
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
+from radiotwin.inference.gaussian import MAD_SD, robust_sd
 from radiotwin.links import Links
 from radiotwin.twin.model.correlated_shadowing import receivers_move
 from radiotwin.twin.model.model import Fit

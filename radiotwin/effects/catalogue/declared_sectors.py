@@ -47,8 +47,9 @@ from radiotwin.effects.params import (
     quantities,
     quantity,
 )
+from radiotwin.inference.gaussian import MAD_SD
 from radiotwin.links import Links
-from radiotwin.links.sites import MAD_SD, antenna_of, site_of
+from radiotwin.links.sites import antenna_of, site_of
 
 GROUP_SD_DB = 3.0  # between masts, and between directions of a mast
 DEVICE_SD_DB = 3.0  # between carriers of an antenna: powers and cables differ

@@ -20,7 +20,6 @@ from pydantic import Field
 from scipy.stats import t
 from typing_extensions import override
 
-from radiotwin.effects.arrays import robust_sd
 from radiotwin.effects.base import GainEffect, LevelAt, ResidualView, Term
 from radiotwin.effects.comparison import (
     by_precision,
@@ -38,6 +37,7 @@ from radiotwin.effects.params import (
     quantity,
 )
 from radiotwin.effects.patterns import Pattern, members
+from radiotwin.inference.gaussian import robust_sd
 from radiotwin.links import Links
 
 MIN_LINKS = 30  # of a receiver on a flight, at places where other flights were

@@ -20,7 +20,7 @@ from pydantic import Field
 from scipy.special import expit, logit, stdtr
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels, robust_sd
+from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import DetectionEffect, ResidualView
 from radiotwin.effects.comparison import compared_where_possible_db
 from radiotwin.effects.params import (
@@ -31,6 +31,7 @@ from radiotwin.effects.params import (
     ReceiverIndex,
     Variation,
 )
+from radiotwin.inference.gaussian import robust_sd
 from radiotwin.inference.student import DOF, Losses, log_density
 from radiotwin.links import Links
 
