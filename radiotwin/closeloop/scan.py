@@ -380,12 +380,17 @@ def _without(readings: Readings, found: _Found) -> Readings:
         excess = readings.blank_excess.copy()
         excess[rows] = np.nan
         return replace(readings, blank_excess=excess)
+    return moved(readings, rows, found.compared.statistic, -found.size)
+
+
+def moved(readings: Readings, rows: np.ndarray, statistic: str, size: float) -> Readings:
+    """Return readings with the level [dB] or log scatter of some rows (n,) off by a size more."""
     residual_db = readings.residual_db.copy()
-    if found.compared.statistic == "level":
-        residual_db[rows] -= found.size
+    if statistic == "level":
+        residual_db[rows] += size
     else:
-        middle = np.nanmedian(residual_db[rows])
-        residual_db[rows] = middle + (residual_db[rows] - middle) / np.exp(found.size)
+        middle_db = np.nanmedian(residual_db[rows])
+        residual_db[rows] = middle_db + (residual_db[rows] - middle_db) * np.exp(size)
     return replace(readings, residual_db=residual_db)
 
 

@@ -13,7 +13,7 @@ from scipy.special import logit
 
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Readings, families_of, units_of
-from radiotwin.closeloop.scan import UNITS, Compared, compare
+from radiotwin.closeloop.scan import UNITS, Compared, compare, moved
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.inference.groups import Units
 
@@ -78,19 +78,8 @@ def _least_size(compared: Compared, readings: Readings, units: Units) -> float:
     rows, sure = family.groups.members(group, len(readings)), logit(MIN_SURE)
     size = FIRST * total
     while size <= MOST[statistic]:
-        tables = compare(_moved(readings, rows, statistic, size), [family], units)
+        tables = compare(moved(readings, rows, statistic, size), [family], units)
         if max(each.log_odds[group] for each in tables) >= sure:
             return size
         size *= STEP
     return np.inf
-
-
-def _moved(readings: Readings, rows: np.ndarray, statistic: str, size: float) -> Readings:
-    """Return readings of which the level or the scatter of a group (n,) is off by a size more."""
-    residual_db = readings.residual_db.copy()
-    middle_db = np.nanmedian(residual_db[rows])
-    if statistic == "level":
-        residual_db[rows] += size
-    else:
-        residual_db[rows] = middle_db + (residual_db[rows] - middle_db) * np.exp(size)
-    return replace(readings, residual_db=residual_db)
