@@ -91,7 +91,7 @@ def _is_wrong_map(score: Trial, nuisance: dict | None) -> bool:
 
 def _row(score: Trial) -> list:
     return [score.step, score.name, score.passed, list(score.features),
-            score.gain_by_fold.round(2).tolist(), round(score.p_value, 6)]
+            score.gain_by_fold.round(2).tolist()]
 
 
 def main() -> None:

@@ -12,8 +12,8 @@ from studies.tables import make_panels, markdown
 
 PHYSICS = ("wall_reflection", "diffraction")  # in every traced world
 # Prior: log-odds rise with each feature but the last two; few cases do not show otherwise.
-MEAN, SD = (0.4, 0.5, 0.1, 0.2, -0.5, -0.5), (0.3, 0.3, 0.3, 0.3, 0.5, 0.5)
-RISES = (True, True, True, True, False, False)
+MEAN, SD = (0.4, 0.5, 0.1, -0.5, -0.5), (0.3, 0.3, 0.3, 0.5, 0.5)
+RISES = (True, True, True, False, False)
 NAME_SD, NOTHING_SD = 1.0, 1.0  # of a name's own intercept, and of the weights of "nothing"
 FOLDS = 10
 THRESHOLDS = (0.2, 0.35, 0.5, 0.7, 0.9)

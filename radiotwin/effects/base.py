@@ -126,7 +126,7 @@ class Effect(ABC):
         Params: its parameters, a subclass of `EffectParams`.
         figure: key of the figure that shows it (`radiotwin.report`); "" = residual against the
             variable that it acts through.
-        nlos_only: acts on links without line of sight only, so those with it need not support it.
+        nlos_only: acts on links without line of sight only.
         confused_with: names of effects that may look alike.
         repeatable: whether there may be several, each found in a step of its own.
         sparse: whether each of its coefficients belongs to one end, and any few may be there.

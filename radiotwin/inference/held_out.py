@@ -1,4 +1,4 @@
-"""Held-out data: groups, how surely a gain is not chance, and weights of predictions.
+"""Held-out data: groups, and weights of predictions.
 
 Weights are those of a convex combination: not negative, with the sum one (Breiman 1996, 'Stacked
 regressions', Machine Learning 24; van der Laan, Polley and Hubbard 2007, 'Super learner',
@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import nnls
-from scipy.special import logsumexp
 
 TOGETHER = 1e4  # weight of the condition that weights sum to one, relative to the errors
-FLIPS = 4_000  # sign flips drawn: a p-value of 0.1 is known to 0.005
 
 
 def deal_groups(group: np.ndarray, max_folds: int, rng: np.random.Generator) -> np.ndarray:
@@ -73,35 +71,3 @@ def combine(predictions: np.ndarray, share: np.ndarray, weights: np.ndarray) -> 
     """Return the combination (n,) of predictions (n, k) with shares (n,) and weights (2, k)."""
     of_each = (1 - share)[:, None] * weights[0] + share[:, None] * weights[1]
     return (of_each * predictions).sum(axis=1)
-
-
-def cross_fit_p_value(gains: np.ndarray) -> float:
-    """Return a bound on the probability of such held-out gains if the effect is not there.
-
-    A likelihood ratio whose parameters were fitted elsewhere is 1 on average then, if the model
-    without the effect is known, and so is its mean over the folds; by Markov's inequality
-    (Wasserman, Ramdas and Balakrishnan 2020, 'Universal inference', PNAS 117(29), the cross-fit
-    test). Here that model is fitted elsewhere, too, so that the average is above 1 where links are
-    few. Gains (folds,) are in log-likelihood [nats].
-    """
-    return float(np.exp(-max(logsumexp(gains) - np.log(len(gains)), 0.0)))
-
-
-def sign_flip_p_value(gains: np.ndarray, seed: int) -> float:
-    """Return the one-sided sign-flip permutation p-value of the sum of gains.
-
-    Each is of an independent piece of evidence; zeros do not count.
-    """
-    rng = np.random.default_rng(seed)
-    gains = gains[gains != 0]
-    if not len(gains):
-        return 1.0
-    # Batches of matrix products: scipy.stats.permutation_test takes ten times as long on 6,000.
-    batch = max(int(4e6 // len(gains)), 100)
-    larger, done = 0, 0
-    while done < FLIPS:
-        count = min(batch, FLIPS - done)
-        signs = rng.integers(0, 2, (count, len(gains))) * 2 - 1
-        larger += int((signs @ gains >= gains.sum()).sum())
-        done += count
-    return (larger + 1) / (FLIPS + 1)

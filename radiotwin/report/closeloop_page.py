@@ -157,7 +157,6 @@ def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
 def _evidence(effect: dict) -> str:
     """Describe the form of an effect, its evidence, and what it may be confused with."""
     text = f"{effect['variant'].capitalize()}. " if effect.get("variant") else ""
-    evidence = effect["evidence"]
     if effect.get("probability") is not None:
         text += f"Probability that it is there: {probability(effect['probability'])}. "
     size = effect.get("size_db")
@@ -168,8 +167,6 @@ def _evidence(effect: dict) -> str:
     elif size is not None:
         text += f"It changes the links that it acts on by {number(size['value'])} dB (RMS"
         text += f"; 90 % interval {_interval(size)}). " if _interval(size) != "–" else "). "
-    if evidence["p_value"] is not None:
-        text += f"That held-out links gain by chance: p {_p_value(evidence['p_value'])}."
     same = [name_label(name) for name in effect.get("indistinguishable_from", [])]
     alike = [name_label(name) for name in effect.get("confused_with", [])
              if name_label(name) not in same]

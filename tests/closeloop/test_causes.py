@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from radiotwin.closeloop.crossfit import (
-    CrossFit,
     LogDistanceBase,
     cross_validate,
     make_folds,
@@ -36,7 +35,7 @@ def test_an_offset_that_no_fold_has_links_enough_for_is_not_kept(open_ground):
     loop = close_loop(open_ground.measured(world).select(few), base="log-distance")
     *offsets, offset = [score for score in loop.found.log.trials if score.name == "device_gain_offset"]
     assert not any(each.kept for each in offsets)
-    assert not offset.kept and "gains 0 nats on held-out links" in offset.reason
+    assert not offset.kept and "gains too little on held-out links" in offset.reason
 
 
 def test_a_candidate_that_no_held_out_link_can_judge_is_refused(open_ground):
@@ -45,43 +44,8 @@ def test_a_candidate_that_no_held_out_link_can_judge_is_refused(open_ground):
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
     extended = model.extended(model.whole, model.folds)
     extended.held_out_nll = np.full(len(links), np.nan)
-    score = score_model(model, extended, Trial("device_gain_offset"), None, 1, INPUTS)
+    score = score_model(model, extended, Trial("device_gain_offset"), INPUTS.criteria)
     assert "no held-out link" in score.reason
-
-
-@pytest.mark.parametrize(("gains", "passes"), [((40, 30, 0, 0, 0, 0), True), ((40, -8, 0, 0, 0, 0), False),
-                                               ((40, 30, -8, -8, -8, 0), False)])
-def test_folds_that_a_candidate_does_not_act_on_do_not_vote(open_ground, gains, passes):
-    """A receiver that was on two of six flights shows its fault on these two."""
-    links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
-    folds = make_folds(links, 0)
-    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-    index = np.arange(len(links)) % 6
-    six = CrossFit(model.whole, model.folds[:1] * 6, index, model.twin)
-    per_link = np.array(gains)[index] / np.bincount(index)[index] * model.whole.view.design_effect
-    six.held_out_nll = model.held_out_nll
-    extended = six.extended(six.whole, six.folds)
-    extended.held_out_nll = model.held_out_nll - per_link
-    score = score_model(six, extended, Trial("lock_loss"), None, 1, INPUTS)
-    assert ("folds" in score.reason) == (not passes)
-
-
-@pytest.mark.parametrize(("in_sight", "passes"), [(0, True), (1, True), (-1, True), (40, True), (-20, False)])
-def test_links_with_line_of_sight_are_asked_if_it_moves_them(open_ground, in_sight, passes):
-    """What gains 240 nats without line of sight, and some with it."""
-    links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
-    los = np.arange(len(links)) // 6 % 2 == 0
-    folds = make_folds(links, 0)
-    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-    index, gains = np.arange(len(links)) % 6, np.where(los, in_sight, 40) + np.arange(6)[np.arange(len(links)) % 6] / 10
-    whole = replace(model.whole, model=replace(model.whole.model, links=links.with_los(los)))
-    six = CrossFit(whole, model.folds[:1] * 6, index, model.twin)
-    per_link = gains / len(links) * 12 * model.whole.view.design_effect
-    six.held_out_nll = model.held_out_nll
-    extended = six.extended(six.whole, six.folds)
-    extended.held_out_nll = model.held_out_nll - per_link
-    score = score_model(six, extended, Trial("interference"), None, 1, INPUTS)
-    assert ("line of sight" in score.reason) == (not passes)
 
 
 @pytest.mark.usefixtures("short_report")
@@ -195,8 +159,8 @@ def test_what_gains_nothing_is_no_part_of_the_base_either(open_ground):
     folds = make_folds(links, 0)
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
     same = model.extended(model.whole, model.folds)
-    score = score_model(model, same, Trial("roof_heights"), None, 1, replace(INPUTS, criteria=INPUTS.criteria.of_no_claim))
-    assert score.nll_gain == 0 and not score.passed and "gains nothing" in score.reason
+    score = score_model(model, same, Trial("roof_heights"), INPUTS.criteria)
+    assert score.nll_gain == 0 and not score.passed and "gains too little" in score.reason
 
 
 def test_of_two_effects_of_one_name_the_one_that_is_probable_beside_another_is_kept(monkeypatch):

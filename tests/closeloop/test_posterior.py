@@ -105,7 +105,7 @@ def test_noise_is_told_from_a_rest_that_belongs_to_places(open_ground):
 
 def test_probabilities_sum_to_one_and_a_weak_candidate_is_refused(open_ground):
     model, hypotheses = looked_at(open_ground, 5)
-    scores = [Trial(name, passed=True, nll_gain=10 * nats, rmse_db=model.rmse_db() * 0.99, rmse_fall=0.01, evidence_nats=nats,
+    scores = [Trial(name, passed=True, nll_gain=10 * nats, rmse_db=model.rmse_db() * 0.99, evidence_nats=nats,
                              gain_by_fold=np.full(4, nats / 4)) for name, nats in (("foliage", 3.0), ("interference", 2.0))]
     judged, step = judge(scores, model, hypotheses, CRITERIA)
     assert set(step.probabilities) == {"foliage", "interference", NONE, OTHER}
@@ -129,16 +129,16 @@ def test_what_makes_links_blank_has_no_rival_among_what_changes_levels(open_grou
 
 def test_more_evidence_is_never_less_probable():
     nats = np.arange(0.0, 300.0, 10.0)
-    found = [probability_of("foliage", features((each,) * 3, 0.01 * each, 1.0, False)) for each in nats]
+    found = [probability_of("foliage", features((each,) * 3, 1.0, False)) for each in nats]
     assert np.all(np.diff(found) > 0)
 
 
 def test_where_more_of_the_rest_belongs_to_places_the_same_evidence_is_worth_less():
-    found = [probability_of("foliage", features((40.0,) * 3, 0.1, ratio, False)) for ratio in (0.3, 1.0, 3.0, 9.0)]
+    found = [probability_of("foliage", features((40.0,) * 3, ratio, False)) for ratio in (0.3, 1.0, 3.0, 9.0)]
     assert np.all(np.diff(found) < 0)
 
 
 def test_beside_an_effect_of_another_kind_the_same_evidence_is_worth_less():
-    alone, beside = (probability_of("foliage", features((40.0,) * 3, 0.1, 1.0, there)) for there in (False, True))
+    alone, beside = (probability_of("foliage", features((40.0,) * 3, 1.0, there)) for there in (False, True))
     assert beside < 0.8 * alone
     assert needed_nats("foliage", 0.5, 1.0, True) > needed_nats("foliage", 0.5, 1.0)

@@ -111,7 +111,7 @@ def test_fields_that_are_not_checked_are_not_kept(sample):
 def least():
     """The least that a report of this version has."""
     scores = {"n": 3, "rmse_db": 4.0}
-    effect = {"name": "foliage", "rank": 1, "parameters": {}, "evidence": {"heldout_nll_gain": 1.0, "p_value": 0.1}}
+    effect = {"name": "foliage", "rank": 1, "parameters": {}, "evidence": {"heldout_nll_gain": 1.0}}
     return {"schema": "radiotwin.closeloop/3", "base": "twin", "verdict": "effect", "effects": [effect], "candidates": [],
             "heldout": {"by": "flight", "folds": 2, "n": 3}, "baselines": {}, "notes": [],
             "error": {"before": dict(scores), "after": dict(scores), "noise_floor_db": None},

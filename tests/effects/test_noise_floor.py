@@ -112,7 +112,7 @@ def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
     model = CrossFit(whole, tuple(folds), index, None)
     inputs = SearchInputs(links, None, None, ())
     candidate = fit_candidate(model, NoiseFloor(), inputs.criteria)
-    score, extended = score_candidate(model, candidate, 20, inputs)
+    score, extended = score_candidate(model, candidate, inputs)
     assert score.reason == "" and extended is not None
 
 

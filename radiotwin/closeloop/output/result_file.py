@@ -88,7 +88,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
                 "indistinguishable_from": sorted({*trial.rivals,
                                                   *each.same_as(loop.after.links, parameters)}),
                 "probability": trial.probability, "anomalies": explained,
-                "evidence": {"heldout_nll_gain": trial.nll_gain, "p_value": trial.p_value,
+                "evidence": {"heldout_nll_gain": trial.nll_gain,
                              "evidence_nats": trial.evidence_nats}}
                for rank, (trial, each, parameters, size, explained) in enumerate(
                    zip(named, loop.after.whole.effects, loop.parameters, loop.sizes_db,
@@ -97,7 +97,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
     candidates = [{"name": trial.name, "variant": trial.variant, "step": trial.step + 1,
                    "heldout_rmse_db": trial.rmse_db,
-                   "heldout_nll_gain": trial.nll_gain, "p_value": trial.p_value, "kept": trial.kept,
+                   "heldout_nll_gain": trial.nll_gain, "kept": trial.kept,
                    "reason": trial.reason, "passed": trial.passed,
                    "evidence_nats": trial.evidence_nats, "features": list(trial.features),
                    "probability": trial.probability,
@@ -338,7 +338,7 @@ def _shadowing(trial: Trial, model: CrossFit, rank: int) -> dict[str, Any]:
             "parameters": {name: {"value": value, "low": np.nan, "high": np.nan, "unit": unit}
                            for name, (value, unit) in numbers.items()},
             "confused_with": [], "indistinguishable_from": [],
-            "evidence": {"heldout_nll_gain": trial.nll_gain, "p_value": trial.p_value}} | NOT_KNOWN
+            "evidence": {"heldout_nll_gain": trial.nll_gain}} | NOT_KNOWN
 
 
 def _groups(links: Links) -> dict[str, dict[str, np.ndarray]]:

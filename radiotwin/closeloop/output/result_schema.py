@@ -66,7 +66,6 @@ class EvidenceRecord(Record):
     """Evidence for an effect."""
 
     heldout_nll_gain: Real | None
-    p_value: Real | None
     evidence_nats: Real | None = None
 
 
@@ -97,7 +96,6 @@ class CandidateRecord(Record):
     step: Whole
     heldout_rmse_db: Real | None
     heldout_nll_gain: Real | None
-    p_value: Real | None
     kept: bool
     reason: str
     evidence_nats: Real | None = None

@@ -9,6 +9,7 @@ any more.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -66,21 +67,31 @@ def _with_cause(state: SearchState, anomaly: Anomaly, inputs: SearchInputs
         fitted = fit_candidate(model, effect, criteria, hypotheses, group, MIN_RIVAL_SHARE * most)
         if isinstance(fitted, Candidate) and np.isfinite(fitted.evidence):
             candidates.append(fitted)
-    nats = [*(each.evidence for each in candidates), hypotheses.of_group(group)]
-    causes: dict[str, float] = {}
+    while True:
+        causes = _shares(candidates, hypotheses.of_group(group))
+        best = max(candidates, key=lambda each: each.evidence, default=None)
+        if best is None or causes[best.effect.name] < criteria.min_probability:
+            return state, causes
+        trial, extended = _held_out(model, best, inputs)
+        trial = replace(trial, probability=causes[best.effect.name])
+        if extended is not None and not best.effect.within_flights:
+            why = why_not_borne_out(extended, state.step)
+            if why:
+                trial, extended = trial.refuse(why, passed=False), None
+        if extended is not None:
+            return state.keep(trial, extended), causes
+        state = state.refuse(trial)
+        candidates.remove(best)  # what does not return is no cause
+
+
+def _shares(candidates: Sequence[Candidate], another: float) -> dict[str, float]:
+    """Return the probability of each cause, and of `ANOTHER` with such evidence [nats]."""
     names = [*(each.effect.name for each in candidates), ANOTHER]
+    nats = [*(each.evidence for each in candidates), another]
+    causes: dict[str, float] = {}
     for name, share in sorted(zip(names, softmax(nats), strict=True), key=lambda each: -each[1]):
         causes[name] = causes.get(name, 0.0) + float(share)
-    best = max(candidates, key=lambda each: each.evidence, default=None)
-    if best is None or causes[best.effect.name] < criteria.min_probability:
-        return state, causes
-    trial, extended = _held_out(model, best, inputs)
-    trial = replace(trial, probability=causes[best.effect.name])
-    if extended is not None and not best.effect.within_flights:
-        why = why_not_borne_out(extended, state.step)
-        if why:
-            trial, extended = trial.refuse(why, passed=False), None
-    return (state.refuse(trial) if extended is None else state.keep(trial, extended)), causes
+    return causes
 
 
 def _named(anomaly: Anomaly) -> str:
@@ -100,7 +111,7 @@ def _held_out(model: CrossFit, candidate: Candidate,
 
     What happened on a flight does not return on others, and so they cannot refuse it.
     """
-    trial, extended = score_candidate(model, candidate, 1, inputs)
+    trial, extended = score_candidate(model, candidate, inputs)
     if candidate.effect.within_flights:
         return replace(trial, reason="", passed=True), adopted(model, candidate)
     return trial, extended

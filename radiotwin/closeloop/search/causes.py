@@ -102,12 +102,12 @@ def _one_more(state: SearchState, available: list[Effect], causes: bool,
         waiting = [each.waiting for each in tried if each.waiting is not None]
         if waiting and not _passed(tried):
             # What gains most is not probable; a weaker candidate may be.
-            asked = _score(state, waiting, len(available), inputs)
+            asked = _score(state, waiting, inputs)
             tried = [*(each for each in tried if each.waiting is None), *asked]
             state, tried = _judged(state, tried, hypotheses, inputs.criteria)
         if not _passed(tried):
             together = _probable_together(state, [each for each in tried if each.trial.passed],
-                                         len(available), inputs)
+                                         inputs)
             if together and _all_borne_out(together[-1].model, len(together)):
                 return _keep_together(state, tried, together)
     if not _passed(tried):
@@ -136,10 +136,10 @@ def _try_all(state: SearchState, available: list[Effect], hypotheses: Hypotheses
             candidates.append(fitted)
         else:
             refused.append(Tried(effect, fitted, model))
-    return refused + _score(state, candidates, len(available), inputs, needless=_beyond)
+    return refused + _score(state, candidates, inputs, needless=_beyond)
 
 
-def _score(state: SearchState, candidates: list[Candidate], available: int, inputs: SearchInputs,
+def _score(state: SearchState, candidates: list[Candidate], inputs: SearchInputs,
            needless: Callable[..., bool] = lambda *_: False) -> list[Tried]:
     """Score candidates of one step, but for those that are `needless` beside one that passed."""
     model, step = state.model, state.step
@@ -156,9 +156,7 @@ def _score(state: SearchState, candidates: list[Candidate], available: int, inpu
             tried.append(Tried(effect, trial, model, candidate))
             continue
         inputs.on_progress(f"step {step + 1}: {effect.name}, held out")
-        # One more of a kind needs no correction: that there is such a thing has been shown.
-        more = any(each.entry is effect for each in model.whole.effects)
-        trial, extended = score_candidate(model, candidate, 1 if more else available, inputs)
+        trial, extended = score_candidate(model, candidate, inputs)
         tried.append(Tried(effect, trial, extended or model))
     return tried
 
@@ -190,11 +188,11 @@ def _all_borne_out(model: CrossFit, last: int) -> bool:
                    for number in range(count - last, count))
 
 
-def _probable_together(state: SearchState, supported: Sequence[Tried], tried: int,
+def _probable_together(state: SearchState, supported: Sequence[Tried],
                       inputs: SearchInputs) -> list[Tried]:
     """Return effects that are probable together, in order; none where there are none.
 
-    Of a step none of whose `tried` candidates is probable enough by itself.
+    Of a step none of whose candidates is probable enough by itself.
     """
     criteria, step = inputs.criteria, state.steps[-1]
     ranked = sorted(supported, key=lambda each: -each.trial.probability)
@@ -211,14 +209,14 @@ def _probable_together(state: SearchState, supported: Sequence[Tried], tried: in
         hypotheses = Hypotheses.of(model.whole, inputs.seed)
         longer = []
         for effect in effects:
-            trial, extended = fit_and_score(model, effect, tried, inputs, hypotheses)
+            trial, extended = fit_and_score(model, effect, inputs, hypotheses)
             if extended is not None:
                 longer.append([*found, Tried(effect, trial, extended)])
         return longer
 
     def probability(found: list[Tried]) -> float:
         names = {each.trial.name for each in found}
-        others = [each.trial.held_out_nats for each in ranked if each.trial.name not in names]
+        others = [each.trial.nats for each in ranked if each.trial.name not in names]
         return probability_of_all([each.trial for each in found], max([0.0, *others]), state.model,
                                   step.rest_db / step.noise_db)
 
@@ -252,30 +250,29 @@ def _keep_best(state: SearchState, tried: list[Tried], hypotheses: Hypotheses | 
     beside an offset of each device.
     """
     criteria, step = inputs.criteria, state.step
-    nats_of = _currency([each for each in tried if each.trial.passed])
-    passed = sorted(_passed(tried), key=lambda each: -nats_of(each.trial))
+    passed = sorted(_passed(tried), key=lambda each: -each.trial.nats)
     # Of those that the data cannot tell apart the one with the least error.
-    most_nats = nats_of(passed[0].trial)
-    close = [each for each in passed if _alike(most_nats, nats_of(each.trial), criteria)]
+    most_nats = passed[0].trial.nats
+    close = [each for each in passed if _alike(most_nats, each.trial.nats, criteria)]
     passed.sort(key=lambda each: each.trial.rmse_db if each in close else np.inf)
     first = passed[0]
-    kept, least = [first], nats_of(first.trial)
+    kept, least = [first], first.trial.nats
     rival = next((each for each in passed[1:] if each.effect.repeatable), None)
     if rival is None and not first.effect.repeatable:
         rival = max((each for each in tried if each.trial.passed and each.effect.repeatable
-                     and nats_of(each.trial) >= MIN_RIVAL_SHARE * least),
-                    key=lambda each: nats_of(each.trial), default=None)
+                     and each.trial.nats >= MIN_RIVAL_SHARE * least),
+                    key=lambda each: each.trial.nats, default=None)
     most = criteria.max_repeats if not first.effect.repeatable else _on_one_mast(first.model)
     if rival is not None and most > 1:
         inputs.on_progress(f"step {step + 1}: more of {rival.trial.name}")
-        several = _several(rival, hypotheses, nats_of, least, most, inputs)
+        several = _several(rival, hypotheses, least, most, inputs)
         if several and rival.trial.reason:
             several = _if_likelier(state, several, first.trial, criteria)
         kept = several or kept
-    best, nats = kept[0], sum(nats_of(each.trial) for each in kept)
+    best, nats = kept[0], sum(each.trial.nats for each in kept)
     name = best.trial.name
     rivals = tuple(each.trial.name for each in passed
-                   if each.trial.name != name and _alike(nats, nats_of(each.trial), criteria))
+                   if each.trial.name != name and _alike(nats, each.trial.nats, criteria))
     less = f"{name} explains more"
     trials = [best.trial.keep(rivals=rivals) if each.effect is best.effect
               else each.trial.refuse(less) if each.trial.is_open else each.trial for each in tried]
@@ -292,7 +289,7 @@ def _if_likelier(state: SearchState, several: list[Tried], best: Trial,
     Else none.
     """
     step = state.steps[-1]
-    chance = probability_of_all([each.trial for each in several], best.held_out_nats, state.model,
+    chance = probability_of_all([each.trial for each in several], best.nats, state.model,
                                 step.rest_db / step.noise_db)
     if chance < max(best.probability, criteria.min_probability):
         return []
@@ -314,16 +311,6 @@ def _beyond(passed: Tried, candidate: Candidate, model: CrossFit,
     return clear and not more and (passed.effect.repeatable or not candidate.effect.repeatable)
 
 
-def _currency(tried: list[Tried]) -> Callable[[Trial], float]:
-    """Return by which nats candidates are compared: evidence, or gains where one has none.
-
-    A flexible effect always gains a little more on held-out links of the places that it has seen.
-    """
-    if all(np.isfinite(each.trial.evidence_nats) for each in tried):
-        return lambda trial: trial.evidence_nats
-    return lambda trial: trial.held_out_nats
-
-
 def _alike(nats: float, other_nats: float, criteria: SelectionCriteria) -> bool:
     """Return whether the data cannot tell an effect with other nats from the best, `nats`."""
     return nats - other_nats < criteria.indistinguishable_nats
@@ -337,8 +324,8 @@ def _on_one_mast(model: CrossFit) -> int:
     return len(devices) if on_mast else 0
 
 
-def _several(rival: Tried, hypotheses: Hypotheses | None, nats_of: Callable[[Trial], float],
-             min_nats: float, most: int, inputs: SearchInputs) -> list[Tried]:
+def _several(rival: Tried, hypotheses: Hypotheses | None, min_nats: float, most: int,
+             inputs: SearchInputs) -> list[Tried]:
     """Add an effect of which a step finds one again and again, until all have more than `min_nats`.
 
     Such as groves or towers, each seen from few devices, against an offset for each device; or
@@ -348,12 +335,12 @@ def _several(rival: Tried, hypotheses: Hypotheses | None, nats_of: Callable[[Tri
     while len(model.whole.effects) < inputs.criteria.max_effects and len(found) < most:
         if hypotheses is not None:
             hypotheses = Hypotheses.of(model.whole, inputs.seed)
-        trial, extended = fit_and_score(model, rival.effect, 1, inputs, hypotheses)
+        trial, extended = fit_and_score(model, rival.effect, inputs, hypotheses)
         if extended is None:
             return []
         model, trial = extended, replace(trial, probability=rival.trial.probability)
         found.append(Tried(rival.effect, trial, model))
-        if sum(nats_of(each.trial) for each in found) > min_nats:
+        if sum(each.trial.nats for each in found) > min_nats:
             return found if _all_borne_out(model, len(found)) else []
     return []
 

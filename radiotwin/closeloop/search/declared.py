@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from radiotwin.closeloop.search.scoring import fit_and_score
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
 from radiotwin.effects.base import Effect
@@ -30,9 +28,7 @@ def _with_best(state: SearchState, forms: list[Effect], inputs: SearchInputs) ->
     tried, passed = [], []
     for effect in forms:
         inputs.on_progress(effect.variant)
-        criteria = inputs.criteria if effect.is_cause else inputs.criteria.of_no_claim
-        trial, extended = fit_and_score(before, effect, len(forms),
-                                        replace(inputs, criteria=criteria))
+        trial, extended = fit_and_score(before, effect, inputs)
         tried.append(trial)
         if extended is not None:
             passed.append((effect, trial, extended))

@@ -9,8 +9,7 @@ Where a receiver or a device changed after its first flight, that flight held ou
 that shows it, and the others held out are predicted well by each other. So changes between flights
 are scored on blocks of ground, with the effects that were found already. A warm-up over the first
 flight and ageing change the level between flights, too: the form is the one that explains most.
-Positions cannot tell a change from flights that differ anyhow, so it must also be larger than
-flights of all receivers, or all devices, differ.
+How much flights differ anyhow is a part of the evidence (`radiotwin.closeloop.verdict.hypotheses`).
 """
 
 from __future__ import annotations
@@ -18,8 +17,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
-from scipy.stats import t
 
 from radiotwin.closeloop.crossfit import (
     Base,
@@ -34,7 +31,6 @@ from radiotwin.closeloop.search.scoring import (
     Candidate,
     fit_and_score,
     fit_candidate,
-    score_candidate,
     with_candidate,
 )
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
@@ -42,8 +38,8 @@ from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import (
     MIN_HELD_OUT_DEVICES,
     MIN_SHARED,
-    SelectionCriteria,
 )
+from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 from radiotwin.closeloop.verdict.intervals import why_not_borne_out
 from radiotwin.closeloop.verdict.posterior import judge
 from radiotwin.effects.base import DetectionEffect, Effect
@@ -63,30 +59,45 @@ def add_changes(state: SearchState, inputs: SearchInputs) -> SearchState:
 
 def _with_one_kind(state: SearchState, effect: Effect, inputs: SearchInputs) -> SearchState:
     """Add changes of receivers, or of devices."""
-    criteria = inputs.criteria
-    first = fit_candidate(state.model, effect, criteria)
-    if not _stands_out(state.model, first, criteria):
-        return state
-    inputs.on_progress(f"{effect.name}, held out by block")
-    links = located_links(state.model, inputs.links, inputs.base)
-    model = _in_other_folds(state.model, links, inputs.base,
-                            make_folds(links, inputs.seed, "block"))
-    while not state.is_full(criteria):
-        candidate = fit_candidate(model, effect, criteria)
-        if isinstance(candidate, Trial) or not _stands_out(model, candidate, criteria):
+    model = None
+    while not state.is_full(inputs.criteria):
+        state, hypotheses = state.look(inputs.seed)
+        candidate = fit_candidate(state.model, effect, inputs.criteria, hypotheses)
+        if isinstance(candidate, Trial):
             return state
-        trial, extended = score_candidate(model, candidate, 1, inputs)
+        inputs.on_progress(f"{effect.name}, held out by block")
+        if model is None:
+            links = located_links(state.model, inputs.links, inputs.base)
+            model = _in_other_folds(state.model, links, inputs.base,
+                                    make_folds(links, inputs.seed, "block"))
+        trial, extended = _judged(model, candidate, hypotheses, inputs)
         if extended is None:
             return state.refuse(trial)
-        why = why_not_borne_out(extended, state.step)
-        if why:
-            return state.refuse(trial.refuse(why, passed=False))
         model = extended
-        found = candidate.whole.effects[-1]
-        there = replace(candidate, whole=with_effect(state.model, found).whole)
         # A flight that is held out does not tell when the change was.
-        state = state.keep(trial, with_candidate(state.model, there, inputs.executor))
+        state = state.keep(trial, with_candidate(state.model, candidate, inputs.executor))
     return state
+
+
+def _judged(model: CrossFit, candidate: Candidate, hypotheses: Hypotheses,
+            inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
+    """Return what a model in other folds says of a candidate, and that model with it.
+
+    Args:
+        model: without it, in folds that show what the candidate may be.
+        candidate: with its evidence.
+        hypotheses: that the evidence is of.
+        inputs: of the search.
+    """
+    trial, extended = fit_and_score(model, candidate.effect, inputs)
+    if extended is None:
+        return trial, None
+    trial = replace(trial, evidence_nats=candidate.evidence)
+    trial = judge([trial], model, hypotheses, inputs.criteria)[0][0]
+    if trial.reason:
+        return trial, None
+    why = why_not_borne_out(extended, len(model.whole.effects))
+    return (trial.refuse(why, passed=False), None) if why else (trial, extended)
 
 
 def located_links(model: CrossFit, links: Links, base: Base) -> Links:
@@ -97,43 +108,6 @@ def located_links(model: CrossFit, links: Links, base: Base) -> Links:
     anchors = frozenset(np.flatnonzero(known).tolist()) | links.anchors
     links = links.with_devices(device_m).with_ends(anchors=anchors)
     return links.with_columns(evidence=model.links.evidence)
-
-
-def _stands_out(model: CrossFit, candidate: Candidate | Trial,
-                criteria: SelectionCriteria) -> bool:
-    """Return whether a change is larger than flights of all receivers, or all devices, differ.
-
-    Student's t with their pooled standard deviation, corrected for the number of ends and of
-    intervals between flights.
-    """
-    if not isinstance(candidate, Candidate):
-        return False
-    view = model.whole.view
-    links = view.links
-    change = candidate.whole.effects[-1].change(links)
-    if change is None:
-        return False
-    end, changed, when_s = change
-    seen = np.isfinite(links.level_db) & np.isfinite(links.time_s)
-    begins_s = pd.Series(links.time_s[seen]).groupby(links.flight[seen]).transform("min")
-    group = np.where((end[seen] == changed) & (begins_s >= when_s), -1, end[seen])
-    cells, cell = np.unique(np.column_stack([group, links.flight[seen]]), axis=0,
-                            return_inverse=True)
-    # Plain means: where all of a flight is off, its links are no outliers.
-    mean_db = np.bincount(cell.ravel(), weights=view.residual_db[seen]) / np.bincount(cell.ravel())
-    groups, member = np.unique(cells[:, 0], return_inverse=True)
-    flights = np.bincount(member)
-    level_db = np.bincount(member, weights=mean_db) / flights
-    freedom = len(mean_db) - len(groups)
-    if freedom < 1 or not {-1, changed} <= set(groups):
-        return False
-    sd_db = np.sqrt(((mean_db - level_db[member]) ** 2).sum() / freedom)
-    after, before = np.flatnonzero(groups == -1)[0], np.flatnonzero(groups == changed)[0]
-    gap_db = abs(level_db[after] - level_db[before])
-    error_db = max(sd_db * np.sqrt(1 / flights[after] + 1 / flights[before]), 1e-9)
-    intervals = len(np.unique(end)) * max(len(np.unique(links.flight)) - 1, 1)
-    p_value = 2 * t.sf(gap_db / error_db, freedom) * intervals
-    return bool(p_value <= criteria.max_p_value)
 
 
 def with_effect(model: CrossFit, effect: Effect) -> CrossFit:
@@ -159,17 +133,11 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
                 links = located_links(state.model, inputs.links, inputs.base)
                 model = _in_other_folds(state.model, links, inputs.base,
                                         _within_flights(links, inputs.seed))
-            trial, extended = fit_and_score(model, candidate.effect, len(timed), inputs)
+            trial, extended = _judged(model, candidate, hypotheses, inputs)
             if extended is not None:
-                trial = replace(trial, evidence_nats=candidate.evidence)
-                trial = judge([trial], model, hypotheses, criteria)[0][0]
-                if not trial.reason:
-                    why = why_not_borne_out(extended, step)
-                    trial = replace(trial, passed=not why, reason=why)
-                if not trial.reason:
-                    model = extended
-                    state = state.keep(trial, adopted(state.model, candidate))
-                    break
+                model = extended
+                state = state.keep(trial, adopted(state.model, candidate))
+                break
             refused.append(trial)
         else:
             return state.refuse(*refused)

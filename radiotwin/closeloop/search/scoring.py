@@ -10,11 +10,10 @@ import numpy as np
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.search.stages import SearchInputs
 from radiotwin.closeloop.search.trials import Trial
-from radiotwin.closeloop.verdict.criteria import MIN_FOLD_GAIN, MIN_MOVED, SelectionCriteria
+from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses, is_judged_by_levels
 from radiotwin.effects.base import Effect
-from radiotwin.inference.held_out import cross_fit_p_value, sign_flip_p_value
-from radiotwin.links import Links, evidence_blocks
+from radiotwin.links import Links
 from radiotwin.runtime.execution import Executor
 from radiotwin.twin.model.fitting import add_effect, along_paths, prepare_additions
 from radiotwin.twin.model.model import Fit
@@ -105,14 +104,13 @@ def fit_candidate(model: CrossFit, effect: Effect, criteria: SelectionCriteria,
     return Candidate(effect, whole, gain, hypotheses.of_named(whole))
 
 
-def score_candidate(model: CrossFit, candidate: Candidate, tried: int,
+def score_candidate(model: CrossFit, candidate: Candidate,
                     inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
     """Fit a candidate to each fold's training links, and score it on the others.
 
     Args:
         model: without it.
         candidate: fitted to all links.
-        tried: number of candidates, that the p-value is corrected for.
         inputs: of the search.
 
     Returns:
@@ -124,8 +122,9 @@ def score_candidate(model: CrossFit, candidate: Candidate, tried: int,
     trial = Trial(candidate.effect.name, step=len(model.whole.effects), params=found.params,
                   evidence_nats=candidate.evidence, variant=candidate.effect.variant,
                   devices=devices, receivers=receivers)
-    trial = score_model(model, extended, trial, evidence_blocks(model.links), tried, inputs,
-                        candidate.effect.nlos_only)
+    is_judged = found.is_cause or found.is_declared
+    trial = score_model(model, extended, trial, inputs.criteria,
+                        0.0 if is_judged else inputs.criteria.min_training_gain_nats)
     return trial, None if trial.reason else extended
 
 
@@ -137,71 +136,35 @@ def with_candidate(model: CrossFit, candidate: Candidate, executor: Executor) ->
                                             for fold in model.folds])
 
 
-def fit_and_score(model: CrossFit, effect: Effect, tried: int, inputs: SearchInputs,
+def fit_and_score(model: CrossFit, effect: Effect, inputs: SearchInputs,
                   hypotheses: Hypotheses | None = None) -> tuple[Trial, CrossFit | None]:
     """Return `score_candidate` of `fit_candidate`; of one that is refused, no model."""
     candidate = fit_candidate(model, effect, inputs.criteria, hypotheses)
     if isinstance(candidate, Trial):
         return candidate, None
-    return score_candidate(model, candidate, tried, inputs)
+    return score_candidate(model, candidate, inputs)
 
 
-def score_model(model: CrossFit, extended: CrossFit, trial: Trial, block: np.ndarray | None,
-                tried: int, inputs: SearchInputs, nlos_only: bool = False) -> Trial:
+def score_model(model: CrossFit, extended: CrossFit, trial: Trial, criteria: SelectionCriteria,
+                min_gain_nats: float = 0.0) -> Trial:
     """Return what held-out links say of an extended model; with the reason where it is refused.
 
-    Without pieces of evidence `block` (n,) the gain may hang on a few positions.
+    They refuse what does not return: what makes them no likelier (a description by less than
+    `min_gain_nats`), or their error larger.
     """
-    gain, criteria = model.held_out_nll - extended.held_out_nll, inputs.criteria
-    known, los = np.isfinite(gain), model.links.los
+    gain = model.held_out_nll - extended.held_out_nll
+    known = np.isfinite(gain)
     usable = known & ~model.unforeseen
     if not usable.any():
         return replace(trial, reason="no held-out link can be judged with it")
-    design_effect = model.whole.view.design_effect
-
-    def by_fold(rows: np.ndarray) -> np.ndarray:
-        own = np.bincount(model.index[rows], weights=gain[rows], minlength=len(model.folds))
-        return own / design_effect
-
-    total, shares = float(gain[usable].sum()), by_fold(usable)
-    per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
-    p_value = min(tried * cross_fit_p_value(shares), 1.0)
-    before_db, after_db = model.rmse_db(usable), extended.rmse_db(usable)
-    fall = float(np.log(before_db / after_db)) if before_db > 0 and after_db > 0 else 0.0
-    # A receiver, or a device, is not in every fold.
-    moved = np.bincount(model.index[usable], np.abs(gain[usable]), len(model.folds))
-    touched = (moved >= MIN_MOVED * moved.max()) \
-        & (np.abs(shares) >= MIN_FOLD_GAIN * np.abs(shares).max())
-    few_p = 0.0
-    if block is not None:
-        few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), inputs.seed)
-    los_p, moved_los = 0.0, np.abs(gain[usable & los]).sum()
-    # What is weak, as an emitter's power is, leaves links with line of sight as they are.
-    if not los.all() and not nlos_only and moved_los > MIN_MOVED * moved.sum():
-        los_p = cross_fit_p_value(by_fold(usable & los))
-    reason = ""
-    if total < criteria.min_gain_nats:
-        reason = (f"gains {total:.0f} nats on held-out links, {criteria.min_gain_nats:.0f} are "
-                  "needed")
-    elif total <= 0:
-        reason = "gains nothing on held-out links"
-    elif p_value > criteria.max_p_value:
-        reason = f"its gain may be chance (p = {p_value:.2g} after correction)"
-    elif few_p > criteria.max_sign_flip_p_value:
-        reason = f"its gain hangs on a few places (p = {few_p:.2g} if signs are flipped)"
-    elif (shares[touched] > 0).mean() < criteria.min_gaining_folds:
-        reason = (f"gains in {(shares[touched] > 0).sum()} of the {touched.sum()} folds only that "
-                  "it acts on")
-    elif per_link < criteria.min_gain_per_link_nats \
-            and after_db > criteria.max_rmse_ratio * before_db:
-        reason = (f"gains {per_link:.3f} nats a link only, {criteria.min_gain_per_link_nats} are "
-                  "needed")
-    elif after_db > criteria.max_rmse_rise * before_db:
+    total = float(gain[usable].sum())
+    shares = np.bincount(model.index[usable], gain[usable], len(model.folds))
+    after_db, reason = extended.rmse_db(usable), ""
+    if total <= min_gain_nats:
+        reason = f"gains too little on held-out links: {total:.0f} nats"
+    elif after_db > criteria.max_rmse_rise * model.rmse_db(usable):
         reason = (f"the error of held-out links would rise to {after_db:.2f} dB, though they "
                   "become likelier")
-    elif los_p > criteria.max_los_p_value:
-        reason = ("links with line of sight, where the base is surest, do not support it "
-                  f"(p = {los_p:.2g})")
     return replace(trial, reason=reason, passed=not reason, nll_gain=total,
-                   rmse_db=extended.rmse_db(known), rmse_fall=fall, p_value=p_value,
-                   gain_by_fold=shares)
+                   rmse_db=extended.rmse_db(known),
+                   gain_by_fold=shares / model.whole.view.design_effect)

@@ -24,16 +24,13 @@ class Trial:
         reason: why not; empty where it was.
         nll_gain: held-out likelihood gained [nats]; NaN where it was not tried.
         rmse_db: held-out RMSE with it [dB].
-        rmse_fall: logarithm of the held-out RMSE without it over that with it, on links of which
-            their fold could know.
-        p_value: of no gain, links that err alike counted as one, corrected for the candidates.
         step: number of effects that were there before.
         gain_by_fold: (folds,) `nll_gain` of each fold, divided by the design effect;
             empty where it was not tried.
         evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
             it was not looked at.
         passed: whether held-out links support it; it may be refused for other reasons.
-        features: (6,) what its probability depends on, see `radiotwin.closeloop.verdict.posterior`;
+        features: (5,) what its probability depends on, see `radiotwin.closeloop.verdict.posterior`;
             empty where it was not tried.
         probability: that it is there.
         params: as fitted to all links; None where it was not tried.
@@ -49,8 +46,6 @@ class Trial:
     reason: str = ""
     nll_gain: float = np.nan
     rmse_db: float = np.nan
-    rmse_fall: float = 0.0
-    p_value: float = np.nan
     step: int = 0
     gain_by_fold: np.ndarray = field(default_factory=lambda: np.zeros(0))
     evidence_nats: float = np.nan

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 from radiotwin.errors import BadInput
 
 # Of single judgements, which no caller sets.
-# Share of the gain or loss in the fold where a candidate moves likelihoods most, for another fold
-# to vote; and of all folds, for links with line of sight to do.
-MIN_MOVED = 0.05
-MIN_FOLD_GAIN = 0.1  # share of the largest gain or loss of a fold, for another fold to vote
 MIN_FIRST_SHARE = 0.5  # of `min_probability`, for another effect to be tried beside a candidate
 MAX_SECONDS = 2  # effects that are tried beside it
 MIN_RIVAL_SHARE = 0.5  # of what the best gains, for several of a kind to be tried in its place
@@ -38,25 +34,14 @@ class SelectionCriteria:
 
     Attributes:
         min_training_gain_nats: on the links that it is fitted to, for a candidate to be fitted to
-            the folds. Saves time: one that gains less cannot gain `min_gain_nats`
-            on held-out links.
+            the folds. Saves time: one that gains less is hardly probable. On held-out links, for a
+            description of the rest, which has no probability.
         min_probability: that a cause is there, to be named; it is told with the name: more probable
             than not (`radiotwin.closeloop.verdict.posterior`).
         max_rest_db: standard deviation of what belongs to places and has no name, for
             "none" to be said.
-        min_gain_nats: on held-out links. Calibrated.
-        min_gain_per_link_nats: on held-out links, unless the RMSE falls by `max_rmse_ratio`; 0.02
-            is what an RMSE lower by 2 % gains.
-        max_rmse_ratio: held-out RMSE with the effect over that without.
-        max_rmse_rise: the same ratio, above which likelier links do not help.
-        min_gaining_folds: share of the folds that must gain.
-        max_p_value: of the cross-fit test (Wasserman et al. 2020), corrected for the number of
-            candidates (Bonferroni).
-        max_sign_flip_p_value: of the sign-flip test over pieces of evidence, so that a gain does
-            not hang on a few positions.
-        max_los_p_value: of the cross-fit test on links with line of sight, where the channel is
-            surest, for effects that act there: more is not asked of so few than that they are
-            likelier with it.
+        max_rmse_rise: held-out RMSE with the effect over that without, above which likelier links
+            do not help.
         indistinguishable_nats: log(100): how much likelier the data must be with one effect than
             with another to tell them apart.
         max_effects: in all.
@@ -71,14 +56,7 @@ class SelectionCriteria:
     min_training_gain_nats: float = 10.0
     min_probability: float = 0.5
     max_rest_db: float = 3.0
-    min_gain_nats: float = 25.0
-    min_gain_per_link_nats: float = 0.01
-    max_rmse_ratio: float = 0.98
     max_rmse_rise: float = 1.01
-    min_gaining_folds: float = 0.6
-    max_p_value: float = 0.01
-    max_sign_flip_p_value: float = 0.1
-    max_los_p_value: float = 0.5
     indistinguishable_nats: float = 4.605170185988092
     max_effects: int = 12
     max_repeats: int = 4
@@ -92,9 +70,3 @@ class SelectionCriteria:
             if not getattr(self, each.name) >= 0:
                 raise BadInput(f"SelectionCriteria.{each.name} is {getattr(self, each.name)}; "
                                "allowed are numbers from 0")
-
-    @property
-    def of_no_claim(self) -> SelectionCriteria:
-        """The same for what is given no name: held-out links are likelier, and err no more."""
-        return replace(self, min_gain_nats=0.0, min_gain_per_link_nats=0.0, min_gaining_folds=0.0,
-                       max_p_value=1.0, max_sign_flip_p_value=1.0, max_los_p_value=1.0)

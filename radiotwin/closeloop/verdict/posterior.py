@@ -70,15 +70,14 @@ def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
     judged = []
     for score in scores:
         if score.gain_by_fold.size:
-            held_out = score.held_out_nats
             # What makes links blank has no rival among what changes levels, nor among curves.
             by_levels = bool(np.isfinite(score.evidence_nats))
-            others = [each.held_out_nats for each in scores if each.name != score.name
-                      and each.gain_by_fold.size
+            others = [each.nats for each in scores if each.name != score.name
+                      and each.held_out_nats > 0
                       and (by_levels or not np.isfinite(each.evidence_nats))]
-            nats = score.nats, held_out, held_out - max([0.0, *others])
-            score = replace(score, features=features(
-                nats, score.rmse_fall, rest_db / noise_db, bool(there - {score.name})))
+            nats = score.nats, score.held_out_nats, score.nats - max([0.0, *others])
+            score = replace(score, features=features(nats, rest_db / noise_db,
+                                                     bool(there - {score.name})))
             probability = probability_of(score.name, score.features)
             low = probability < criteria.min_probability
             why = (f"it is not probable enough ({probability:.2f}; "
@@ -109,18 +108,17 @@ def verdict_without_effect(steps: Sequence[Step], criteria: SelectionCriteria) -
     return "none" if first.probabilities[NONE] >= criteria.min_probability else "undecided"
 
 
-def features(nats: tuple[float, float, float], rmse_fall: float, rest_over_noise: float,
+def features(nats: tuple[float, float, float], rest_over_noise: float,
              is_another_kind: bool) -> tuple[float, ...]:
-    """Return what a candidate's probability depends on, (6,).
+    """Return what a candidate's probability depends on, (5,).
 
     Args:
-        nats: its evidence beside a correlated rest, its gain on held-out links, and its lead over
-            the best other effect there [nats].
-        rmse_fall: of held-out links, logarithm of the error without it over that with it.
+        nats: its evidence beside a correlated rest, its gain on held-out links, and the lead of its
+            evidence over that of the best other effect that held-out links support [nats].
         rest_over_noise: standard deviations of what belongs to places and of noise.
         is_another_kind: whether an effect of another name is there already.
     """
-    return (*np.arcsinh(np.array(nats) / NATS).tolist(), 10 * rmse_fall,
+    return (*np.arcsinh(np.array(nats) / NATS).tolist(),
             float(np.log(max(rest_over_noise, LEAST_RATIO))), float(is_another_kind))
 
 
@@ -130,16 +128,14 @@ def probability_of_all(scores: Sequence[Trial], other: float, before: CrossFit,
 
     Args:
         scores: each of a model with those before it.
-        other: most that any other effect gains on held-out links [nats].
+        other: most evidence for any other effect [nats].
         before: the model without any of them.
         rest_over_noise: standard deviations of what belongs to places and of noise, without them.
     """
     evidence, held_out = (sum(each.nats for each in scores),
                           sum(each.held_out_nats for each in scores))
     kinds = {each.name for each in scores} | before.whole.model.effect_names
-    values = features((evidence, held_out, held_out - other),
-                      sum(each.rmse_fall for each in scores),
-                      rest_over_noise, len(kinds) > 1)
+    values = features((evidence, held_out, evidence - other), rest_over_noise, len(kinds) > 1)
     return min(probability_of(each.name, values) for each in scores)
 
 

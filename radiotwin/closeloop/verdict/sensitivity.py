@@ -95,7 +95,7 @@ def needed_nats(name: str, probability: float, rest_over_noise: float,
     inf where none does.
     """
     def lack(nats: float) -> float:
-        return probability_of(name, features((nats, nats, nats), 0.0, rest_over_noise,
+        return probability_of(name, features((nats, nats, nats), rest_over_noise,
                                              is_another_kind)) - probability
 
     if lack(0.0) >= 0:
