@@ -1,10 +1,11 @@
 """Causes of groups of links that stand out: only effects that act on such groups are tried.
 
 The scan says where; here each effect of the catalogue that may act on a group of that family is
-fitted to it, with all other links as the reference. They are judged once, by their evidence on all
+fitted to it, with all other links as the reference. They are compared by their evidence on all
 readings, beside a cause without a name that acts on the same links; all are equally probable
-before. One that is then more probable than not is named, and what it explains is no open question
-any more.
+before. The likeliest is judged as every other candidate
+(`radiotwin.closeloop.verdict.posterior`). One that is more probable than not is named, and what it
+explains is no open question any more.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from scipy.special import softmax
 
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.scan import Anomaly, scan
-from radiotwin.closeloop.search.faults import adopted
-from radiotwin.closeloop.search.scoring import Candidate, fit_candidate, score_candidate
+from radiotwin.closeloop.search.faults import adopted, judged_elsewhere, within_flights
+from radiotwin.closeloop.search.scoring import Candidate, fit_candidate, judged
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import MIN_RIVAL_SHARE, MIN_SHARED, MIN_SURE
-from radiotwin.closeloop.verdict.intervals import why_not_borne_out
+from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 from radiotwin.effects.base import Effect
 
 ANOTHER = "another"  # name of a cause that the catalogue does not have
@@ -67,21 +68,21 @@ def _with_cause(state: SearchState, anomaly: Anomaly, inputs: SearchInputs
         fitted = fit_candidate(model, effect, criteria, hypotheses, group, MIN_RIVAL_SHARE * most)
         if isinstance(fitted, Candidate) and np.isfinite(fitted.evidence):
             candidates.append(fitted)
+    another = hypotheses.of_group(group)
     while True:
-        causes = _shares(candidates, hypotheses.of_group(group))
+        causes = _shares(candidates, another)
         best = max(candidates, key=lambda each: each.evidence, default=None)
         if best is None or causes[best.effect.name] < criteria.min_probability:
             return state, causes
-        trial, extended = _held_out(model, best, inputs)
-        trial = replace(trial, probability=causes[best.effect.name])
-        if extended is not None and not best.effect.within_flights:
-            why = why_not_borne_out(extended, state.step)
-            if why:
-                trial, extended = trial.refuse(why, passed=False), None
+        candidates.remove(best)
+        others = [another, *(each.evidence for each in candidates)]
+        trial, extended = _judged(model, best, others, hypotheses, inputs)
         if extended is not None:
             return state.keep(trial, extended), causes
         state = state.refuse(trial)
-        candidates.remove(best)  # what does not return is no cause
+        if trial.passed:  # so much evidence is often found where there is no such cause
+            causes[ANOTHER] += causes[best.effect.name] - trial.probability
+            return state, causes | {best.effect.name: trial.probability}
 
 
 def _shares(candidates: Sequence[Candidate], another: float) -> dict[str, float]:
@@ -105,13 +106,14 @@ def _acting_on(anomaly: Anomaly, model: CrossFit, inputs: SearchInputs) -> list[
                    and not effect.unavailable(model.links)), key=lambda each: each.always_exact)
 
 
-def _held_out(model: CrossFit, candidate: Candidate,
-              inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
-    """Return what held-out links say of a cause, and the model with it unless they refuse it.
+def _judged(model: CrossFit, candidate: Candidate, others: Sequence[float],
+            hypotheses: Hypotheses, inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
+    """Return a cause with its probability, and the model with it unless it is refused.
 
-    What happened on a flight does not return on others, and so they cannot refuse it.
+    What happened on a flight does not return on others: it is judged within flights.
     """
-    trial, extended = score_candidate(model, candidate, inputs)
-    if candidate.effect.within_flights:
-        return replace(trial, reason="", passed=True), adopted(model, candidate)
-    return trial, extended
+    if not candidate.effect.within_flights:
+        return judged(model, candidate, others, hypotheses, inputs)
+    trial, there = judged_elsewhere(within_flights(model, inputs), candidate, others, hypotheses,
+                                    inputs)
+    return trial, None if there is None else adopted(model, candidate)

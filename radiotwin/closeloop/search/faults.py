@@ -14,6 +14,7 @@ How much flights differ anyhow is a part of the evidence (`radiotwin.closeloop.v
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,8 +30,8 @@ from radiotwin.closeloop.crossfit import (
 )
 from radiotwin.closeloop.search.scoring import (
     Candidate,
-    fit_and_score,
     fit_candidate,
+    judged,
     with_candidate,
 )
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
@@ -40,8 +41,6 @@ from radiotwin.closeloop.verdict.criteria import (
     MIN_SHARED,
 )
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses
-from radiotwin.closeloop.verdict.intervals import why_not_borne_out
-from radiotwin.closeloop.verdict.posterior import judge
 from radiotwin.effects.base import DetectionEffect, Effect
 from radiotwin.links import Links
 from radiotwin.links.correlation import devices_move
@@ -70,7 +69,7 @@ def _with_one_kind(state: SearchState, effect: Effect, inputs: SearchInputs) -> 
             links = located_links(state.model, inputs.links, inputs.base)
             model = _in_other_folds(state.model, links, inputs.base,
                                     make_folds(links, inputs.seed, "block"))
-        trial, extended = _judged(model, candidate, hypotheses, inputs)
+        trial, extended = judged_elsewhere(model, candidate, [], hypotheses, inputs)
         if extended is None:
             return state.refuse(trial)
         model = extended
@@ -79,25 +78,13 @@ def _with_one_kind(state: SearchState, effect: Effect, inputs: SearchInputs) -> 
     return state
 
 
-def _judged(model: CrossFit, candidate: Candidate, hypotheses: Hypotheses,
-            inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
-    """Return what a model in other folds says of a candidate, and that model with it.
-
-    Args:
-        model: without it, in folds that show what the candidate may be.
-        candidate: with its evidence.
-        hypotheses: that the evidence is of.
-        inputs: of the search.
-    """
-    trial, extended = fit_and_score(model, candidate.effect, inputs)
-    if extended is None:
-        return trial, None
-    trial = replace(trial, evidence_nats=candidate.evidence)
-    trial = judge([trial], model, hypotheses, inputs.criteria)[0][0]
-    if trial.reason:
-        return trial, None
-    why = why_not_borne_out(extended, len(model.whole.effects))
-    return (trial.refuse(why, passed=False), None) if why else (trial, extended)
+def judged_elsewhere(model: CrossFit, candidate: Candidate, others: Sequence[float],
+                     hypotheses: Hypotheses, inputs: SearchInputs
+                     ) -> tuple[Trial, CrossFit | None]:
+    """Return `judged` of a candidate that was fitted in other folds than those of the model."""
+    found = candidate.whole.effects[-1]
+    whole = model.whole.with_effects([*model.whole.effects, found])
+    return judged(model, replace(candidate, whole=whole), others, hypotheses, inputs)
 
 
 def located_links(model: CrossFit, links: Links, base: Base) -> Links:
@@ -130,10 +117,8 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
         for candidate in sorted(candidates, key=lambda each: -each.gain):
             inputs.on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
             if model is None:
-                links = located_links(state.model, inputs.links, inputs.base)
-                model = _in_other_folds(state.model, links, inputs.base,
-                                        _within_flights(links, inputs.seed))
-            trial, extended = _judged(model, candidate, hypotheses, inputs)
+                model = within_flights(state.model, inputs)
+            trial, extended = judged_elsewhere(model, candidate, [], hypotheses, inputs)
             if extended is not None:
                 model = extended
                 state = state.keep(trial, adopted(state.model, candidate))
@@ -240,10 +225,12 @@ def _in_other_folds(model: CrossFit, links: Links, base: Base, folds: Folds) -> 
     return other
 
 
-def _within_flights(links: Links, seed: int) -> Folds:
-    """Return folds that leave part of each flight."""
+def within_flights(model: CrossFit, inputs: SearchInputs) -> CrossFit:
+    """Return the base with a model's effects in folds that leave part of each flight."""
+    links = located_links(model, inputs.links, inputs.base)
     by_device = len(links.anchors & set(links.device.tolist())) >= MIN_HELD_OUT_DEVICES
-    return make_folds(links, seed, "device" if by_device and not devices_move(links) else "block")
+    by = "device" if by_device and not devices_move(links) else "block"
+    return _in_other_folds(model, links, inputs.base, make_folds(links, inputs.seed, by))
 
 
 def adopted(model: CrossFit, candidate: Candidate) -> CrossFit:

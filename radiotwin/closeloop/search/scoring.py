@@ -12,6 +12,8 @@ from radiotwin.closeloop.search.stages import SearchInputs
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses, is_judged_by_levels
+from radiotwin.closeloop.verdict.intervals import why_not_borne_out
+from radiotwin.closeloop.verdict.posterior import with_probability
 from radiotwin.effects.base import Effect
 from radiotwin.links import Links
 from radiotwin.runtime.execution import Executor
@@ -134,6 +136,31 @@ def with_candidate(model: CrossFit, candidate: Candidate, executor: Executor) ->
     prepare_additions(model.folds, [effect], executor, like)
     return model.extended(candidate.whole, [add_effect(fold, effect, like) or fold
                                             for fold in model.folds])
+
+
+def judged(model: CrossFit, candidate: Candidate, others: Sequence[float],
+           hypotheses: Hypotheses, inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
+    """Return what held-out links and the evidence say of a candidate, with its probability.
+
+    Args:
+        model: without it.
+        candidate: fitted to all links.
+        others: evidence for its rivals [nats].
+        hypotheses: that the evidence is of.
+        inputs: of the search.
+
+    Returns:
+        the trial, and the model with it; None where it is refused.
+    """
+    trial, extended = score_candidate(model, candidate, inputs)
+    if extended is None:
+        return trial, None
+    rest_db, noise_db = hypotheses.sizes_db
+    trial = with_probability(trial, others, model, rest_db / noise_db, inputs.criteria)
+    if trial.reason:
+        return trial, None
+    why = why_not_borne_out(extended, len(model.whole.effects))
+    return (trial.refuse(why, passed=False), None) if why else (trial, extended)
 
 
 def fit_and_score(model: CrossFit, effect: Effect, inputs: SearchInputs,

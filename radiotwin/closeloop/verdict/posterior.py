@@ -66,7 +66,6 @@ def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
     """
     rest_db, noise_db = hypotheses.sizes_db
     step = Step(len(model.whole.effects), hypotheses.unnamed_nats, rest_db, noise_db, {})
-    there = model.whole.model.effect_names
     judged = []
     for score in scores:
         if score.gain_by_fold.size:
@@ -75,18 +74,31 @@ def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
             others = [each.nats for each in scores if each.name != score.name
                       and each.held_out_nats > 0
                       and (by_levels or not np.isfinite(each.evidence_nats))]
-            nats = score.nats, score.held_out_nats, score.nats - max([0.0, *others])
-            score = replace(score, features=features(nats, rest_db / noise_db,
-                                                     bool(there - {score.name})))
-            probability = probability_of(score.name, score.features)
-            low = probability < criteria.min_probability
-            why = (f"it is not probable enough ({probability:.2f}; "
-                   f"{criteria.min_probability:g} is needed)") if low else ""
-            score = replace(score, probability=probability,
-                            reason=why if score.passed else score.reason)
+            score = with_probability(score, others, model, rest_db / noise_db, criteria)
         judged.append(score)
     return judged, replace(step, probabilities=_probabilities(judged, step.best_unnamed, rest_db,
                                                               noise_db))
+
+
+def with_probability(score: Trial, others: Sequence[float], model: CrossFit,
+                     rest_over_noise: float, criteria: SelectionCriteria) -> Trial:
+    """Return a score with the probability of its effect; refused where that is too low.
+
+    Args:
+        score: of a candidate that was scored on held-out links.
+        others: evidence for its rivals [nats].
+        model: without it.
+        rest_over_noise: standard deviations of what belongs to places and of noise.
+        criteria: one that passed is refused below `min_probability`.
+    """
+    nats = score.nats, score.held_out_nats, score.nats - max([0.0, *others])
+    is_another_kind = bool(model.whole.model.effect_names - {score.name})
+    score = replace(score, features=features(nats, rest_over_noise, is_another_kind))
+    probability = probability_of(score.name, score.features)
+    low = probability < criteria.min_probability
+    why = (f"it is not probable enough ({probability:.2f}; {criteria.min_probability:g} is "
+           "needed)") if low else ""
+    return replace(score, probability=probability, reason=why if score.passed else score.reason)
 
 
 def verdict_without_effect(steps: Sequence[Step], criteria: SelectionCriteria) -> str:
