@@ -273,7 +273,7 @@ def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np
         for k in longest:
             along = sides[k] - dot(sides[k], normal) * normal
             along = along / np.sqrt(dot(along, along))
-            across = cross(normal, along)
+            across = np.array(cross(normal, along))
             low_u = low_v = np.inf
             high_u = high_v = -np.inf
             for point_m in points_m:
@@ -388,7 +388,7 @@ def _open_sectors(
             middle = middle - (middle * axis).sum() * axis
             if i == 0:
                 x = middle / np.sqrt((middle * middle).sum())
-                y = cross(axis, x)
+                y = np.array(cross(axis, x))
             cosine, sine = (middle * x).sum(), (middle * y).sum()
             angle[i] = np.arctan2(sine, cosine)
             turn = cosine * y - sine * x  # towards a larger angle

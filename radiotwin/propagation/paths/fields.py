@@ -5,10 +5,15 @@ The field of the ray is followed from one interaction to the next.
 
 import numpy as np
 
-from radiotwin.propagation.paths.images import Candidates, PathBuffer, sequence_length
+from radiotwin.propagation.paths.images import (
+    MAX_INTERACTIONS,
+    Candidates,
+    PathBuffer,
+    sequence_length,
+)
 from radiotwin.propagation.paths.interactions import Slabs, diffract, reflect
 from radiotwin.propagation.paths.surfaces import MATERIAL, Surfaces
-from radiotwin.propagation.paths.vectors import dot
+from radiotwin.propagation.paths.vectors import Triple, dot
 from radiotwin.runtime.compiled import njit
 
 
@@ -32,9 +37,10 @@ def path_gains(
         (m,) linear.
     """
     gain = np.empty(len(rows))
+    legs, field = _room()
     for i in range(len(rows)):
         received, spread, _ = _follow(surfaces, candidates, wave_number, slabs, wedge, buffer,
-                                      rows[i])
+                                      rows[i], legs, field)
         gain[i] = spread * abs(received) ** 2 / (2.0 * wave_number) ** 2
     return gain
 
@@ -52,30 +58,42 @@ def path_amplitudes(
         paths [m].
     """
     amplitude, total_m = np.empty(len(rows), dtype=np.complex128), np.empty(len(rows))
+    legs, field = _room()
     for i in range(len(rows)):
         received, spread, total_m[i] = _follow(surfaces, candidates, wave_number, slabs, wedge,
-                                               buffer, rows[i])
+                                               buffer, rows[i], legs, field)
         amplitude[i] = received * np.sqrt(spread) / (2.0 * wave_number) \
             * np.exp(-1j * wave_number * total_m[i])
     return amplitude, total_m
 
 
+@njit(cache=True)
+def _room() -> tuple[np.ndarray, np.ndarray]:
+    """Return room for directions and lengths (m, 4) of a path's legs, and for its field (3,)."""
+    return np.empty((MAX_INTERACTIONS + 1, 4)), np.empty(3, dtype=np.complex128)
+
+
 @njit(cache=True, error_model="numpy")
 def _follow(
     surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs, wedge: int,
-    buffer: PathBuffer, path: int,
+    buffer: PathBuffer, path: int, legs: np.ndarray, field: np.ndarray,
 ) -> tuple[complex, float, float]:
-    """Return the received field, the spreading factor of its power [1/m²], and the length [m]."""
-    planes, row, legs = surfaces.planes, buffer.candidate[path], buffer.count[path] - 1
-    direction, length_m = np.empty((legs, 3)), np.empty(legs)
-    for k in range(legs):
-        direction[k] = buffer.points_m[path, k + 1] - buffer.points_m[path, k]
-        length_m[k] = max(np.sqrt((direction[k] ** 2).sum()), 1e-9)
-        direction[k] /= length_m[k]
+    """Return the received field, the spreading factor of its power [1/m²], and the length [m].
+
+    What `legs` and `field` of `_room` hold is overwritten.
+    """
+    planes, row, count = surfaces.planes, buffer.candidate[path], buffer.count[path] - 1
+    direction, length_m = legs[:count, :3], legs[:count, 3]
+    for k in range(count):
+        for axis in range(3):
+            direction[k, axis] = buffer.points_m[path, k + 1, axis] - buffer.points_m[path, k, axis]
+        length_m[k] = max(np.sqrt(dot(direction[k], direction[k])), 1e-9)
+        for axis in range(3):
+            direction[k, axis] /= length_m[k]
     before, edge = sequence_length(candidates.before, row), candidates.edge[row]
     before_m, after_m = length_m[:before + 1].sum(), length_m[before + 1:].sum()
-    field = vertical(direction[0]).astype(np.complex128)
-    for k in range(legs - 1):
+    field[0], field[1], field[2] = vertical(direction[0])
+    for k in range(count - 1):
         if k == before:
             diffract(surfaces.edges, edge, direction[k], direction[k + 1], before_m, after_m,
                      wave_number, slabs, wedge, field)
@@ -83,16 +101,17 @@ def _follow(
             facet = candidates.before[row, k] if k < before \
                 else candidates.after[row, k - before - 1]
             reflect(planes[facet, :3], int(planes[facet, MATERIAL]), direction[k], slabs, field)
-    received, total_m = dot(field, vertical(direction[legs - 1])), length_m.sum()
+    received, total_m = dot(field, vertical(direction[count - 1])), length_m.sum()
     if edge < 0:
         return received, 1.0 / total_m ** 2, total_m
     return received, 1.0 / (before_m * after_m * (before_m + after_m)), total_m
 
 
 @njit(cache=True, error_model="numpy")
-def vertical(direction: np.ndarray) -> np.ndarray:
+def vertical(direction: np.ndarray) -> Triple:
     """Return the unit vector of a ray's vertical polarisation; north for a vertical ray."""
     flat2 = direction[0] ** 2 + direction[1] ** 2
     if flat2 < 1e-12:
-        return np.array([0.0, 1.0, 0.0])
-    return (np.array([0.0, 0.0, 1.0]) - direction[2] * direction) / np.sqrt(flat2)
+        return 0.0, 1.0, 0.0
+    size, z = np.sqrt(flat2), direction[2]
+    return -(z * direction[0]) / size, -(z * direction[1]) / size, (1.0 - z * z) / size

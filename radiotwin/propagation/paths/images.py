@@ -102,34 +102,47 @@ def find_paths(
     n = len(receiver_m)
     image, mirror = np.empty((MAX_INTERACTIONS + 1, 3)), np.empty((MAX_INTERACTIONS + 1, 3))
     possible, spheres = np.empty(n, dtype=np.int64), spheres_around(receiver_m)
-    lit_m, source_m, window = np.empty(2), np.empty(2), np.empty(4)
-    found = 0
+    lit_m, source_m = np.empty(2), np.empty(2)
+    windows = np.empty((MAX_INTERACTIONS + 1, 4))  # narrowed to none of the facets after an edge, to one, ...
+    frame = np.empty((3, 4))
+    found = narrowed = 0
+    is_lit, way = False, -1  # way: the row whose facets before its edge and windows these are
     for row in range(cursor // n, len(candidates.edge)):
         before = sequence_length(candidates.before, row)
         after = sequence_length(candidates.after, row)
         facets_before, facets_after = candidates.before[row, :before], candidates.after[row, :after]
-        if not source_images(planes, facets_before, device_m, image):
-            continue
         edge = candidates.edge[row]
-        along_m = across_m = 0.0
+        count = 0
         if edge < 0:
+            way = -1
+            if not source_images(planes, facets_before, device_m, image):
+                continue
             count = through_facet(planes, facets_before[-1], image[before], receiver_m, spheres,
                                   possible)
         else:
-            is_open, along_m, across_m = \
-                around_edge(edges, edge, image[before, 0], image[before, 1], image[before, 2])
-            if not is_open:
-                continue
-            lit_m[0], lit_m[1] = lit_part(planes, edges, edge, facets_before, image)
-            source_m[0], source_m[1] = along_m, across_m
-            open_window(edges, edge, lit_m, window)
-            is_open = lit_m[0] < lit_m[1]
-            for k in range(after):
-                is_open = is_open and narrow(planes, edges, edge, facets_after, k, source_m, window)
-            count = 0
+            if way >= 0 and _same_way(candidates, way, row):
+                narrowed = min(narrowed, _same_facets(candidates.after, way, row))
+            else:
+                narrowed = 0
+                is_lit = source_images(planes, facets_before, device_m, image)
+                if is_lit:
+                    is_lit, source_m[0], source_m[1] = around_edge(
+                        edges, edge, image[before, 0], image[before, 1], image[before, 2])
+                if is_lit:
+                    lit_m[0], lit_m[1] = lit_part(planes, edges, edge, facets_before, image)
+                    open_window(edges, edge, lit_m, windows[0])
+                    is_lit = lit_m[0] < lit_m[1]
+            way = row
+            is_open = is_lit
+            while is_open and narrowed < after:
+                windows[narrowed + 1] = windows[narrowed]
+                is_open = narrow(planes, edges, edge, facets_after, narrowed, source_m,
+                                 windows[narrowed + 1])
+                narrowed += is_open
             if is_open:
-                count = over_edge(planes, edges, edge, facets_after, window, source_m, receiver_m,
-                                  spheres, possible)
+                count = over_edge(planes, edges, edge, facets_after, windows[after], source_m,
+                                  receiver_m, spheres, frame, possible)
+        along_m, across_m = source_m
         for i in range(count):
             at = possible[i]
             if row * n + at < cursor:
@@ -153,6 +166,24 @@ def find_paths(
             buffer.count[found] = interactions + 2
             found += 1
     return found, n * len(candidates.edge)
+
+
+@njit(cache=True, error_model="numpy")
+def _same_way(candidates: Candidates, row: int, other: int) -> bool:
+    """Return whether two candidates have the same edge and the same facets before it."""
+    same = candidates.edge[row] == candidates.edge[other]
+    for k in range(candidates.before.shape[1]):
+        same = same and candidates.before[row, k] == candidates.before[other, k]
+    return same
+
+
+@njit(cache=True, error_model="numpy")
+def _same_facets(facets: np.ndarray, row: int, other: int) -> int:
+    """Return how many facets two rows of `Candidates` begin with alike."""
+    k = 0
+    while k < facets.shape[1] and facets[row, k] >= 0 and facets[row, k] == facets[other, k]:
+        k += 1
+    return k
 
 
 @njit(cache=True, error_model="numpy")
@@ -291,13 +322,14 @@ def clear_paths(
     legs = buffer.count[:found] - 1
     points_m = np.empty((int(legs.max(initial=0)) + 1, found, 3))
     _move_off_surfaces(surfaces, candidates, buffer, SKIN_M, points_m)
+    # The first legs are those that rays have gone: the last ones are blocked most often.
     rows = np.arange(found)
     for leg in range(len(points_m) - 1):
         used = np.flatnonzero(legs[rows] > leg)
         tested = rows[used]
+        end = legs[tested] - leg
         clear = np.ones(len(rows), dtype=bool)
-        clear[used] = city.line_of_sight(points_m[leg].take(tested, 0),
-                                         points_m[leg + 1].take(tested, 0))
+        clear[used] = city.line_of_sight(points_m[end - 1, tested], points_m[end, tested])
         rows = rows[clear]
     return rows
 

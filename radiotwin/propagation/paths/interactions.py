@@ -51,7 +51,7 @@ from radiotwin.propagation.paths.surfaces import (
     START,
     TANGENT,
 )
-from radiotwin.propagation.paths.vectors import cross, dot
+from radiotwin.propagation.paths.vectors import Triple, cross, divided, dot
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import Material, constants
@@ -243,20 +243,22 @@ def _cotangent_term(beta: float, x: float, n: float, sign: int) -> complex:
 @njit(cache=True, error_model="numpy")
 def reflect(
     normal: np.ndarray, material: int, direction_in: np.ndarray, slabs: Slabs, field: np.ndarray
-) -> np.ndarray:
+) -> Triple:
     """Reflect the complex field (3,) of a ray, in place, and return the reflected ray's direction.
 
     The surface has a unit normal (3,), on either side, and a material, a row of the slabs.
     """
     cosine = dot(direction_in, normal)
-    direction = direction_in - 2.0 * cosine * normal
+    direction = (direction_in[0] - 2.0 * cosine * normal[0],
+                 direction_in[1] - 2.0 * cosine * normal[1],
+                 direction_in[2] - 2.0 * cosine * normal[2])
     across = cross(direction_in, normal)
     size2 = dot(across, across)
     if size2 < 1e-12:  # normal incidence: any direction in the plane is across
-        other = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
+        other = (1.0, 0.0, 0.0) if abs(normal[0]) < 0.7 else (0.0, 1.0, 0.0)
         across = cross(direction_in, other)
         size2 = dot(across, across)
-    across /= np.sqrt(size2)
+    across = divided(across, np.sqrt(size2))
     within_in, within = cross(across, direction_in), cross(across, direction)
     te, tm = reflection(abs(cosine), slabs, material)
     field_te = te * dot(field, across)
@@ -321,7 +323,8 @@ def diffract(
         material_0, material_n = material_n, material_0
     across_in, across = cross(direction_in, along), cross(along, direction)
     sine = np.sqrt(dot(across, across))
-    across_in, across = across_in / np.sqrt(dot(across_in, across_in)), across / sine
+    across_in = divided(across_in, np.sqrt(dot(across_in, across_in)))
+    across = divided(across, sine)
     upright_in, upright = cross(direction_in, across_in), cross(direction, across)
     distance_m = before_m * after_m / (before_m + after_m) * sine * sine
     if wedge == LUEBBERS:
@@ -352,5 +355,5 @@ def _reflected(
     reflected = field.copy()
     ray = reflect(normal, material, direction_in, slabs, reflected)
     across = cross(along, ray)
-    across /= np.sqrt(dot(across, across))
+    across = divided(across, np.sqrt(dot(across, across)))
     return dot(reflected, cross(ray, across)), dot(reflected, across)

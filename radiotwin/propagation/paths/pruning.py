@@ -141,8 +141,8 @@ def narrow(
     if facet == len(planes) - 1:
         return True
     row = edges[edge]
-    corner, x, y = np.empty(3), np.empty(4), np.empty(4)
-    at_m, across_m, least_m = np.empty(4), np.empty(4), np.empty(4)
+    corners = np.empty((6, 4))
+    x, y, at_m, across_m, least_m, corner = corners
     for i in range(4):
         for axis in range(3):
             corner[axis] = planes[facet, ORIGIN + axis] \
@@ -285,7 +285,8 @@ def through_facet(
 @njit(cache=True, error_model="numpy")
 def over_edge(
     planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, window: np.ndarray,
-    source_m: np.ndarray, receiver_m: np.ndarray, spheres: np.ndarray, possible: np.ndarray,
+    source_m: np.ndarray, receiver_m: np.ndarray, spheres: np.ndarray, frame: np.ndarray,
+    possible: np.ndarray,
 ) -> int:
     """Find the receivers that a ray over the lit part of an edge may reach.
 
@@ -298,24 +299,29 @@ def over_edge(
         source_m: (2,) position of the source along the edge, and distance from its line [m].
         receiver_m: (n, 3) positions [m].
         spheres: of `spheres_around` these.
+        frame: (3, 4) is overwritten.
         possible: (n,) output: rows of the receivers.
 
     Returns:
         The number of rows in `possible`.
     """
     # All in metres from the edge's start. A receiver's image in the facets is an affine map of it.
-    matrix, shift = np.eye(3), -edges[edge, START:START + 3]
+    # Nothing is allocated here: that would take longer than the geometry.
+    for i in range(3):
+        for j in range(3):
+            frame[i, j] = 1.0 if i == j else 0.0
+        frame[i, 3] = -edges[edge, START + i]
     for k in range(len(after)):
-        normal = planes[after[k], NORMAL:NORMAL + 3]
-        turned = _product(matrix, normal)
-        shift += 2.0 * planes[after[k], OFFSET] * turned
+        nx, ny, nz = planes[after[k], NORMAL:NORMAL + 3]
         for i in range(3):
-            for j in range(3):
-                matrix[i, j] -= 2.0 * turned[i] * normal[j]
-    xx, xy, xz = matrix[0]
-    yx, yy, yz = matrix[1]
-    zx, zy, zz = matrix[2]
-    x0, y0, z0 = shift
+            turned = frame[i, 0] * nx + frame[i, 1] * ny + frame[i, 2] * nz
+            frame[i, 3] += 2.0 * planes[after[k], OFFSET] * turned
+            frame[i, 0] -= 2.0 * turned * nx
+            frame[i, 1] -= 2.0 * turned * ny
+            frame[i, 2] -= 2.0 * turned * nz
+    xx, xy, xz, x0 = frame[0]
+    yx, yy, yz, y0 = frame[1]
+    zx, zy, zz, z0 = frame[2]
     ax, ay, az = edges[edge, ALONG:ALONG + 3]
     nx, ny, nz = edges[edge, NORMAL_0:NORMAL_0 + 3]
     mx, my, mz = edges[edge, NORMAL_N:NORMAL_N + 3]
@@ -323,17 +329,21 @@ def over_edge(
     facet = after[0] if len(after) else 0
     sided = len(after) > 0 and facet < len(planes) - 1
     fx, fy, fz = planes[facet, NORMAL:NORMAL + 3]
-    ox, oy, oz = planes[facet, ORIGIN:ORIGIN + 3] - edges[edge, START:START + 3]
+    ox, oy, oz = planes[facet, ORIGIN] - edges[edge, START], \
+        planes[facet, ORIGIN + 1] - edges[edge, START + 1], \
+        planes[facet, ORIGIN + 2] - edges[edge, START + 2]
     ux, uy, uz = planes[facet, AXIS_U:AXIS_U + 3]
     vx, vy, vz = planes[facet, AXIS_V:AXIS_V + 3]
     size_u, size_v = planes[facet, SIZE:SIZE + 2]
     low_m, high_m = window[0], window[1]
     along_m, across_m = source_m
     # Half planes at the window's angles; receivers are between them
-    tangent, normal = edges[edge, TANGENT:TANGENT + 3], edges[edge, NORMAL_0:NORMAL_0 + 3]
+    tx, ty, tz = edges[edge, TANGENT:TANGENT + 3]
     narrow_angle = window[3] - window[2] < np.pi
-    lx, ly, lz = np.cos(window[2]) * normal - np.sin(window[2]) * tangent
-    hx, hy, hz = np.sin(window[3]) * tangent - np.cos(window[3]) * normal
+    cosine, sine = np.cos(window[2]), np.sin(window[2])
+    lx, ly, lz = cosine * nx - sine * tx, cosine * ny - sine * ty, cosine * nz - sine * tz
+    cosine, sine = np.cos(window[3]), np.sin(window[3])
+    hx, hy, hz = sine * tx - cosine * nx, sine * ty - cosine * ny, sine * tz - cosine * nz
     count = 0
     for group in range(len(spheres)):
         rx, ry, rz = spheres[group, 0], spheres[group, 1], spheres[group, 2]
@@ -380,12 +390,3 @@ def over_edge(
             possible[count] = i
             count += 1
     return count
-
-
-@njit(cache=True, error_model="numpy")
-def _product(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return a matrix (3, 3) times a vector (3,); numba's `@` would need BLAS."""
-    out = np.empty(3)
-    for i in range(3):
-        out[i] = matrix[i, 0] * vector[0] + matrix[i, 1] * vector[1] + matrix[i, 2] * vector[2]
-    return out

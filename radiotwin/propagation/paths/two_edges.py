@@ -246,7 +246,7 @@ def two_edge_gains(
             direction[k] = legs[k] / length_m
         sine2 = _twist(surfaces.edges[edge[i, 0], ALONG:ALONG + 3],
                        surfaces.edges[edge[i, 1], ALONG:ALONG + 3], direction[1])
-        field[:] = vertical(direction[0])
+        field[0], field[1], field[2] = vertical(direction[0])
         diffract(surfaces.edges, edge[i, 0], direction[0], direction[1], a,
                  wave_at_edge(a, b, c, sine2)[1], wave_number, slabs, wedge, field)
         diffract(surfaces.edges, edge[i, 1], direction[1], direction[2],
