@@ -9,7 +9,6 @@ import numpy as np
 
 from radiotwin.runtime.compiled import njit
 
-
 Triple = tuple[float, float, float]
 Vector = np.ndarray | Triple
 
