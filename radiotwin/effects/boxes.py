@@ -13,6 +13,7 @@ from radiotwin.effects.params import Allowed, Length, Metres
 from radiotwin.inference.student import DOF
 from radiotwin.links import Links
 from radiotwin.propagation import terrain
+from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import HEIGHT_SD_M, CityMap
 
 SAMPLE_M = 5.0  # between points on a link, while it is back-projected
@@ -126,52 +127,63 @@ def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
         a_m: (n, 3) first ends [m].
         b_m: (n, 3) second ends [m].
     """
-    half = 0.5 * np.array([box.length_m, box.width_m])
     start, end = ((point[:, :2] - (box.x_m, box.y_m)) @ box.axes.T for point in (a_m, b_m))
-    enter, leave, crosses = _shares_within(start, end, half)
-    rise = b_m[:, 2] - a_m[:, 2]
-    step = end - start
-    track = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
-    unit = step / track[:, None]
-    corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * half
-    across = (unit[:, 0, None] * (corners[None, :, 1] - start[:, 1, None])
-              - unit[:, 1, None] * (corners[None, :, 0] - start[:, 0, None]))
-    below = _share_below(a_m[:, 2], rise, enter, leave, box.height_m)
-    inside_m = np.maximum(below, 0) * np.linalg.norm(b_m - a_m, axis=1)
-    over_m = (box.height_m - (a_m[:, 2] + share * rise) for share in (enter, leave))
-    values = (*over_m, across.max(axis=1), -across.min(axis=1), enter * track,
-              (leave - enter) * track, (1 - leave) * track)
-    return Crossing(np.where(crosses, inside_m, 0.0),
-                    *(np.where(crosses, value, np.nan) for value in values))
+    return Crossing(*_crossing(start, end, a_m[:, 2], b_m[:, 2],
+                               np.linalg.norm(b_m - a_m, axis=1), 0.5 * box.length_m,
+                               0.5 * box.width_m, box.height_m))
 
 
-def _shares_within(start: np.ndarray, end: np.ndarray,
-                   half: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the shares of ground tracks (n, 2) at which they enter and leave, and if they do."""
-    step = end - start
-    with np.errstate(divide="ignore", invalid="ignore"):
-        sides = np.stack([(-half - start) / step, (half - start) / step])
-    # A track along an axis: within the box all the way, or never.
-    parallel = np.abs(step) < 1e-9
-    within = np.abs(start) <= half
-    low = np.where(parallel, np.where(within, -np.inf, np.inf),
-                   np.nanmin(np.where(parallel, np.inf, sides), axis=0)).max(axis=1)
-    high = np.where(parallel, np.where(within, np.inf, -np.inf),
-                    np.nanmax(np.where(parallel, -np.inf, sides), axis=0)).min(axis=1)
-    enter, leave = np.clip(low, 0, 1), np.clip(high, 0, 1)
-    return enter, leave, (leave > enter) & (low < 1) & (high > 0)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _crossing(start: np.ndarray, end: np.ndarray, start_z_m: np.ndarray, end_z_m: np.ndarray,
+              length_m: np.ndarray, half_length_m: float, half_width_m: float, height_m: float
+              ) -> np.ndarray:
+    """Return the rows of `Crossing` (8, n) of links from (n, 2) to (n, 2) in the box's axes [m]."""
+    found = np.full((8, len(start)), np.nan)
+    found[0] = 0.0
+    for i in range(len(start)):
+        x_m, y_m = start[i]
+        step_x, step_y = end[i, 0] - x_m, end[i, 1] - y_m
+        low_x, high_x = _shares_within(x_m, step_x, half_length_m)
+        low_y, high_y = _shares_within(y_m, step_y, half_width_m)
+        low, high = max(low_x, low_y), min(high_x, high_y)
+        enter, leave = min(max(low, 0.0), 1.0), min(max(high, 0.0), 1.0)
+        if not (leave > enter and low < 1 and high > 0):
+            continue
+        track_m = max(np.sqrt(step_x * step_x + step_y * step_y), 1e-9)
+        unit_x, unit_y = step_x / track_m, step_y / track_m
+        most_m, least_m = -np.inf, np.inf
+        for corner_x in (half_length_m, -half_length_m):
+            for corner_y in (half_width_m, -half_width_m):
+                across_m = unit_x * (corner_y - y_m) - unit_y * (corner_x - x_m)
+                most_m, least_m = max(most_m, across_m), min(least_m, across_m)
+        z_m, rise_m = start_z_m[i], end_z_m[i] - start_z_m[i]
+        below = _share_below(z_m, rise_m, enter, leave, height_m)
+        found[0, i] = max(below, 0.0) * length_m[i]
+        found[1, i], found[2, i] = height_m - (z_m + enter * rise_m), \
+            height_m - (z_m + leave * rise_m)
+        found[3, i], found[4, i] = most_m, -least_m
+        found[5, i], found[6, i] = enter * track_m, (leave - enter) * track_m
+        found[7, i] = (1 - leave) * track_m
+    return found
 
 
-def _share_below(start_z_m: np.ndarray, rise_m: np.ndarray, enter: np.ndarray, leave: np.ndarray,
-                 height_m: float) -> np.ndarray:
-    """Return the share (n,) of links between `enter` and `leave` that is below a height."""
-    level = np.abs(rise_m) < 1e-9
-    with np.errstate(divide="ignore", invalid="ignore"):
-        roof = np.where(level, np.where(start_z_m < height_m, np.inf, -np.inf),
-                        (height_m - start_z_m) / rise_m)
-    below = (np.where(rise_m > 0, np.minimum(leave, roof), leave)
-             - np.where(rise_m < 0, np.maximum(enter, roof), enter))
-    return np.where(level & (start_z_m >= height_m), 0.0, below)
+@njit(cache=True, error_model="numpy")
+def _shares_within(start: float, step: float, half: float) -> tuple[float, float]:
+    """Return the shares of a way along one axis at which it enters and leaves -half to half."""
+    if abs(step) < 1e-9:  # at right angles to the axis: within all the way, or never
+        return (-np.inf, np.inf) if abs(start) <= half else (np.inf, -np.inf)
+    one, other = (-half - start) / step, (half - start) / step
+    return min(one, other), max(one, other)
+
+
+@njit(cache=True, error_model="numpy")
+def _share_below(start_z_m: float, rise_m: float, enter: float, leave: float,
+                 height_m: float) -> float:
+    """Return the share of a link between `enter` and `leave` that is below a height."""
+    if abs(rise_m) < 1e-9:
+        return leave - enter if start_z_m < height_m else 0.0
+    roof = (height_m - start_z_m) / rise_m
+    return min(leave, roof) - enter if rise_m > 0 else leave - max(enter, roof)
 
 
 def devices_through(box: Box, links: Links) -> np.ndarray:

@@ -103,10 +103,11 @@ def find_paths(
     image, mirror = np.empty((MAX_INTERACTIONS + 1, 3)), np.empty((MAX_INTERACTIONS + 1, 3))
     possible, spheres = np.empty(n, dtype=np.int64), spheres_around(receiver_m)
     lit_m, source_m = np.empty(2), np.empty(2)
-    windows = np.empty((MAX_INTERACTIONS + 1, 4))  # narrowed to none of the facets after an edge, to one, ...
+    # Row k: narrowed to the first k facets after the edge
+    windows = np.empty((MAX_INTERACTIONS + 1, 4))
     frame = np.empty((3, 4))
     found = narrowed = 0
-    is_lit, way = False, -1  # way: the row whose facets before its edge and windows these are
+    is_lit, way = False, -1  # the candidate that `image` and `windows` are of
     for row in range(cursor // n, len(candidates.edge)):
         before = sequence_length(candidates.before, row)
         after = sequence_length(candidates.after, row)
