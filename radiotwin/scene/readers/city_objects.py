@@ -16,7 +16,7 @@ import shapely
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import SHAPES, VERTICES
 from radiotwin.scene.checks import Problem, listed, warning
-from radiotwin.scene.readers.features import Feature, LeftOut, MapFile, Shell
+from radiotwin.scene.readers.features import Feature, LeftOut, MapFile, Shell, hidden
 from radiotwin.scene.readers.heights import column_name
 from radiotwin.scene.readers.systems import (
     chosen_system,
@@ -109,8 +109,13 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
                        "--crs EPSG:25832")
     points = _in_degrees(path, [geometry for _, _, found in chosen for geometry in found],
                          _one_system(path, systems, crs))
-    features = _features(chosen, points, by_name)
-    return MapFile(features, [LeftOut(one.name, _NOT_BUILT, None) for one in unusable], problems)
+    features, left_out = [], [LeftOut(one.name, _NOT_BUILT, None) for one in unusable]
+    for feature in _features(chosen, points, by_name):
+        if below := hidden(feature.name, feature.tags, feature.area):
+            left_out.append(below)
+        else:
+            features.append(feature)
+    return MapFile(features, left_out, problems)
 
 
 def _root(one: CityObject, by_name: Mapping[str, CityObject]) -> str:

@@ -2,8 +2,17 @@
 
 To take apart an outline that crosses itself costs time and memory by the number of crossings, which
 can be the square of the number of corners: it is checked before geometry is computed.
+
+What lies below the ground is told by tags of OpenStreetMap [1] [2] [3], Overture Maps [4], CityGML
+(`relativeToTerrain`), ALKIS of the German states (`OFL`) and the Dutch BGT.
+
+[1] https://wiki.openstreetmap.org/wiki/Key:location
+[2] https://wiki.openstreetmap.org/wiki/Tag:building:levels=0
+[3] https://wiki.openstreetmap.org/wiki/Simple_Indoor_Tagging
+[4] https://docs.overturemaps.org/schema/reference/buildings/building
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,9 +23,18 @@ from shapely.geometry.base import BaseGeometry
 
 from radiotwin.io.budgets import CROSSINGS, OUTLINE_CORNERS, VERTICES
 from radiotwin.scene.checks import Problem, Severity, listed
+from radiotwin.scene.readers.heights import number, parse_length_m
 from radiotwin.scene.vegetation import count_meetings
 
 BUILDING_KEYS = ("building", "building:part")  # tags of OpenStreetMap
+UNDERGROUND = "building(s) lie below the ground: left out"
+INDOORS = "room(s) are inside of buildings: left out"
+_BELOW = {  # tag or column -> its values of what lies below the ground
+    "location": ("underground",), "is_underground": ("true", "yes", "1"),
+    "tunnel": ("yes", "true", "1"), "relativetoterrain": ("entirelybelowterrain",),
+    "ofl": ("1200",), "lagezurerdoberflaeche": ("1200",)}
+_LEVELS = ("layer", "level", "relatievehoogteligging", "relatieve_hoogteligging")  # 0: the ground
+_LEVEL_RANGE = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*(?:-\s*(-?\d+(?:\.\d+)?)\s*)?")
 _CHUNK = 256  # segments: bounds the pairs that are found at once
 
 
@@ -117,9 +135,39 @@ def left_out_problems(left_out: Sequence[LeftOut],
 
 
 def is_building(tags: Mapping[str, str]) -> bool:
-    """Return whether tags describe something built above the ground."""
-    return any(_is_set(tags, key) for key in BUILDING_KEYS) \
-        and tags.get("location") != "underground"
+    """Return whether tags describe a building or a part of one."""
+    return any(_is_set(tags, key) for key in BUILDING_KEYS)
+
+
+def hidden(name: str, tags: Mapping[str, str], place: BaseGeometry | None) -> LeftOut | None:
+    """Return a building that is below the ground or inside of another; None: it is neither."""
+    why = _below_ground(tags)
+    if why:
+        return LeftOut(f"{name}: {why}", UNDERGROUND, place)
+    if _is_set(tags, "indoor") and not _is_set(tags, "building"):
+        return LeftOut(f"{name}: indoor={tags['indoor']}", INDOORS, place)
+    return None
+
+
+def _below_ground(tags: Mapping[str, str]) -> str:
+    """Return the tag that says that a building lies below the ground; "" if none does."""
+    for key, values in _BELOW.items():
+        if tags.get(key, "").strip().lower() in values:
+            return f"{key}={tags[key]}"
+    for key in _LEVELS:
+        found = [_LEVEL_RANGE.fullmatch(part) for part in tags.get(key, "").split(";")]
+        ends = [float(end) for each in found if each for end in each.groups() if end]
+        if all(found) and max(ends) < 0:
+            return f"{key}={tags[key]}"
+    storeys, below = (number(tags.get(key, "")) for key in (
+        "building:levels", "building:levels:underground"))
+    top_m, roof_m = (parse_length_m(tags.get(key, "")) for key in ("height", "roof:height"))
+    rises = top_m > 0 or roof_m > 0 or number(tags.get("roof:levels", "")) > 0
+    if below > 0 and storeys == 0 and not rises:
+        return f"building:levels=0, building:levels:underground={below:g}"
+    if top_m <= 0 and parse_length_m(tags.get("min_height", "")) < 0:
+        return f"min_height={tags['min_height']}, height={tags['height']}"
+    return ""
 
 
 def _is_set(tags: Mapping[str, str], key: str) -> bool:

@@ -15,6 +15,7 @@ servers.
 import re
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from radiotwin.scene.readers.features import (
     Feature,
     LeftOut,
     MapFile,
+    hidden,
     is_building,
 )
 from radiotwin.scene.readers.heights import ALIASES
@@ -39,6 +41,8 @@ from radiotwin.scene.readers.systems import WGS84, chosen_system, degrees_from, 
 
 _OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*+)"', re.DOTALL)
 _NAME_LENGTH = 200  # characters of an id that are kept
+_AREAS = ("Polygon", "MultiPolygon", "GeometryCollection")
+NO_AREA = "building(s) are points or lines, without an area: left out"
 _KINDS = ("POLYGON", "MULTIPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE", "MULTISURFACE",
           "CURVEPOLYGON")
 _ENVELOPE_DOUBLES = (0, 4, 6, 6, 8)  # of a geometry's header, by its code
@@ -139,19 +143,29 @@ def map_file(
     Raises:
         BadInput: no coordinate reference system, or one that is not known.
     """
-    tagged = [(name, _tags(properties), area) for name, properties, area in rows]
+    tagged = [(name, _part_or_whole(properties, _tags(properties)), area)
+              for name, properties, area in rows]
     marked = any(key in tags for _, tags, _ in tagged for key in BUILDING_KEYS)
-    features, unusable = [], []
+    features, left_out = [], []
     for name, tags, area in tagged:
         if marked and not is_building(tags):
             continue
-        if area is None or area.geom_type not in ("Polygon", "MultiPolygon", "GeometryCollection"):
-            unusable.append(Feature(name, {}, shapely.Point() if area is None else area))
-            continue
-        features.append(Feature(name, tags if marked else tags | {"building": "yes"}, area))
-    return MapFile(_to_degrees(path, features, crs), [
-        LeftOut(one.name, "building(s) are points or lines, without an area: left out", one.area)
-        for one in _to_degrees(path, unusable, crs)])
+        tags = tags if marked else tags | {"building": "yes"}
+        if below := hidden(name, tags, area):
+            left_out.append(below)
+        elif area is None or area.geom_type not in _AREAS:
+            left_out.append(LeftOut(name, NO_AREA, area))
+        else:
+            features.append(Feature(name, tags, area))
+    if (features or left_out) and crs not in WGS84:
+        if crs is None:
+            raise BadInput(f"{path} has no coordinate reference system; declare it with --crs, "
+                           "such as --crs EPSG:25832")
+        project = degrees_from(path, find_system(path, crs))
+        features = [replace(one, area=shapely.transform(one.area, project)) for one in features]
+        left_out = [replace(one, place=shapely.transform(one.place, project))
+                    if one.place is not None else one for one in left_out]
+    return MapFile(features, left_out)
 
 
 def _tags(properties: Mapping) -> dict[str, str]:
@@ -170,6 +184,17 @@ def _tags(properties: Mapping) -> dict[str, str]:
     return tags
 
 
+def _part_or_whole(columns: Mapping, tags: dict[str, str]) -> dict[str, str]:
+    """Return the tags of a row, of Overture Maps with what tells a part from a building."""
+    names = {str(name).lower() for name in columns}
+    if not names & set(BUILDING_KEYS) and names & {"facade_color", "roof_shape", "is_underground"}:
+        if "building_id" in tags:  # that the part belongs to
+            return tags | {"building:part": "yes"}
+        if "has_parts" in names:
+            return tags | {"building": "yes"}
+    return tags
+
+
 def _other_tags(text: str) -> dict[str, str]:
     """Return the pairs of `"key"=>"value","key"=>"value"`, as GDAL writes rare tags."""
     tags, found = {}, _OTHER_TAG.match(text)
@@ -177,17 +202,6 @@ def _other_tags(text: str) -> dict[str, str]:
         tags[found[1]] = found[2]
         found = _OTHER_TAG.match(text, found.end())
     return tags
-
-
-def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Feature]:
-    if not features or crs in WGS84:
-        return features
-    if crs is None:
-        raise BadInput(f"{path} has no coordinate reference system; declare it with --crs, such as "
-                       "--crs EPSG:25832")
-    project = degrees_from(path, find_system(path, crs))
-    return [Feature(feature.name, feature.tags, shapely.transform(feature.area, project))
-            for feature in features]
 
 
 def read_geopackage(path: Path, crs: str | None = None) -> MapFile:

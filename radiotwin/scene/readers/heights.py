@@ -1,16 +1,18 @@
 """Height of a building from its tags, or from the columns of a publisher, with its source.
 
 Tags and units are as in OpenStreetMap [1]: metres unless a unit is given, `33'`, `33 ft`, `33'6"`.
-A height counts from the ground beside the building. An elevation counts from a vertical datum, so
-that of the ground is subtracted. Storeys count 3 m each. Only columns whose meaning and unit are
-published are known by name: OpenStreetMap [1], Overture Maps [2], CityGML 2.0 (section 10.3), 3D
-BAG [3], swissBUILDINGS3D 3.0, the LoD models of German states (AdV), BD TOPO of IGN, OS MasterMap,
-buildings of New York City [4] and INSPIRE BU.
+A height counts from the ground beside the building, and includes the roof. An elevation counts from
+a vertical datum, so that of the ground is subtracted. Storeys count 3 m each; `building:levels` are
+those below the roof [5], which `roof:height` or `roof:levels` are added to. Only columns whose
+meaning and unit are published are known by name: OpenStreetMap [1], Overture Maps [2], CityGML 2.0
+(section 10.3), 3D BAG [3], swissBUILDINGS3D 3.0, the LoD models of German states (AdV), BD TOPO of
+IGN, OS MasterMap, buildings of New York City [4] and INSPIRE BU.
 
 [1] https://wiki.openstreetmap.org/wiki/Key:height
 [2] https://docs.overturemaps.org/schema/reference/buildings/building
 [3] https://docs.3dbag.nl/en/schema/attributes
 [4] https://github.com/CityOfNewYork/nyc-geo-metadata
+[5] https://wiki.openstreetmap.org/wiki/Simple_3D_Buildings
 """
 
 import math
@@ -28,18 +30,25 @@ STOREYS = "storeys"
 UNITS_M = {"m": 1.0, "ft": FOOT_M, "cm": 0.01, STOREYS: LEVEL_M}
 MAX_LISTED = 20  # columns in a message
 _UNIT = re.compile(r"(.+):(m|ft|cm|storeys)", re.IGNORECASE | re.DOTALL)
-_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)\s*")
-# Tags and columns whose `:` a table cannot have in its names
+# A comma may separate decimals, where it cannot separate thousands
+_DECIMAL = r"\d+(?:\.\d*|,\d{1,2})?|\.\d+"
+_NUMBER = re.compile(rf"\s*([+-]?(?:{_DECIMAL}))\s*")
+# Tags and columns whose `:` a table cannot have in its names, and names of Overture Maps
 ALIASES = {key.replace(":", "_"): key for key in (
     "building:part", "building:levels", "building:min_level", "building:material",
-    "building:height")}
+    "building:height", "building:levels:underground", "roof:height", "roof:levels")} | {
+    "min_floor": "building:min_level", "num_floors_underground": "building:levels:underground",
+    "facade_material": "building:material", "hasparts": "has_parts", "minheight": "min_height"}
+ESTIMATED = "est_height"
+ROOFLESS = ("building:levels", "num_floors")  # storeys that do not count those of the roof
 TAG_SD_M, STOREYS_SD_M = 1.5, 3.0  # of a height that is given in metres; counted from storeys
 GUESS_SD_M = 6.0  # of a default, where few heights of the map are known
 MIN_KNOWN = 10  # heights of a map that tell how far a default is off
 MAX_HEIGHT_M = 1000.0  # [m], the tallest building has 828 m
-_METRES = re.compile(r"([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*(?:m|meters?|metres?)?", re.IGNORECASE)
-_FEET = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*(?:'|′|’|ft\.?|feet|foot)\s*"
-                   r"(?:(\d+(?:\.\d*)?)\s*(?:\"|″|”|''|in\.?|inch(?:es)?)?)?", re.IGNORECASE)
+_METRES = re.compile(rf"([+-]?(?:{_DECIMAL}))\s*(?:m|meters?|metres?)?", re.IGNORECASE)
+_FEET = re.compile(rf"([+-]?(?:{_DECIMAL}))\s*(?:'|′|’|ft\.?|feet|foot)\s*"
+                   rf"(?:(\d{{1,2}}(?:[.,]\d*)?)\s*(?:\"|″|”|''|in\.?|inch(?:es)?)?)?",
+                   re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,11 @@ class HeightColumn:
         """Its name in `buildings.csv` and in reports."""
         return f"{self.name} - {self.ground}" if self.ground else self.name
 
+    @property
+    def sd_m(self) -> float:
+        """Standard deviation of the heights in it [m]."""
+        return STOREYS_SD_M if self.unit == STOREYS or self.name == ESTIMATED else TAG_SD_M
+
 
 def _elevations(ground: str, *names: str) -> tuple[HeightColumn, ...]:
     return tuple(HeightColumn(name, ground=ground) for name in names)
@@ -70,6 +84,7 @@ KNOWN = (
     *(HeightColumn(name) for name in (
         "height", "building:height", "measuredheight", "gesamthoehe", "gebaeudehoehe", "hoehe",
         "height_m", "hauteur", "relhmax", "relh2")),
+    HeightColumn(ESTIMATED),
     *(HeightColumn(name, "ft") for name in ("heightroof", "height_roof", "height_ft")),
     *_elevations("b3_h_maaiveld", "b3_h_dak_max", "b3_h_max", "b3_h_dak_70p",
                  "b3_h_70p", "b3_h_dak_50p", "b3_h_50p"),
@@ -167,14 +182,14 @@ def _listed(names: Iterable[str]) -> str:
 def parse_length_m(text: str) -> float:
     """Parse a length of OpenStreetMap [m]; NaN if the text is none.
 
-    >>> parse_length_m("12.5"), round(parse_length_m("33'"), 4)
+    >>> parse_length_m("12,5"), round(parse_length_m("33'"), 4)
     (12.5, 10.0584)
     """
     text = text.strip()
     if found := _METRES.fullmatch(text):
-        return float(found[1])
+        return number(found[1])
     if found := _FEET.fullmatch(text):
-        feet, inches = float(found[1]), float(found[2] or 0)
+        feet, inches = number(found[1]), number(found[2] or "0")
         length_m = abs(feet) * 0.3048 + inches * 0.0254
         return math.copysign(length_m, feet)
     return math.nan
@@ -202,10 +217,11 @@ class Height:
 
 def height_of(tags: Mapping[str, str], default_m: float,
               declared: HeightColumn | None = None) -> Height:
-    """Return the vertical extent of a building; impossible values are listed as unusable.
+    """Return the vertical extent of a building; values that cannot be used are listed.
 
     The top is the first usable of the declared column, the known ones (see `KNOWN`), and the
-    default; the bottom that of `min_height`, `building:min_level` × 3 m, and the ground.
+    default; the bottom that of `min_height`, `building:min_level` × 3 m, and the ground, where it
+    is below that, too.
     """
     unusable: list[str] = []
     top_m, source, sd_m = default_m, "default", math.nan
@@ -213,21 +229,28 @@ def height_of(tags: Mapping[str, str], default_m: float,
         if column.name not in tags or (column.ground and column.ground not in tags):
             continue
         value_m = _top_m(column, tags)
+        if column.name in ROOFLESS and value_m >= 0:
+            value_m += _first(tags, (("roof:height", 1.0), ("roof:levels", LEVEL_M)), unusable)
         if 0 < value_m <= MAX_HEIGHT_M:
-            top_m, source = value_m, column.label
-            sd_m = STOREYS_SD_M if column.unit == STOREYS else TAG_SD_M
+            top_m, source, sd_m = value_m, column.label, column.sd_m
             break
         unusable.append(", ".join(f"{name}={tags[name]}" for name in (column.name, column.ground)
                                   if name))
-    bottom_m = 0.0
-    for key, unit_m in (("min_height", 1.0), ("building:min_level", LEVEL_M)):
+    bottom_m = _first(tags, (("min_height", 1.0), ("building:min_level", LEVEL_M)), unusable,
+                      -MAX_HEIGHT_M)
+    return Height(max(bottom_m, 0.0), top_m, source, unusable, sd_m)
+
+
+def _first(tags: Mapping[str, str], keys: Iterable[tuple[str, float]], unusable: list[str],
+           least_m: float = 0.0) -> float:
+    """Return the first usable of some tags [m], by their unit; 0 without one."""
+    for key, unit_m in keys:
         if key in tags:
-            value_m = parse_length_m(tags[key]) if unit_m == 1 else unit_m * _number(tags[key])
-            if 0 <= value_m <= MAX_HEIGHT_M:
-                bottom_m = value_m
-                break
+            value_m = parse_length_m(tags[key]) if unit_m == 1 else unit_m * number(tags[key])
+            if least_m <= value_m <= MAX_HEIGHT_M:
+                return value_m
             unusable.append(f"{key}={tags[key]}")
-    return Height(bottom_m, top_m, source, unusable, sd_m)
+    return 0.0
 
 
 def height_sds_m(top_m: np.ndarray, sd_m: np.ndarray) -> np.ndarray:
@@ -261,13 +284,12 @@ def source_text(source: str, declared: HeightColumn | None = None) -> str:
 def _top_m(column: HeightColumn, tags: Mapping[str, str]) -> float:
     """Return the top above the ground [m]; NaN where a text is no number."""
     unit_m = UNITS_M[column.unit]
-    top = parse_length_m(tags[column.name]) if column.unit == "m" else _number(tags[column.name])
+    top = parse_length_m(tags[column.name]) if column.unit == "m" else number(tags[column.name])
     ground = parse_length_m(tags[column.ground]) if column.ground else 0.0
     return unit_m * (top - ground)
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+def number(text: str) -> float:
+    """Parse a number, with a decimal point or comma; NaN if the text is none."""
+    found = _NUMBER.fullmatch(text)
+    return float(found[1].replace(",", ".")) if found else math.nan

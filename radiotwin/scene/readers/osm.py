@@ -1,7 +1,8 @@
 """OpenStreetMap: areas of buildings and vegetation, from files and from the Overpass API [1].
 
 A closed way is an area, and so is a relation of type multipolygon whose ways form closed rings [2];
-rings of role `inner` are courtyards. `.osm` files are the XML of OpenStreetMap's API, of Overpass
+rings of role `inner` are courtyards. Where a ring has no role, those within an odd number of others
+are. `.osm` files are the XML of OpenStreetMap's API, of Overpass
 and of JOSM. `.osm.pbf` files are read with libosmium [3] in several passes that keep only what is
 needed, so that an extract of a whole region needs little memory.
 
@@ -35,6 +36,7 @@ from radiotwin.scene.readers.features import (
     LeftOut,
     MapFile,
     OutlineBudget,
+    hidden,
     is_building,
 )
 from radiotwin.scene.readers.vegetation import TAGS, kind_of
@@ -111,13 +113,19 @@ def assemble(elements: OsmElements) -> MapFile:
             left_out.append(LeftOut(f"relation/{number}", INCOMPLETE if area == "incomplete"
                                     else UNCLOSED, _place(relation, elements)))
             continue
-        used.update(way for way, role in relation.members if role != "inner")
-        relations.append(Feature(f"relation/{number}", tags, area))
+        used.update(way for way, role in relation.members if role == "outer" or (
+            role != "inner" and not _is_courtyard(elements.ways[way], area, elements)))
+        if below := hidden(f"relation/{number}", tags, area):
+            left_out.append(below)
+        else:
+            relations.append(Feature(f"relation/{number}", tags, area))
     ways = []
     for number, way in elements.ways.items():
         if number in used or not is_building(way.tags):
             continue
-        if any(node not in elements.positions for node in way.nodes):
+        if below := hidden(f"way/{number}", way.tags, _place(way, elements)):
+            left_out.append(below)
+        elif any(node not in elements.positions for node in way.nodes):
             left_out.append(LeftOut(f"way/{number}", INCOMPLETE, _place(way, elements)))
         elif len(way.nodes) < MIN_RING_NODES or way.nodes[0] != way.nodes[-1]:
             left_out.append(LeftOut(f"way/{number}", UNCLOSED, _place(way, elements)))
@@ -199,7 +207,7 @@ def _relation_area(
 ) -> BaseGeometry | Literal["incomplete", "open"]:
     """Return the area, or that ways or nodes are missing, or that the ways do not close."""
     chains: dict[bool, list[Sequence[int]]] = {True: [], False: []}
-    corners = 0
+    corners, named = 0, True
     for number, role in relation.members:
         way = elements.ways.get(number)
         corners += len(way.nodes) if way is not None else 0
@@ -207,13 +215,25 @@ def _relation_area(
         if way is None or any(node not in elements.positions for node in way.nodes):
             return "incomplete"
         chains[role != "inner"].append(way.nodes)
+        named &= role in ("outer", "inner")
     outer, inner = stitch(chains[True]), stitch(chains[False])
     if not outer or inner is None:
         return "open"
     outlines, holes = ([_polygon(ring, elements) for ring in rings] for rings in (outer, inner))
     budget.check(name, shapely.MultiPolygon([*outlines, *holes]))
+    if not named:
+        return shapely.build_area(shapely.union_all(shapely.get_rings([*outlines, *holes])))
     area = _union(outlines)
     return area.difference(_union(holes)) if holes else area
+
+
+def _is_courtyard(way: Way, area: BaseGeometry, elements: OsmElements) -> bool:
+    """Return whether what is just inside of a way is not in an area."""
+    if len(way.nodes) < MIN_RING_NODES or way.nodes[0] != way.nodes[-1]:
+        return False
+    outline = shapely.make_valid(_polygon(way.nodes, elements))
+    rim = outline.difference(outline.buffer(-1e-3 * math.sqrt(outline.area)))
+    return not area.contains(rim.representative_point())
 
 
 def _union(polygons: list[shapely.Polygon]) -> BaseGeometry:

@@ -131,8 +131,8 @@ class _Defects:
         "no area": ("warning", "building(s) have no area: left out"),
         "sliver": ("warning", f"sliver(s), under {SLIVER_AREA_M2:g} m² or {SLIVER_WIDTH_M:g} m "
                               "wide: left out"),
-        "height": ("warning", "building(s) have an impossible height, level or bottom; the next "
-                              "tag, or the default, was taken"),
+        "height": ("warning", "building(s) have a height, level or bottom that cannot be used; "
+                              "the next tag, or the default, was taken"),
         "upside down": ("warning", "building(s) begin (min_height) no lower than they end: left "
                                    "out"),
         "no footprint": ("warning", "building(s) have no area seen from above: left out"),
@@ -145,6 +145,9 @@ class _Defects:
                                 "--material NAME=ITU"),
         "rest": ("warning", f"outline(s) are covered to less than {MIN_COVERED_SHARE:.0%} by their "
                             "parts: the rest keeps the outline's own height"),
+        "no parts": ("warning", "building(s) have parts (has_parts) that the file does not hold: "
+                                "built as their outline. Give the parts (building_part of "
+                                "Overture Maps) as another layer of one GeoPackage"),
         "floating": ("warning", f"building(s) begin more than {HEADROOM_M:g} m above the ground, "
                                 "with all their parts: nothing of them reaches it. They are built "
                                 "so; where that is wrong, correct min_height or add what is below"),
@@ -251,6 +254,8 @@ def _resolve_parts(
             defects.add("rest", feature.name)
             area = shapely.MultiPolygon([polygon for polygon in rest.geoms
                                          if polygon.area >= SLIVER_AREA_M2])
+        elif feature.tags.get("has_parts", "").lower() in ("true", "1"):
+            defects.add("no parts", feature.name)
         resolved.append((feature, area, wholes[index]))
     return resolved
 
@@ -260,8 +265,9 @@ def _inherit(part: Feature, whole: Feature) -> Feature:
     tags = {key: value for key, value in whole.tags.items()
             if key not in ("min_height", "building:min_level")}
     known = [column.name for column in KNOWN]
-    own = next((row for row, name in enumerate(known) if name in part.tags), 0)
-    for name in known[:own]:  # which would take precedence over what the part itself has
+    own = next((row for row, name in enumerate(known) if name in part.tags), None)
+    # What would take precedence over what the part itself has, or be added to it
+    for name in () if own is None else (*known[:own], "roof:height", "roof:levels"):
         tags.pop(name, None)
     return replace(part, tags=tags | dict(part.tags))
 

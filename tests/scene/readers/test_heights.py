@@ -8,13 +8,13 @@ from radiotwin.scene.readers.heights import Height, height_of, height_sds_m, par
 
 
 @pytest.mark.parametrize(("text", "metres"), [
-    ("12", 12), ("12.5", 12.5), (" 12 m", 12), ("12m", 12), ("9 metres", 9), (".5", 0.5), ("33'", 10.0584),
+    ("12", 12), ("12.5", 12.5), ("12,5", 12.5), (" 12 m", 12), ("12m", 12), ("9 metres", 9), (".5", 0.5), ("33'", 10.0584),
     ("33 ft", 10.0584), ("33 feet", 10.0584), ("6'6\"", 1.9812), ("33′ 6″", 10.2108), ("-5", -5), ("-3'", -0.9144)])
 def test_lengths(text, metres):
     assert parse_length_m(text) == pytest.approx(metres)
 
 
-@pytest.mark.parametrize("text", ["", "tall", "12,5", "12;14", "1e3", "12 km", "nan", "inf", "12 34", "'", "٣x"])
+@pytest.mark.parametrize("text", ["", "tall", "1,234", "1'000", "12;14", "1e3", "12 km", "nan", "inf", "12 34", "'", "٣x"])
 def test_invalid_lengths(text):
     assert math.isnan(parse_length_m(text))
 
@@ -32,12 +32,21 @@ def test_invalid_lengths(text):
     ({"height": "20", "min_height": "5"}, Height(5, 20, "height")),
     ({"height": "20", "min_height": "0"}, Height(0, 20, "height")),
     ({"height": "20", "building:min_level": "2"}, Height(6, 20, "height")),
-    ({"height": "20", "min_height": "-1"}, Height(0, 20, "height", ["min_height=-1"])),
+    ({"height": "20", "min_height": "-1"}, Height(0, 20, "height")),  # the rest of it is below the ground
+    ({"building:levels": "2", "building:min_level": "-1"}, Height(0, 6, "building:levels")),
+    ({"height": "20", "min_height": "low"}, Height(0, 20, "height", ["min_height=low"])),
+    ({"building:levels": "3", "roof:levels": "2"}, Height(0, 15, "building:levels")),
+    ({"building:levels": "3", "roof:height": "6", "roof:levels": "1"}, Height(0, 15, "building:levels")),
+    ({"building:levels": "0", "roof:levels": "1"}, Height(0, 3, "building:levels")),
+    ({"building:levels": "0"}, Height(0, 10, "default", ["building:levels=0"])),
+    ({"building:levels": "2,5", "roof:levels": "low"}, Height(0, 7.5, "building:levels", ["roof:levels=low"])),
+    ({"height": "12", "roof:height": "4"}, Height(0, 12, "height")),  # it counts the roof
+    ({"est_height": "25", "building:levels": "3"}, Height(0, 25, "est_height")),
 ])
 def test_height_and_its_source(tags, height):
     found = height_of(tags, 10.0)
     assert replace(found, sd_m=0.0) == replace(height, sd_m=0.0)
-    sd_m = {"height": 1.5, "building:levels": 3.0, "default": math.nan}[height.source]
+    sd_m = {"height": 1.5, "default": math.nan}.get(height.source, 3.0)
     assert found.sd_m == pytest.approx(sd_m, nan_ok=True)
 
 

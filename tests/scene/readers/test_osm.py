@@ -91,3 +91,40 @@ def test_missing_package_names_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "osmium", None)
     with pytest.raises(BadInput, match=r"pip install 'radiotwin\[gis\]'"):
         read_osm_pbf(tmp_path / "a.osm.pbf")
+
+
+def ring(first, x0, x1):
+    """Return nodes and the closed way `first` of a square (x0, x1) by (x0, x1) degrees."""
+    corners = [(x0, x0), (x1, x0), (x1, x1), (x0, x1)]
+    nodes = "".join(f'<node id="{first * 10 + i}" lon="{x}" lat="{y}"/>' for i, (x, y) in enumerate(corners))
+    return nodes, f'<way id="{first}">' + "".join(f'<nd ref="{first * 10 + i % 4}"/>' for i in range(5))
+
+
+@pytest.mark.parametrize(("roles", "area"), [
+    (("outer", "inner", ""), 100 - 36 + 4), (("", "", ""), 100 - 36 + 4), (("outer", "", "outer"), 100 - 36 + 4),
+    (("outer", "inner", "inner"), 100 - 36), (("outer", "outer", "outer"), 100),
+    (("outline", "", ""), 100 - 36 + 4)])
+def test_rings_without_a_role_are_courtyards_by_where_they_lie(tmp_path, roles, area):
+    """Three squares of 10, 6 and 2 degrees within each other; the second has a tower of its own."""
+    rings = [ring(1, 0, 10), ring(2, 2, 8), ring(3, 4, 6)]
+    tower = '<tag k="building" v="tower"/>'
+    ways = "".join(way + (tower if number == 2 else "") + "</way>" for number, (_, way) in enumerate(rings, 1))
+    members = "".join(f'<member type="way" ref="{number}" role="{role}"/>' for number, role in enumerate(roles, 1))
+    path = tmp_path / "a.osm"
+    path.write_text("<osm>" + "".join(nodes for nodes, _ in rings) + ways + f'<relation id="9">{members}<tag k="type" '
+                    'v="multipolygon"/><tag k="building" v="yes"/></relation></osm>')
+    found = {one.name: one.area.area for one in assemble(read_osm_xml(path)).features}
+    assert found["relation/9"] == pytest.approx(area)
+    assert ("way/2" in found) == (roles[1] != "outer")
+
+
+def test_ways_of_one_ring_without_roles(tmp_path):
+    nodes, _ = ring(1, 0, 10)
+    halves = ('<way id="1"><nd ref="10"/><nd ref="11"/><nd ref="12"/></way>'
+              '<way id="2"><nd ref="12"/><nd ref="13"/><nd ref="10"/></way>')
+    members = '<member type="way" ref="1" role="outer"/><member type="way" ref="2" role=""/>'
+    path = tmp_path / "a.osm"
+    path.write_text(f'<osm>{nodes}{halves}<relation id="9">{members}<tag k="type" v="multipolygon"/>'
+                    '<tag k="building" v="yes"/></relation></osm>')
+    (one,) = assemble(read_osm_xml(path)).features
+    assert one.area.area == pytest.approx(100)

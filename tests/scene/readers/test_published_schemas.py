@@ -1,0 +1,92 @@
+"""Tags and columns of published schemas: what stands above the ground, and what its heights are."""
+
+import json
+
+import pandas as pd
+import pytest
+
+from radiotwin.scene.readers import build_scene
+from radiotwin.scene.readers.features import INDOORS, UNDERGROUND, hidden
+from tests.scene.readers.test_height_columns import box
+
+
+def built(tmp_path, source):
+    """Return the table of buildings by name, and the warnings."""
+    out = tmp_path / f"out{len(list(tmp_path.iterdir()))}"
+    report = build_scene(source, out)
+    table = pd.read_csv(out / "buildings.csv").set_index("building")
+    return table, "\n".join(problem.message for problem in report.problems)
+
+
+def geojson(tmp_path, rows):
+    features = [{"type": "Feature", "properties": row, "geometry": box(x_m)} for x_m, row in rows]
+    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return tmp_path / "a.geojson"
+
+
+@pytest.mark.parametrize("tags", [
+    {"location": "underground", "height": "8"}, {"layer": "-1", "building:levels": "1"}, {"level": "-2;-1"},
+    {"level": "-3--1"}, {"tunnel": "yes"}, {"building:levels": "0", "building:levels:underground": "3"},
+    {"min_height": "-6", "height": "0"}, {"min_height": "-9", "height": "-3"}, {"is_underground": "True"},
+    {"relativetoterrain": "entirelyBelowTerrain"}, {"ofl": "1200"}, {"relatievehoogteligging": "-1"}])
+def test_what_lies_below_the_ground(tags):
+    found = hidden("way/1", {"building": "yes"} | tags, None)
+    assert found is not None and found.reason == UNDERGROUND and found.name.startswith("way/1: ")
+
+
+@pytest.mark.parametrize("tags", [
+    {}, {"location": "roof"}, {"layer": "1"}, {"layer": "roofs"}, {"level": "-1;0"}, {"level": "-1-2"}, {"level": "0-3"},
+    {"tunnel": "building_passage"}, {"tunnel": "no"}, {"building:levels": "0"},
+    {"building:levels": "0", "building:levels:underground": "2", "roof:levels": "1"},
+    {"building:levels": "0", "building:levels:underground": "2", "height": "4"},
+    {"building:levels": "4", "building:levels:underground": "2"}, {"min_height": "-2", "height": "9"},
+    {"is_underground": "False"}, {"relativetoterrain": "substantiallyBelowTerrain"}, {"height": "-3"}])
+def test_what_stands_above_the_ground(tags):
+    assert hidden("way/1", {"building": "yes"} | tags, None) is None
+
+
+def test_rooms_are_inside_of_buildings():
+    found = hidden("way/1", {"building:part": "yes", "indoor": "room", "level": "2"}, None)
+    assert found is not None and found.reason == INDOORS
+    assert hidden("way/1", {"building": "yes", "indoor": "yes"}, None) is None
+
+
+def test_what_lies_below_is_left_out_and_told_and_does_not_replace_what_stands_above(tmp_path, empty_map):
+    drawn = (empty_map.box(0, 0, 20, 20, height="20")
+             .box(0, 0, 20, 20, building="no", building__part="yes", building__levels="0", building__levels__underground="3")
+             .box(40, 0, 60, 20, layer="-1"))
+    table, told = built(tmp_path, drawn.write(tmp_path / "a.osm"))
+    assert table["top_m"].to_dict() == {"way/1": 20.0}
+    assert "2 building(s) lie below the ground: left out" in told and "'way/3: layer=-1'" in told
+
+
+def test_a_part_with_storeys_of_its_own_has_not_the_roof_of_the_whole(tmp_path, empty_map):
+    drawn = (empty_map.box(0, 0, 40, 20, building__levels="5", roof__levels="2")
+             .box(0, 0, 20, 20, building="no", building__part="yes", building__levels="2")
+             .box(20, 0, 40, 20, building="no", building__part="yes"))
+    table, _ = built(tmp_path, drawn.write(tmp_path / "a.osm"))
+    assert table["top_m"].to_dict() == {"way/2": 6.0, "way/3": 21.0}
+
+
+def test_overture_floors_roofs_and_what_is_underground(tmp_path):
+    of_all = {"has_parts": False, "is_underground": False, "roof_shape": "hip"}
+    table, told = built(tmp_path, geojson(tmp_path, [
+        (0, of_all | {"num_floors": 4, "roof_height": 2.5}), (100, of_all | {"is_underground": True, "height": 6.0}),
+        (200, of_all | {"height": 30.0, "min_floor": 2})]))
+    assert table["top_m"].to_dict() == {"feature 1": 14.5, "feature 3": 30.0}
+    assert table["bottom_m"].to_dict() == {"feature 1": 0.0, "feature 3": 6.0}
+    assert "1 building(s) lie below the ground: left out ('feature 2: is_underground=True')" in told
+
+
+def test_parts_of_overture_replace_their_building(tmp_path):
+    whole = {"has_parts": True, "is_underground": False, "height": 40.0, "building_id": None}
+    part = {"has_parts": None, "is_underground": False, "height": 12.0, "building_id": "08b"}
+    table, _ = built(tmp_path, geojson(tmp_path, [(0, whole), (0, part)]))
+    assert table["top_m"].to_dict() == {"feature 2": 12.0}
+    table, told = built(tmp_path, geojson(tmp_path, [(0, whole)]))
+    assert table["top_m"].to_dict() == {"feature 1": 40.0} and "parts (has_parts) that the file does not hold" in told
+
+
+def test_a_building_id_of_a_city_makes_no_part(tmp_path):
+    table, _ = built(tmp_path, geojson(tmp_path, [(0, {"building_id": 7, "height": 9})]))
+    assert table["top_m"].to_dict() == {"feature 1": 9.0}
