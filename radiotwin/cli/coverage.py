@@ -85,10 +85,9 @@ def coverage(
     from radiotwin.coverage import CoverageSettings, RateModel, predict_coverage, read_transmitters
     from radiotwin.coverage.areas import read_areas
     from radiotwin.coverage.output import FILES, available_formats, write_formats, write_tables
-    from radiotwin.io.files import atomic_folder, require_writable
+    from radiotwin.io.files import atomic_folder, require_folder
     from radiotwin.io.inputs import keep_inputs
     from radiotwin.report import write_coverage_pictures
-    from radiotwin.scene.build import check_target
 
     settings = CoverageSettings(
         height_m=height, step_m=step, extent_m=parse_extent(extent), tx_power_dbm=tx_power_dbm,
@@ -100,9 +99,8 @@ def coverage(
     settings.check()
     world = _world(source, scene, model)
     usable, notes = available_formats(world, split_names(formats))
-    check_target(out, FILES)
+    require_folder(out, FILES, mark="coverage.json")
     keep_inputs(out, transmitters, polygon, world.folder, source)
-    require_writable(out / "coverage.json")
     areas = read_areas(polygon, world) if polygon else []
     table = read_transmitters(transmitters, world) if transmitters else None
     with _gains(source, world, model) as gains:

@@ -158,19 +158,18 @@ def compare(
     Published laws that hold at the scene's frequency are among them, fitted to nothing.
     With --truth they are compared with the truth map, too.
     """
-    from radiotwin.io.files import require_writable
     from radiotwin.links.measurements import read_measurements
     from radiotwin.maps.survey import read_truth
-    from radiotwin.report import write_comparison_folder
+    from radiotwin.report import check_comparison_folder, write_comparison_folder
     from radiotwin.report.comparison import compare_held_out
     from radiotwin.runtime.execution import open_executor
     from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.twin.compare import split_flights
 
-    require_writable(out / "compare.json")
     world = Scene.load(scene)
     keep_scene_apart(out, world)
+    check_comparison_folder(out)
     data = in_frame_of(world, read_measurements(measurements, devices), shift)
     split_flights(data, held_out)  # refuses before a map is read
     truth_map = read_truth(world, truth) if truth else None

@@ -5,7 +5,6 @@ The GeoPackage has the areas of each class as vectors, and the transmitters.
 
 import io
 import json
-import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -25,27 +24,26 @@ from radiotwin.coverage.run import Coverage
 from radiotwin.errors import BadInput
 from radiotwin.geo import local_crs, to_geographic
 from radiotwin.io.cells import write_csv
-from radiotwin.io.files import atomic_file, atomic_path
+from radiotwin.io.files import atomic_file
+from radiotwin.io.geopackage import Layer, geopackage
 from radiotwin.maps.export.geotiff import GDAL_OPTIONS, georeference, require_rasterio
 from radiotwin.maps.export.kmz import OPACITY, Overlay, enlarged_png, write_overlays
 from radiotwin.scene import Scene
 
-DEGREES = "EPSG:4326"
 LEGEND_ROWS = 24  # servers in a legend
 RASTERS = ("received_power_dbm", "received_power_sd_db", "best_server", "snr_db", "sinr_db",
            "rate_bps", "coverage_probability")
 
 
-def _require_vectors() -> Any:
-    """Return the packages rasterio's features and pyogrio; raise BadInput if one is missing."""
+def _require_features() -> Any:
+    """Return the package rasterio's features; raise BadInput if it is missing."""
     try:
-        import pyogrio
         from rasterio import features
     except ImportError as error:
-        raise BadInput("coverage.gpkg: GeoPackages are written with the packages rasterio and "
-                       f"pyogrio, and {error.name} is not installed; install both with `pip "
-                       "install 'radiotwin[gis]'`") from None
-    return features, pyogrio
+        raise BadInput("coverage.gpkg: GeoPackages are written with the package rasterio, and "
+                       f"{error.name} is not installed; install it with `pip install "
+                       "'radiotwin[gis]'`") from None
+    return features
 
 
 def _write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
@@ -53,51 +51,40 @@ def _write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
 
     Coordinates are WGS84 degrees; local metres, without a system, where the scene has no origin.
     """
-    features, pyogrio = _require_vectors()
+    features = _require_features()
     grid, origin = coverage.grid, scene.config.origin
     transform = georeference(grid.x_m, grid.y_m, grid.step_m, origin)["transform"]
 
     def project(points: np.ndarray) -> np.ndarray:
         return points if origin is None else np.column_stack(to_geographic(origin, *points.T))
 
-    with atomic_path(path) as temporary:
-        temporary.unlink()
-        for name in drawn_rasters(coverage):
-            legend = legend_of(name, coverage)
-            classes = legend.classes(coverage.dataset[name].values)[::-1]
-            parts: dict[int, list] = {}
-            for outline, number in features.shapes(classes, mask=classes >= 0, connectivity=4,
-                                                   transform=transform):
-                parts.setdefault(int(number), []).append(shapely.geometry.shape(outline))
-            numbers = sorted(parts)
-            areas = [shapely.multipolygons(parts[number]) for number in numbers]
-            lower = np.array([legend.lower[number] if number < len(legend.lower) else np.nan
-                              for number in numbers])
-            columns = {"class": np.array([legend.labels[number] for number in numbers], object),
-                       "colour": np.array([legend.colours[number] for number in numbers], object),
-                       "minimum": lower, "area_m2": shapely.area(areas)}
-            _write(pyogrio, temporary, file_stem(name), shapely.transform(areas, project),
-                   "MultiPolygon", columns, origin is not None)
-        placed = [each for each in coverage.transmitters if np.isfinite(each.position_m).all()]
-        power_dbm = {each["device"]: each["tx_power_dbm"]
-                     for each in coverage.summary["transmitters"]}
-        position_m = np.array([each.position_m for each in placed]).reshape(-1, 3)
-        columns = {"device": np.array([each.name for each in placed], object),
-                   "z_m": position_m[:, 2],
-                   "tx_power_dbm": np.array([power_dbm[each.name] for each in placed], float)}
-        _write(pyogrio, temporary, "transmitters",
-               np.asarray(shapely.points(project(position_m[:, :2]))), "Point", columns,
-               origin is not None)
-
-
-def _write(pyogrio: Any, path: Path, layer: str, shapes: np.ndarray, kind: str,
-           columns: dict[str, np.ndarray], is_placed: bool) -> None:
-    """Add a layer to a GeoPackage."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)
-        pyogrio.raw.write(path, shapely.to_wkb(shapes), list(columns.values()), list(columns),
-                          layer=layer, driver="GPKG", geometry_type=kind, append=path.exists(),
-                          crs=DEGREES if is_placed else None)
+    layers = []
+    for name in drawn_rasters(coverage):
+        legend = legend_of(name, coverage)
+        classes = legend.classes(coverage.dataset[name].values)[::-1]
+        parts: dict[int, list] = {}
+        for outline, number in features.shapes(classes, mask=classes >= 0, connectivity=4,
+                                               transform=transform):
+            parts.setdefault(int(number), []).append(shapely.geometry.shape(outline))
+        numbers = sorted(parts)
+        areas = [shapely.multipolygons(parts[number]) for number in numbers]
+        lower = np.array([legend.lower[number] if number < len(legend.lower) else np.nan
+                          for number in numbers])
+        columns = {"class": np.array([legend.labels[number] for number in numbers], object),
+                   "colour": np.array([legend.colours[number] for number in numbers], object),
+                   "minimum": lower, "area_m2": shapely.area(areas)}
+        layers.append(Layer(file_stem(name), "MULTIPOLYGON", shapely.transform(areas, project),
+                            columns))
+    placed = [each for each in coverage.transmitters if np.isfinite(each.position_m).all()]
+    power_dbm = {each["device"]: each["tx_power_dbm"] for each in coverage.summary["transmitters"]}
+    position_m = np.array([each.position_m for each in placed]).reshape(-1, 3)
+    columns = {"device": np.array([each.name for each in placed], object),
+               "z_m": position_m[:, 2],
+               "tx_power_dbm": np.array([power_dbm[each.name] for each in placed], float)}
+    layers.append(Layer("transmitters", "POINT",
+                        np.asarray(shapely.points(project(position_m[:, :2]))), columns))
+    with atomic_file(path) as file:
+        file.write(geopackage(layers, origin is not None))
 
 
 def write_tables(coverage: Coverage, folder: Path) -> None:
@@ -258,7 +245,7 @@ def _check_origin(scene: Scene) -> None:
 
 FORMATS: dict[str, Callable[[Scene], object]] = {
     "nc": lambda scene: None, "tif": lambda scene: require_rasterio(Path("received_power.tif")),
-    "gpkg": lambda scene: _require_vectors(), "kmz": _check_origin,
+    "gpkg": lambda scene: _require_features(), "kmz": _check_origin,
     "png": lambda scene: None}
 """Formats, and what raises BadInput where one cannot be written for a scene."""
 FILES = frozenset({

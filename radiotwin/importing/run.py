@@ -1,7 +1,6 @@
 """The whole import, from files to a folder, and its report: counts, ranges, implausible data."""
 
 import json
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -21,7 +20,7 @@ from radiotwin.importing.settings import Settings, read_settings, write_settings
 from radiotwin.importing.source import Source, Tally
 from radiotwin.importing.tracks import add_tracks
 from radiotwin.importing.units import clock_notes
-from radiotwin.io.files import atomic_folder
+from radiotwin.io.files import atomic_folder, require_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
 from radiotwin.links.measurements import (
@@ -186,7 +185,7 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
         BadInput: all that is wrong, with file, row and column; nothing is written.
     """
     out = Path(out)
-    _check_target(out)
+    require_folder(out, FILES, mark="import.json")
     paths = [paths] if isinstance(paths, (str, Path)) else paths
     tables = [out, settings.devices, settings.receivers, *(track.file for track in settings.track)]
     files, others = list_files(paths, filter(None, tables))
@@ -255,16 +254,6 @@ def import_measurements(paths: Path | str | Sequence[Path | str], out: Path | st
     folder = Path(paths[0]).parent if paths else None
     import_files(paths, read_settings(mapping, given, folder), out, compress, on_progress)
     return read_measurements(out / ("measurements.csv.gz" if compress else "measurements.csv"))
-
-
-def _check_target(out: Path) -> None:
-    """Refuse a folder that holds anything but an earlier import."""
-    if os.path.isdir(out):  # False, not an error, of a name that no folder can have
-        others = sorted(path.name for path in out.iterdir() if path.name not in FILES)
-        if others or (any(out.iterdir()) and not (out / "import.json").is_file()):
-            detail = f" (it has {others[0]})" if others else ""
-            raise BadInput(f"{out} is not empty and not an earlier import{detail}; choose another "
-                           "output folder")
 
 
 def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,

@@ -6,13 +6,14 @@ taken away. (Files are not locked: HDF5 locks those that it writes itself.)
 """
 
 import errno
+import fnmatch
 import io
 import os
 import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -121,31 +122,70 @@ def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[byte
 
 
 @contextmanager
-def atomic_folder(path: Path | str) -> Iterator[Path]:
-    """Write a folder atomically.
+def atomic_folder(path: Path | str, names: Collection[str] | None = None) -> Iterator[Path]:
+    """Write a folder atomically: all that it gets is written elsewhere, flushed, and moved in.
 
     Args:
         path: of the folder; missing parents are made.
+        names: of the files and folders that it gets, as patterns such as `effect_*.png`: what an
+            older folder holds under other names stays in it. None: the older folder is replaced.
 
     Yields:
-        an empty temporary folder beside `path`, which replaces `path` on success and is removed on
-        failure.
+        an empty temporary folder, whose content replaces that of `path` on success; it is removed
+        on failure.
 
     Raises:
-        BadInput: the parent cannot be written, or `path` is a file.
+        BadInput: the folder cannot be written, or `path` is a file.
         RunFailed: the disk is full or failed; an older folder at `path` is unchanged.
     """
     path = Path(path)
-    with _reported(path):
-        if path.exists() and not path.is_dir():
-            raise BadInput(f"{path} is a file; give the name of a folder")
     with (_parent_of(path), _reported(path, only_disk=True),
-          _temporary_folder(path) as temporary):
-        yield temporary
+          _temporary_folder(_beside(path)) as temporary):
+        try:
+            yield temporary
+        except (BadInput, RunFailed) as error:  # of a file in it, by the name that it will have
+            raise type(error)(str(error).replace(str(temporary), str(path))) from error
         with _reported(path):
             _flush_all([inside for inside in temporary.rglob("*") if inside.is_file()])
             temporary.chmod(0o755)
-            _swap(temporary, path)
+            _swap(temporary, path, names)
+
+
+def require_folder(path: Path | str, names: Collection[str], mark: str | None = None,
+                   keep_others: bool = False) -> None:
+    """Check that a folder can be written without loss of what others put in it.
+
+    Call it before long work.
+
+    Args:
+        path: of the folder.
+        names: of all that an earlier run may have written, as patterns such as `effect_*.png`.
+        mark: name of a file that every earlier run wrote; without it, the files are others'.
+        keep_others: files of other names stay in the folder (`names` of `atomic_folder`).
+
+    Raises:
+        BadInput: the folder cannot be written, or something in it would be lost.
+        RunFailed: the disk is full.
+    """
+    path = Path(path)
+    place = _beside(path)
+    try:
+        held = sorted(name for name in os.listdir(path)
+                      if not _TEMPORARY.fullmatch(name) and name != ".DS_Store")
+    except (FileNotFoundError, NotADirectoryError):
+        held = []
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        raise BadInput(f"cannot write {path}: {getattr(error, 'strerror', None) or error}; "
+                       "choose another output folder") from None
+    is_earlier = mark is None or mark in held
+    lost = [name for name in held if (not keep_others if not _is_one_of(name, names)
+                                      else not is_earlier)]
+    if lost:
+        unmarked = "" if is_earlier else f", and no {mark} of an earlier run"
+        raise BadInput(f"{path} holds {', '.join(lost[:5])}{unmarked}, which the new content "
+                       "would erase; move it away or choose another output folder")
+    with _parent_of(path, only_tried=True), _reported(path), _temporary_folder(place):
+        pass
 
 
 @contextmanager
@@ -299,19 +339,66 @@ def _remove_stale(path: Path, aside: bool) -> None:
         os.close(handle)
 
 
-def _swap(new: Path, path: Path) -> None:
-    """Replace the folder `path` by `new`; restore the old one if that fails."""
-    if not path.exists():
-        os.replace(new, path)
-        return
-    with _temporary_folder(path, "-aside") as aside, deferred():
-        old = aside / path.name
-        os.replace(path, old)
+def _is_one_of(name: str, patterns: Collection[str]) -> bool:
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _beside(path: Path) -> Path:
+    """Return a path whose folder is for temporaries of the folder `path`: its parent, or itself.
+
+    The working folder, a link and a mount point (a volume of a container) cannot be renamed, nor
+    what lies in a folder without rights.
+    """
+    with _reported(path):
+        if path.exists() and not path.is_dir():
+            raise BadInput(f"{path} is a file; give the name of a folder")
+        stays = path.is_dir() and (
+            path.is_symlink() or path.is_mount() or path.samefile(os.curdir)
+            or not os.access(path.parent, os.W_OK))
+    return path / "inside" if stays else path
+
+
+def _swap(new: Path, path: Path, names: Collection[str] | None) -> None:
+    """Replace the folder `path`, or the `names` in it, by what is in `new`; all or nothing."""
+    inside = _beside(path) != path
+    if not inside:
         try:
-            os.replace(new, path)
+            os.replace(new, path)  # nothing is there, or an empty folder
+            return
         except OSError:
-            os.replace(old, path)
+            if not path.exists():
+                raise
+    base = path / "inside" if inside or names is not None else path
+    with (_temporary_folder(base, "-aside") as aside, deferred(),
+          _locked(base.parent)):  # another process may replace it, too
+        if base == path:
+            pairs = [(path, aside / path.name), (new, path)]
+        else:
+            fresh = os.listdir(new)
+            pairs = [(path / name, aside / name) for name in os.listdir(path)
+                     if not _TEMPORARY.fullmatch(name)
+                     and (name in fresh or names is None or _is_one_of(name, names))]
+            pairs += [(new / name, path / name) for name in fresh]
+        done = 0
+        try:
+            for source, target in pairs:
+                os.replace(source, target)
+                done += 1
+        except OSError:
+            for source, target in reversed(pairs[:done]):
+                os.replace(target, source)
             raise
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Wait until no other process replaces what is in a folder; a temporary is locked already."""
+    handle = None if fcntl is None or is_temporary(folder) else _lock(str(folder))
+    try:
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)
 
 
 @contextmanager

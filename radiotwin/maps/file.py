@@ -19,7 +19,7 @@ from xarray.conventions import decode_cf_variable
 from radiotwin.errors import BadInput, optional_package
 from radiotwin.io.array_stores import METADATA, check_hdf5, check_zarr
 from radiotwin.io.budgets import DEVICES, MAP_AXIS, MAP_STREAM_VALUES, MAP_VALUES
-from radiotwin.io.files import atomic_folder, require_writable
+from radiotwin.io.files import atomic_folder, require_folder, require_writable
 from radiotwin.io.forms import MAX_NAME, MAX_POSITION_M
 from radiotwin.io.inputs import open_input, parse_json
 from radiotwin.links.measurements import MAX_LEVEL_DB
@@ -177,14 +177,7 @@ def _require_zarr(path: Path) -> Any:
 def _check_zarr_target(path: Path) -> None:
     """Raise BadInput unless a Zarr folder can be written under a name."""
     _require_zarr(path)
-    if path.exists() and not path.is_dir():
-        raise BadInput(f"{path} is a file; a radio map in Zarr is a folder: choose another name")
-    if path.is_dir() and any(path.iterdir()) and not (path / METADATA).is_file():
-        raise BadInput(f"{path} is a folder with other content than a radio map; choose another "
-                       "name")
-    with atomic_folder(path.with_name(f"{path.name}.radiotwin-try")) as folder:
-        pass
-    folder.with_name(f"{path.name}.radiotwin-try").rmdir()
+    require_folder(path, ("*",), mark=METADATA)
 
 
 def _write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[MapBlock],

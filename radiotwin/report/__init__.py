@@ -8,6 +8,7 @@ from radiotwin.report.coverage_figures import write_coverage_pictures
 from radiotwin.report.folders import (
     Run,
     check_closeloop_folder,
+    check_comparison_folder,
     check_map_target,
     export_map,
     read_run,
@@ -17,7 +18,7 @@ from radiotwin.report.folders import (
 from radiotwin.report.map_figures import write_picture
 from radiotwin.report.run_page import write_report
 
-__all__ = ["Run", "check_closeloop_folder", "check_map_target",
+__all__ = ["Run", "check_closeloop_folder", "check_comparison_folder", "check_map_target",
            "closeloop_summary", "export_map", "read_run", "write_closeloop_figures",
            "write_closeloop_folder", "write_closeloop_page", "write_comparison_figures",
            "write_comparison_folder", "write_coverage_pictures", "write_picture", "write_report"]

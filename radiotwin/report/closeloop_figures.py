@@ -272,13 +272,10 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
         scene: whose buildings are drawn; None: no 3D map.
         report: content of `closeloop.json`.
         folder: for `groups.png`, `waterfall.png`, `residual_map.png`, `level_map.png`,
-            `drivers.png`, and `effect_RANK_NAME.png` for each effect; those of an earlier run
-            are removed.
+            `drivers.png`, and `effect_RANK_NAME.png` for each effect.
     """
     folder, data = Path(folder), collect(loop)
     background = MapBackground(data.links, scene)
-    for old in [*folder.glob("effect_*.png"), folder / "level_map.png", folder / "drivers.png"]:
-        old.unlink(missing_ok=True)
     save(groups_figure(data, report), folder / "groups.png")
     save(waterfall_figure(report), folder / "waterfall.png")
     save(residual_map_figure(data, background), folder / "residual_map.png")

@@ -20,7 +20,7 @@ from radiotwin.closeloop.run import Loop
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import PAGE_MAPS, PAGE_VALUES
 from radiotwin.io.cells import PLANNING, POSITION, RESIDUALS, TRACK, read_table
-from radiotwin.io.files import require_writable
+from radiotwin.io.files import atomic_folder, require_folder
 from radiotwin.io.forms import Record, read_record, validated
 from radiotwin.io.inputs import is_within, require_within
 from radiotwin.links.alignment import in_known_frame
@@ -46,6 +46,12 @@ TRUTH_MAPS = (f"truth{NETCDF}", f"truth{ZARR}")  # of a scene's folder
 OVERVIEW_LINKS = 20_000_000  # of all maps of a page that are in memory: 9 bytes each
 MEASUREMENTS = tuple(f"{folder}measurements{suffix}" for folder in ("", "survey/")
                      for suffix in (".csv", ".csv.gz", ".parquet"))
+PAGE = "report.html"  # of a run's folder
+CLOSELOOP_FILES = ("closeloop.json", "closeloop.html", "residuals.csv.gz", "twin", PAGE,
+                   "groups.png", "waterfall.png", "residual_map.png", "level_map.png",
+                   "drivers.png", "effect_*.png")
+COMPARISON_FILES = ("compare.json", "scores.csv", "locations.csv", "predictions.csv.gz", PAGE,
+                    "scatter.png", "estimates.png", "maps.png")
 CONTENT = ("scene.toml, twin.json, closeloop.json, compare.json, config.json of a planning run, or "
            "measurements.csv")
 
@@ -54,9 +60,9 @@ def check_closeloop_folder(folder: Path | str) -> None:
     """Check that the result of a close-loop can be written to a folder, before it is made.
 
     Raises:
-        BadInput: it cannot be written, or its `twin` is not a twin's folder.
+        BadInput: it cannot be written, or something that no close-loop wrote would be lost.
     """
-    require_writable(Path(folder) / "closeloop.json")
+    require_folder(folder, CLOSELOOP_FILES, "closeloop.json", keep_others=True)
     check_twin_target(Path(folder) / "twin")
 
 
@@ -71,7 +77,7 @@ def write_closeloop_folder(loop: Loop, scene: Scene | None, folder: Path | str, 
     Args:
         loop: result to write.
         scene: it was found in; None: there was none.
-        folder: to write; other files in it are kept.
+        folder: to write; an older result in it is replaced as a whole, other files are kept.
         title: of the page.
         inputs: names of measurements and scene, for `closeloop.json`.
 
@@ -84,12 +90,22 @@ def write_closeloop_folder(loop: Loop, scene: Scene | None, folder: Path | str, 
     folder = Path(folder)
     check_closeloop_folder(folder)
     report = make_report(loop) | ({} if inputs is None else {"inputs": inputs})
-    write_closeloop_figures(loop, scene, report, folder)
-    write_report(report, folder / "closeloop.json")
-    residuals(loop).save(folder / "residuals.csv.gz")
-    corrected_twin(loop, scene).save(folder / "twin")
-    write_closeloop_page(report, folder, title)
+    with atomic_folder(folder, CLOSELOOP_FILES) as temporary:
+        write_closeloop_figures(loop, scene, report, temporary)
+        write_report(report, temporary / "closeloop.json")
+        residuals(loop).save(temporary / "residuals.csv.gz")
+        corrected_twin(loop, scene).save(temporary / "twin")
+        write_closeloop_page(report, temporary, title)
     return report
+
+
+def check_comparison_folder(folder: Path | str) -> None:
+    """Check that a comparison can be written to a folder, before it is made.
+
+    Raises:
+        BadInput: it cannot be written, or something that no comparison wrote would be lost.
+    """
+    require_folder(folder, COMPARISON_FILES, "compare.json", keep_others=True)
 
 
 def write_comparison_folder(comparison: Comparison, scene: Scene, folder: Path | str,
@@ -99,11 +115,13 @@ def write_comparison_folder(comparison: Comparison, scene: Scene, folder: Path |
     Args:
         comparison: result to write.
         scene: of the measurements.
-        folder: to write; other files in it are kept.
+        folder: to write; an older result in it is replaced as a whole, other files are kept.
         truth: the map that was judged on; None: there was none.
     """
-    write_comparison(comparison, scene, folder)
-    write_comparison_figures(comparison, scene, truth, Path(folder))
+    check_comparison_folder(folder)
+    with atomic_folder(folder, COMPARISON_FILES) as temporary:
+        write_comparison(comparison, scene, temporary)
+        write_comparison_figures(comparison, scene, truth, temporary)
 
 
 def check_map_target(path: Path | str, scene: Scene) -> None:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from radiotwin.errors import BadInput
+from radiotwin.io.files import require_folder
 from radiotwin.io.forms import MAX_COORDINATE_M
 from radiotwin.io.inputs import is_within
 from radiotwin.runtime.console import progress
@@ -194,17 +195,7 @@ def _meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
 
 def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | None = None) -> None:
     """Raise BadInput if writing a folder would erase more than the allowed names, or the source."""
-    try:
-        held = os.listdir(folder)
-    except (FileNotFoundError, NotADirectoryError):
-        held = []
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        raise BadInput(f"cannot write {folder}: {getattr(error, 'strerror', None) or error}; "
-                       "choose another output folder") from None
-    foreign = sorted(set(held) - allowed)
-    if foreign:
-        raise BadInput(f"{folder} holds {', '.join(foreign[:5])}, which the new content would "
-                       "erase; move it away or choose another output folder")
+    require_folder(folder, allowed)
     if source is not None and is_within(source, folder):
         raise BadInput(f"{source} lies in {folder}, which the new scene would replace; choose "
                        "another output folder")

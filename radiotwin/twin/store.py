@@ -17,7 +17,7 @@ from radiotwin.effects.base import Effect, Levels
 from radiotwin.effects.params import Seconds
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
-from radiotwin.io.files import require_writable
+from radiotwin.io.files import require_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import parse_json
 from radiotwin.links.declared import NOTHING, Declared, Radio
@@ -217,12 +217,7 @@ def check_twin_target(folder: Path) -> None:
     Raises:
         BadInput: it cannot.
     """
-    require_writable(folder / TWIN_FILE)
-    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    foreign = sorted(name for name in names - TWIN_FILES if not name.startswith("."))
-    if foreign:
-        raise BadInput(f"{folder} holds {foreign[0]}, which is not a twin's and would be lost; "
-                       "choose another output folder, or move it away")
+    require_folder(folder, TWIN_FILES, mark=TWIN_FILE)
 
 
 def _declared_record(declared: Declared) -> tuple[dict[str, Any] | None, dict[str, np.ndarray]]:

@@ -74,6 +74,7 @@ def fill(disk, free, *names):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     (disk / "filler").touch()  # what is written into a folder that exists takes room as well
     for name in {"old.csv", "old.nc", *names}:
+        (disk / name).parent.mkdir(exist_ok=True)
         (disk / name).write_bytes(OLD)
     with contextlib.suppress(OSError), open(disk / "filler", "wb", buffering=0) as file:
         while file.write(bytes(4096)):
@@ -110,7 +111,7 @@ COMMANDS = [
     *(f"map twin --scene scene -o {{disk}}/{name}" for name in ("new.zarr", *(f"old{suffix}" for suffix in (*EXPORTERS, ".png") if suffix != ".zarr"))),
     *(f"export-scene scene -o {{disk}}/{name}" for name in ("new", "old.glb", "old.gltf", "old.obj")),
     "report twin --scene scene -o {disk}/old.html", "locate links/measurements.csv --twin corrected -o {disk}/old.csv",
-    "demo -o {disk}/new",
+    "coverage scene --tx-power-dbm 20 --step 20 -o {disk}/new", "demo -o {disk}/new",
 ]
 
 
@@ -129,12 +130,14 @@ def test_the_old_output_stays(run, disk, inputs, command, free):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("free", [0, 24 * 1024, 160 * 1024])
-@pytest.mark.parametrize("command", ["compare m.csv --scene scene -o {disk}/new",
-                                     "close-loop m.csv --scene scene --base log-distance -o {disk}/new"])
-def test_what_takes_long_says_so_in_the_end(run, disk, inputs, command, free):
-    fill(disk, free)
+@pytest.mark.parametrize("command, names", [
+    ("compare m.csv --scene scene -o {disk}/run", ("compare.json", "scatter.png", "predictions.csv.gz")),
+    ("close-loop m.csv --scene scene --base log-distance -o {disk}/run", ("closeloop.json", "closeloop.html", "effect_3_foliage.png"))])
+def test_an_older_folder_stays_as_a_whole(run, disk, inputs, command, names, free):
+    fill(disk, free, *(f"run/{name}" for name in (*names, "notes.txt")))
+    before = content(disk)
     assert_says_so(run(command.format(disk=disk), inputs))
-    assert_all_is_whole(disk)
+    assert content(disk) == before
 
 
 PLANNED = ("config.json", "twin", "checkpoint.safetensors", "metrics.csv", "tensorboard", "comparison.csv", "curve.png",

@@ -18,6 +18,7 @@ from radiotwin.io.files import (
     atomic_file,
     atomic_folder,
     atomic_path,
+    require_folder,
     require_writable,
     scratch_folder,
 )
@@ -61,6 +62,113 @@ def test_a_folder_replaces_the_old_one_whole(tmp_path):
         (temporary / "new").touch()
     assert [path.name for path in target.iterdir()] == ["new"]
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+NAMES = ("result.json", "effect_*.png")
+
+
+def content(folder):
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(params=["beside", "working folder", "link", "volume"])
+def older(request, tmp_path, monkeypatch):
+    """An older result with a file of the user's, in a folder that can, or cannot, be renamed."""
+    folder = tmp_path / "real"
+    (folder / "twin").mkdir(parents=True)
+    for name in ("result.json", "effect_1.png", "notes.txt", "twin/twin.json"):
+        (folder / name).write_text("old")
+    if request.param == "working folder":
+        monkeypatch.chdir(folder)
+        return Path(".")
+    if request.param == "link":
+        (tmp_path / "link").symlink_to(folder)
+        return tmp_path / "link"
+    if request.param == "volume":
+        monkeypatch.setattr(Path, "is_mount", lambda path: path == folder)
+    return folder
+
+
+def test_of_a_folder_what_is_written_is_replaced_as_a_whole_and_the_rest_stays(older, tmp_path):
+    before = content(older)
+    with pytest.raises(ZeroDivisionError), atomic_folder(older, (*NAMES, "twin")) as temporary:
+        (temporary / "result.json").write_text("half")
+        1 / 0
+    assert content(older) == before
+    with atomic_folder(older, (*NAMES, "twin")) as temporary:
+        (temporary / "twin").mkdir()
+        for name in ("result.json", "twin/channel.pt"):
+            (temporary / name).write_text("new")
+    assert content(tmp_path / "real") == {"result.json": "new", "twin/channel.pt": "new", "notes.txt": "old"}
+    assert {path.name for path in tmp_path.iterdir()} <= {"real", "link"}
+
+
+def test_a_folder_that_cannot_be_renamed_is_replaced_too(older, tmp_path):
+    with atomic_folder(older) as temporary:
+        (temporary / "new").write_text("new")
+    assert content(tmp_path / "real") == {"new": "new"}
+
+
+@pytest.mark.parametrize("number", range(6))  # of renames: three away, three in
+def test_a_failed_rename_in_a_folder_leaves_the_old_content(tmp_path, monkeypatch, number):
+    older = tmp_path / "out"
+    older.mkdir()
+    for name in ("a", "b", "c", "mine"):
+        (older / name).write_text("old")
+    replace, done = os.replace, []
+
+    def refuse_one(source, target):
+        if target == older:
+            raise OSError(errno.ENOTEMPTY, "Directory not empty")
+        done.append(source)
+        if len(done) == number + 1:
+            raise OSError(errno.EIO, "Input/output error")
+        replace(source, target)
+
+    monkeypatch.setattr("os.replace", refuse_one)
+    with pytest.raises(RunFailed, match="out: Input/output error; what was there before is unchanged"), \
+            atomic_folder(older, "abc") as temporary:
+        for name in ("a", "b", "d"):
+            (temporary / name).write_text("new")
+    monkeypatch.undo()
+    assert content(tmp_path) == {f"out/{name}": "old" for name in ("a", "b", "c", "mine")}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="folders are locked on POSIX only")
+@pytest.mark.parametrize("names", [None, NAMES])
+def test_two_that_write_a_folder_at_once_leave_that_of_one(tmp_path, names):
+    program = ("import sys; from radiotwin.io.files import *\n"
+               "for number in range(60):\n"
+               "    with atomic_folder(sys.argv[1], eval(sys.argv[3])) as folder:\n"
+               "        for name in ('result.json', 'effect_1.png', 'effect_2.png'):\n"
+               "            (folder / name).write_text(sys.argv[2])")
+    both = [subprocess.Popen([sys.executable, "-c", program, tmp_path / "out", who, repr(names)]) for who in "ab"]
+    assert [each.wait() for each in both] == [0, 0]
+    assert len(set(content(tmp_path / "out").values())) == 1 and len(content(tmp_path)) == 3
+
+
+def test_a_folder_with_files_that_would_be_lost_is_refused(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    require_folder(tmp_path, NAMES, "result.json", keep_others=True)
+    with pytest.raises(BadInput, match="holds notes.txt, which the new content would erase; move it away"):
+        require_folder(tmp_path, NAMES)
+    (tmp_path / "effect_1.png").touch()
+    with pytest.raises(BadInput, match="holds effect_1.png, and no result.json of an earlier run, which"):
+        require_folder(tmp_path, NAMES, "result.json", keep_others=True)
+    (tmp_path / "result.json").touch()
+    require_folder(tmp_path, NAMES, "result.json", keep_others=True)
+    (tmp_path / "notes.txt").unlink()
+    require_folder(tmp_path, NAMES, "result.json")
+    with pytest.raises(BadInput, match="is a file; give the name of a folder"):
+        require_folder(tmp_path / "result.json", NAMES)
+    with pytest.raises(BadInput, match="cannot write"):
+        require_folder("a" * 300, NAMES)
+
+
+def test_what_fails_in_a_folder_is_named_as_it_would_be_there(tmp_path):
+    with pytest.raises(RunFailed, match=f"cannot write {tmp_path}/out/a.csv: No space left"), \
+            atomic_folder(tmp_path / "out") as temporary, atomic_path(temporary / "a.csv"):
+        raise OSError(errno.ENOSPC, "No space left on device")
 
 
 def test_what_cannot_be_written_is_bad_input(tmp_path):
