@@ -150,15 +150,18 @@ class CorrelatedEvidence:
         share = 1.0 - np.exp(theta[0]) / variance  # of the field
         value, left, freedom = np.log(variance).sum() + (z * z / variance).sum(), z, np.zeros(2)
         if columns.shape[1]:
-            weighted = columns.T / variance
-            inner = weighted @ columns
+            # A matrix times its own transpose takes half of the time of another product
+            root = np.sqrt(variance)
+            weighted = columns.T / root
+            inner = weighted @ weighted.T
             factor = cho_factor(inner + np.diag(1.0 / np.square(prior_sd)), lower=True)
-            moments = weighted @ z
+            moments = weighted @ (z / root)
             best = cho_solve(factor, moments)
             value += 2 * np.log(np.diag(factor[0])).sum() + 2 * np.log(prior_sd).sum()
             value -= moments @ best
             left = z - columns @ best
-            of_field = (weighted * share) @ columns
+            weighted *= np.sqrt(share)
+            of_field = weighted @ weighted.T
             freedom = np.array([np.trace(cho_solve(factor, each)) for each in (inner, of_field)])
         excess = 1.0 - left * left / variance
         slope = np.array([excess.sum(), share @ excess]) - freedom

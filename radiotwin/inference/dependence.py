@@ -55,11 +55,12 @@ def permutation_p_value(level: np.ndarray, z: np.ndarray, series: Series,
     neighbours stay neighbours; else whole series swap their means. (`scipy.stats.permutation_test`
     knows neither.) Sequential (Besag and Clifford 1991, 'Sequential Monte Carlo p-values').
     """
-    observed = _between(level, z)
-    permuted = _rotated if _changes_within(level[series.order], series.starts) else _swapped
+    level, z, count = level[series.order], z[series.order], np.maximum(np.bincount(level), 1)
+    observed = _between(level, z, count)
+    permuted = _rotated if _changes_within(level, series.starts) else _swapped
     stronger, tried = 0, 0
     while tried < PERMUTATIONS and stronger < MIN_STRONGER:
-        stronger += _between(level, permuted(z, series, rng)) >= observed
+        stronger += _between(level, permuted(z, series.starts, rng), count) >= observed
         tried += 1
     return stronger / tried if stronger == MIN_STRONGER else (stronger + 1) / (tried + 1)
 
@@ -70,9 +71,8 @@ def holm(p_values: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(np.minimum(p_values * factor, 1.0))
 
 
-def _between(level: np.ndarray, z: np.ndarray) -> float:
-    """Return the sum of squares between the bins."""
-    count = np.maximum(np.bincount(level), 1)
+def _between(level: np.ndarray, z: np.ndarray, count: np.ndarray) -> float:
+    """Return the sum of squares between the bins of `count` values."""
     return float((np.bincount(level, weights=z) ** 2 / count).sum())
 
 
@@ -83,21 +83,17 @@ def _changes_within(level: np.ndarray, starts: np.ndarray) -> bool:
     return bool(np.mean(changes > 0) > 0.5)
 
 
-def _rotated(z: np.ndarray, series: Series, rng: np.random.Generator) -> np.ndarray:
-    starts, length = series.starts, np.diff(series.starts)
+def _rotated(z: np.ndarray, starts: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return the values, in the order of the series, each of which is rotated."""
+    length = np.diff(starts)
     shift = (rng.random(len(length)) * length).astype(int)
-    place = np.arange(len(z)) - np.repeat(starts[:-1], length)
-    source = np.repeat(starts[:-1], length) \
-        + (place + np.repeat(shift, length)) % np.repeat(length, length)
-    result = np.empty_like(z)
-    result[series.order] = z[series.order][source]
-    return result
+    return np.concatenate([part for start, end, by in zip(
+        starts[:-1].tolist(), starts[1:].tolist(), shift.tolist(), strict=True)
+        for part in (z[start + by:end], z[start:start + by])])
 
 
-def _swapped(z: np.ndarray, series: Series, rng: np.random.Generator) -> np.ndarray:
+def _swapped(z: np.ndarray, starts: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the values with the series' means elsewhere; what is around them stays."""
-    starts, length = series.starts, np.diff(series.starts)
-    means = np.add.reduceat(z[series.order], starts[:-1]) / length
-    result = np.empty_like(z)
-    result[series.order] = z[series.order] + np.repeat(rng.permutation(means) - means, length)
-    return result
+    length = np.diff(starts)
+    means = np.add.reduceat(z, starts[:-1]) / length
+    return z + np.repeat(rng.permutation(means) - means, length)

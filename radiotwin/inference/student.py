@@ -136,9 +136,11 @@ def censored_nll(level_db: np.ndarray, limit_db: np.ndarray, mean_db: np.ndarray
         (n,)
     """
     blank = np.isnan(level_db)
-    _, of_states = _of_states(level_db, mean_db, scale_db, dof, losses)
-    value = np.log(scale_db) - np.logaddexp.reduce(of_states) \
-        - np.log1p(-np.asarray(losses.blank, dtype=float))
+    if np.any(losses.drop):
+        density = np.logaddexp.reduce(_of_states(level_db, mean_db, scale_db, dof, losses)[1])
+    else:  # one state; a blank's is replaced below
+        density = log_density((level_db - mean_db) / scale_db, dof)
+    value = np.log(scale_db) - density - np.log1p(-np.asarray(losses.blank, dtype=float))
     if blank.any():
         own = losses.select(blank)
         known = np.isfinite(limit_db[blank])
@@ -158,8 +160,11 @@ def derivatives(level_db: np.ndarray, limit_db: np.ndarray, mean_db: np.ndarray,
         (n,) slope in the mean, (n,) curvature in it, (n,) slope in the logarithm of the scale.
     """
     blank = np.isnan(level_db)
-    z, of_states = _of_states(level_db, mean_db, scale_db, dof, losses)
-    share = np.exp(of_states - np.logaddexp.reduce(of_states))
+    if np.any(losses.drop):
+        z, of_states = _of_states(level_db, mean_db, scale_db, dof, losses)
+        share = np.exp(of_states - np.logaddexp.reduce(of_states))
+    else:
+        z, share = np.where(blank, 0.0, (level_db - mean_db) / scale_db)[None], np.ones(1)
     weight = share * (dof + 1) / (dof + z * z)
     slope, curvature = (weight * z).sum(axis=0) / scale_db, weight.sum(axis=0) / scale_db**2
     scale_slope = (weight * z * z).sum(axis=0) - 1.0

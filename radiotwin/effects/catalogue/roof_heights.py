@@ -83,7 +83,7 @@ class RoofCrossings(NamedTuple):
         """Return the loss over each roof alone, by two edges (ITU-R P.526) [dB].
 
         Args:
-            raised_m: (r,) how much higher the roofs are than on the map [m].
+            raised_m: (r,), or (…, 1), how much higher the roofs are than on the map [m].
             wavelength_m: of the radio [m].
             rows: r pairs.
         """
@@ -311,9 +311,8 @@ class _Search:
         without_db = self._loss_db.copy()
         without_db[mine] = 0.0
         others_db = self._most_db(without_db)[link]
-        after_db = np.array([_level_db(np.maximum(others_db, self._ways.loss_db(
-            offset_m, self._wavelength_m, mine)), self._contrast_db[link])
-            for offset_m in offsets_m])
+        loss_db = self._ways.loss_db(offsets_m[:, None], self._wavelength_m, mine)
+        after_db = _level_db(np.maximum(others_db, loss_db), self._contrast_db[link])
         telling = np.ptp(after_db, axis=0) > TELLING_DB
         if telling.sum() < MIN_LINKS:
             return 0.0, prior_m

@@ -236,7 +236,9 @@ class ResidualField:
 
     def _correlation(self, distance_m: np.ndarray, kind: np.ndarray,
                      other: np.ndarray) -> np.ndarray:
-        correlation = self.share * np.exp(-distance_m / self.length_m)
+        correlation = distance_m / -self.length_m
+        np.exp(correlation, out=correlation)
+        correlation *= self.share
         if self.kind_share:
             return correlation + self.kind_share * (kind[:, None] == other[None])
         return correlation
@@ -244,7 +246,7 @@ class ResidualField:
     def _covariance(self, field: _Field, distance_m: np.ndarray) -> np.ndarray:
         covariance = self._correlation(distance_m, field.kind, field.kind)
         nugget = (1 - self.share - self.kind_share) / field.count
-        covariance[np.diag_indices(len(covariance))] += nugget + 1e-8  # keeps it positive definite
+        covariance.ravel()[::len(covariance) + 1] += nugget + 1e-8  # keeps it positive definite
         return covariance
 
     def _fit_correlation(self, fields: list[_Field], kinds: bool) -> None:
@@ -265,8 +267,10 @@ class ResidualField:
             assign(theta)
             value = 0.0
             for field, distance_m in zip(fields, distances_m, strict=True):
-                factor = cholesky(self._covariance(field, distance_m), lower=True, overwrite_a=True)
-                whitened = solve_triangular(factor, field.residual, lower=True)
+                # It is symmetric: transposed it needs no copy
+                factor = cholesky(self._covariance(field, distance_m).T, lower=True,
+                                  overwrite_a=True, check_finite=False)
+                whitened = solve_triangular(factor, field.residual, lower=True, check_finite=False)
                 value += 0.5 * whitened @ whitened + np.log(np.diag(factor)).sum()
             return value
 
