@@ -11,6 +11,8 @@ from radiotwin.cli.options import parse_origin
 from radiotwin.errors import BadInput
 from radiotwin.runtime.console import print_rows, say
 
+_BAD_ROWS = 20  # that are printed
+
 if TYPE_CHECKING:
     from radiotwin.importing.settings import Settings
 
@@ -36,7 +38,8 @@ def import_(
         metavar="COLUMN=A|B", help="Keep the rows in which a column is one of these; may be "
                                    "repeated.")] = None,
     delimiter: Annotated[str | None, typer.Option(
-        help="Of a text: , ; | or tab [found].")] = None,
+        help="Of a text: , ; | tab, space (any number of blanks) or spaces (two and more) "
+             "[found].")] = None,
     encoding: Annotated[str | None, typer.Option(
         help="Of a text, such as cp1252 [found].")] = None,
     decimal: Annotated[str | None, typer.Option(help="Decimal mark, . or , [found].")] = None,
@@ -46,6 +49,11 @@ def import_(
         metavar="NAME,…", help="Names of the columns of a text without a header.")] = None,
     lines_before_header: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
     lines_after_table: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
+    skip_bad_rows: Annotated[int | None, typer.Option(
+        metavar="N", help="Leave out rows that cannot be read, and list them, if they are not more "
+                          "than N [0].")] = None,
+    no_quotes: Annotated[bool, typer.Option(
+        "--no-quotes", help="Quotation marks of a text are letters.")] = False,
     level_unit: Annotated[str | None, typer.Option(
         help="dBm, mW, W (received power), or dB (gain).")] = None,
     level_offset_db: Annotated[float | None, typer.Option(
@@ -111,7 +119,9 @@ def import_(
     given: dict[str, Any] = {
         "format": format, "only": _choices(only), "sheet": sheet,
         "encoding": encoding, "decimal": decimal,
-        "delimiter": "\t" if delimiter in ("tab", "\\t") else delimiter,
+        "delimiter": {"tab": "\t", "\\t": "\t", "space": " ", "spaces": "  "}.get(
+            delimiter or "", delimiter),
+        "skip_bad_rows": skip_bad_rows, "quotes": False if no_quotes else None,
         "lines_before_header": lines_before_header, "lines_after_table": lines_after_table,
         "header": header.split(",") if header else None,
         "level_offset_db": level_offset_db,
@@ -167,6 +177,12 @@ def _print(report: dict[str, Any]) -> None:
     if report["origin"]:
         say("origin: latitude {latitude_deg}, longitude {longitude_deg}, ground at {altitude_m} m"
             .format(**report["origin"]))
+    bad = report["bad_rows"]
+    for row in bad[:_BAD_ROWS]:
+        say(f"bad row left out: {row['row']}, {row['column'] or 'all'}: {row['cell']} "
+            f"{row['reason']}")
+    if len(bad) > _BAD_ROWS:
+        say(f"and {len(bad) - _BAD_ROWS} more bad rows: all are in import.json")
     for text in report["warnings"]:
         say(f"note: {text}")
 

@@ -8,8 +8,8 @@ import csv
 import io
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from datetime import date, datetime, time
 from pathlib import Path
 from typing import IO, Any
@@ -20,10 +20,10 @@ import pandas as pd
 from radiotwin.errors import BadInput, optional_package
 from radiotwin.importing.log_files import BINARIES, TEXTS, Lines, LogFile, open_archive, open_member
 from radiotwin.importing.settings import Settings
-from radiotwin.importing.source import Source
-from radiotwin.importing.text_table import find_dialect, read_text_table
+from radiotwin.importing.source import BadRows, Source
+from radiotwin.importing.text_table import find_dialect, has_other_lines, read_text_table
 from radiotwin.io.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, FILE_BYTES, ROWS
-from radiotwin.io.cells import listed, read_cells
+from radiotwin.io.cells import RaggedRows, listed, read_cells
 from radiotwin.io.inputs import parse_json
 
 LISTS = ("rxInfo", "rx_metadata", "rxpk", "gateways")
@@ -218,10 +218,11 @@ class Expected:
 
 
 def read_source(file: LogFile | Path | str, settings: Settings | None = None,
-                expected: Expected = Expected()) -> Source:
+                expected: Expected = Expected(), bad_rows: BadRows | None = None) -> Source:
     """Open a file of measurements of one of the formats of `log_files`.
 
-    What the settings do not declare of a text, and what is expected to be in it, is found.
+    What the settings do not declare of a text, and what is expected to be in it, is found. Bad rows
+    are noted where a user may allow them, see `Source`.
 
     Raises:
         BadInput: another format, unreadable, or without rows.
@@ -234,23 +235,23 @@ def read_source(file: LogFile | Path | str, settings: Settings | None = None,
         source = Source(str(file), _read_geojson(file), lambda index: f"feature {index + 1}")
     elif file.suffix == ".xlsx" and file.member is None:
         settings = (settings or Settings()).model_copy(update={"decimal": ".", "delimiter": ","})
-        source = _read_text(_read_sheet(file, settings.sheet), settings, expected)
+        source = _read_text(_read_sheet(file, settings.sheet), settings, expected, bad_rows)
     elif file.suffix in TEXTS:
-        source = _read_text(file, settings or Settings(), expected)
+        source = _read_text(file, settings or Settings(), expected, bad_rows)
     else:
         raise BadInput(f"{file}: unknown format; allowed are {', '.join((*TEXTS, *BINARIES))}, and "
                        "the first ones with .gz")
     if not len(source):
         raise BadInput(f"{file}: has no rows; it needs at least one measurement")
-    return source
+    return replace(source, bad_rows=bad_rows)
 
 
-def _read_text(file: LogFile, settings: Settings, expected: Expected) -> Source:
+def _read_text(file: LogFile, settings: Settings, expected: Expected,
+               bad_rows: BadRows | None) -> Source:
     """Read a text: by the faster parser where it is plain CSV."""
     first = _first_line(file)
     kind = next((each for each in expected.without_header
                  if re.fullmatch(each.first_line, first)), None)
-    notes: tuple[str, ...] = ()
     if first.startswith("{"):
         table, lines = _read_json_lines(file)
     elif kind is not None and kind.read is not None:
@@ -259,11 +260,18 @@ def _read_text(file: LogFile, settings: Settings, expected: Expected) -> Source:
         names = settings.header or (list(kind.names) if kind is not None else [])
         dialect = find_dialect(file, settings, expected.columns, names)
         description = dialect.described()
-        if not description and file.member is None and file.suffix == ".csv":
-            return Source(file.path, read_cells(file.path), lambda index: f"row {index + 2}")
-        notes = (f"{file.name}: {description}",) * bool(description)
-        table, lines = read_text_table(file, dialect)
-    return Source(str(file), table, lambda index: f"line {lines[index]}", notes)
+        plain = dialect.quotes and not (description or dialect.has_comments)
+        if plain and file.member is None and file.suffix == ".csv":
+            with suppress(RaggedRows):
+                cells = read_cells(file.path)
+                if not has_other_lines(cells):
+                    return Source(file.path, cells, lambda index: f"row {index + 2}")
+        text = read_text_table(file, dialect, bad_rows)
+        notes = (*(f"{file.name}: {description}",) * bool(description), *text.notes)
+        left_out = (("bad row", len(text.bad), f"line {text.bad[0]}"),) if text.bad else ()
+        return Source(str(file), text.cells, lambda index: f"line {text.lines[index]}", notes,
+                      text.fields, left_out)
+    return Source(str(file), table, lambda index: f"line {lines[index]}")
 
 
 def _first_line(file: LogFile) -> str:

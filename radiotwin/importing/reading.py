@@ -1,13 +1,15 @@
 """The files of an import as links, each by its own format: a row per receiver, device, reading."""
 
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from radiotwin.display import count as counted
 from radiotwin.errors import BadInput
 from radiotwin.importing.formats import FORMATS, expected, find_format, format_named
 from radiotwin.importing.log_files import LogFile, flight_names
@@ -22,7 +24,16 @@ from radiotwin.importing.settings import (
     Wide,
     merged,
 )
-from radiotwin.importing.source import ALWAYS, Problems, Source, Tally, as_text, columns_of
+from radiotwin.importing.source import (
+    ALWAYS,
+    BadRows,
+    Problems,
+    Source,
+    Tally,
+    are_few,
+    as_text,
+    columns_of,
+)
 from radiotwin.importing.units import LEVEL_COLUMN, calendar_days, in_metres, read_levels, seconds
 from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, listed, shown
@@ -63,6 +74,10 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
         source.require({name: spec for name, spec in columns.items()
                         if spec not in (BY_DAY, BY_POSITION)})
     shared = _shared(source, columns, settings, problems)
+    bad_rows = source.bad_rows or BadRows()
+    if not problems:
+        shared = bad_rows.without(shared, tally, len(levels), source.where)
+        source = source.select(source.table.index.isin(shared.index))
     ROWS.check(len(source) * len(levels), f"{source.path}: rows times columns of levels")
     parts = []
     for level in levels:
@@ -120,7 +135,7 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
             links[name] = source.names(spec, name)
             nobody = (links[name] == "").to_numpy()
             links = tally.drop(links, nobody, f"no {name}", spec, source.where)
-            source = Source(source.path, source.table[~nobody], source.where)
+            source = source.select(~nobody)
         else:
             if spec and (fault := name_fault(spec)):
                 raise BadInput(f"{source.path}: {name} {shown(spec)} of column {level.spec} "
@@ -131,10 +146,12 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
         offset_db = offset_db + np.minimum(links.pop("snr").fillna(0.0).to_numpy(), 0.0)
     levels = read_levels(source, level.spec, settings, offset_db)
     links["level_db"] = levels.db
-    unmeasured = levels.not_measured
-    links = tally.drop(links, unmeasured, "not measured", level.spec, source.where)
-    links = tally.drop(links, levels.impossible[~unmeasured], "impossible level", level.spec,
-                       source.where)
+    links["reason"] = np.select([levels.not_measured, levels.impossible],
+                                ["not measured", "impossible level"], "")
+    links = (source.bad_rows or BadRows()).without(links, tally, 1, source.where)
+    for reason in ("not measured", "impossible level"):
+        links = tally.drop(links, links["reason"] == reason, reason, level.spec, source.where)
+    links = links.drop(columns="reason")
     for name in NAMES:
         if name in links:
             links = tally.drop(links, links[name] == "", f"no {name}",
@@ -142,7 +159,8 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
     for prefix in ("", "device_"):
         if {prefix + name for name in LIMITS_DEG} <= set(links):
             for name in LIMITS_DEG:
-                _check_degrees(source, links, prefix, name, _spec(settings, level, prefix + name))
+                links = _without_no_degrees(source, links, prefix, name,
+                                            _spec(settings, level, prefix + name), tally)
             no_fix = (links[prefix + "latitude"] == 0) & (links[prefix + "longitude"] == 0)
             reason = f"{prefix}latitude, longitude 0, 0 (no fix)".replace("_", " ")
             links = tally.drop(links, no_fix, reason, _spec(settings, level, prefix + "latitude"),
@@ -257,16 +275,20 @@ def _spec(settings: Settings, level: LevelColumn, name: str) -> str:
     return level.own.get(own) or getattr(settings.columns, name, None) or name
 
 
-def _check_degrees(source: Source, links: pd.DataFrame, prefix: str, name: str, spec: str) -> None:
+def _without_no_degrees(source: Source, links: pd.DataFrame, prefix: str, name: str, spec: str,
+                        tally: Tally) -> pd.DataFrame:
+    """Return links without the few whose latitude or longitude is none; many are refused."""
     limit = LIMITS_DEG[name]
     bad = links[prefix + name].abs() > limit
-    if bad.any():
+    if not are_few(bad.sum(), len(bad)):
         longitude = links[prefix + "longitude"].abs()
         swapped = (name == "latitude" and bad.mean() > 0.5
                    and (longitude <= LIMITS_DEG["latitude"]).all())
         hint = "; are latitude and longitude swapped in the mapping?" if swapped else ""
         source.refuse(spec, links[prefix + name], bad,
                       f"is no {name}; allowed are -{limit:g} to {limit:g} degrees{hint}")
+        return (source.bad_rows or BadRows()).without(links, tally, 1, source.where)
+    return tally.drop(links, bad, f"no {name} (beyond {limit:g}°)", spec, source.where)
 
 
 @dataclass(frozen=True)
@@ -282,6 +304,7 @@ class Logs:
         files: name, rows, readings and format of each file, for the report.
         notes: on how files were read.
         format: of all files, or None.
+        bad_rows: those that were left out, as of `BadRows`.
     """
 
     source: Source
@@ -292,6 +315,7 @@ class Logs:
     files: list[dict[str, Any]]
     notes: list[str]
     format: str | None
+    bad_rows: list[dict[str, str]]
 
 
 def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
@@ -303,7 +327,7 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
     Raises:
         BadInput: all that is wrong, with file, row and column.
     """
-    problems = Problems()
+    problems, bad_rows = Problems(), BadRows(settings.skip_bad_rows)
     parts: list[pd.DataFrame] = []
     records: list[dict[str, Any]] = []
     wheres: list[tuple[int, Callable[[int], str]]] = []
@@ -315,18 +339,22 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
     by_default = BY_FILE if len(files) > 1 else "always flight"
     for file, name in zip(files, flight_names(files)):
         on_progress(f"reading {file.name}" if len(files) > 1 else "reading")
+        bad_rows.prefix = f"{file.name}: " * (len(files) > 1)
         with problems.noted():
-            source = read_source(file, settings, may_be)
+            source = read_source(file, settings, may_be, bad_rows)
             own, format_name, caution = _settings_of(source, settings, by_default)
-            source = _numbered_from(source, rows, file.name if len(files) > 1 else "")
+            source = _numbered_from(source, rows, bad_rows.prefix)
             wheres.append((rows, source.where))
-            count = len(source)
-            rows += count
+            rows += len(source)
             ROWS.check(rows, "all files")
+            source = _without_cut_rows(source, own)
+            count = len(source) + sum(number for _, number, _ in source.left_out)
             on_progress("links")
             links, per_row = _links_of(source, own, tally, problems, name)
             if not per_row:
                 continue
+            for reason, number, place in source.left_out:
+                tally.count(reason, "", number * per_row, place)
             if own.read_at == "device":
                 links[READS] = 1.0
             parts.append(links)
@@ -347,9 +375,10 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
     whole = Source(str(label), links.iloc[:0], where)
     if len(files) > 1:
         links = _without_copies(whole, links, starts, tally)
-    return Logs(whole, links, level_column, rows,
+    return Logs(whole, links, level_column, sum(record["rows"] for record in records),
                 sum(record["readings"] for record in records), records,
-                list(dict.fromkeys(notes)), formats.pop() if len(formats) == 1 else None)
+                list(dict.fromkeys(notes)), formats.pop() if len(formats) == 1 else None,
+                list(bad_rows.rows.values()))
 
 
 def _declared_columns(settings: Settings) -> set[str]:
@@ -385,12 +414,51 @@ def _settings_of(source: Source, settings: Settings,
     return own, found.name if found else None, found.caution if found else ""
 
 
-def _numbered_from(source: Source, first: int, name: str) -> Source:
-    """Return the same file with rows numbered from `first`, and its name in every place."""
-    prefix = f"{name}: " * bool(name)
+def _numbered_from(source: Source, first: int, prefix: str) -> Source:
+    """Return the same file with rows numbered from `first`, and a prefix of every place."""
     own = source.where
     table = source.table.set_axis(pd.RangeIndex(first, first + len(source)))
-    return Source(source.path, table, lambda index: f"{prefix}{own(index - first)}", source.notes)
+    return replace(source, table=table, where=lambda index: f"{prefix}{own(index - first)}",
+                   fields={first + row: count for row, count in source.fields.items()},
+                   left_out=tuple((reason, number, f"{prefix}{place}")
+                                  for reason, number, place in source.left_out))
+
+
+def _without_cut_rows(source: Source, settings: Settings) -> Source:
+    """Return the rows that are whole as far as their columns are used; many others are refused.
+
+    Programs leave out last cells that are empty. A row that ends where no other does, with a column
+    that is used, may have been cut off within it.
+    """
+    header = list(map(str, source.table))
+    specs = settings.columns.model_dump(exclude_none=True).values()
+    used = {name for spec in specs for name in columns_of(spec, header)} & set(header)
+    needed = 1 + max((header.index(name) for name in used), default=-1)
+    lengths = Counter(source.fields.values())
+    cut = np.array([row for row, count in source.fields.items()
+                    if count < needed or (count == needed and lengths[count] == 1)], dtype=int)
+    short = [row for row in source.fields if row not in set(cut.tolist())]
+    if short:
+        last = min(source.fields[row] for row in short)
+        source = replace(source, notes=(
+            *source.notes, f"{counted(len(short), 'row')} without the last cells (from "
+                           f"{header[last]} on), the first is {source.where(short[0])}"))
+    if not len(cut):
+        return source
+    first, count = int(cut[0]), source.fields[int(cut[0])]
+    bad_rows = source.bad_rows or BadRows()
+    if are_few(len(cut), len(source)):
+        reason = "row was cut off"
+    elif all(bad_rows.add(source.where(row), "", f"{source.fields[row]} fields", "was cut off")
+             for row in cut):
+        reason = "bad row"
+    else:
+        more = f" ({len(cut)} such rows)" * (len(cut) > 1)
+        raise BadInput(f"{source.path}: {source.where(first)} has {count} fields, the header has "
+                       f"{len(header)}{more}; the last that is needed is {header[needed - 1]}"
+                       f"{bad_rows.hint(len(cut))}")
+    whole = source.select(~source.table.index.isin(cut))
+    return replace(whole, left_out=(*source.left_out, (reason, len(cut), source.where(first))))
 
 
 def _links_of(source: Source, settings: Settings, tally: Tally, problems: Problems,
@@ -420,7 +488,7 @@ def _only(source: Source, settings: Settings) -> tuple[Source, list[tuple[list[i
             allowed = sorted({str(value).removesuffix(".0") for value in numbers} | set(texts))
             raise BadInput(f"{source.path}: column {spec} never is {' or '.join(allowed)} "
                            f"(only); it is {', '.join(sorted(set(cells))[:20])}")
-        source = Source(source.path, source.table[~bad], source.where, source.notes)
+        source = source.select(~bad)
     return source, left_out
 
 

@@ -172,8 +172,7 @@ def without_repetition(source: Source) -> tuple[Source, list[int]]:
         comparable = comparable.astype(str)
     repeats = np.zeros(len(table), dtype=bool)
     repeats[rows] = comparable.duplicated()
-    unique = Source(source.path, table[~repeats], source.where, source.notes)
-    return unique, list(table.index[repeats])
+    return source.select(~repeats), list(table.index[repeats])
 
 
 def _hashes(cells: pd.Series, rows: np.ndarray) -> np.ndarray:

@@ -62,6 +62,7 @@ def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Ta
         "left_out": [{"reason": reason, "column": column, "readings": number,
                       "first": tally.first[reason, column]}
                      for (reason, column), number in tally.left_out.items()],
+        "bad_rows": logs.bad_rows,
         "written": len(table), "not_detected": int(np.isnan(measurements.level_db).sum()),
         "devices": len(devices), "anchors": int(measurements.is_anchor.sum()),
         "receivers": int(table["receiver"].nunique()), "flights": len(measurements.flights),

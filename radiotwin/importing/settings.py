@@ -20,6 +20,8 @@ Positive = Annotated[Number, Field(gt=0)]
 _NO_TEXTS = ("idna", "punycode", "unicode_escape", "raw_unicode_escape", "undefined")
 """Codecs of names and of source code: none is the encoding of a file."""
 DELIMITERS = (",", ";", "\t", "|")
+BLANKS = ("  ", " ")
+"""Separators of two and more blanks, and of any number of them."""
 BY_DAY, BY_FILE, BY_POSITION = "by day", "by file", "by position"
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
 ABOVE_GROUND = "above_ground"  # in place of a height of `POSITION`, which no frame can convert
@@ -133,13 +135,19 @@ class Settings(Table):
 
     format: str | None = Field(None, max_length=50, description="name of a known format")
     encoding: str | None = Field(None, max_length=50)
-    delimiter: Literal[",", ";", "\t", "|"] | None = None
+    delimiter: Literal[",", ";", "\t", "|", " ", "  "] | None = Field(
+        None, description="a blank is any number of them, two are two and more")
     decimal: Literal[".", ","] | None = None
+    quotes: bool = Field(True, description="whether quotation marks of a text hold a field "
+                                           "together; else they are letters")
     sheet: str | None = Field(None, max_length=200, description="of a workbook; the first one")
     header: list[Spec] = Field([], max_length=5000, description="names of the columns of a text "
                                                                 "without a header")
     lines_before_header: int | None = Field(None, ge=0, le=100)
     lines_after_table: int | None = Field(None, ge=0, le=10_000)
+    skip_bad_rows: int = Field(
+        0, ge=0, le=1_000_000, description="rows that cannot be read are left out, if they are not "
+                                           "more in all files")
     only: dict[Spec, list[Number | str]] = Field(
         {}, description="column -> texts of the rows that are kept")
     band_hz: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = Field(

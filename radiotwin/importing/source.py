@@ -7,15 +7,16 @@ that read = kept + left out.
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
 from radiotwin.errors import BadInput
-from radiotwin.io.cells import as_numbers, listed, refuse
+from radiotwin.io.cells import as_numbers, listed, refuse, shown
 from radiotwin.io.forms import name_fault
 
 EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
@@ -25,6 +26,63 @@ ALWAYS = "always "
 _ROWS_AT_ONCE = 1_000_000  # of which stripped texts are made
 _TEMPLATE = re.compile(r"\{([^{}]+)\}")
 _SHOWN = 20  # of the problems in a message
+_FEW, _FEW_SHARE = 20, 0.1  # damaged rows that are no sign of a file that is read wrongly
+
+
+def are_few(number: int, total: int) -> bool:
+    """Return whether so many damaged rows of a file are left out without being asked for."""
+    return number <= min(_FEW, _FEW_SHARE * total)
+
+
+@dataclass
+class BadRows:
+    """Rows that cannot be read, and are left out where the user allows so many.
+
+    Attributes:
+        limit: of the rows of all files, `skip_bad_rows`.
+        prefix: of places in the file that is read, as its name where there are several.
+        rows: where, column, cell and reason of each that is left out.
+        fresh: index -> column of those that `take` noted last.
+    """
+
+    limit: int = 0
+    prefix: str = ""
+    rows: dict[str, dict[str, str]] = field(default_factory=dict)
+    fresh: dict[int, str] = field(default_factory=dict)
+
+    def add(self, where: str, column: str, cell: object, reason: str) -> bool:
+        """Note a row; False if that would be more than allowed."""
+        if where not in self.rows and len(self.rows) >= self.limit:
+            return False
+        self.rows.setdefault(where, {"row": where, "column": column, "cell": shown(cell),
+                                     "reason": reason.partition(";")[0]})
+        return True
+
+    def take(self, source: "Source", spec: str, cells: pd.Series, rows: np.ndarray,
+             reason: str) -> bool:
+        """Note rows (n,) of cells; False, and none is noted, if they are more than allowed."""
+        index = [int(cells.index[row]) for row in rows] if len(rows) <= self.limit else []
+        places = [source.where(each) for each in index]
+        if not places or len(self.rows.keys() | set(places)) > self.limit:
+            return False
+        for row, place in zip(rows, places):
+            self.add(place, spec, cells.iloc[row], reason)
+        self.fresh |= dict.fromkeys(index, spec)
+        return True
+
+    def hint(self, number: int) -> str:
+        """Return how so many more rows can be left out, for the end of a message."""
+        return f"; --skip-bad-rows {len(self.rows) + number} leaves such rows out"
+
+    def without(self, links: pd.DataFrame, tally: "Tally", readings: int,
+                where: Callable[[int], str]) -> pd.DataFrame:
+        """Return links without the rows noted last; each counts as so many readings."""
+        fresh, self.fresh = self.fresh, {}
+        for spec in dict.fromkeys(fresh.values()):
+            own = links.index[links.index.isin([row for row in fresh if fresh[row] == spec])]
+            if len(own):
+                tally.count("bad row", spec, len(own) * readings, where(own[0]))
+        return links[~links.index.isin(list(fresh))] if fresh else links
 
 
 @dataclass(frozen=True)
@@ -36,15 +94,25 @@ class Source:
         table: cells as in the file.
         where: index -> `row 7`, as the file's user counts.
         notes: on how the file was read.
+        fields: index -> number of fields, of the rows that had fewer than the header.
+        left_out: rows that are not in the table: reason, number, and the first of them.
+        bad_rows: where cells that cannot be read are noted; None where all must be readable.
     """
 
     path: Path | str
     table: pd.DataFrame
     where: Callable[[int], str]
     notes: tuple[str, ...] = ()
+    fields: Mapping[int, int] = field(default_factory=dict)
+    left_out: tuple[tuple[str, int, str], ...] = ()
+    bad_rows: BadRows | None = None
 
     def __len__(self) -> int:
         return len(self.table)
+
+    def select(self, keep: np.ndarray) -> Self:
+        """Return the rows (n,) that are kept."""
+        return replace(self, table=self.table[keep])
 
     def cells(self, spec: str, purpose: str) -> pd.Series:
         """Return the cells of a column, a constant, or texts made of several columns.
@@ -126,8 +194,20 @@ class Source:
     def refuse(self, spec: str, cells: pd.Series, bad: ArrayLike, reason: str) -> None:
         """Raise BadInput about the first bad cell (n,) of a column, if there is one.
 
-        The message names file, row and column, and ends with the reason.
+        The message names file, row and column, and ends with the reason. Nothing is raised where
+        the user allows so many bad rows; they are noted.
         """
+        rows = np.flatnonzero(np.asarray(bad, dtype=bool))
+        if not len(rows):
+            return
+        if spec in self.table:  # as in the file, where `N/A` is an empty cell
+            own = self.table[spec].reindex(cells.index)
+            cells = own.where(own.map(lambda cell: isinstance(cell, str)), cells)
+        if self.bad_rows is not None:
+            if self.bad_rows.take(self, spec, cells, rows, reason):
+                return
+            if len(rows) < len(cells) / 2:  # else it is not the rows that are wrong
+                reason += self.bad_rows.hint(len(rows))
         refuse(self.path, spec, cells, bad, reason, lambda row: self.where(cells.index[row]))
 
 

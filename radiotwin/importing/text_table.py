@@ -15,7 +15,8 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.log_files import Lines, LogFile
-from radiotwin.importing.settings import DELIMITERS, Settings
+from radiotwin.importing.settings import BLANKS, DELIMITERS, Settings
+from radiotwin.importing.source import EMPTY, BadRows
 from radiotwin.io.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS
 from radiotwin.io.cells import shown
 from radiotwin.io.texts import unquoted, without_quotes
@@ -29,7 +30,10 @@ _UNDEFINED = b"\x81\x8d\x8f\x90\x9d"  # in Windows-1252
 _POINT = re.compile(r"[+-]?(\d+\.\d*|\.\d+)([eE][+-]?\d+)?")
 COMMA = re.compile(r"[+-]?(\d+,\d+|,\d+)([eE][+-]?\d+)?")
 _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
-_NAMES = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "vertical bars"}
+_NAMES = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "vertical bars", " ": "blanks",
+          "  ": "two and more blanks"}
+_RUNS = {" ": re.compile(r'"[^"]*"|[ \t]+'), "  ": re.compile(r'"[^"]*"| *\t *| {2,}')}
+_COMMENT = re.compile(r"\s*(#|%|//)")
 _CHUNK_CELLS = 2_000_000  # of which a table is made at a time
 
 
@@ -45,6 +49,10 @@ class Dialect:
         after: lines after the last row, blank ones not counted.
         repeated: a name of a column that occurs more than once, or `""`.
         names: of the columns where there is no header.
+        units: line below the header that has no digit, as one of units, or `""`.
+        has_comments: whether some of the first lines, or the header, begin with `#`.
+        is_mark: whether the first field of the header is such a mark alone.
+        quotes: whether quotation marks hold a field together.
     """
 
     encoding: str = "utf-8"
@@ -54,6 +62,10 @@ class Dialect:
     after: int = 0
     repeated: str = ""
     names: tuple[str, ...] = ()
+    units: str = ""
+    has_comments: bool = False
+    is_mark: bool = False
+    quotes: bool = True
 
     def described(self) -> str:
         """Return what differs from comma-separated UTF-8, or `""`."""
@@ -61,7 +73,8 @@ class Dialect:
                  "decimal commas" * (self.decimal == ","),
                  f"encoding {self.encoding}" * (not self.encoding.startswith("utf-8")),
                  "no header" * bool(self.names), _lines(self.before, "before the header"),
-                 _lines(self.after, "after the table")]
+                 _lines(self.after, "after the table"),
+                 f"a row of units ({self.units})" * bool(self.units)]
         if self.repeated:
             parts.append(f"column {shown(self.repeated)} occurs more than once: the others are "
                          f"{self.repeated}.2, …")
@@ -98,20 +111,58 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
     after = settings.lines_after_table
     if after is None:
         last = _split(tail.decode(encoding, "replace"))
-        after = _trailer(every[first:] if whole else last[1:], delimiter, header)
+        lengths = Counter(map(len, rows))
+        after = _trailer(every[first:] if whole else last[1:], delimiter, header,
+                         {each for each, number in lengths.items() if each > 1 and number > 1})
     stripped = [name.strip() for name in header]
     repeated = next((name for i, name in enumerate(stripped) if name and name in stripped[:i]), "")
-    return Dialect(encoding, delimiter, decimal, before, after, repeated, tuple(names))
+    columns = len(header_names(header))
+    filled = [row for row in rows if any(field.strip() for field in row)][:2]
+    units = ", ".join(filter(None, map(str.strip, filled[0]))) \
+        if not names and _is_of_units(filled, columns) else ""
+    has_comments = any(is_comment(row, columns, filled[:1]) for row in rows) \
+        or (not names and bool(header) and _COMMENT.match(header[0]) is not None)
+    is_mark = bool(has_comments and header and filled and _COMMENT.fullmatch(header[0].strip())
+                   and fits(filled[0], columns - 1))
+    return Dialect(encoding, delimiter, decimal, before, after, repeated, tuple(names), units,
+                   has_comments, is_mark, settings.quotes)
 
 
 def fits(row: Sequence[str], columns: int) -> bool:
-    """Return whether a row has as many fields as the header; some programs end it with one more."""
-    return len(row) == columns or (len(row) == columns + 1 and not row[-1].strip())
+    """Return whether a row has as many fields as the header; some programs end it with more."""
+    return len(row) >= columns and not any(field.strip() for field in row[columns:])
+
+
+def is_comment(row: Sequence[str], columns: int, first: Sequence[Sequence[str]]) -> bool:
+    """Return whether a row is a comment: it has a mark that the first row [of a table] has not."""
+    mark = _COMMENT.match(row[0]) if row else None
+    if mark is None:
+        return False
+    return not fits(row, columns) or not any(_COMMENT.match(each[0]) for each in first if each)
+
+
+def has_other_lines(cells: pd.DataFrame) -> bool:
+    """Return whether some rows may be comments, or repeat the header."""
+    first = cells.iloc[:, 0]
+    return bool((first == cells.columns[0]).any() or first.str.startswith(("#", "%", "//")).any())
+
+
+def _is_of_units(rows: Sequence[Sequence[str]], columns: int) -> bool:
+    """Return whether the first of two rows has no digit where the second has them twice or more."""
+    if len(rows) < 2 or not fits(rows[0], columns) or _COMMENT.match(rows[0][0]):
+        return False
+    digits = [any(character.isdigit() for character in above) for above in rows[0]]
+    return not any(digits) and sum(
+        bool(above.strip()) and above.strip().lower() not in EMPTY
+        and any(character.isdigit() for character in below)
+        for above, below in zip(*rows)) > 1
 
 
 def header_names(fields: Sequence[str]) -> list[str]:
     """Return names of columns: without a last empty one, empty and repeated ones numbered."""
     names = [re.sub("[\u200b\ufeff]", "", name).strip() for name in fields]  # of no width
+    if names and (mark := _COMMENT.match(names[0])):  # as NumPy writes a header
+        names[0] = names[0][mark.end():].strip() or names[0]
     if len(names) > 1 and not names[-1]:
         names = names[:-1]
     names = [name or f"column {number}" for number, name in enumerate(names, start=1)]
@@ -173,25 +224,35 @@ def _split(text: str) -> list[str]:
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
+    line, delimiter = _with_tabs(line, delimiter), "\t" if delimiter in BLANKS else delimiter
     try:
         return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     except csv.Error:
         return []
 
 
+def _with_tabs(line: str, delimiter: str) -> str:
+    """Return a line with a tab for each run of blanks outside quotation marks that separates."""
+    if delimiter not in BLANKS:
+        return line
+    return _RUNS[delimiter].sub(lambda run: run[0] if run[0].startswith('"') else "\t",
+                                line.strip(" \t\r\n"))
+
+
 def _delimiter(lines: list[str], columns: int) -> str:
     """Return the delimiter with which most lines have so many fields."""
-    return max(DELIMITERS, key=lambda each: sum(fits(_fields(line, each), columns)
-                                                for line in lines))
+    return max((*DELIMITERS, *BLANKS), key=lambda each: sum(fits(_fields(line, each), columns)
+                                                            for line in lines))
 
 
 def _header(lines: list[str], settings: Settings,
             expected: Sequence[Collection[str]]) -> tuple[int, str]:
     """Return the index of the header and the delimiter that give the largest table.
 
-    A line with more of the expected names comes first.
+    A line with more of the expected names comes first. Blanks are in texts, too: they separate
+    where they alone find all names, or nothing else does.
     """
-    delimiters = [settings.delimiter] if settings.delimiter else list(DELIMITERS)
+    delimiters = [settings.delimiter] if settings.delimiter else [*DELIMITERS, *BLANKS]
     places = range(min(len(lines), _HEADER_LINES))
     if settings.lines_before_header is not None:
         places = range(settings.lines_before_header, settings.lines_before_header + 1)
@@ -211,7 +272,8 @@ def _header(lines: list[str], settings: Settings,
             good = sum(fits(row, len(names)) for row in rows[place + 1:])
             bad = sum(count > 0 for count in counts[place + 1:]) - good
             score = (found, len(names) * (1 + good - bad))
-            if score > best:
+            if score > best and (delimiter not in BLANKS or score[0] == 1 > best[0]
+                                 or best[0] < 0 or result[1] in BLANKS):
                 best, result = score, (place, delimiter)
     return result
 
@@ -237,24 +299,49 @@ def _decimal(file: LogFile, delimiter: str, rows: list[list[str]]) -> str:
     return "." if delimiter == "," and any(map(_POINT.fullmatch, cells)) else ","
 
 
-def _trailer(lines: list[str], delimiter: str, header: list[str]) -> int:
-    """Return the number of lines at the end that are no rows of the table, such as a summary."""
+def _trailer(lines: list[str], delimiter: str, header: list[str], lengths: set[int]) -> int:
+    """Return the number of lines at the end that are no rows of the table, such as a summary.
+
+    Rows have as many fields as the header, or one of the numbers that others have.
+    """
     columns, count = len(header_names(header)), 0
     for line in reversed(lines):
         fields = _fields(line, delimiter)
         if not any(field.strip() for field in fields):
             continue
-        if fits(fields, columns) or line.count('"') % 2:
+        if fits(fields, columns) or len(fields) in lengths or line.count('"') % 2:
             return count if count <= _MAX_TRAILER else 0
         count += 1
     return 0  # no row is left: reading says what is wrong
 
 
-def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.ndarray]:
-    """Read all cells of a text as texts.
+@dataclass(frozen=True)
+class TextTable:
+    """Cells of a text as texts, `""` where empty, decimal commas as points.
 
-    Returns:
-        cells, `""` where empty, decimal commas as points; and the line of each row, from 1.
+    Attributes:
+        cells: a row for each of the text.
+        lines: of the rows, (n,) from 1.
+        fields: row -> number of fields, of those that had fewer than the header.
+        notes: on lines that are no rows.
+        bad: lines of the rows with too many fields, which were left out.
+    """
+
+    cells: pd.DataFrame
+    lines: np.ndarray
+    fields: dict[int, int]
+    notes: tuple[str, ...]
+    bad: list[int]
+
+
+def read_text_table(file: LogFile, dialect: Dialect, bad_rows: BadRows | None) -> TextTable:
+    """Read all cells of a text.
+
+    Args:
+        file: of text.
+        dialect: of the text.
+        bad_rows: where rows with too many fields are noted, and those with too few are filled up;
+            None where there may be none.
 
     Raises:
         BadInput: no header, a repeated name, or a row with too few or too many fields.
@@ -263,13 +350,16 @@ def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.n
         lines = _QuotedLines(text, file)
         for _ in islice(lines, dialect.before):
             lines.row_characters = 0
-        reader = _rows(csv.reader(lines, delimiter=dialect.delimiter, skipinitialspace=True,
-                                  strict=True), lines)
+        delimiter = dialect.delimiter
+        reader = _rows(csv.reader(
+            (_with_tabs(line, delimiter) for line in lines),
+            delimiter="\t" if delimiter in BLANKS else delimiter, skipinitialspace=True,
+            strict=True, quoting=csv.QUOTE_MINIMAL if dialect.quotes else csv.QUOTE_NONE), lines)
         try:
-            return _read(file, dialect, reader, lines)
+            return _read(file, dialect, reader, lines, bad_rows)
         except csv.Error as error:
             raise BadInput(f"{file}: line {lines.number}: {error}; is a quotation mark not "
-                           "closed?") from None
+                           "closed? --no-quotes takes these marks for letters") from None
         except UnicodeDecodeError:
             raise BadInput(f"{file} is not text in {dialect.encoding}; give --encoding") from None
 
@@ -296,24 +386,48 @@ def _rows(reader: Iterator[list[str]], lines: _QuotedLines) -> Iterator[list[str
 
 
 def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
-          lines: Lines) -> tuple[pd.DataFrame, np.ndarray]:
+          lines: Lines, bad_rows: BadRows | None) -> TextTable:
     names = list(dialect.names)
     if not names:
         fields = next(filter(None, reader), [])
         COLUMNS.check(len(fields), f"{file}: header")
-        names = header_names([unquoted(name) for name in fields])
+        names = header_names([unquoted(name) for name in fields[dialect.is_mark:]])
     if not names:
         raise BadInput(f"{file} is empty; it needs a row with the names of the columns")
     chunk_rows = max(_CHUNK_CELLS // len(names), 1)
-    chunks, numbers = [], []
+    chunks, numbers, bad, comments, headers = [], [], [], [], []
     rows: list[list[str]] = []
-    total = 0
+    few: dict[int, int] = {}
+    first: list[list[str]] = []
+    total, width = 0, len(names)
+    has_units = bool(dialect.units)
     for number, row in _without_last(reader, lines, dialect.after):
-        if not fits(row, len(names)):
-            raise BadInput(f"{file}: line {number} has {len(row)} fields, the header has "
-                           f"{len(names)}; every row needs as many. If it is no row, leave it out, "
-                           "or give --lines-before-header or --lines-after-table")
-        rows.append(row[:len(names)])
+        if is_comment(row, width, first):
+            comments.append(number)
+            continue
+        if header_names([unquoted(name) for name in row]) == names:  # files were joined
+            headers.append(number)
+            continue
+        first = first or [row]
+        if has_units:
+            has_units = False
+            continue
+        if len(row) != width and not fits(row, width):
+            if bad_rows is None or len(row) > width:
+                if bad_rows is not None and bad_rows.add(
+                        f"{bad_rows.prefix}line {number}", "", f"{len(row)} fields",
+                        f"is more than the {width} of the header"):
+                    bad.append(number)
+                    continue
+                hint = "" if bad_rows is None else bad_rows.hint(1)
+                if dialect.delimiter in BLANKS:
+                    hint += "; where blanks are in a cell, --header names its parts"
+                raise BadInput(f"{file}: line {number} has {len(row)} fields, the header has "
+                               f"{width}; every row needs as many{hint}. If it is no row, leave it "
+                               "out, or give --lines-before-header or --lines-after-table")
+            few[total] = len(row)
+            row = [*row, *[""] * (width - len(row))]
+        rows.append(row[:width])
         numbers.append(number)
         total += 1
         if len(rows) == chunk_rows:
@@ -324,7 +438,10 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
     if rows or not chunks:
         chunks.append(_cells(rows, names, dialect.decimal))
     ROWS.check(total, file)
-    return pd.concat(chunks, ignore_index=True), np.array(numbers, dtype=np.int64)
+    notes = [f"{file.name}: {_lines(len(those), what)} left out, the first is line {those[0]}"
+             for those, what in ((comments, "of comments"), (headers, "like the header")) if those]
+    return TextTable(pd.concat(chunks, ignore_index=True), np.array(numbers, dtype=np.int64), few,
+                     tuple(notes), bad)
 
 
 def _without_last(reader: Iterator[list[str]], lines: Lines,

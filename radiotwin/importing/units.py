@@ -225,6 +225,9 @@ def read_levels(source: Source, spec: str, settings: Settings,
         named = cells.notna() & (cells.astype(str).str.strip().str.lower() == NOT_A_NUMBER)
         text = text.mask(named, NOT_A_NUMBER)
     numbers = as_numbers(text)
+    if settings.level_unit and np.isnan(numbers).any():  # some cells are `-80 dBm`
+        text = text.str.replace(rf"(?<=[\d.])\s*{settings.level_unit}$", "", case=False, regex=True)
+        numbers = as_numbers(text)
     not_measured = _is_one_of(text, numbers, settings.not_measured, is_text)
     not_detected = _is_one_of(text, numbers, settings.not_detected, is_text) & ~not_measured
     declared = not_measured | not_detected

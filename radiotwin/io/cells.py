@@ -29,6 +29,7 @@ _NUMBERS_AT_ONCE = 1_000_000  # pandas makes an object of each
 _MAX_DIGITS = 1000  # of a number
 _PARQUET_ROWS, _NESTED_ROWS = 2**17, 2**10  # that are decoded at a time
 _SHOWN_CHARACTERS, _SHOWN_COLUMNS = 80, 50  # of a cell, and of a table, in a message
+_SIGNS = re.compile("(?:^|(?<=[eE]))[\u2212\u2010-\u2014\ufe63\uff0d]")
 POSITION = ("x_m", "y_m", "z_m")
 TRACK = {"flight": "text", "uav": "text", "time_s": "number", "x_m": "number", "y_m": "number",
          "z_m": "number or nothing"}
@@ -40,6 +41,10 @@ RESIDUALS = {
 PLANNING = {"method": "text", "trained_in": "text", "real_episodes": "number",
             "truth_ratio": "number"}
 """Column -> kind of its cells; the columns that a table must have."""
+
+
+class RaggedRows(BadInput):
+    """A row with another number of fields than the header."""
 
 
 class CsvLayout:
@@ -149,8 +154,8 @@ class CsvLayout:
         CELLS.check((self.rows - 1) * len(self.header), self._path)
 
     def _refuse(self, row: int, fields: int) -> None:
-        raise BadInput(f"{self._path}: row {row} has {fields} fields, the header has "
-                       f"{len(self.header)}; every row needs as many commas as the header")
+        raise RaggedRows(f"{self._path}: row {row} has {fields} fields, the header has "
+                         f"{len(self.header)}; every row needs as many commas as the header")
 
 
 def read_cells(path: Path, required: Collection[str] = (),
@@ -241,7 +246,10 @@ def refuse(path: Path | str, name: str, column: pd.Series, bad: ArrayLike, reaso
 
 
 def as_numbers(text: pd.Series) -> np.ndarray:
-    """Convert texts (n,) without spaces around to numbers; NaN where one is none, or empty."""
+    """Convert texts (n,) without spaces around to numbers; NaN where one is none, or empty.
+
+    A number may have one of the minus signs and dashes of Unicode, as word processors set them.
+    """
     numbers = np.empty(len(text))
     for start in range(0, len(text), _NUMBERS_AT_ONCE):
         rows = slice(start, start + _NUMBERS_AT_ONCE)
@@ -250,6 +258,11 @@ def as_numbers(text: pd.Series) -> np.ndarray:
         except ValueError:  # an integer of more digits than Python converts
             short = text.iloc[rows].mask(text.iloc[rows].str.len() > _MAX_DIGITS, "")
             numbers[rows] = pd.to_numeric(short, errors="coerce")
+    odd = np.flatnonzero(np.isnan(numbers))
+    signs = text.iloc[odd].str.contains(_SIGNS).to_numpy(dtype=bool)
+    if signs.any():
+        odd = odd[signs]
+        numbers[odd] = as_numbers(text.iloc[odd].str.replace(_SIGNS, "-", regex=True))
     return numbers
 
 

@@ -201,8 +201,8 @@ def test_what_cannot_be_imported(bring_in, local, tmp_path, columns, text, given
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ("48,11\n1000,11\n", r"row 3, column lat: '1000.0' is no latitude; allowed are -90 to 90"),
-    ("48,11\n48,400\n", r"row 3, column lon: '400.0' is no longitude"),
+    ("48,11\n1000,11\n", r"row 3, column lat: '1000' is no latitude; allowed are -90 to 90"),
+    ("48,11\n48,400\n", r"row 3, column lon: '400' is no longitude"),
     ("-111.8,40.7\n-111.9,40.8\n", r"row 2, column lat.*swapped"),
 ])
 def test_degrees_that_are_none(bring_in, text, message):

@@ -56,7 +56,7 @@ def test_impossible_levels_are_counted_and_left_out(bring_in, local, unit, level
      r"column level: level_unit is not given; allowed are dBm, mW and W.*dB.*run from -120 to -60, median -75"),
     ({}, (-90, "weak"), r"row 3, column level: 'weak' is not a number.*not_detected"),
     ({}, (-90, ""), r"row 3, column level: '' is empty; say what that means.*not_detected.*not_measured"),
-    ({"not_detected": ["empty"]}, (-90, "NaN"), r"row 3, column level: 'nan' is not a number.*not_detected.*not_measured"),
+    ({"not_detected": ["empty"]}, (-90, "NaN"), r"row 3, column level: 'NaN' is not a number.*not_detected.*not_measured"),
     ({}, (-90, "inf"), r"row 3, column level: 'inf' is not a number"),
     ({"level_unit": "dBW"}, (-90,), "level_unit.*dBW.*dBm"),
 ])

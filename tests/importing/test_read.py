@@ -76,7 +76,7 @@ def test_geojson_that_is_not_points(points, tmp_path, change, message):
 
 @pytest.mark.parametrize(("name", "content", "message"), [
     ("data.geojson", b"{", "is not readable JSON"), ("data.csv", b"", "is empty"), ("data.csv", b"a,b\n", "has no rows"),
-    ("data.csv", b"a,b\n1\n", "row 2 has 1 fields"), ("data.csv.gz", b"no", "cannot be read"),
+    ("data.csv", b"a,b\n1\n", "line 2 has 1 fields"), ("data.csv.gz", b"no", "cannot be read"),
     ("data.parquet", b"no", "cannot be read"), ("data.kml", b"no", "unknown format; allowed.*geojson"),
     ("data.csv", "a,b\nü,1\n".encode("utf-16-le"), "is not text .it has null characters")])
 def test_files_that_are_not_tables(tmp_path, name, content, message):
