@@ -77,6 +77,12 @@ def build_scene(
     terrain: Annotated[Path | None, typer.Option(
         metavar="FILE.tif", help="Heights of a map's ground, a GeoTIFF; buildings stand on it "
                                  "[flat ground].")] = None,
+    terrain_unit: Annotated[str | None, typer.Option(
+        metavar="m|ft", help="Unit of the heights in a --terrain that names none [m; one whose "
+                             "plan is in feet is refused].")] = None,
+    layer: Annotated[list[str] | None, typer.Option(
+        metavar="NAME", help="Layer of a GeoPackage, or Shapefile of an archive, with the "
+                             "buildings [chosen by names and columns]. May be repeated.")] = None,
     crs: Annotated[str | None, typer.Option(
         metavar="EPSG:N", help="Coordinate reference system of a map that names none.")] = None,
     overpass: Annotated[bool, typer.Option(
@@ -113,7 +119,8 @@ def build_scene(
                    origin=parse_origin(origin), scale=scale, up=up,
                    default_height_m=height_default, height_column=height_column,
                    ground_column=ground_column, material_table=material_table,
-                   terrain=terrain, crs=crs, overpass=overpass, step_m=step,
+                   terrain=terrain, terrain_unit=terrain_unit, crs=crs, layers=layer or (),
+                   overpass=overpass, step_m=step,
                    altitudes_m=None if altitudes is None else
                    parse_numbers("--altitudes", altitudes),
                    extent_m=parse_extent(extent), check_only=check)

@@ -9,6 +9,9 @@ import numpy as np
 from radiotwin.scene.surfaces import Surfaces
 
 Severity = Literal["error", "warning", "fixed"]
+# No city has a median above it (San Francisco's centre 11 m, Munich's 16 m), but 60 feet are six
+# storeys. Low-rise cities in feet stay below and are not noticed.
+MAX_MEDIAN_M = 60.0  # of heights
 _TO_Z_UP = {  # rotation that makes the axis point up
     "x": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=float),
     "y": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=float),
@@ -107,9 +110,7 @@ def check_units(surfaces: Surfaces) -> list[Problem]:
         return [warning(f"the tallest building is {tallest:.3g} m and the city {width:.3g} m wide; "
                         "if that is kilometres, convert with --scale 1000, if it is right say "
                         "--scale 1")]
-    # No city has a median above 60 m (San Francisco's centre 11 m, Munich's 16 m), but 60 feet are
-    # six storeys. Low-rise cities in feet stay below and are not noticed.
-    if median > 60.0 and len(heights) > 1:
+    if median > MAX_MEDIAN_M and len(heights) > 1:
         return [warning(f"half of the buildings are taller than {median:.0f} m; if that is feet, "
                         "convert with --scale 0.3048, if it is right say --scale 1")]
     return []

@@ -30,8 +30,8 @@ def build_scene(
     up: str | None = None, default_height_m: float | None = None,
     height_column: str | None = None, ground_column: str | None = None,
     material_table: MaterialTable | Path | str | None = None,
-    terrain: Path | str | None = None, crs: str | None = None, overpass: bool = False,
-    check_only: bool = False,
+    terrain: Path | str | None = None, terrain_unit: str | None = None, crs: str | None = None,
+    layers: Sequence[str] = (), overpass: bool = False, check_only: bool = False,
 ) -> BuildReport:
     """Build a scene folder from a map or a city model, and report on it.
 
@@ -62,7 +62,10 @@ def build_scene(
         ground_column: of a map: column of the ground's elevation, which is subtracted.
         material_table: of a map: materials of its tags, or the file that declares them.
         terrain: of a map: GeoTIFF of the ground's heights; None: flat ground.
+        terrain_unit: of heights in a terrain that names none, `m` or `ft`.
         crs: of a map: coordinate reference system of a file that names none, as `EPSG:25832`.
+        layers: of a map: those to read of a GeoPackage or an archive of Shapefiles; none: those
+            that hold buildings.
         overpass: download the map `source`, an .osm file that does not exist yet, for `bbox`.
         check_only: write nothing, and return errors in the report instead of raising them.
 
@@ -80,14 +83,16 @@ def build_scene(
     of_cities = _given(scale=scale, up=up)
     of_maps = _given(default_height_m=default_height_m, height_column=height_column,
                      ground_column=ground_column, material_table=material_table,
-                     terrain=terrain, crs=crs, overpass=overpass or None)
+                     terrain=terrain, terrain_unit=terrain_unit, crs=crs,
+                     layer=tuple(layers) or None, overpass=overpass or None)
     text = str(source)
     if map_suffix(source):
         _refuse(of_cities, f"{source} is a map")
         table = _material_table(material_table, materials or {})
         options = MapOptions(bbox, default_height_m, table,
                              _height_column(height_column, ground_column),
-                             None if terrain is None else Path(terrain), crs)
+                             None if terrain is None else Path(terrain), crs, tuple(layers),
+                             terrain_unit)
         options.check()
         if overpass:
             _download(source, bbox)

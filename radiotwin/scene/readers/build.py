@@ -34,6 +34,7 @@ from radiotwin.scene.readers.citygml import read_citygml
 from radiotwin.scene.readers.cityjson import read_cityjson
 from radiotwin.scene.readers.extrude import make_blocks, split_roof
 from radiotwin.scene.readers.features import (
+    READ_TAGS,
     Feature,
     MapFile,
     OutlineBudget,
@@ -42,13 +43,18 @@ from radiotwin.scene.readers.features import (
 )
 from radiotwin.scene.readers.gis_files import read_geojson, read_geopackage, read_geoparquet
 from radiotwin.scene.readers.heights import (
+    KNOWN,
+    READ_COLUMNS,
     HeightColumn,
     check_declared,
+    column_name,
     height_sds_m,
+    listed_columns,
     no_height_text,
 )
 from radiotwin.scene.readers.heights import source_text as height_text
 from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml
+from radiotwin.scene.readers.plausible import implausible_heights
 from radiotwin.scene.readers.shapefiles import read_shapefile
 from radiotwin.scene.readers.solids import (
     Contacts,
@@ -75,6 +81,7 @@ READERS: dict[str, Callable[[Path, str | None], MapFile]] = {
     ".city.json": read_cityjson, ".city.json.gz": read_cityjson, ".json": read_cityjson,
     ".cityjson": read_cityjson, ".jsonl": read_cityjson, ".gml": read_citygml,
     ".citygml": read_citygml}
+LAYERED = {".gpkg": read_geopackage, ".zip": read_shapefile}  # those that may have layers
 GROUND = "ground"  # name of its shape
 GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent
 MAX_WIDTH_M = 50e3  # [m], chosen so that a plane and single precision are good enough
@@ -124,6 +131,9 @@ class MapOptions:
         terrain: GeoTIFF of the ground's heights; None: the ground is flat.
         crs: coordinate reference system of a file that names none; None: such a file is refused,
             and GeoJSON is in degrees.
+        layers: of a GeoPackage or an archive of Shapefiles; none: those that hold buildings.
+        terrain_unit: of a terrain that names none, `m` or `ft`; None: metres, and one whose plan is
+            in feet is refused.
     """
 
     bbox_deg: Bounds | None = None
@@ -132,6 +142,8 @@ class MapOptions:
     height_column: HeightColumn | None = None
     terrain: Path | None = None
     crs: str | None = None
+    layers: tuple[str, ...] = ()
+    terrain_unit: str | None = None
 
     @property
     def height_m(self) -> float:
@@ -145,6 +157,10 @@ class MapOptions:
                            "more than 0 and at most 1000 m")
         if self.crs is not None:
             check_declared_system(self.crs)
+        if self.terrain_unit not in (None, "m", "ft"):
+            raise BadInput(f"--terrain-unit {self.terrain_unit!r} is not possible; give m or ft")
+        if self.terrain_unit is not None and self.terrain is None:
+            raise BadInput("--terrain-unit is that of a terrain; give one with --terrain FILE.tif")
         if self.bbox_deg is not None:
             south, west, north, east = self.bbox_deg
             if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
@@ -199,7 +215,12 @@ def build_scene_from_map(
     if map_options.crs is not None and suffix in OSM_SUFFIXES:
         raise BadInput(f"{path} is in longitude and latitude, as all of OpenStreetMap; leave --crs "
                        "out")
-    found = READERS[suffix](path, map_options.crs)
+    if suffix in LAYERED:
+        found = LAYERED[suffix](path, map_options.crs, map_options.layers)
+    elif map_options.layers:
+        raise BadInput(f"{path} has no layers; leave --layer out (it is for {', '.join(LAYERED)})")
+    else:
+        found = READERS[suffix](path, map_options.crs)
     FEATURES.check(len(found.features), path)
     features = _within(found.features, map_options.bbox_deg, path)
     SHAPES.check(len(features), path)
@@ -214,15 +235,20 @@ def build_scene_from_map(
     bodies, found_in_bodies = make_shell_prisms(shells, origin, map_options.materials)
     prisms += bodies
     problems += found_in_bodies
+    _check_unit(prisms, found.plan_m, map_options.height_column, path)
     problems = (found.problems + left_out_problems(found.left_out, map_options.bbox_deg)
-                + problems + _without_height(prisms, features, map_options, path))
+                + problems + _without_height(prisms, features, map_options, path)
+                + implausible_heights([(prism.name, prism.height, prism.site or prism.area)
+                                       for prism in prisms],
+                                      {feature.name: feature.tags for feature in features}))
     if not prisms:
         raise BadInput("\n".join([f"{path}: none of its {len(features)} buildings can be used:",
                                   *(problem.message for problem in problems)]))
     around = choose_extent(_bounds_m(prisms, origin, map_options.bbox_deg))
     extent = around if options.extent_m is None else make_extent(options.extent_m)
     _check_width(max(np.ptp(extent.bounds[:2]), np.ptp(extent.bounds[2:])), MAX_WIDTH_M)
-    ground = make_ground(map_options.terrain, origin, _ground_box(prisms, extent.bounds), GROUND)
+    ground = make_ground(map_options.terrain, origin, _ground_box(prisms, extent.bounds), GROUND,
+                         map_options.terrain_unit)
     if ground.config is not None:
         origin = origin.model_copy(update={"altitude_m": ground.config.datum_m})
         prisms = stand_on(prisms, ground)
@@ -237,7 +263,8 @@ def build_scene_from_map(
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
                         _facts(table["building"].nunique(), len(set(shape_of.values())), counts,
-                               origin, map_options, vegetation, shells, ground), vegetation,
+                               origin, map_options, vegetation, shells, ground)
+                        + _not_used(found, features, map_options), vegetation,
                         ground.config)
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
@@ -257,6 +284,19 @@ def _facts(
             ("ground", ground.fact),
             *([("vegetation", vegetation_fact(vegetation))] if vegetation else []),
             ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"))
+
+
+def _not_used(found: MapFile, features: list[Feature],
+              map_options: MapOptions) -> tuple[tuple[str, str], ...]:
+    """Return a line on tags, columns and layers that change nothing."""
+    declared = map_options.height_column
+    used = READ_COLUMNS | READ_TAGS | set(map_options.materials.by_tag) | (
+        {declared.name, declared.ground} if declared else set())
+    names = {key for feature in features for key in feature.tags} | {
+        column_name(name) for name in found.columns}
+    unused = [f"tags or columns {listed_columns(names - used)}"] * bool(names - used)
+    unused += [f"layers {listed_columns(found.layers)}"] * bool(found.layers)
+    return (("not used", "; ".join(unused)),) if unused else ()
 
 
 def _provenance(
@@ -289,6 +329,18 @@ def _without_height(prisms: list[Prism], features: list[Feature], map_options: M
         sorted(guessed), f"of {len(buildings):,} building(s) have no height in the map: "
         f"{map_options.height_m:g} m was taken for them. Give the height of such buildings with "
         "--height-default M, or name a column with --height-column")
+
+
+def _check_unit(prisms: list[Prism], plan_m: float, declared: HeightColumn | None,
+                path: Path) -> None:
+    """Raise BadInput if a plan is in feet, and heights may be in feet or metres."""
+    silent = {column.name for column in KNOWN if column.unit == "m" and not column.ground
+              and not column.name.endswith("_m")} - ({declared.name} if declared else set())
+    used = sorted({prism.height.source for prism in prisms} & silent)
+    if used and plan_m != 1.0:
+        raise BadInput(f"{path}: its plan is in feet or another unit ({plan_m:.7g} m), and nothing "
+                       f"says that of the column {used[0]!r}; say --height-column {used[0]}:ft or "
+                       f"--height-column {used[0]}:m")
 
 
 def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:

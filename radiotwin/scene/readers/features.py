@@ -34,6 +34,8 @@ _BELOW = {  # tag or column -> its values of what lies below the ground
     "tunnel": ("yes", "true", "1"), "relativetoterrain": ("entirelybelowterrain",),
     "ofl": ("1200",), "lagezurerdoberflaeche": ("1200",)}
 _LEVELS = ("layer", "level", "relatievehoogteligging", "relatieve_hoogteligging")  # 0: the ground
+READ_TAGS = frozenset((*BUILDING_KEYS, *_BELOW, *_LEVELS, "indoor", "has_parts", "building_id",
+                       "building:levels:underground", "other_tags"))
 _LEVEL_RANGE = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*(?:-\s*(-?\d+(?:\.\d+)?)\s*)?")
 _CHUNK = 256  # segments: bounds the pairs that are found at once
 
@@ -101,12 +103,18 @@ class MapFile:
         vegetation: areas, and lines of trees, see `radiotwin.scene.readers.vegetation`.
         left_out: parts of the file that could not be used.
         problems: findings about the whole file.
+        plan_m: unit of its east and north [m].
+        columns: of its tables, also those of other things than buildings.
+        layers: that hold no areas.
     """
 
     features: list[Feature]
     left_out: list[LeftOut] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
     vegetation: list[Feature] = field(default_factory=list)
+    plan_m: float = 1.0
+    columns: set[str] = field(default_factory=set)
+    layers: tuple[str, ...] = ()
 
 
 def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:

@@ -14,7 +14,7 @@ servers.
 
 import re
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,14 @@ from radiotwin.scene.readers.features import (
     is_building,
 )
 from radiotwin.scene.readers.heights import ALIASES
-from radiotwin.scene.readers.systems import WGS84, chosen_system, degrees_from, find_system
+from radiotwin.scene.readers.layers import choose_layers, join_layers
+from radiotwin.scene.readers.systems import (
+    WGS84,
+    chosen_system,
+    degrees_from,
+    find_system,
+    plane_unit_m,
+)
 
 _OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*+)"', re.DOTALL)
 _NAME_LENGTH = 200  # characters of an id that are kept
@@ -143,8 +150,11 @@ def map_file(
     Raises:
         BadInput: no coordinate reference system, or one that is not known.
     """
-    tagged = [(name, _part_or_whole(properties, _tags(properties)), area)
-              for name, properties, area in rows]
+    tagged: list[tuple[str, dict[str, str], BaseGeometry | None]] = []
+    columns: set[str] = set()
+    for name, properties, area in rows:
+        columns.update(properties)
+        tagged.append((name, _part_or_whole(properties, _tags(properties)), area))
     marked = any(key in tags for _, tags, _ in tagged for key in BUILDING_KEYS)
     features, left_out = [], []
     for name, tags, area in tagged:
@@ -157,15 +167,17 @@ def map_file(
             left_out.append(LeftOut(name, NO_AREA, area))
         else:
             features.append(Feature(name, tags, area))
+    plan_m = 1.0
     if (features or left_out) and crs not in WGS84:
         if crs is None:
             raise BadInput(f"{path} has no coordinate reference system; declare it with --crs, "
                            "such as --crs EPSG:25832")
-        project = degrees_from(path, find_system(path, crs))
+        system = find_system(path, crs)
+        project, plan_m = degrees_from(path, system), plane_unit_m(system)
         features = [replace(one, area=shapely.transform(one.area, project)) for one in features]
         left_out = [replace(one, place=shapely.transform(one.place, project))
                     if one.place is not None else one for one in left_out]
-    return MapFile(features, left_out)
+    return MapFile(features, left_out, plan_m=plan_m, columns=set(map(str, columns)))
 
 
 def _tags(properties: Mapping) -> dict[str, str]:
@@ -204,30 +216,41 @@ def _other_tags(text: str) -> dict[str, str]:
     return tags
 
 
-def read_geopackage(path: Path, crs: str | None = None) -> MapFile:
-    """Read the polygons of all layers of a GeoPackage, in any coordinate reference system.
+def read_geopackage(path: Path, crs: str | None = None, wanted: Sequence[str] = ()) -> MapFile:
+    """Read the polygons of a GeoPackage's layers of buildings, in any coordinate reference system.
 
-    `crs` is that of layers whose own is undefined; None: refuse them.
+    Args:
+        path: `.gpkg` file.
+        crs: of layers whose own is undefined; None: refuse them.
+        wanted: names of layers; none: those that hold buildings, see `choose_layers`.
 
     Raises:
-        BadInput: no such file, not a GeoPackage, one that another program has open, or a layer
-            that is a view.
+        BadInput: no such file, not a GeoPackage, one that another program has open, a layer that is
+            a view, or layers of which nothing tells which to read.
     """
-    found = MapFile([])
+    parts: dict[str, MapFile] = {}
+    others: list[str] = []
     try:
         with open_tables(path, "GeoPackage") as database:
-            for layer, geometry, srs in _layers(database):
+            layers = {layer: (geometry, srs) for layer, geometry, srs in _layers(database, others)}
+            chosen, problems = choose_layers(
+                path, {layer: [row[1] for row in stored_columns(database, layer)]
+                       for layer in layers}, wanted)
+            for layer in chosen:
+                geometry, srs = layers[layer]
                 rows = _rows(path, database, layer, geometry)
-                part = map_file(path, rows, chosen_system(path, _system(database, srs), crs))
-                found.features += part.features
-                found.left_out += part.left_out
+                parts[layer] = map_file(path, rows, chosen_system(path, _system(database, srs),
+                                                                  crs))
     except (sqlite3.Error, shapely.errors.GEOSException, OverflowError) as error:
         raise BadInput(f"{path} is not a readable GeoPackage ({error}); export it again") from None
-    return found
+    return replace(join_layers(path, parts, problems), layers=tuple(others))
 
 
-def _layers(database: sqlite3.Connection) -> list[tuple[str, str, int]]:
-    """Return table, column of the geometry, and number of the system of each layer of areas."""
+def _layers(database: sqlite3.Connection, others: list[str]) -> list[tuple[str, str, int]]:
+    """Return table, column of the geometry, and number of the system of each layer of areas.
+
+    Names of other layers are added to `others`.
+    """
     for table in ("gpkg_contents", "gpkg_geometry_columns", "gpkg_spatial_ref_sys"):
         require_table(database, table)
     registered = {str(name).lower() for name, kind in scan(
@@ -236,7 +259,9 @@ def _layers(database: sqlite3.Connection) -> list[tuple[str, str, int]]:
     for table, column, kind, srs in scan(
             database, "gpkg_geometry_columns",
             ["table_name", "column_name", "geometry_type_name", "srs_id"]):
-        if str(table).lower() in registered and str(kind).upper() in _KINDS:
+        if str(table).lower() in registered and str(kind).upper() not in _KINDS:
+            others.append(str(table)[:_NAME_LENGTH])
+        elif str(table).lower() in registered:
             require_table(database, str(table))
             if not isinstance(srs, int):  # of SQLite's columns the type is a wish
                 raise sqlite3.DataError(f"srs_id of {str(table)[:100]!r} is {srs!r:.100}")
@@ -294,7 +319,7 @@ def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
     Raises:
         BadInput: no such file, no GeoParquet, damaged, or too large; no pyarrow.
     """
-    names, geometry, own = _schema(path)
+    names, nested, geometry, own = _schema(path)
     system = chosen_system(path, _name(path, own) if own else None, crs)
     if own is None and system is None:
         system = WGS84[0]
@@ -309,14 +334,14 @@ def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
                    area_of_wkb(data) if isinstance(data, bytes) else None)
 
     try:
-        return map_file(path, rows(), system)
+        return replace(map_file(path, rows(), system), columns={*names, *nested} - {geometry})
     except shapely.errors.GEOSException as error:
         raise BadInput(f"{path}: a geometry is damaged ({str(error)[:100]}); export it again"
                        ) from None
 
 
-def _schema(path: Path) -> tuple[list[str], str, dict | str | None]:
-    """Return the flat columns, that of the geometry, and its system: "" unknown, None default."""
+def _schema(path: Path) -> tuple[list[str], list[str], str, dict | str | None]:
+    """Return flat and nested columns, that of geometries, its system: "" unknown, None default."""
     require_pyarrow(path)
     from pyarrow import ArrowException, types
     from pyarrow.parquet import ParquetFile
@@ -349,8 +374,9 @@ def _schema(path: Path) -> tuple[list[str], str, dict | str | None]:
     except (KeyError, TypeError):
         raise BadInput(f"{path}: its metadata `geo` is not as GeoParquet has it (primary_column, "
                        "and of that encoding and crs); export it again") from None
-    names = [field.name for field in schema if not types.is_nested(field.type)]
-    return names, geometry, own
+    names, nested = ([field.name for field in schema if types.is_nested(field.type) == is_nested]
+                     for is_nested in (False, True))
+    return names, nested, geometry, own
 
 
 def _name(path: Path, own: dict | str) -> str:

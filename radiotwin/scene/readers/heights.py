@@ -96,6 +96,8 @@ KNOWN = (
         "nombre_d_etages", "nb_etages", "numberoffloorsaboveground", "aog", "geschosse",
         "storeys", "stories", "floors", "levels")))
 """Known columns; of a building, the first usable one counts."""
+READ_COLUMNS = frozenset(name for column in KNOWN for name in (column.name, column.ground)) | {
+    "roof:height", "roof:levels", "min_height", "building:min_level"}
 
 
 def column_name(text: str) -> str:
@@ -140,7 +142,8 @@ def check_declared(column: HeightColumn, rows: Iterable[Mapping[str, str]], sour
     there = {key for tags in rows for key in tags}
     for name in (column.name, column.ground):
         if name and name not in there:
-            raise BadInput(f"{source} has no column {name!r}; its columns are: {_listed(there)}")
+            raise BadInput(f"{source} has no column {name!r}; its columns are: "
+                           f"{listed_columns(there)}")
 
 
 def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
@@ -160,7 +163,7 @@ def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
                     f"above 0 and up to 1,000 m, only such as {value.strip()[:20]}. Correct it, "
                     "name another column with --height-column NAME, or give all buildings one "
                     "height with --height-default M. Its columns of numbers are: "
-                    f"{_listed(numeric)}")
+                    f"{listed_columns(numeric)}")
     elevations = [f"{column.name} is an elevation, from which the ground's ({column.ground}) has "
                   "to be subtracted, and the file has none"
                   for column in KNOWN if column.ground and column.name in counts
@@ -169,10 +172,11 @@ def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
     return ("none of its columns is known to hold heights" + hint + ". Name one with "
             "--height-column NAME (metres above ground; NAME:ft, NAME:cm or NAME:storeys; of an "
             "elevation, with --ground-column NAME), or give all buildings one height with "
-            f"--height-default M. Its columns of numbers are: {_listed(numeric)}")
+            f"--height-default M. Its columns of numbers are: {listed_columns(numeric)}")
 
 
-def _listed(names: Iterable[str]) -> str:
+def listed_columns(names: Iterable[str]) -> str:
+    """Return names in order, of many the first twenty."""
     ordered = sorted(names)
     more = len(ordered) - MAX_LISTED
     return ", ".join(repr(name[:60]) for name in ordered[:MAX_LISTED]) + (

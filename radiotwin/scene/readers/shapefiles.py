@@ -12,7 +12,8 @@ import io
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -23,6 +24,7 @@ from shapely.geometry.base import BaseGeometry
 from radiotwin.errors import BadInput, optional_package
 from radiotwin.io.budgets import COLUMNS, ENTRIES, FEATURES, FILE_BYTES, OUTLINE_CORNERS, VERTICES
 from radiotwin.io.inputs import open_input, read_bytes, require_within
+from radiotwin.scene.checks import Problem
 from radiotwin.scene.readers.city_objects import (
     CityObject,
     Geometry,
@@ -32,6 +34,7 @@ from radiotwin.scene.readers.city_objects import (
 from radiotwin.scene.readers.features import MapFile
 from radiotwin.scene.readers.gis_files import map_file
 from radiotwin.scene.readers.heights import full_names
+from radiotwin.scene.readers.layers import choose_layers, join_layers
 from radiotwin.scene.readers.systems import (
     chosen_system,
     degrees_from,
@@ -47,6 +50,7 @@ _LOD = 2.0  # of a building with its roof, in the words of CityGML
 _PARTS = (".shp", ".dbf", ".prj", ".cpg")
 _MAGIC, _HEADER = 9994, 100  # file code and length of the header [bytes] [1]
 _POLYGONS = (0, 5, 15, 25)  # null, Polygon, PolygonZ, PolygonM [1]
+_AREAS = (*_POLYGONS[1:], MULTIPATCH)
 _CODECS = {"utf-8": "utf-8", "utf8": "utf-8", "65001": "utf-8", "1252": "cp1252",
            "cp1252": "cp1252", "ansi 1252": "cp1252", "windows-1252": "cp1252",
            "88591": "iso-8859-1", "iso-8859-1": "iso-8859-1", "iso88591": "iso-8859-1"}
@@ -101,19 +105,32 @@ def _patch_surfaces(shape: Any) -> list[Polygon]:
     return found
 
 
-def read_shapefile(path: Path, crs: str | None = None) -> MapFile:
+def read_shapefile(path: Path, crs: str | None = None, wanted: Sequence[str] = ()) -> MapFile:
     """Read the polygons or multipatches of a Shapefile, in any coordinate reference system.
 
     Args:
         path: `.shp` file with `.dbf` and `.prj` beside it, or `.zip` archive of one or more.
         crs: coordinate reference system of a file without `.prj`; None: refuse it.
+        wanted: names of those in an archive; none: those that hold buildings, see `choose_layers`.
 
     Raises:
         BadInput: no such file, one of the three missing, cut off or damaged, or too large.
     """
-    found = MapFile([])
-    layers = _archived(path) if path.suffix.lower() == ".zip" else [(path.stem, _beside(path))]
-    for name, files in layers:
+    layers = _archived(path) if path.suffix.lower() == ".zip" else {path.stem: _beside(path)}
+    chosen: list[str] = list(layers)
+    problems: list[Problem] = []
+    others: tuple[str, ...] = ()
+    if len(layers) > 1:
+        areas = {name: files for name, files in layers.items() if _kind(files) in _AREAS}
+        chosen, problems = choose_layers(
+            path, {name: _columns(path, name, files) for name, files in (areas or layers).items()},
+            wanted)
+        others = tuple(name for name in layers if areas and name not in areas)
+    elif wanted:
+        raise BadInput(f"{path} is one Shapefile, without layers; leave --layer out")
+    parts = {}
+    for name in chosen:
+        files = layers[name]
         for suffix in (".shp", ".dbf"):
             if suffix not in files:
                 raise BadInput(f"{path}: the Shapefile {name} has no {suffix}; keep its .shp, "
@@ -124,12 +141,28 @@ def read_shapefile(path: Path, crs: str | None = None) -> MapFile:
                            "--crs EPSG:25832")
         system = chosen_system(path, _text(files[".prj"]) if ".prj" in files else None, crs)
         assert system is not None
-        is_patch = files[".shp"][32:36] == struct.pack("<i", MULTIPATCH)
+        is_patch = _kind(files) == MULTIPATCH
         rows = _rows(path, name, files, _patch_surfaces if is_patch else _area)
-        part = (_patches_file if is_patch else map_file)(path, rows, system)
-        found.features += part.features
-        found.left_out += part.left_out
-    return found
+        parts[name] = (_patches_file if is_patch else map_file)(path, rows, system)
+    return replace(join_layers(path, parts, problems), layers=others)
+
+
+def _kind(files: Mapping[str, bytes]) -> int:
+    """Return the type of a Shapefile's shapes [1]; -1 of one that is too short to have one."""
+    head = files[".shp"][32:36]
+    return int.from_bytes(head, "little") if len(head) == 4 else -1
+
+
+def _columns(path: Path, name: str, files: Mapping[str, bytes]) -> list[str]:
+    shapefile = _pyshp(path)
+    if ".dbf" not in files:
+        return []
+    try:
+        with shapefile.Reader(dbf=io.BytesIO(files[".dbf"]), encodingErrors="replace") as reader:
+            return [str(field[0]) for field in reader.fields]
+    except (shapefile.ShapefileException, *_ERRORS) as error:
+        raise BadInput(f"{path}, {name} is not a readable Shapefile ({error}); export it again"
+                       ) from None
 
 
 def _beside(path: Path) -> dict[str, bytes]:
@@ -147,7 +180,7 @@ def _beside(path: Path) -> dict[str, bytes]:
     return files
 
 
-def _archived(path: Path) -> list[tuple[str, dict[str, bytes]]]:
+def _archived(path: Path) -> dict[str, dict[str, bytes]]:
     """Return name and parts of each Shapefile in a ZIP archive."""
     layers: dict[str, dict[str, bytes]] = {}
     read = 0
@@ -167,7 +200,7 @@ def _archived(path: Path) -> list[tuple[str, dict[str, bytes]]]:
     except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError, OSError,
             ValueError) as error:
         raise BadInput(f"{path} is not a readable ZIP archive ({error}); pack it again") from None
-    found = [(name, files) for name, files in layers.items() if ".shp" in files]
+    found = {name: files for name, files in layers.items() if ".shp" in files}
     if not found:
         raise BadInput(f"{path} holds no .shp file; give an archive of a Shapefile")
     return found
@@ -177,12 +210,16 @@ def _text(data: bytes) -> str:
     return data.decode("utf-8-sig", "replace").strip("\0 \r\n\t")
 
 
+def _pyshp(path: Path) -> Any:
+    return optional_package(
+        "shapefile", f"{path}: Shapefiles are read with the package pyshp, which is not installed; "
+                     "install it with `pip install 'radiotwin[gis]'`")
+
+
 def _rows(path: Path, name: str, files: Mapping[str, bytes], convert: Callable[[Any], Any]
           ) -> Iterator[tuple[str, dict[str, Any], Any]]:
     """Yield name, columns and converted shape of each building."""
-    shapefile = optional_package(
-        "shapefile", f"{path}: Shapefiles are read with the package pyshp, which is not installed; "
-                     "install it with `pip install 'radiotwin[gis]'`")
+    shapefile = _pyshp(path)
     subject = f"{path}, {name}"
     records = _check_records(subject, files[".shp"])
     codec = _CODECS.get(_text(files.get(".cpg", b"")).lower(), "utf-8")

@@ -111,7 +111,14 @@ def vertical_unit_m(system: "CRS") -> float:
     axes = system.axis_info
     if len(axes) > 2:
         return float(axes[2].unit_conversion_factor)
-    return 1.0 if system.is_geographic or not axes else float(axes[0].unit_conversion_factor)
+    return plane_unit_m(system)
+
+
+def plane_unit_m(system: "CRS") -> float:
+    """Return the unit of east and north [m]; 1 of a geographic system."""
+    plane = plane_of(system)
+    axes = plane.axis_info
+    return 1.0 if plane.is_geographic or not axes else float(axes[0].unit_conversion_factor)
 
 
 def to_degrees(path: Path, system: "CRS", points: np.ndarray) -> np.ndarray:

@@ -26,8 +26,10 @@ from radiotwin.runtime.console import progress
 from radiotwin.scene.checks import Problem, warning
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.folder import source_text
+from radiotwin.scene.readers.heights import FOOT_M, UNITS_M
+from radiotwin.scene.readers.plausible import STEP_M, steep_steps, zero_voids
 from radiotwin.scene.readers.solids import Prism
-from radiotwin.scene.readers.systems import find_system
+from radiotwin.scene.readers.systems import find_system, plane_unit_m
 from radiotwin.scene.terrain import GroundMesh, HeightGrid, Kind, TerrainConfig, triangulate
 
 if TYPE_CHECKING:
@@ -38,8 +40,9 @@ MIN_SPACING_M = 1.0
 MARGIN_PIXELS = 2  # around the grid, for the interpolation at its border
 HEIGHTS_M = (-500.0, 9_000.0)  # on land; what is outside was meant to be no height
 MIN_KNOWN = 0.5  # share of the nodes that the raster must have a height for
-_FEET = {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us survey foot": 1200 / 3937,
-         "us-ft": 1200 / 3937, "us_survey_feet": 1200 / 3937}
+_FEET = dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048) | dict.fromkeys(
+    ("us survey foot", "us survey feet", "us_survey_foot", "us_survey_feet", "us-ft", "ftus",
+     "foot_us"), 1200 / 3937)
 _METRES = ("", "m", "metre", "metres", "meter", "meters")
 _GDAL = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO",
          "GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 2**26}
@@ -51,11 +54,12 @@ SAMPLE_M = 2.0  # along outlines: on a slope of 45 degrees the ground falls by a
 FLAT_FACT = "flat, at z = 0: a map holds no terrain (--terrain FILE.tif adds one)"
 
 
-def read_heights(path: Path, origin: Origin, box_m: Bounds) -> HeightGrid:
+def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = None) -> HeightGrid:
     """Read the heights of an area (x_min, x_max, y_min, y_max) [m], brought to a grid.
 
     They are above the zero of the file's vertical reference, averaged or interpolated. A node
-    without one, where the file has no data, has that of the nearest pixel which has one.
+    without one, where the file has no data, has that of the nearest pixel which has one. The unit,
+    `m` or `ft`, is that of a file which names none; None: metres, unless its plan is in feet.
 
     Raises:
         BadInput: rasterio is not installed; not a GeoTIFF, or one without a system, with several
@@ -64,13 +68,14 @@ def read_heights(path: Path, origin: Origin, box_m: Bounds) -> HeightGrid:
     with _opened(path) as file:
         system = _system(path, file)
         to_pixel = _pixels_of(file, system, origin)
-        factor, reference, kind = _vertical(path, file, system)
-        x_m, y_m, every = _nodes(file, system, origin, box_m)
+        factor, reference, kind = _vertical(path, file, system, unit)
+        x_m, y_m, every, pixel_m = _nodes(file, system, origin, box_m)
         column, row = to_pixel(*np.meshgrid(x_m, y_m))
-        height, first = _window(path, file, column, row, every)
+        height, first, voids = _window(path, file, column, row, every, pixel_m / factor)
     height = height * factor
     wrong = (height < HEIGHTS_M[0]) | (height > HEIGHTS_M[1])
     height[wrong] = np.nan
+    step_m, steps = steep_steps(height, every * pixel_m)
     known = np.isfinite(height)
     at = [(row - first[0]) / every - 0.5, (column - first[1]) / every - 0.5]
     nearest = [np.clip(np.round(axis), 0, size - 1).astype(int)
@@ -87,6 +92,15 @@ def read_heights(path: Path, origin: Origin, box_m: Bounds) -> HeightGrid:
     if wrong.any():
         notes.append(f"{np.count_nonzero(wrong):,} pixel(s) are no heights on land "
                      f"({HEIGHTS_M[0]:g} to {HEIGHTS_M[1]:g} m): taken for no data")
+    if voids:
+        notes.append(f"{voids:,} pixel(s) are 0 amid heights that are not, or mixed with such: "
+                     "taken for no data. Where 0 is a height, declare another value as no data "
+                     "(`gdal_edit.py -a_nodata -9999`)")
+    if steps:
+        notes.append(f"the ground falls by up to {step_m:.0f} m between neighbouring pixels "
+                     f"{every * pixel_m:.3g} m apart ({steps:,} times more than {STEP_M:g} m and "
+                     "80 degrees): are these voids, or is it a surface model with towers? Declare "
+                     "what is no data with `gdal_edit.py -a_nodata VALUE`")
     if factor != 1.0:
         notes.append(f"heights in feet were converted to metres ({factor:.7g})")
     return HeightGrid(x_m, y_m, heights_m, float(1 - covered.mean()), reference, kind, tuple(notes))
@@ -155,13 +169,25 @@ def _pixels_of(file: Any, system: "CRS", origin: Origin) -> Any:
     return to_pixel
 
 
-def _vertical(path: Path, file: Any, system: "CRS") -> tuple[float, str, Kind]:
+def _vertical(path: Path, file: Any, system: "CRS",
+              declared: str | None) -> tuple[float, str, Kind]:
     """Return the factor to metres, the name of the vertical reference, and its kind."""
     vertical = next((part for part in system.sub_crs_list if part.is_vertical), None)
     axis = vertical.axis_info[0] if vertical is not None else (
         system.axis_info[2] if len(system.axis_info) == 3 else None)
     unit = (file.units[0] or "").strip().lower()
-    if unit in _METRES:
+    plan_m = plane_unit_m(system)
+    if not unit and axis is None:  # programs take the plan's unit, or metres
+        if declared is None and plan_m != 1.0:
+            raise BadInput(f"{path} names no unit of its heights, and its plan is in feet or "
+                           f"another unit ({plan_m:.7g} m); say --terrain-unit ft or "
+                           "--terrain-unit m")
+        is_foot = abs(plan_m - FOOT_M) < 1e-3  # of a survey, or the international one
+        factor = plan_m if declared == "ft" and is_foot else UNITS_M[declared or "m"]
+    elif declared is not None:
+        raise BadInput(f"{path} names the unit of its heights itself; leave --terrain-unit out, or "
+                       "correct the file's unit if it is wrong")
+    elif unit in _METRES:
         factor = axis.unit_conversion_factor if axis is not None and not unit else 1.0
     elif unit in _FEET:
         factor = _FEET[unit]
@@ -176,8 +202,8 @@ def _vertical(path: Path, file: Any, system: "CRS") -> tuple[float, str, Kind]:
 
 
 def _nodes(file: Any, system: "CRS", origin: Origin,
-           box_m: Bounds) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the coordinates of the grid's lines [m], and how many pixels go to one along each."""
+           box_m: Bounds) -> tuple[np.ndarray, np.ndarray, int, float]:
+    """Return the grid's lines [m], how many pixels go to one along each, and a pixel's size [m]."""
     from pyproj import Transformer
 
     x_min, x_max, y_min, y_max = box_m
@@ -196,14 +222,14 @@ def _nodes(file: Any, system: "CRS", origin: Origin,
     spacing_m = max(pixel_m, MIN_SPACING_M, np.sqrt((x_max - x_min) * (y_max - y_min) / MAX_NODES))
     lines = [np.linspace(low, high, max(int(np.ceil((high - low) / spacing_m)), 1) + 1)
              for low, high in ((x_min, x_max), (y_min, y_max))]
-    return lines[0], lines[1], max(int(spacing_m / pixel_m), 1)
+    return lines[0], lines[1], max(int(spacing_m / pixel_m), 1), pixel_m
 
 
-def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray,
-            every: int) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return the mean heights of squares of pixels around all nodes, and the first row and column.
+def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray, every: int,
+            pixel: float) -> tuple[np.ndarray, tuple[int, int], int]:
+    """Return the mean heights of squares of pixels, the first row and column, and zeros left out.
 
-    A square without data is not a number.
+    A square without data is not a number. The size of a pixel is in the unit of heights.
     """
     finite = np.isfinite(column) & np.isfinite(row)
     bounds = []
@@ -212,13 +238,14 @@ def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray,
         high = np.ceil(np.max(values[finite], initial=-np.inf)) + MARGIN_PIXELS * every
         low, high = max(low, 0), min(high, size)
         if not low < high:
-            return np.full((1, 1), np.nan), (0, 0)
+            return np.full((1, 1), np.nan), (0, 0), 0
         bounds.append((int(low), int(high)))
     (top, bottom), (left, right) = bounds
     TERRAIN_PIXELS.check(float(bottom - top) * (right - left), path)
     rows, columns = -(-(bottom - top) // every), -(-(right - left) // every)
     out = np.empty((rows, columns))
     at_once = max(1, 8_000_000 // (every * (right - left)))
+    scale, offset, voids = file.scales[0], file.offsets[0], 0
     with progress("reading terrain", total=rows) as advance:
         for first in range(0, rows, at_once):
             count = min(at_once, rows - first)
@@ -227,10 +254,13 @@ def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray,
             values = np.full((count * every, columns * every), np.nan)
             with np.errstate(invalid="ignore"):  # NaN that signal
                 values[:end - start, :right - left] = np.ma.filled(part.astype(float), np.nan)
+            if file.nodata is None:
+                void = zero_voids(values, pixel / scale)
+                values[void] = np.nan
+                voids += int(np.count_nonzero(void))
             out[first:first + count] = _means(values, every)
             advance(count)
-    scale, offset = file.scales[0], file.offsets[0]
-    return out * scale + offset, (top, left)
+    return out * scale + offset, (top, left), voids
 
 
 def _means(values: np.ndarray, every: int) -> np.ndarray:
@@ -269,7 +299,8 @@ class Ground:
     problems: tuple[Problem, ...] = ()
 
 
-def make_ground(terrain: Path | None, origin: Origin, box_m: Bounds, shape: str) -> Ground:
+def make_ground(terrain: Path | None, origin: Origin, box_m: Bounds, shape: str,
+                unit: str | None = None) -> Ground:
     """Return the ground of an area, above its datum.
 
     Args:
@@ -277,6 +308,7 @@ def make_ground(terrain: Path | None, origin: Origin, box_m: Bounds, shape: str)
         origin: of the local frame; an altitude other than 0 becomes the datum of a terrain.
         box_m: (x_min, x_max, y_min, y_max) [m].
         shape: name of its shape.
+        unit: of the heights of a file that names none, `m` or `ft`.
 
     Raises:
         BadInput: the raster cannot be used, or the declared altitude is above the lowest ground.
@@ -285,7 +317,7 @@ def make_ground(terrain: Path | None, origin: Origin, box_m: Bounds, shape: str)
     if terrain is None:
         corners = np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
         return Ground(corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    grid = read_heights(terrain, origin, box_m)
+    grid = read_heights(terrain, origin, box_m, unit)
     low_m = round(float(grid.height_m.min()), 3)
     # Of 0 m, an origin declares no altitude
     datum_m = origin.altitude_m or float(np.floor(low_m)) or -1.0

@@ -1,0 +1,124 @@
+"""Which layers of a file hold its buildings, where it has several.
+
+A GeoPackage of 3D BAG [1] has the same buildings in each level of detail, one of Overture Maps has
+buildings and their parts, an extract of Geofabrik [2] also woods, water and railways.
+
+[1] https://docs.3dbag.nl/en/schema/layers
+[2] https://download.geofabrik.de/osm-data-in-gis-formats-free.pdf
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import shapely
+
+from radiotwin.errors import BadInput
+from radiotwin.scene.checks import Problem, listed, warning
+from radiotwin.scene.readers.features import BUILDING_KEYS, MapFile
+from radiotwin.scene.readers.heights import KNOWN, column_name
+
+WHOLE, GROUND_COLUMNS = "pand", ("b3_h_maaiveld", "h_maaiveld")  # of 3D BAG
+IDENTIFIER = "identificatie"  # of its buildings
+_PROJECTED = re.compile(r"lod(\d)(\d)_2d")  # its roofs seen from above, by level of detail
+_NAMES = re.compile(r"building|gebaeude|gebäude|b[aâ]timent|pand(?![a-z])|edifi[ck]|fabbricat|"
+                    r"budyn|bygning|byggnad|rakennu|epulet|épület|footprint|hous|haeuser|häuser|"
+                    r"huizen", re.IGNORECASE)
+SAME_GROUND = 0.5  # share of a layer's buildings within those of another that makes both one
+
+
+def choose_layers(path: Path, columns: Mapping[str, Sequence[str]],
+                  wanted: Sequence[str]) -> tuple[list[str], list[Problem]]:
+    """Return the layers that hold the buildings, and a warning of those that are not read.
+
+    They are those that the user wants; else, of 3D BAG, the most detailed roofs seen from above and
+    the outlines; else those with tags of buildings, whose name says so, or with known heights.
+
+    Args:
+        path: for messages.
+        columns: of each layer of areas, by its name.
+        wanted: names of layers; none: choose.
+
+    Raises:
+        BadInput: no layer is called so, or nothing tells which one is meant.
+    """
+    names = list(columns)
+    if unknown := [name for name in wanted if name not in columns]:
+        raise BadInput(f"{path} has no layer of areas called {unknown[0]!r}; its layers are: "
+                       f"{listed_all(names)}")
+    chosen = [name for name in names if name in wanted] if wanted else _meant(columns)
+    if not chosen and names:
+        raise BadInput(f"{path} has {len(names)} layers of areas, and none is known to hold "
+                       "buildings by its name or columns; choose with --layer NAME: "
+                       f"{listed_all(names)}")
+    left = [name for name in names if name not in chosen]
+    if wanted or not left:
+        return chosen, []
+    return chosen, [warning(f"{len(left)} layer(s) were not read ({listed(left)}): buildings are "
+                            f"taken from {listed_all(chosen)}; --layer NAME reads another")]
+
+
+def listed_all(names: Sequence[str]) -> str:
+    """Return `'a', 'b'`, of many the first twenty."""
+    return ", ".join(repr(name[:60]) for name in names[:20]) + ", …" * (len(names) > 20)
+
+
+def _meant(columns: Mapping[str, Sequence[str]]) -> list[str]:
+    names = list(columns)
+    if len(names) < 2:
+        return names
+    if projected := [name for name in names if _PROJECTED.fullmatch(name.lower())]:
+        return [max(projected), *(name for name in names if name.lower() == WHOLE)]
+    known = {one.name for one in KNOWN} - {one.name for one in KNOWN if one.ground}
+    own = {name: {column_name(column) for column in columns[name]} for name in names}
+    rules = ([name for name in names if own[name] & {*BUILDING_KEYS, "has_parts"} or
+              {"building_id", "is_underground"} <= own[name]],
+             [name for name in names if _NAMES.search(name)],
+             [name for name in names if own[name] & known])
+    return next((found for found in rules if found), [])
+
+
+def join_layers(path: Path, parts: Mapping[str, MapFile], problems: list[Problem]) -> MapFile:
+    """Return the buildings of all layers that were read.
+
+    Of 3D BAG the outline of a building is taken where it has no roofs (greenhouses), and roofs have
+    its ground.
+
+    Raises:
+        BadInput: layers hold the same buildings.
+    """
+    plans_m = [part.plan_m for part in parts.values() if part.plan_m != 1.0]
+    found = MapFile([], [one for part in parts.values() for one in part.left_out], problems,
+                    plan_m=plans_m[0] if plans_m else 1.0,
+                    columns={name for part in parts.values() for name in part.columns})
+    whole = next((name for name in parts if name.lower() == WHOLE), None)
+    if whole is not None and len(parts) > 1:
+        outlines = {one.tags.get(IDENTIFIER): one for one in parts[whole].features}
+        for one in (one for name in parts if name != whole for one in parts[name].features):
+            outline = outlines.get(one.tags.get(IDENTIFIER))
+            ground = {} if outline is None else {
+                key: outline.tags[key] for key in GROUND_COLUMNS if key in outline.tags}
+            found.features.append(replace(one, tags=ground | dict(one.tags)))
+        roofed = {one.tags.get(IDENTIFIER) for one in found.features}
+        found.features += [one for one in parts[whole].features
+                           if one.tags.get(IDENTIFIER) not in roofed]
+        return found
+    wholes = {name: [one.area for one in part.features if not one.is_part]
+              for name, part in parts.items()}
+    for name, areas in wholes.items():
+        for other, others in wholes.items():
+            if name != other and _share_within(areas, others) > SAME_GROUND:
+                raise BadInput(f"{path}: the layers {name!r} and {other!r} hold the same "
+                               f"buildings; choose one with --layer {name}")
+    found.features += [one for part in parts.values() for one in part.features]
+    return found
+
+
+def _share_within(areas: Sequence[shapely.Geometry], others: Sequence[shapely.Geometry]) -> float:
+    """Return the share of areas whose middle lies in one of the others."""
+    if not areas or not others:
+        return 0.0
+    inside = shapely.STRtree(others).query(shapely.point_on_surface(list(areas)), "within")[0]
+    return len(np.unique(inside)) / len(areas)

@@ -1,0 +1,140 @@
+"""Values of maps and terrains that can be read, and that can hardly be meant.
+
+A building of more than 300 m is rare: some 200 of them exist [1]; the most slender is 24 times as
+tall as wide [2]. No city has a median above 60 m. Rasters that were clipped or warped without a
+value for no data have zeros there [3]. Single pixels that differ by more than 100 m from those
+around them were taken for errors where SRTM was edited [4].
+
+[1] Council on Tall Buildings and Urban Habitat, height criteria ("supertall").
+[2] https://skyscraper.org/super-slenders/slenderness
+[3] https://gdal.org/en/stable/programs/gdalwarp.html (-dstnodata)
+[4] Slater et al., "The SRTM data 'finishing' process and products", Photogrammetric Engineering and
+    Remote Sensing 72(3), 2006.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import shapely
+from scipy import ndimage
+from shapely.geometry.base import BaseGeometry
+
+from radiotwin.scene.checks import MAX_MEDIAN_M, Problem
+from radiotwin.scene.readers.features import problems_of
+from radiotwin.scene.readers.heights import KNOWN, STOREYS, Height, number
+
+RARE_M, RARE_SLENDERNESS = 300.0, 24.0  # of a building: [1]; height over width: [2]
+VOID_STEP_M, VOID_SLOPE = 30.0, math.tan(math.radians(60.0))  # around zeros that are no heights
+VOID_BORDER = 0.9  # share of the pixels around them that are so much higher
+KERNEL_PIXELS = 3  # that a cubic interpolation mixes with a void
+STEP_M, STEP_SLOPE = 100.0, math.tan(math.radians(80.0))  # between pixels, that is told: [4]
+_AROUND = np.ones((3, 3), dtype=bool)
+
+
+def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
+                        columns: Mapping[str, Mapping[str, str]]) -> list[Problem]:
+    """Return a warning about buildings that are hardly as tall as their map has them.
+
+    Args:
+        buildings: name, height and site in the local frame [m] of each; of a height that is a
+            default nothing is said.
+        columns: by name of a building, its tags.
+    """
+    tallest: dict[str, tuple[str, Height, BaseGeometry]] = {}
+    for name, height, site in buildings:
+        if height.source != "default" and (
+                name not in tallest or height.top_m > tallest[name][1].top_m):
+            tallest[name] = name, height, site
+    known = list(tallest.values())
+    tops_m = np.array([height.top_m for _, height, _ in known])
+    if not len(tops_m):
+        return []
+    wide_m = np.array([_width_m(site) for _, _, site in known])
+    rare = (tops_m > RARE_M) | (tops_m > RARE_SLENDERNESS * np.maximum(wide_m, 1.0))
+    shifted = len(tops_m) > 1 and float(np.median(tops_m)) > MAX_MEDIAN_M
+    if not (rare.any() or shifted):
+        return []
+    named = np.flatnonzero(rare if rare.any() else tops_m > MAX_MEDIAN_M)
+    said = [f"{known[row][0]}: {tops_m[row]:.4g} m tall, {wide_m[row]:.3g} m wide"
+            for row in sorted(named, key=lambda row: -tops_m[row])]
+    what = (f"building(s) are taller than {RARE_M:g} m, or than {RARE_SLENDERNESS:g} times their "
+            "width, as hardly any building is" if rare.any() else
+            f"of {len(tops_m):,} building(s) are taller than {MAX_MEDIAN_M:g} m, more than half, "
+            "as in no city")
+    return problems_of(said, what + _hint(known[int(named[0])][1].source, known, columns))
+
+
+def _width_m(site: BaseGeometry) -> float:
+    """Return the shorter side of the narrowest rectangle around an area [m]."""
+    corners = shapely.get_coordinates(shapely.oriented_envelope(site))
+    sides_m = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    return float(sides_m[:2].min()) if len(sides_m) > 1 else 0.0
+
+
+def _hint(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
+          columns: Mapping[str, Mapping[str, str]]) -> str:
+    """Return what a column of heights may hold instead, and how to say so."""
+    if source == "model":
+        return "; are the model's elevations in metres?"
+    column = source.split(" - ")[0]
+    if any(one.name == column and one.unit == STOREYS for one in KNOWN):
+        return (f". If {column!r} does not count storeys, say --height-column {column}; if it "
+                "does, nothing is to be done")
+    ground = _ground_column(known, columns)
+    return (f". If {column!r} is an elevation, say --height-column {column} --ground-column "
+            f"{ground or 'GROUND'}; if it is in feet or centimetres, --height-column {column}:ft "
+            f"or {column}:cm. If the heights are right, nothing is to be done")
+
+
+def _ground_column(known: Sequence[tuple[str, Height, BaseGeometry]],
+                   columns: Mapping[str, Mapping[str, str]]) -> str | None:
+    """Return a column whose difference to the heights is that of usual buildings."""
+    rows = [(height.top_m, columns.get(name, {})) for name, height, _ in known]
+    for column in sorted({column for _, tags in rows for column in tags}):
+        above_m = np.array([top_m - number(tags.get(column, "")) for top_m, tags in rows])
+        ground_m = np.array([top_m for top_m, _ in rows]) - above_m
+        if ((above_m > 0) & (ground_m > MAX_MEDIAN_M)).all() and np.median(above_m) < MAX_MEDIAN_M:
+            return column
+    return None
+
+
+def zero_voids(height_m: np.ndarray, pixel_m: float) -> np.ndarray:
+    """Return which pixels (rows, columns) [m] are zeros that stand for no data, or mixed with them.
+
+    These are regions of zeros with a wall of 30 m and of 60 degrees around nine tenths of them, and
+    the pixels that an interpolation has mixed with them.
+    """
+    region, count = ndimage.label(height_m == 0.0, _AROUND)
+    if not count:
+        return np.zeros(height_m.shape, dtype=bool)
+    wall_m = max(VOID_STEP_M, VOID_SLOPE * pixel_m)
+    borders, walls = np.zeros(count + 1), np.zeros(count + 1)
+    for inner, outer in _neighbours(height_m.shape):
+        beside = (region[inner] > 0) & (region[outer] == 0) & np.isfinite(height_m[outer])
+        at = region[inner][beside]
+        borders += np.bincount(at, minlength=count + 1)
+        walls += np.bincount(at, height_m[outer][beside] > wall_m, minlength=count + 1)
+    void = ((borders > 0) & (walls >= VOID_BORDER * borders))[region]
+    for _ in range(KERNEL_PIXELS if void.any() else 0):
+        rim = ndimage.binary_dilation(void, _AROUND) & ~void
+        mixed = np.zeros_like(void)
+        for inner, outer in _neighbours(height_m.shape):
+            mixed[inner] |= rim[inner] & ~void[outer] & (height_m[outer] - height_m[inner] > wall_m)
+        void |= mixed
+    return void
+
+
+def steep_steps(height_m: np.ndarray, pixel_m: float) -> tuple[float, int]:
+    """Return the largest step between neighbouring pixels [m], and how many are hardly natural."""
+    steps_m = np.concatenate([np.abs(np.diff(height_m, axis=axis)).ravel() for axis in (0, 1)])
+    steps_m = steps_m[np.isfinite(steps_m)]
+    steep = steps_m > max(STEP_M, STEP_SLOPE * pixel_m)
+    return float(steps_m.max(initial=0.0)), int(np.count_nonzero(steep))
+
+
+def _neighbours(shape: tuple[int, ...]) -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
+    """Return index pairs of the pixels of a raster and of their neighbours on each side."""
+    first, last, whole = slice(None, -1), slice(1, None), slice(None)
+    return [((first, whole), (last, whole)), ((last, whole), (first, whole)),
+            ((whole, first), (whole, last)), ((whole, last), (whole, first))]
