@@ -19,7 +19,7 @@ from scipy.special import softmax
 from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.scan import Anomaly, scan
 from radiotwin.closeloop.search.faults import adopted, judged_elsewhere, within_flights
-from radiotwin.closeloop.search.scoring import Candidate, fit_candidate, judged
+from radiotwin.closeloop.search.scoring import Candidate, fit_candidate, judged, with_candidate
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import MIN_RIVAL_SHARE, MIN_SHARED, MIN_SURE
@@ -110,10 +110,16 @@ def _judged(model: CrossFit, candidate: Candidate, others: Sequence[float],
             hypotheses: Hypotheses, inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
     """Return a cause with its probability, and the model with it unless it is refused.
 
-    What happened on a flight does not return on others: it is judged within flights.
+    What happened on a flight, or changed between two, does not return on others: it is judged
+    within flights.
     """
-    if not candidate.effect.within_flights:
+    effect = candidate.effect
+    changes = inputs.folds.by == "flight" and effect.between_flights() is not None
+    if not (effect.within_flights or changes):
         return judged(model, candidate, others, hypotheses, inputs)
-    trial, there = judged_elsewhere(within_flights(model, inputs), candidate, others, hypotheses,
-                                    inputs)
-    return trial, None if there is None else adopted(model, candidate)
+    trial, there = judged_elsewhere(within_flights(model, inputs, "block" if changes else ""),
+                                    candidate, others, hypotheses, inputs)
+    if there is None:
+        return trial, None
+    return trial, (with_candidate(model, candidate, inputs.executor) if changes
+                   else adopted(model, candidate))

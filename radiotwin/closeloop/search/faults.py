@@ -66,9 +66,7 @@ def _with_one_kind(state: SearchState, effect: Effect, inputs: SearchInputs) -> 
             return state
         inputs.on_progress(f"{effect.name}, held out by block")
         if model is None:
-            links = located_links(state.model, inputs.links, inputs.base)
-            model = _in_other_folds(state.model, links, inputs.base,
-                                    make_folds(links, inputs.seed, "block"))
+            model = within_flights(state.model, inputs, "block")
         trial, extended = judged_elsewhere(model, candidate, [], hypotheses, inputs)
         if extended is None:
             return state.refuse(trial)
@@ -225,11 +223,14 @@ def _in_other_folds(model: CrossFit, links: Links, base: Base, folds: Folds) -> 
     return other
 
 
-def within_flights(model: CrossFit, inputs: SearchInputs) -> CrossFit:
-    """Return the base with a model's effects in folds that leave part of each flight."""
+def within_flights(model: CrossFit, inputs: SearchInputs, by: str = "") -> CrossFit:
+    """Return the base with a model's effects in folds that leave part of each flight.
+
+    Of devices, where enough are known, or of blocks; `by` says which.
+    """
     links = located_links(model, inputs.links, inputs.base)
     by_device = len(links.anchors & set(links.device.tolist())) >= MIN_HELD_OUT_DEVICES
-    by = "device" if by_device and not devices_move(links) else "block"
+    by = by or ("device" if by_device and not devices_move(links) else "block")
     return _in_other_folds(model, links, inputs.base, make_folds(links, inputs.seed, by))
 
 

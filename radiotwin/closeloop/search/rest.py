@@ -38,7 +38,7 @@ def add_shadowing(state: SearchState, inputs: SearchInputs) -> SearchState:
     for tried in (fields, [replace(each, certain=False) for each in fields]):
         extended = model.map(lambda fit, own: replace(fit, shadowing=own), tried)
         trial = score_model(model, extended, Trial(SHADOWING, step=state.step), inputs.criteria,
-                            inputs.criteria.min_training_gain_nats)
+                            inputs.criteria.min_gain_nats)
         if not trial.reason:
             return replace(state, model=extended, log=state.log.record(trial.keep()))
     return state.refuse(trial)

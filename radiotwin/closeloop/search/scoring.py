@@ -126,7 +126,7 @@ def score_candidate(model: CrossFit, candidate: Candidate,
                   devices=devices, receivers=receivers)
     is_judged = found.is_cause or found.is_declared
     trial = score_model(model, extended, trial, inputs.criteria,
-                        0.0 if is_judged else inputs.criteria.min_training_gain_nats)
+                        0.0 if is_judged else inputs.criteria.min_gain_nats)
     return trial, None if trial.reason else extended
 
 

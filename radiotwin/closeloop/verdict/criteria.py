@@ -34,8 +34,8 @@ class SelectionCriteria:
 
     Attributes:
         min_training_gain_nats: on the links that it is fitted to, for a candidate to be fitted to
-            the folds. Saves time: one that gains less is hardly probable. On held-out links, for a
-            description of the rest, which has no probability.
+            the folds. Saves time: one that gains less is hardly probable.
+        min_gain_nats: on held-out links, for a description of the rest, which has no probability.
         min_probability: that a cause is there, to be named; it is told with the name: more probable
             than not (`radiotwin.closeloop.verdict.posterior`).
         max_rest_db: standard deviation of what belongs to places and has no name, for
@@ -56,6 +56,7 @@ class SelectionCriteria:
     min_training_gain_nats: float = 10.0
     min_probability: float = 0.5
     max_rest_db: float = 3.0
+    min_gain_nats: float = 25.0
     max_rmse_rise: float = 1.01
     indistinguishable_nats: float = 4.605170185988092
     max_effects: int = 12
