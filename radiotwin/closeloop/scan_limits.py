@@ -47,7 +47,8 @@ def seen_from(model: CrossFit) -> list[Seen]:
     """
     readings = Readings.of(model)
     units = units_of(readings)
-    families = [replace(each, statistics=tuple({*each.statistics} & {*STATISTICS}))
+    families = [replace(each, statistics=tuple(
+        statistic for statistic in STATISTICS if statistic in each.statistics))
                 for each in families_of(readings, units)]
     sharpest: dict[tuple[str, str], Compared] = {}
     for each in compare(readings, families, units):
