@@ -6,11 +6,13 @@
 
 The base is `twin`; nothing else of the loop runs. `studies.where_truth` says which groups are those
 of an effect. Where a map is off by a metre or two, and by a building or two beside what is hidden,
-a group of links most of which it has with the wrong sight is neither right nor wrong.
+a group of links most of which it has with the wrong sight is neither right nor wrong, nor is one
+of ends that no longer stands out once the links that it has with the wrong sight are left out.
 """
 
 import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +26,9 @@ from radiotwin.closeloop.crossfit import (
     make_folds,
     training_parts,
 )
+from radiotwin.closeloop.families import Readings, families_of, units_of
 from radiotwin.closeloop.scan import Anomaly, scan
+from radiotwin.closeloop.scan import compare as compare_groups
 from radiotwin.links import prepare_links
 from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.limits import limits_to_explain
@@ -46,6 +50,7 @@ from studies.where_truth import (
 from tests.undeclared.cases import FAMILIES, OUTSIDE, case
 from tests.undeclared.foreign.cases import foreign_case, names, split_of
 
+UNITED = {"noise": "scatter"}  # statistics that are said as another
 SURE, NOTICEABLE_DB, MIN_LINKS = 0.9, 1.0, 15
 VISIBLE_T = 4.0
 OLDER = [*((family, 0) for family in (*FAMILIES, *OUTSIDE)),
@@ -104,7 +109,13 @@ def compare(model: CrossFit, anomalies: Sequence[Anomaly], measurements: Measure
     ends = {end: np.array(getattr(links, f"{end}_names"), dtype=object)[getattr(links, end)]
             for end in ENDS}
     by_median = robust_z(residual_db, ends, links.los)
-    by_places = shrunken(residual_db, ends, links.los, moving_end_m(links)[:, :2])
+    moving_m = moving_end_m(links)[:, :2]
+    by_places = shrunken(residual_db, ends, links.los, moving_m)
+    # Where no link has the wrong sight, no group stands out because of the map.
+    stays = _ends_without(Readings.of(model), wrong) if wrong.any() else None
+    stays_by_places = {_ends_of(each) for each in shrunken(
+        np.where(wrong, np.nan, residual_db), ends, links.los, moving_m)
+        if each.score >= THRESHOLD} if wrong.any() else None
     said = [each for each in anomalies if each.probability >= SURE]
     said_by_places = [each for each in by_places if each.score >= THRESHOLD]
     return {
@@ -118,19 +129,42 @@ def compare(model: CrossFit, anomalies: Sequence[Anomaly], measurements: Measure
                     "almost": max((each.probability for each in anomalies
                                    if is_there(each, one, heard)), default=0.0)}
                    for one in hidden],
-        "said": [_said(each, each.probability, float(each.size.value), hidden, wrong, heard)
+        "said": [_said(each, each.probability, float(each.size.value), hidden, wrong, heard, stays)
                  for each in anomalies],
-        "by_places": [_said(each, each.score, each.shift, hidden, wrong, heard)
+        "by_places": [_said(each, each.score, each.shift, hidden, wrong, heard, stays_by_places)
                       for each in said_by_places[:8]],
-        "by_median": [_said(each, each.score, each.shift, hidden, wrong, heard)
+        "by_median": [_said(each, each.score, each.shift, hidden, wrong, heard, None)
                       for each in by_median[:1]],
         "top_score": by_places[0].score if by_places else 0.0,
         "rmse_db": model.rmse_db(), "links": len(links)}
 
 
+Ends = tuple[str, frozenset, str]
+"""Family, members and statistic of a group."""
+
+
+def _ends_of(group: Any) -> Ends:
+    return group.family, frozenset(group.members.items()), group.statistic
+
+
+def _ends_without(readings: Readings, wrong: np.ndarray) -> set[Ends]:
+    """Return groups of ends that are likelier than not without some links (n,)."""
+    left = replace(readings, residual_db=np.where(wrong, np.nan, readings.residual_db),
+                   blank_excess=np.where(wrong, np.nan, readings.blank_excess))
+    units = units_of(left)
+    families = [each for each in families_of(left, units)
+                if each.name in ENDS or each.pairs]
+    return {(table.family.name, frozenset(table.family.describe(int(group))[0].items()),
+             UNITED.get(table.statistic, table.statistic))
+            for table in compare_groups(left, families, units)
+            for group in np.flatnonzero(table.log_odds > 0)}
+
+
 def _said(group: Group, sure: float, size: float, hidden: list[Truth], wrong: np.ndarray,
-          heard: np.ndarray) -> dict:
+          heard: np.ndarray, stays: set[Ends] | None) -> dict:
     there = any(is_there(group, one, heard) for one in hidden)
+    of_map = holds_mostly(group, wrong, heard) or (
+        stays is not None and not getattr(group, "ranges", {}) and _ends_of(group) not in stays)
     members = " ".join("+".join(its) for its in group.members.values())
     ranges = "".join(f" {name} {low:.0f}..{high:.0f}"
                      for name, (low, high) in getattr(group, "ranges", {}).items())
@@ -138,7 +172,7 @@ def _said(group: Group, sure: float, size: float, hidden: list[Truth], wrong: np
     return {"group": f"{group.family} {members}{ranges}".strip(), "statistic": group.statistic,
             "sight": getattr(group, "sight", "all"), "size": float(size), "sure": float(sure),
             "links": int(rows.sum() if rows.dtype == bool else len(rows)),
-            "is": "there" if there else "map" if holds_mostly(group, wrong, heard) else "not there"}
+            "is": "there" if there else "map" if of_map else "not there"}
 
 
 def where_table(rows: pd.DataFrame) -> str:

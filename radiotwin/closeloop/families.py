@@ -15,7 +15,8 @@ from radiotwin.links.correlation import moving_end_m
 
 PASSING_M, LASTING_M = 25.0, 75.0  # errors of one flight, and of the map, are alike within
 SECTORS, BANDS, WINDOWS = 8, 8, (2, 4, 8, 16, 32)
-RAY_SAMPLES, LOW_M, GRID_M = 24, 40.0, (50.0, 100.0)  # of links that pass through a place
+RAY_SAMPLES, LOW_M, GRID_M = 24, 40.0, (25.0, 50.0, 100.0)  # of links that pass through a place
+READINGS_A_BIN, MAX_WINDOWS, LEVEL_BANDS, CURVE_SECTOR_DEG = 40, 64, 12, 22.5  # of curves
 Words = tuple[dict[str, tuple[str, ...]], dict[str, tuple[float, float]]]
 """Members and ranges of a group."""
 
@@ -110,6 +111,9 @@ class Family:
         statistics: that are compared.
         pairs: label of both ends (k,) each, of groups that are pairs.
         is_crossing: whether several groups may have read one device at one place.
+        curve: (k,) of groups that are bins of curves, the number of each one's curve, of which
+            `describe` tells; None: each group is judged by itself.
+        along: of curves, the variable that they go along, with unit.
     """
 
     name: str
@@ -119,6 +123,16 @@ class Family:
     statistics: tuple[str, ...] = ("level", "noise", "scatter", "blanks")
     pairs: tuple[np.ndarray, ...] = ()
     is_crossing: bool = False
+    curve: np.ndarray | None = None
+    along: str = ""
+
+    def members(self, group: int, n: int) -> np.ndarray:
+        """Return the mask (n,) of the rows of a group, or of a curve."""
+        if self.curve is None:
+            return self.groups.members(group, n)
+        rows = np.zeros(n, dtype=bool)
+        rows[self.groups.row[self.curve[self.groups.group] == group]] = True
+        return rows
 
 
 def units_of(readings: Readings) -> Units:
@@ -167,6 +181,7 @@ def families_of(readings: Readings, units: Units) -> Iterator[Family]:
     yield from _directions(readings, units)
     yield from _bands(readings, units)
     yield from _places(readings, units)
+    yield from _curves(readings, units)
 
 
 def _pairs(readings: Readings, first: str, second: str,
@@ -294,6 +309,56 @@ def _bands(readings: Readings, units: Units) -> Iterator[Family]:
             return {}, {key: (float(values[rows].min()), float(values[rows].max()))}
         yield Family(name, Groups.of_labels(code, units), describe, (readings.device,),
                      ("level", "scatter"))
+
+
+def _curves(readings: Readings, units: Units) -> Iterator[Family]:
+    """Yield how the levels of each device, receiver and flight go along a variable.
+
+    A device's levels by direction are left to the directions: a wrong building nearby changes them.
+    """
+    track, device, receiver = readings.track, readings.device, readings.receiver
+    timed, predicted_db = np.isfinite(readings.time_s), readings.predicted_db
+    body_deg = readings.angles_deg["body azimuth"]
+    ends = device, track
+    by_receiver, by_flight = (_windows_of(readings, label, READINGS_A_BIN)
+                              for label in (track, readings.flight))
+    few = _windows_of(readings, readings.flight, READINGS_A_BIN * len(np.unique(device)))
+    sector = np.floor(np.nan_to_num(body_deg) / CURVE_SECTOR_DEG).astype(np.int64)
+    level = _quantile_band(predicted_db, LEVEL_BANDS)
+    for end, along, bins, known, off in (
+            ("receiver", "time_s", (track, by_receiver), timed, ends),
+            ("receiver", "flight", (readings.flight,), None, (device, receiver)),
+            ("receiver", "body_azimuth_deg", (sector,), np.isfinite(body_deg), ends),
+            ("receiver", "predicted_db", (level,), np.isfinite(predicted_db), ends),
+            ("flight", "time_s", (by_flight,), timed, ends),
+            ("device", "time_s", (readings.flight, few), timed, ends),
+            ("device", "flight", (readings.flight,), None, ends)):
+        label = getattr(readings, end)
+        known = np.ones(len(readings), dtype=bool) if known is None else known
+        if known.mean() < 0.5 or (along == "flight" and readings.flight.max() == 0):
+            continue
+        code = _packed(codes_of(label, *bins), known)
+
+        def describe(group: int, end: str = end) -> Words:
+            return {end: (readings.names[end][group],)}, {}
+        yield Family(end, Groups.of_labels(code, units), describe, off, ("curve",),
+                     is_crossing=True, curve=label[known][_examples(code[known])], along=along)
+
+
+def _windows_of(readings: Readings, label: np.ndarray, count: int) -> np.ndarray:
+    """Return the window (n,) of time within its label (n,), of about `count` readings each."""
+    begin, end = _extremes(readings.time_s, label)
+    number = np.clip(np.bincount(label, minlength=len(begin)) // count, 2, MAX_WINDOWS)
+    share = (readings.time_s - begin[label]) / np.maximum(end - begin, 1e-9)[label]
+    return np.floor(np.clip(np.nan_to_num(share), 0, 1 - 1e-9) * number[label]).astype(np.int64)
+
+
+def _quantile_band(values: np.ndarray, count: int) -> np.ndarray:
+    known = np.isfinite(values)
+    if not known.any():
+        return np.zeros(len(values), dtype=np.int64)
+    edges = np.unique(np.quantile(values[known], np.linspace(0, 1, count + 1)[1:-1]))
+    return np.searchsorted(edges, values)
 
 
 def _places(readings: Readings, units: Units) -> Iterator[Family]:

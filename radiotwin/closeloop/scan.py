@@ -20,6 +20,7 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Family, Readings, codes_of, families_of, units_of
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.effects.params import QUANTILE_90, Parameter
+from radiotwin.inference.curves import Curves, curves, curves_together
 from radiotwin.inference.gaussian import robust_sd
 from radiotwin.inference.groups import (
     HUBER,
@@ -51,9 +52,12 @@ LOS_DOF, NLOS_DOF = 60.0, 6.0  # tails of these differences of levels, Student's
 BOTH_SHARE = 0.8  # of what stands out does so with line of sight and without
 SCATTER_SPREAD, NOISE_SPREAD = 0.2, 0.3  # of peers: logarithm
 LOS_BLANKS_SPREAD, NLOS_BLANKS_SPREAD = 0.03, 0.12  # of peers: share of blanks
-ANYWHERE_DB, ANYWHERE_LOG, ANYWHERE_SHARE = 5.0, 0.8, 0.3  # scale of what stands out
+LOS_CURVE_SHARE, NLOS_CURVE_SHARE = 0.08, 0.1  # of a base's scatter by which curves change
+# Scale of what stands out.
+ANYWHERE, ANYWHERE_LOG = {"level": 5.0, "curve": 3.0, "blanks": 0.3}, 0.8
 # Odds that something of a family stands out in one way: a device, receiver or flight; others.
-END_ODDS, FAMILY_ODDS = 0.4, 0.03
+ODDS, FAMILY_ODDS = {"device": 0.4, "receiver": 0.4, "flight": 0.4, "place": 1.0}, 0.03
+PLACE_BOTH = 0.3
 LEAST_SCALE_DB = 0.5  # half a step of coarse readings
 MAX_ANOMALIES = 10
 ECHO = 1 / 3  # of the first size, below which a later find may be what the first left on others
@@ -63,7 +67,7 @@ MIN_LINKS = 60  # of a class of line of sight
 ENDS = "device", "receiver", "flight"
 BASE_ERRORS = "distance", "altitude", "level"  # in which a base's usual errors differ
 HEIGHTS_M, QUARTERS = (5.0, 20.0, 60.0), 4  # at which a base errs otherwise: street, roofs, above
-UNITS = {"level": "dB", "scatter": "times", "noise": "times", "blanks": "share"}
+UNITS = {"level": "dB", "curve": "dB", "scatter": "times", "noise": "times", "blanks": "share"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +80,11 @@ class Anomaly:
         members: names of the devices, receivers and flights.
         ranges: low and high end of each variable that bounds it, by name with unit.
         sight: `los`, `nlos` or `all`: the links that it is of.
-        statistic: `level`, `scatter` or `blanks`.
+        statistic: `level`, `scatter`, `blanks`, or `curve`: levels that change along a variable.
         size: against its peers, with its 90 % interval: dB, times or share.
         probability: that it is real.
         rows: (n,) bool, its links.
+        along: of a curve, the variable that the levels change along.
         causes: probability of each cause that may explain it, by name of the effect; `another` is
             one that the catalogue does not have. Empty before causes were looked for.
     """
@@ -92,6 +97,7 @@ class Anomaly:
     size: Parameter
     probability: float
     rows: np.ndarray
+    along: str = ""
     causes: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -102,7 +108,7 @@ class Compared:
     family: Family
     statistic: str
     sight: str
-    distance: Apart
+    distance: Apart | Curves
     log_odds: np.ndarray
 
     @property
@@ -141,7 +147,8 @@ def scan_readings(readings: Readings) -> list[Anomaly]:
     """Return the groups of readings that stand out, see `scan`."""
     units = units_of(readings)
     families = list(families_of(readings, units))
-    few = [family for family in families if family.name in ENDS or family.pairs]
+    few = [each for each in families
+           if each.curve is None and (each.name in ENDS or each.pairs)]
     found: list[Anomaly] = []
     taken: list[_Found] = []
     left, first = readings, None
@@ -202,7 +209,7 @@ class _Class:
                                             self.units.lasting[groups.row])
         return values
 
-    def compare(self, family: Family) -> Apart | None:
+    def compare(self, family: Family) -> Apart | Curves | None:
         """Return how far a family's groups are from their peers; None if too few are judged."""
         groups = family.groups.among(self.rows)
         if not len(groups.row):
@@ -214,7 +221,11 @@ class _Class:
             own, limit_db = own - np.median(own), HUBER * scale_db
             followed_db = self.nested.error(np.clip(own, -limit_db, limit_db))
             lasting_db = followed_db / float((np.abs(own) < limit_db).mean())
-            found = levels(values, groups, lasting_db, LEAST_SCALE_DB)
+            is_bin = family.curve is not None
+            found = levels(values, groups, lasting_db, LEAST_SCALE_DB, is_bin)
+            if family.curve is not None:
+                usual_db = (LOS_CURVE_SHARE if self.is_los else NLOS_CURVE_SHARE) * scale_db
+                return curves(found, family.curve, usual_db, "los" if self.is_los else "nlos")
             prior = SPREAD_DB.get(family.name, PAIR_SPREAD_DB)
             prior = float(np.hypot(prior, (LOS_SHARE if self.is_los else NLOS_SHARE) * scale_db))
         elif self.statistic == "blanks":
@@ -260,25 +271,28 @@ def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _Class]]:
 def compare(readings: Readings, families: list[Family], units: Units) -> list[Compared]:
     """Return all statistics of families, in each class and in both together."""
     found, classes = [], _classes(readings, units)
-    alike = Counter(family.name for family in families)
+    alike = Counter((family.name, family.curve is None) for family in families)
     for family in families:
         for statistic in family.statistics:
             is_base = family.name in BASE_ERRORS and statistic == "level"
+            of = "base" if is_base else "level" if statistic == "curve" else statistic
             parts = {}
-            for name, each in classes["base" if is_base else statistic].items():
+            for name, each in classes[of].items():
                 part = each.compare(family)
                 if part is not None:
                     parts[name] = part
             if len(parts) > 1:
-                parts["all"] = together(list(parts.values()))
+                join = curves_together if statistic == "curve" else together
+                parts["all"] = join(list(parts.values()))
             elif len(classes["level"]) == 1 and parts:
                 parts["all"] = parts.popitem()[1]
-            outlier = {"level": ANYWHERE_DB, "blanks": ANYWHERE_SHARE}.get(statistic, ANYWHERE_LOG)
+            outlier = ANYWHERE.get(statistic, ANYWHERE_LOG)
             for name, part in parts.items():
-                odds = END_ODDS if family.name in ENDS else FAMILY_ODDS
-                odds /= alike[family.name]
+                odds = ODDS.get(family.name, FAMILY_ODDS)
+                odds /= alike[family.name, family.curve is None]
                 if len(parts) > 1:
-                    odds *= BOTH_SHARE if name == "all" else (1 - BOTH_SHARE) / 2
+                    both = PLACE_BOTH if family.name == "place" else BOTH_SHARE
+                    odds *= both if name == "all" else (1 - both) / 2
                 log_odds = part.log_odds(outlier, odds)
                 if statistic != "level":  # less scatter, or fewer blanks, is no fault
                     log_odds = np.where(part.size > 0, log_odds, -np.inf)
@@ -368,7 +382,7 @@ def _evidence(compared: list[Compared]) -> float:
 
 
 def _rows(found: _Found, readings: Readings) -> np.ndarray:
-    rows = found.compared.family.groups.members(found.group, len(readings))
+    rows = found.compared.family.members(found.group, len(readings))
     sight = found.compared.sight
     return rows & (readings.los if sight == "los" else ~readings.los if sight == "nlos" else True)
 
@@ -380,7 +394,19 @@ def _without(readings: Readings, found: _Found) -> Readings:
         excess = readings.blank_excess.copy()
         excess[rows] = np.nan
         return replace(readings, blank_excess=excess)
+    if isinstance(found.compared.distance, Curves):
+        return _without_curve(readings, found, found.compared.distance)
     return moved(readings, rows, found.compared.statistic, -found.size)
+
+
+def _without_curve(readings: Readings, found: _Found, distance: Curves) -> Readings:
+    residual_db, groups = readings.residual_db.copy(), found.compared.family.groups
+    for sight in distance.bins:
+        level_db = np.zeros(len(readings))
+        level_db[groups.row] = distance.fitted(found.group, sight)[groups.group]
+        rows = _rows(found, readings) & (readings.los == (sight == "los"))
+        residual_db[rows] -= level_db[rows]
+    return replace(readings, residual_db=residual_db)
 
 
 def moved(readings: Readings, rows: np.ndarray, statistic: str, size: float) -> Readings:
@@ -403,13 +429,18 @@ def _anomaly(found: _Found, readings: Readings) -> Anomaly:
             same = never_part(labels[compared.family.name], labels[other])
             if found.group in same:
                 members = {**members, other: (readings.names[other][same[found.group]],)}
-    error = QUANTILE_90 * float(compared.distance.error[found.group])
-    value, low, high = found.size, found.size - error, found.size + error
+    value, distance = found.size, compared.distance
+    if isinstance(distance, Curves):
+        low, high = (float(distance.sd(share)[found.group]) for share in (0.05, 0.95))
+    else:
+        error = QUANTILE_90 * float(distance.error[found.group])
+        low, high = value - error, value + error
     if compared.statistic in ("scatter", "noise"):
         value, low, high = np.exp([value, low, high]).tolist()
     return Anomaly(compared.family.name, members, ranges, compared.sight,
                    "scatter" if compared.statistic == "noise" else compared.statistic,
                    Parameter(value, low, high, UNITS[compared.statistic]),
-                   float(expit(found.log_odds)), _rows(found, readings))
+                   float(expit(found.log_odds)), _rows(found, readings),
+                   along=compared.family.along)
 
 

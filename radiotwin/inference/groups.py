@@ -17,7 +17,8 @@ from scipy.stats import t as student_t
 
 from radiotwin.inference.gaussian import MAD_SD, robust_sd
 
-MIN_VALUES, MIN_UNITS, MIN_LASTING = 12, 4, 3.0  # of a group, to be judged
+LEAST = 12, 4, 3.0  # values, passing and lasting units of a group, to be judged
+BIN_LEAST = 5, 2, 1.0  # of a bin of a curve
 HUBER = 1.345  # scales, beyond which a value pulls no further (95 % efficient for normal errors)
 MAX_SCALES = 6.0  # a single value counts as this far away at most
 LEAVE_OUT = 64  # groups up to which each is left out of its own peers
@@ -104,7 +105,7 @@ class Nested:
         their passing parts explain. Robust, as groups that stand out must not hide themselves.
         """
         several, parts = self._several, self._parts
-        if several.sum() < MIN_UNITS:
+        if several.sum() < LEAST[1]:
             return 0.0
         mean = np.bincount(self._part, values) / self._size
         middle = np.bincount(self._of_part, mean) / parts
@@ -151,7 +152,7 @@ def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
 
 
 def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
-           least_scale: float) -> Statistic:
+           least_scale: float, is_bin: bool = False) -> Statistic:
     """Return the level of each group: Huber's estimate, one step from the median.
 
     Args:
@@ -159,6 +160,7 @@ def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
         groups: of them.
         lasting_sd: standard deviation of lasting units.
         least_scale: of a group's values, such as the step that they are rounded to.
+        is_bin: whether groups are bins of curves, which may be small, as they are judged together.
     """
     x, group, count = values[groups.row], groups.group, groups.count
     middle = medians(x, group, count)
@@ -167,7 +169,7 @@ def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
     inside = np.maximum(np.bincount(group, np.abs(deviation) < HUBER, count), 1.0)
     value = middle + scale * np.bincount(group, np.clip(deviation, -HUBER, HUBER), count) / inside
     pull = np.clip((x - value[group]) / scale[group], -HUBER, HUBER)
-    return _judged(value, scale / inside, pull, groups, lasting_sd)
+    return _judged(value, scale / inside, pull, groups, lasting_sd, is_bin)
 
 
 def log_scatters(values: np.ndarray, groups: Groups, lasting_sd: float | None,
@@ -204,11 +206,12 @@ def means(values: np.ndarray, groups: Groups, lasting_sd: float) -> Statistic:
 
 
 def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Groups,
-            lasting_sd: float | None) -> Statistic:
+            lasting_sd: float | None, is_bin: bool = False) -> Statistic:
     """Return a statistic with its error.
 
     That of passing units is a sandwich, whose influences are `pull` (m,) times `step`. What lasts
-    in lasting units is added. Without it each value is a unit.
+    in lasting units is added. Without it each value is a unit. Bins have few units, so that
+    their sandwich is shrunk to what all groups have.
     """
     count = groups.count
     number = np.bincount(groups.group, minlength=count)
@@ -220,11 +223,16 @@ def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Group
     share = np.bincount(groups.lasting, minlength=len(groups.of_lasting)).astype(float)
     effective = np.maximum(
         number**2 / np.maximum(np.bincount(groups.of_lasting, share**2, count), 1), 1.0)
-    if lasting_sd is None:
-        error = step * np.sqrt(np.bincount(groups.group, pull**2, count))
-    else:
-        error = np.hypot(sandwich, lasting_sd / np.sqrt(effective))
-    enough = (number >= MIN_VALUES) & (several >= MIN_UNITS) & (effective >= MIN_LASTING)
+    independent = step * np.sqrt(np.bincount(groups.group, pull**2, count))
+    least = BIN_LEAST if is_bin else LEAST
+    enough = (number >= least[0]) & (several >= least[1]) & (effective >= least[2])
+    if is_bin and enough.any():
+        ratio = sandwich[enough] / np.maximum(independent[enough], TINY)
+        usual = independent * np.sqrt(np.average(ratio**2, weights=several[enough]))
+        sandwich = np.sqrt((several * sandwich**2 + PEER_WEIGHT * usual**2)
+                           / (several + PEER_WEIGHT))
+    error = independent if lasting_sd is None else np.hypot(
+        sandwich, lasting_sd / np.sqrt(effective))
     return Statistic(np.where(enough, value, np.nan), np.where(enough, error, np.nan))
 
 
