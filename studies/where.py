@@ -4,10 +4,11 @@
     python -m studies where --only undeclared
     python -m studies where --only judge
 
-The base is `twin`; nothing else of the loop runs. `studies.where_truth` says which groups are those
-of an effect. Where a map is off by a metre or two, and by a building or two beside what is hidden,
-a group of links most of which it has with the wrong sight is neither right nor wrong, nor is one
-of ends that no longer stands out once the links that it has with the wrong sight are left out.
+The base is the one that the loop takes; nothing else of it runs. `studies.where_truth` says which
+groups are those of an effect. Where a map is off by a metre or two, and by a building or two
+beside what is hidden, a group of links most of which it has with the wrong sight is neither right
+nor wrong, nor is one of ends that no longer stands out once the links that it has with the wrong
+sight are left out.
 """
 
 import warnings
@@ -19,17 +20,13 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import Measurements, Scene
-from radiotwin.closeloop.crossfit import (
-    CrossFit,
-    cross_validate,
-    make_bases,
-    make_folds,
-    training_parts,
-)
+from radiotwin.closeloop.crossfit import CrossFit, make_folds
 from radiotwin.closeloop.families import Readings, families_of, units_of
+from radiotwin.closeloop.run import fit_base
 from radiotwin.closeloop.scan import Anomaly, scan
 from radiotwin.closeloop.scan import compare as compare_groups
 from radiotwin.links import prepare_links
+from radiotwin.links.checks import stand_anchors
 from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.links.thinning import thin_links
@@ -90,11 +87,10 @@ def hidden_case(settings: dict) -> tuple[Measurements, Scene, list[dict], list[n
 
 
 def base_of(measurements: Measurements, scene: Scene, seed: int) -> CrossFit:
-    """Return the base `twin`, cross-validated as `close_loop` does."""
-    links = limits_to_explain(thin_links(prepare_links(measurements, scene), seed))
-    folds = make_folds(links, seed, "auto")
-    parts = training_parts(links, folds)
-    return cross_validate(links, make_bases(scene, seed)["twin"], folds, parts)
+    """Return the base that `close_loop` takes."""
+    links = stand_anchors(prepare_links(measurements, scene), scene)
+    links = limits_to_explain(thin_links(links, seed))
+    return fit_base(links, scene, make_folds(links, seed), seed=seed)[2]
 
 
 def compare(model: CrossFit, anomalies: Sequence[Anomaly], measurements: Measurements,

@@ -12,6 +12,7 @@ from radiotwin.closeloop.crossfit import (
     BASES,
     FIRST_LOOK_LINKS,
     MIN_GAIN_DB,
+    Base,
     CrossFit,
     Folds,
     LogDistanceBase,
@@ -208,9 +209,50 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         all_links = stand_anchors(all_links, scene, refuse=base != LogDistanceBase.name)
     links = limits_to_explain(thin_links(all_links, seed))
     folds = make_folds(links, seed, hold_out)
+    links, fitted, model = fit_base(links, scene, folds, base, seed, on_progress)
+    effects = tuple(effect() for effect in catalogue()
+                    if not (effect.in_paths and model.whole.channel.follows_paths))
+    inputs = SearchInputs(links, fitted, folds, effects, criteria, seed,
+                          executor or Executor(), on_progress)
+    declared = search(SearchState(model), [add_declared], inputs)
+    on_progress("looking at the residual")
+    declared = replace(declared, anomalies=tuple(scan(declared.model)))
+    before = after = dependences(declared.model, seed)
+    found = search(declared, [add_causes_of_anomalies, add_faults, add_changes, add_causes,
+                              drop_idle_faults], inputs)
+    on_progress("unknown devices again, beside the effects")
+    anew = make_bases(scene, seed)[fitted.name]  # which remembers no earlier position
+    explained = relocate_devices(found.model, links, anew)
+    on_progress("looking at what is left")
+    if explained is not declared.model:
+        after = dependences(explained, seed)
+    left = [each.variable for each in significant(after, criteria)]
+    found = search(replace(found, model=explained),
+                   [partial(add_trends, variables=left), add_shadowing] if left else [], inputs)
+    return Loop(fitted.name, links, folds, declared.model, explained, found, criteria, before,
+                after, seed, noise_floor_db(all_links, criteria), measurements.origin)
+
+
+def fit_base(links: Links, scene: Scene | None, folds: Folds, base: str = "auto", seed: int = 0,
+             on_progress: Callable[[str], None] = lambda _: None
+             ) -> tuple[Links, Base, CrossFit]:
+    """Fit a base, or the one with the least held-out error.
+
+    Args:
+        links: that are used.
+        scene: their map; None: the log-distance law is taken.
+        folds: of the links.
+        base: one of `BASES`, or `auto`: paths are followed if they make the held-out error of a
+            few links smaller.
+        seed: of the fits.
+        on_progress: called with what is being done.
+
+    Returns:
+        the links, with a note where paths were not followed; the base; and its cross-validated fit.
+    """
     names = [base]
     if base == "auto":
-        names = ["log-distance"] if scene is None else [TwinBase.name]
+        names = [LogDistanceBase.name] if scene is None else [TwinBase.name]
         if scene is not None:
             on_progress("looking whether paths explain more than line of sight does")
             gain_db = paths_gain_db(links, scene, folds, seed)
@@ -228,24 +270,4 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         on_progress(f"fitting the base {name}")
         models[name] = cross_validate(links, bases[name], folds, parts)
     best = best_base(models)
-    effects = tuple(effect() for effect in catalogue()
-                    if not (effect.in_paths and models[best].whole.channel.follows_paths))
-    inputs = SearchInputs(links, bases[best], folds, effects, criteria, seed,
-                          executor or Executor(), on_progress)
-    declared = search(SearchState(models[best]), [add_declared], inputs)
-    on_progress("looking at the residual")
-    declared = replace(declared, anomalies=tuple(scan(declared.model)))
-    before = after = dependences(declared.model, seed)
-    found = search(declared, [add_causes_of_anomalies, add_faults, add_changes, add_causes,
-                              drop_idle_faults], inputs)
-    on_progress("unknown devices again, beside the effects")
-    anew = make_bases(scene, seed)[best]  # which remembers no earlier position
-    explained = relocate_devices(found.model, links, anew)
-    on_progress("looking at what is left")
-    if explained is not declared.model:
-        after = dependences(explained, seed)
-    left = [each.variable for each in significant(after, criteria)]
-    found = search(replace(found, model=explained),
-                   [partial(add_trends, variables=left), add_shadowing] if left else [], inputs)
-    return Loop(best, links, folds, declared.model, explained, found, criteria, before, after, seed,
-                noise_floor_db(all_links, criteria), measurements.origin)
+    return links, bases[best], models[best]

@@ -25,7 +25,9 @@ COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", 
           "eleven", "twelve")
 SIGHT = {"los": "with line of sight", "nlos": "without line of sight"}
 STATISTICS = {"level": "level", "scatter": "scatter", "blanks": "share of blanks",
-              "slope": "slope over distance"}
+              "curve": "change of level"}
+ALONG = {"time_s": "in the course of time", "flight": "from flight to flight",
+         "body_azimuth_deg": "with the direction of arrival", "predicted_db": "with the level"}
 PEERS = {"device x flight": "on {its} other flights", "receiver x flight": "on {its} other flights",
          "device x receiver": "with {its} other receivers", "time": "in the rest of the time",
          "direction": "in other directions", "distance": "at other distances",
@@ -118,10 +120,16 @@ def rows(report: dict) -> list[list[str]]:
         sight = SIGHT.get(each.get("sight", "all"))
         group_words = group(each)[0] + (f", {sight}" if sight else "")
         found.append([
-            group_words, STATISTICS[each["statistic"]], size(each), interval(each["size"]),
+            group_words, statistic(each), size(each), interval(each["size"]),
             probability(each["probability"]), f"{each['links']:,}",
             causes(each, _named(index, report)).partition(": ")[2].removesuffix(".") or "open"])
     return found
+
+
+def statistic(anomaly: dict) -> str:
+    """Return what of a group is compared, such as "change of level in the course of time"."""
+    along = ALONG.get(anomaly.get("along", ""), "")
+    return f"{STATISTICS[anomaly['statistic']]} {along}".rstrip()
 
 
 COLUMNS = ("group", "statistic", "against its peers", "90 % interval", "probability", "links",
@@ -156,6 +164,8 @@ def size(anomaly: dict) -> str:
         return f"{'+' * (value > 0)}{signed(100 * value, 0)} %"
     if unit == "times":
         return f"{value:.1f} times"
+    if anomaly.get("statistic") == "curve":
+        return f"{value:.1f} {unit} RMS"
     return f"{'+' * (value > 0)}{signed(value)} {unit}"
 
 
@@ -189,10 +199,10 @@ def _otherwise(anomaly: dict, report: dict, is_plural: bool) -> str:
         blank = "are" if is_plural else "is"
         return (f"{blank} blank on {100 * amount:.0f} %{_within(low, high, 0)} {more} of "
                 f"{'their' if is_plural else 'its'} links than {peers}")
-    if anomaly["statistic"] == "slope":
-        more = "more" if is_less else "less"  # a level that falls faster loses more
-        return (f"lose{end} {amount:.1f} dB{_within(low, high)} {more} with each tenfold distance "
-                f"than {peers}")
+    if anomaly["statistic"] == "curve":
+        along = ALONG[anomaly["along"]]
+        return (f"change{end} by {amount:.1f} dB RMS{_within(low, high)} {along}, more than "
+                f"{peers}")
     return f"read{end} {amount:.1f} dB{_within(low, high)} {more} than {peers}"
 
 

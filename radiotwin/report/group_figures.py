@@ -105,7 +105,7 @@ def groups_figure(data: LoopData, report: dict) -> Figure:
     top_db = max(1.0, known_db.max(), 2 * np.median(known_db)) if len(known_db) else 1.0
     for row, each in enumerate(pivots):
         panels = ((each.median_db, "median residual [dB]", RESIDUAL_COLOURS, -high_db, high_db,
-                   ("level", "slope", "blanks")),
+                   ("level", "curve", "blanks")),
                   (each.scatter_db, "scatter [dB]", SCATTER_COLOURS, 0.0, top_db, ("scatter",)))
         for column, (values, label, colours, low, high, statistics) in enumerate(panels):
             ax = figure.add_subplot(grid[row, column])

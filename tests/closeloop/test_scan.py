@@ -116,3 +116,13 @@ def test_blanks_of_one_receiver_stand_out():
 
 def test_too_few_readings_say_nothing():
     assert scan_readings(changed(made(1, devices=1, receivers=1, flights=1), slice(None), -20.0)) == []
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_receiver_that_drifts_to_and_fro_is_found_though_its_level_is_right(seed):
+    readings = made(seed)
+    drift_db = np.where(readings.receiver == 1, 4.0 * np.sin(2 * np.pi * readings.time_s / 150.0), 0.0)
+    found = sure(changed(readings, np.ones(len(readings), dtype=bool), drift_db))
+    assert [(each.family, each.members, each.statistic, each.along) for each in found[:1]] == [
+        ("receiver", {"receiver": ("u1",)}, "curve", "time_s")]
+    assert found[0].size.low < 4.0 / np.sqrt(2) < found[0].size.high + 0.5

@@ -20,6 +20,7 @@ from radiotwin.closeloop.verdict.posterior import Step
 from radiotwin.closeloop.verdict.sensitivity import Detectable
 from radiotwin.effects.params import Parameter
 from radiotwin.errors import BadInput
+from radiotwin.inference.gaussian import MAD_SD
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import read_record, validated
 from radiotwin.links import Links
@@ -242,7 +243,8 @@ def _anomaly(found: Anomaly) -> dict[str, Any]:
     return {"family": found.family, "members": {key: list(names) for key, names in
                                                 found.members.items()},
             "ranges": {key: list(ends) for key, ends in found.ranges.items()},
-            "sight": found.sight, "statistic": found.statistic, "size": found.size.record(),
+            "sight": found.sight, "statistic": found.statistic, "along": found.along,
+            "size": found.size.record(),
             "probability": found.probability, "links": int(found.rows.sum()),
             "causes": [{"name": name, "probability": probability}
                        for name, probability in found.causes.items()]}
@@ -308,12 +310,15 @@ def _explained_share(anomaly: Anomaly, residual_db: np.ndarray, change_db: np.nd
     if anomaly.statistic == "level":
         peers_db = np.median(change_db[seen & ~rows]) if (seen & ~rows).any() else 0.0
         return float((np.median(change_db[rows]) - peers_db) / size) if rows.any() else 0.0
-    if anomaly.statistic != "scatter" or not rows.any():
+    if anomaly.statistic not in ("scatter", "curve") or not rows.any():
         return 0.0
     if scatters is not None:
         return float((scatters[rows] > 0).mean() - (scatters[seen & ~rows] > 0).mean())
     spread_db = [np.subtract(*np.quantile(each, [0.75, 0.25])) for each in
                  (residual_db[rows], (residual_db - change_db)[rows])]
+    if anomaly.statistic == "curve":
+        sd_db = 0.5 * MAD_SD * np.array(spread_db)
+        return float(np.sqrt(max(sd_db[0] ** 2 - sd_db[1] ** 2, 0.0)) / size)
     return float(np.log(spread_db[0] / max(spread_db[1], 1e-9)) / np.log(size))
 
 

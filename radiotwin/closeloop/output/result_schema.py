@@ -171,7 +171,8 @@ class AnomalyRecord(Record):
         default_factory=dict)
     sight: Literal["los", "nlos", "all"] = "all"
     same_over: list[Literal["flight", "direction"]] = Field(default_factory=list)
-    statistic: Literal["level", "scatter", "blanks", "slope"]
+    statistic: Literal["level", "scatter", "blanks", "curve"]
+    along: Literal["", "time_s", "flight", "body_azimuth_deg", "predicted_db"] = ""
     size: KnownParameterRecord
     probability: Real
     links: Whole
@@ -191,7 +192,7 @@ class SeenRecord(Record):
     """How far a group of a family would have had to be from its peers, to be said."""
 
     family: str
-    statistic: Literal["level", "scatter", "blanks", "slope"]
+    statistic: Literal["level", "scatter", "blanks"]
     size: Real
     unit: str
 
