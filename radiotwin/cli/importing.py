@@ -45,6 +45,9 @@ def import_(
     decimal: Annotated[str | None, typer.Option(help="Decimal mark, . or , [found].")] = None,
     sheet: Annotated[str | None, typer.Option(help="Name of the sheet of a workbook [the first]."
                                               )] = None,
+    list_name: Annotated[str | None, typer.Option(
+        "--list", metavar="NAME", help="List in JSON whose objects are rows, such as hotspots [the "
+                                       "lists of the columns that are used].")] = None,
     header: Annotated[str | None, typer.Option(
         metavar="NAME,…", help="Names of the columns of a text without a header.")] = None,
     lines_before_header: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
@@ -117,7 +120,7 @@ def import_(
     from radiotwin.runtime.console import progress
 
     given: dict[str, Any] = {
-        "format": format, "only": _choices(only), "sheet": sheet,
+        "format": format, "only": _choices(only), "sheet": sheet, "list_name": list_name,
         "encoding": encoding, "decimal": decimal,
         "delimiter": {"tab": "\t", "\\t": "\t", "space": " ", "spaces": "  "}.get(
             delimiter or "", delimiter),

@@ -121,8 +121,9 @@ class Format:
         name: as of `--format`.
         title: of the program that writes it.
         columns: quantity of `Columns` -> entry of a mapping, or several, of which the first counts
-            whose columns the file has; names in any case.
+            whose columns the file has; names in any case, `*` for any text.
         signature: columns by which a file is recognised.
+        needs: quantities of which it has a column, besides.
         level: what the level is, with its unit.
         source: of the description.
         settings: others than `columns`.
@@ -139,10 +140,13 @@ class Format:
     settings: Mapping[str, Any] = field(default_factory=dict)
     caution: str = ""
     without_header: WithoutHeader | None = None
+    needs: tuple[str, ...] = ()
 
     def fits(self, header: Iterable[str]) -> bool:
         """Return whether a header has the signature."""
-        return set(map(_plain, self.signature)) <= set(map(_plain, header))
+        names = list(header)
+        return set(map(_plain, self.signature)) <= set(map(_plain, names)) and (
+            not self.needs or set(self.needs) <= set(self.mapping(names)))
 
     def mapping(self, header: Iterable[str]) -> dict[str, str]:
         """Return the entries of `columns` for a header, without what it does not have."""
@@ -150,10 +154,10 @@ class Format:
         result = {}
         for quantity, entries in self.columns.items():
             for entry in (entries,) if isinstance(entries, str) else entries:
-                names = columns_of(entry, ())
-                if all(_plain(name) in actual for name in names):
-                    for name in names:
-                        entry = entry.replace(name, actual[_plain(name)])
+                own = {name: _found(_plain(name), actual) for name in columns_of(entry, ())}
+                if all(own.values()):
+                    for name, found in own.items():
+                        entry = entry.replace(name, found)
                     result[quantity] = entry
                     break
         return result
@@ -162,6 +166,24 @@ class Format:
 def _plain(name: str) -> str:
     """Return a name in lower case without what programs put after it: an index, `(Text)`."""
     return re.sub(r"(\s*(\(text\)|\[\d+\]))+$", "", name.strip().lower())
+
+
+def _found(name: str, actual: Mapping[str, str]) -> str:
+    """Return the column of a plain name, in which `*` is any text; `""` if there is none."""
+    if "*" not in name:
+        return actual.get(name, "")
+    pattern = re.compile(".*".join(map(re.escape, name.split("*"))))
+    return next((actual[each] for each in reversed(actual) if pattern.fullmatch(each)), "")
+
+
+def _place_in(payload: str) -> dict[str, str | tuple[str, ...]]:
+    """Return the entries of the position that a node sends, as its decoder may name it."""
+    return {quantity: tuple(f"{payload}{each}" for short in (long, *others)
+                            for each in ((f"*{short}",) if short == long else
+                                         (short, f"*.{short}")))
+            for quantity, long, others in (("latitude", "latitude", ("lat",)),
+                                           ("longitude", "longitude", ("lng", "lon", "long")),
+                                           ("altitude", "altitude", ("alt",)))}
 
 
 DRIVE_TEST = (
@@ -208,14 +230,12 @@ def _things_stack(prefix: str) -> tuple[Format, Format]:
         Format(
             f"{name}-mapper", f"{title}, of a node that sends its position (JSON lines)",
             {**common, "device": gateway + "gateway_ids.gateway_id", "receiver": node,
-             "latitude": decoded + "latitude", "longitude": decoded + "longitude",
-             "altitude": decoded + "altitude",
+             **_place_in(decoded),
              "device_latitude": gateway + "location.latitude",
              "device_longitude": gateway + "location.longitude",
              "device_altitude": gateway + "location.altitude"},
-            (gateway + "rssi", gateway + "gateway_ids.gateway_id", node, decoded + "latitude",
-             decoded + "longitude"),
-            _LEVEL, _STACK, _GATEWAYS, caution=_MAPPER),
+            (gateway + "rssi", gateway + "gateway_ids.gateway_id", node),
+            _LEVEL, _STACK, _GATEWAYS, caution=_MAPPER, needs=("latitude", "longitude")),
         Format(
             name, f"{title} (JSON lines)",
             {**common, "device": node, "receiver": gateway + "gateway_ids.gateway_id",
@@ -244,13 +264,11 @@ LORA = (
                              "(JSON lines)",
         {"level": "rxInfo.rssi", "snr": "rxInfo.snr", "time": "time",
          "device": "rxInfo.gatewayId", "receiver": "deviceInfo.devEui",
-         "latitude": "object.latitude", "longitude": "object.longitude",
-         "altitude": "object.altitude", "device_latitude": "rxInfo.location.latitude",
+         **_place_in("object."), "device_latitude": "rxInfo.location.latitude",
          "device_longitude": "rxInfo.location.longitude",
          "device_altitude": "rxInfo.location.altitude"},
-        ("rxInfo.rssi", "rxInfo.gatewayId", "deviceInfo.devEui", "object.latitude",
-         "object.longitude"),
-        _LEVEL, _CHIRPSTACK, _GATEWAYS, caution=_MAPPER),
+        ("rxInfo.rssi", "rxInfo.gatewayId", "deviceInfo.devEui"),
+        _LEVEL, _CHIRPSTACK, _GATEWAYS, caution=_MAPPER, needs=("latitude", "longitude")),
     Format(
         "chirpstack", "ChirpStack 4, uplink events (JSON lines)",
         {"level": "rxInfo.rssi", "snr": "rxInfo.snr", "time": "time",
@@ -376,7 +394,7 @@ def find_format(header: Iterable[str]) -> Format | None:
     """Return the format with the longest signature in a header, or None."""
     names = list(header)
     return max((each for each in FORMATS if each.fits(names)),
-               key=lambda each: len(each.signature), default=None)
+               key=lambda each: len(each.signature) + len(each.needs), default=None)
 
 
 def format_named(name: str) -> Format:

@@ -16,9 +16,11 @@ from radiotwin.errors import BadInput
 from radiotwin.io.budgets import FILE_BYTES, IMPORT_FILES, ROW_BYTES, Budget
 from radiotwin.io.inputs import bounded, is_within, open_gzip, open_input
 
-TEXTS = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".ndjson", ".geojson")
+JSON = (".json", ".jsonl", ".ndjson", ".geojson", ".geojsonl")
+TEXTS = (".csv", ".tsv", ".txt", ".log", *JSON)
 BINARIES = (".parquet", ".xlsx")
 _WHAT = f"log ({', '.join((*TEXTS, *BINARIES))}), folder or .zip"
+_BLOCK_BYTES = 2**20
 _DIRECTORY_BYTES = 4 * 2**20  # of a zip's list of files, which is some tenfold in memory
 _END, _END_64 = b"PK\x05\x06", b"PK\x06\x07"  # APPNOTE.TXT 6.3.10, 4.3.16 and 4.3.15
 
@@ -67,8 +69,10 @@ class LogFile:
             BadInput: it cannot be read, is too large, or no UTF-8.
         """
         with self.open() as file:
-            data = file.read(budget.limit + 1)
-        budget.check(len(data), self)
+            data = bytearray()
+            while block := file.read(_BLOCK_BYTES):  # asked for the limit, it would take all of it
+                data += block
+                budget.check(len(data), self)
         try:
             return data.decode("utf-8-sig")
         except UnicodeDecodeError as error:

@@ -1,7 +1,6 @@
 """Opening of a file of measurements: its format is known by its name and its first line.
 
-Of JSON lines, one object a line, nested values become columns with dots in their names. A sheet of
-a workbook (.xlsx) becomes the text of a table.
+A sheet of a workbook (.xlsx) becomes the text of a table.
 """
 
 import csv
@@ -18,85 +17,20 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput, optional_package
-from radiotwin.importing.log_files import BINARIES, TEXTS, Lines, LogFile, open_archive, open_member
+from radiotwin.importing.json_files import read_json_log
+from radiotwin.importing.log_files import BINARIES, JSON, TEXTS, LogFile, open_archive, open_member
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.source import BadRows, Source
 from radiotwin.importing.text_table import find_dialect, has_other_lines, read_text_table
-from radiotwin.io.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, FILE_BYTES, ROWS
+from radiotwin.io.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, FILE_BYTES
 from radiotwin.io.cells import RaggedRows, listed, read_cells
-from radiotwin.io.inputs import parse_json
 
-LISTS = ("rxInfo", "rx_metadata", "rxpk", "gateways")
-"""Lists of receptions: a row for each of their objects."""
 _MAX_ROWS = 1_048_576  # of a sheet, by the format
 _BLOCK_BYTES = 2**20
 _PICTURES = ("xl/media/", "xl/embeddings/")
 _DOCTYPES = tuple("<!DOCTYPE".encode(name) for name in ("utf-8", "utf-16-le", "utf-16-be",
                                                         "utf-32-le", "utf-32-be"))
 _HEAD_BYTES = 2**16  # in which the first line is looked for
-
-
-def _read_json_lines(file: LogFile) -> tuple[pd.DataFrame, np.ndarray]:
-    """Return the cells of JSON lines as texts, and the line of each row, from 1.
-
-    A cell is `""` where a value is null, missing, or a list other than `LISTS`.
-    """
-    rows: list[dict[str, str]] = []
-    numbers: list[int] = []
-    columns: dict[str, None] = {}  # in the order of their first use
-    cells = 0
-    with file.open() as content, io.TextIOWrapper(content, "utf-8", newline="") as text:
-        lines = Lines(text, file)
-        try:
-            for line in lines:
-                if not line.strip():
-                    continue
-                record = parse_json(line, f"{file}: line {lines.number}")
-                if not isinstance(record, dict):
-                    raise BadInput(f"{file}: line {lines.number} is no JSON object; allowed is "
-                                   "one object a line")
-                for row in _rows(record):
-                    rows.append(row)
-                    numbers.append(lines.number)
-                    columns |= dict.fromkeys(row)
-                    cells += len(row)
-                    # After each: one line may stand for many rows.
-                    COLUMNS.check(len(columns), file)
-                    ROWS.check(len(rows), file)
-                    CELLS.check(len(rows) * len(columns), file)
-                    DOCUMENT_BYTES.check(10 * cells, file)  # each is an object in memory
-        except UnicodeDecodeError:
-            raise BadInput(f"{file} is not text in UTF-8; save it as UTF-8") from None
-    table = pd.DataFrame({name: pd.Series([row.get(name, "") for row in rows], dtype=str)
-                          for name in columns})
-    return table, np.array(numbers, dtype=np.int64)
-
-
-def _rows(record: dict[str, Any]) -> Iterator[dict[str, str]]:
-    """Yield a row for each reception of a record; one where it has no list of them."""
-    flat: dict[str, str] = {}
-    receptions: list[tuple[str, list[Any]]] = []
-    _flatten(record, "", flat, receptions)
-    if not receptions:
-        yield flat
-    for name, items in receptions:
-        for item in items:
-            own: dict[str, str] = {}
-            _flatten(item, f"{name}.", own, [])
-            yield flat | own
-
-
-def _flatten(value: dict[str, Any], prefix: str, flat: dict[str, str],
-             receptions: list[tuple[str, list[Any]]]) -> None:
-    for key, item in value.items():
-        name = f"{prefix}{key}"
-        if isinstance(item, dict):
-            _flatten(item, f"{name}.", flat, receptions)
-        elif isinstance(item, list):
-            if key in LISTS and item and all(isinstance(each, dict) for each in item):
-                receptions.append((name, item))
-        elif item is not None:
-            flat[name] = str(item)
 
 
 @dataclass(frozen=True)
@@ -231,8 +165,6 @@ def read_source(file: LogFile | Path | str, settings: Settings | None = None,
         file = LogFile(Path(file), Path(file).name)
     if file.suffix == ".parquet":
         source = Source(file.path, read_cells(file.path), lambda index: f"row {index + 1}")
-    elif file.suffix == ".geojson" or (file.suffix == ".json" and _is_document(file)):
-        source = Source(str(file), _read_geojson(file), lambda index: f"feature {index + 1}")
     elif file.suffix == ".xlsx" and file.member is None:
         settings = (settings or Settings()).model_copy(update={"decimal": ".", "delimiter": ","})
         source = _read_text(_read_sheet(file, settings.sheet), settings, expected, bad_rows)
@@ -252,9 +184,11 @@ def _read_text(file: LogFile, settings: Settings, expected: Expected,
     first = _first_line(file)
     kind = next((each for each in expected.without_header
                  if re.fullmatch(each.first_line, first)), None)
-    if first.startswith("{"):
-        table, lines = _read_json_lines(file)
-    elif kind is not None and kind.read is not None:
+    if file.suffix in JSON or re.match("\x1e?{|\\[ *({|$)", first):
+        declared, *may_be = expected.columns or (frozenset(),)
+        return read_json_log(file, declared, frozenset().union(*may_be), settings.list_name,
+                             settings.crs, bad_rows)
+    if kind is not None and kind.read is not None:
         table, lines = kind.read(file, settings)
     else:
         names = settings.header or (list(kind.names) if kind is not None else [])
@@ -279,42 +213,3 @@ def _first_line(file: LogFile) -> str:
     with file.open() as content:
         head = content.read(_HEAD_BYTES).decode("latin-1").removeprefix("\u00ef\u00bb\u00bf")
     return next((line for line in map(str.strip, head.splitlines()) if line), "")
-
-
-def _is_document(file: LogFile) -> bool:
-    """Return whether a JSON file is one document: its first line is none by itself, or GeoJSON."""
-    first = _first_line(file)
-    return "FeatureCollection" in first or not (first.startswith("{") and first.endswith("}"))
-
-
-def _read_geojson(path: LogFile) -> pd.DataFrame:
-    """Return one row per point: longitude, latitude, altitude (RFC 7946, 3.1.1) and properties."""
-    data = parse_json(path.read_text(DOCUMENT_BYTES), path)
-    features = data.get("features") if isinstance(data, dict) else None
-    if not isinstance(features, list):
-        raise BadInput(f"{path} is not a GeoJSON FeatureCollection; allowed is one of points")
-    crs = str(data.get("crs") or "CRS84")
-    if not ("CRS84" in crs or "4326" in crs):
-        raise BadInput(f"{path}: its crs is {crs}; allowed is WGS84, the only one of GeoJSON since "
-                       "RFC 7946")
-    ROWS.check(len(features), path)
-    points = [_point(path, number, feature) for number, feature in enumerate(features, start=1)]
-    columns = set().union(*points)
-    COLUMNS.check(len(columns), path)
-    CELLS.check(len(columns) * len(points), path)
-    return pd.DataFrame(points)
-
-
-def _point(path: LogFile, number: int, feature: object) -> dict[str, object]:
-    """Return the properties and coordinates of a GeoJSON feature."""
-    geometry = feature.get("geometry") if isinstance(feature, dict) else None
-    kind = geometry.get("type") if isinstance(geometry, dict) else None
-    coordinates = geometry.get("coordinates") if geometry and kind == "Point" else None
-    if (not isinstance(coordinates, list) or len(coordinates) not in (2, 3)
-            or not all(type(value) in (int, float) for value in coordinates)):
-        what = str(kind or "without a geometry")[:80]
-        raise BadInput(f"{path}: feature {number} is {what}; allowed are points with two or three "
-                       "coordinates: leave the others out")
-    properties = feature.get("properties") if isinstance(feature, dict) else None
-    return ((properties if isinstance(properties, dict) else {})
-            | dict(zip(("longitude", "latitude", "altitude"), coordinates)))

@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import tomli_w
-from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    AliasChoices,
+    BaseModel,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import listed
@@ -141,6 +148,9 @@ class Settings(Table):
     quotes: bool = Field(True, description="whether quotation marks of a text hold a field "
                                            "together; else they are letters")
     sheet: str | None = Field(None, max_length=200, description="of a workbook; the first one")
+    list_name: str | None = Field(
+        None, max_length=200, validation_alias=AliasChoices("list_name", "list"),
+        description="of JSON, the list whose objects are rows")
     header: list[Spec] = Field([], max_length=5000, description="names of the columns of a text "
                                                                 "without a header")
     lines_before_header: int | None = Field(None, ge=0, le=100)

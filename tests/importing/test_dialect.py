@@ -140,7 +140,7 @@ def test_files_of_a_zip_are_read_where_they_are(tmp_path):
         archive.writestr("points.geojson", '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": '
                                            '{"a": 1}, "geometry": {"type": "Point", "coordinates": [1, 2]}}]}')
     source = read_source(LogFile(tmp_path / "a.zip", "points.geojson", "points.geojson"))
-    assert source.table.to_dict("records") == [{"a": 1, "longitude": 1, "latitude": 2}]
+    assert source.table.to_dict("records") == [{"a": "1", "longitude": "1", "latitude": "2"}]
 
 
 @pytest.mark.parametrize(("content", "message"), [

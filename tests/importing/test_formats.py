@@ -221,7 +221,8 @@ def test_what_is_declared_overrules_the_format(bring_in):
 @pytest.mark.parametrize("each", FORMATS, ids=lambda each: each.name)
 def test_no_format_takes_the_files_of_another(each):
     """Those of a node with a position extend those without one."""
-    found = find_format(each.signature)
+    needed = [each.columns[name] for name in each.needs]
+    found = find_format([*each.signature, *(name if isinstance(name, str) else name[0] for name in needed)])
     assert found is each or found.name.endswith("-mapper")
 
 

@@ -1,0 +1,118 @@
+"""Shapes of JSON: records, lists of receptions, documents of pandas and of GIS, and what is in none of them."""
+
+import json
+
+import pytest
+
+from radiotwin.errors import BadInput
+
+COLUMNS = {"latitude": "lat", "longitude": "lon", "level": "rssi", "device": "cell"}
+RECORDS = [{"lat": 48.1 + i / 1000, "lon": 11.5, "rssi": -80 - i, "cell": "A"} for i in range(4)]
+
+
+def lines(records):
+    return "\n".join(map(json.dumps, records)) + "\n"
+
+
+@pytest.mark.parametrize("content", [
+    lines(RECORDS), json.dumps(RECORDS), json.dumps(RECORDS, indent=1), "\n".join(json.dumps(each, indent=4) for each in RECORDS),
+    json.dumps({name: [each[name] for each in RECORDS] for name in COLUMNS.values()}),
+    json.dumps({name: {str(i): each[name] for i, each in enumerate(RECORDS)} for name in COLUMNS.values()}),
+    json.dumps({"columns": list(RECORDS[0]), "index": [0, 1, 2, 3], "data": [list(each.values()) for each in RECORDS]}),
+    lines(RECORDS) + '{"lat": 48.2, "lo'])
+@pytest.mark.parametrize("name", ["log.json", "log.jsonl", "log.txt"])
+def test_records_in_any_arrangement(bring_in, content, name):
+    assert list(bring_in(content, name, columns=COLUMNS).table["rssi_dbm"]) == [-80, -81, -82, -83]
+
+
+def uplink(gateways, **more):
+    return {"time": "2024-05-01T10:00:00Z", "node": {"eui": "1"}, "more": {**more, "gws": [
+        {"id": f"g{i}", "rssi": -80 - i} for i in range(gateways)]}}
+
+
+GATEWAYS = {"columns": {"level": "more.gws.rssi", "receiver": "more.gws.id", "device": "node.eui", "x": "always 0", "y": "always 0"},
+            "length_unit": "m"}
+
+
+def test_lists_of_any_name_are_rows_where_a_column_is_used(bring_in):
+    sensors = [{"t": 1}, {"t": 2}]
+    result = bring_in(lines([uplink(2, sensors=sensors), uplink(3, sensors=sensors)]), "log.jsonl", **GATEWAYS)
+    assert result.report["rows"] == 5
+    assert any("lists that are not read: more.sensors (4 values)" in note for note in result.report["warnings"])
+
+
+def test_a_refusal_names_the_columns_of_lists(bring_in):
+    with pytest.raises(BadInput, match=r"columns.level is missing.*more\.gws\.rssi"):
+        bring_in(lines([uplink(2)]), "log.jsonl")
+    with pytest.raises(BadInput, match=r"'more\.gw\.rssi' .level. is missing; the file has .*more\.gws\.rssi"):
+        bring_in(lines([uplink(2)]), "log.jsonl", columns=GATEWAYS["columns"] | {"level": "more.gw.rssi"}, length_unit="m")
+
+
+def test_a_list_can_be_named(bring_in):
+    given = {"columns": {"level": "b.rssi", "device": "always A", "x": "b.x", "y": "always 0"}, "length_unit": "m"}
+    record = {"a": [{"rssi": 1}], "b": [{"rssi": -80, "x": 1}, {"rssi": -81, "x": 2}]}
+    assert list(bring_in(lines([record]), "log.jsonl", list="b", **given).table["rssi_dbm"]) == [-80, -81]
+
+
+def test_records_without_receptions_are_counted(bring_in):
+    join = {"time": "2024-05-01T09:00:00Z", "node": {"eui": "1"}, "devAddr": "01"}
+    report = bring_in(lines([join, uplink(2), uplink(0), uplink(1)]), "log.jsonl", **GATEWAYS).report
+    assert (report["rows"], report["kept"]) == (5, 2)  # and one repeats another
+    assert report["left_out"][-1] == {"reason": "no reception: a record without more.gws", "column": "", "readings": 2,
+                                      "first": "line 1"}
+
+
+@pytest.mark.parametrize("payload", [
+    {"latitude": 48.1, "longitude": 11.5}, {"location": {"latitude": 48.1, "longitude": 11.5}},
+    {"gps_1": {"latitude": 48.1, "longitude": 11.5, "altitude": 3}}, {"lat": 48.1, "lng": 11.5}, {"pos": {"lat": 48.1, "lon": 11.5}}])
+def test_a_node_that_moves_is_the_receiver_wherever_its_position_is(bring_in, payload):
+    event = {"time": "2024-05-01T10:00:00Z", "deviceInfo": {"devEui": "1"}, "object": payload,
+             "rxInfo": [{"gatewayId": "g", "rssi": -80, "snr": 9, "location": {"latitude": 48.2, "longitude": 11.5}}]}
+    result = bring_in(lines([event]), "log.json")
+    assert result.report["files"][0]["format"] == "chirpstack-mapper" and list(result.devices["device"]) == ["g"]
+    stack = {"received_at": "2024-05-01T10:00:00Z", "end_device_ids": {"device_id": "n"}, "uplink_message": {
+        "decoded_payload": payload, "rx_metadata": [{"gateway_ids": {"gateway_id": "g"}, "rssi": -80, "snr": 9}]}}
+    assert bring_in(lines([stack]), "log.json").report["files"][0]["format"] == "things-stack-mapper"
+
+
+def test_a_node_at_rest_is_the_device(bring_in):
+    event = {"deviceInfo": {"devEui": "1"}, "time": "2024-05-01T10:00:00Z", "object": {"latency": 3, "length": 2}, "rxInfo": [
+        {"gatewayId": "g", "rssi": -80, "snr": 9, "location": {"latitude": 48.2, "longitude": 11.5}}]}
+    assert bring_in(lines([event]), "log.json").report["files"][0]["format"] == "chirpstack"
+
+
+def test_one_position_beyond_the_pole_is_left_out(bring_in):
+    records = [*RECORDS * 4, {**RECORDS[0], "lat": -677.7}]
+    records = [{**each, "n": i} for i, each in enumerate(records)]
+    report = bring_in(lines(records), "log.jsonl", columns=COLUMNS).report
+    assert report["kept"] == 16 and report["left_out"][0]["reason"] == "no latitude (beyond 90°)"
+
+
+def test_geojson_of_another_system(bring_in):
+    """In UTM zone 32 the meridian of 9 degrees is at 500 km east, and its points are east of each other by metres."""
+    features = [{"type": "Feature", "properties": {"cell": "A", "rssi": -80 - i},
+                 "geometry": {"type": "Point", "coordinates": [500_000 + 100 * i, 5_330_000]}} for i in (-1, 1)]
+    points = {"type": "FeatureCollection", "features": features}
+    columns = COLUMNS | {"latitude": "latitude", "longitude": "longitude"}
+    named = {**points, "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}}
+    for content, given in ((named, {}), (points, {"crs": "EPSG:25832"})):
+        result = bring_in(json.dumps(content), "log.geojson", columns=columns, **given)
+        assert result.report["origin"]["longitude_deg"] == pytest.approx(9, abs=1e-6)
+        assert list(result.table["receiver_x_m"]) == pytest.approx([-100, 100], abs=0.1)
+
+
+def test_features_one_a_line(bring_in):
+    features = [{"type": "Feature", "properties": {"cell": "A", "rssi": -80 - i},
+                 "geometry": {"type": "Point", "coordinates": [11.5, 48.1]}} for i in range(3)]
+    columns = COLUMNS | {"latitude": "latitude", "longitude": "longitude"}
+    for name, mark in (("log.geojsonl", ""), ("log.json", "\x1e")):
+        content = "".join(f"{mark}{json.dumps(each)}\n" for each in features)
+        assert list(bring_in(content, name, columns=columns).table["rssi_dbm"]) == [-80, -81, -82]
+
+
+def test_lines_that_are_no_json_can_be_skipped(bring_in):
+    content = lines(RECORDS[:2]) + '{"lat": }\n' + lines(RECORDS[2:])
+    with pytest.raises(BadInput, match="line 3 is not readable JSON.*--skip-bad-rows 1"):
+        bring_in(content, "log.jsonl", columns=COLUMNS)
+    report = bring_in(content, "log.jsonl", columns=COLUMNS, skip_bad_rows=1).report
+    assert report["kept"] == 4 and report["bad_rows"][0]["row"] == "line 3"
