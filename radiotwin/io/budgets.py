@@ -71,11 +71,12 @@ RECORD_BYTES = Budget("RECORD_BYTES", 32 * 2**20, "bytes",
                       "a JSON record of a run that a page shows")
 ENTRIES = Budget("ENTRIES", 100_000, "entries", "one list or object in such a record")
 SETTINGS_BYTES = Budget("SETTINGS_BYTES", 4 * 2**20, "bytes", "a TOML file")
-NESTING = Budget("NESTING", 100, "levels of nesting", "JSON, TOML and XML")
+NESTING = Budget("NESTING", 100, "levels of nesting", "JSON, TOML, XML and geometries")
 # Tables
 ROWS = Budget("ROWS", 50_000_000, "rows", "a table")
 ROW_BYTES = Budget("ROW_BYTES", 16 * 2**20, "bytes in one row", "a CSV file")
 COLUMNS = Budget("COLUMNS", 5_000, "columns", "a table")
+TABLE_BYTES = Budget("TABLE_BYTES", 2**30, "bytes in memory", "a Parquet table, decoded")
 CELLS = Budget("CELLS", 1_000_000_000, "cells", "a table: rows times columns")
 BAG_CHUNK_BYTES = Budget("BAG_CHUNK_BYTES", 256 * 2**20, "bytes",
                          "one chunk of a ROS bag or MCAP file, after decompression")
@@ -102,7 +103,8 @@ TERRAIN_BLOCK_BYTES = Budget("TERRAIN_BLOCK_BYTES", 512 * 2**20, "bytes",
                              "one block of a terrain raster")
 CROSSINGS = Budget("CROSSINGS", 2_000, "crossings of outlines with themselves", "a map")
 OVERLAPS = Budget("OVERLAPS", 20_000, "pairs of buildings that overlap", "a map")
-PART_PAIRS = Budget("PART_PAIRS", 2_000_000, "pairs of a part and a building around it", "a map")
+PART_PAIRS = Budget("PART_PAIRS", 2_000_000, "pairs of a building or part and one around it",
+                    "a map: so many lie on top of each other")
 TOUCHING_CORNERS = Budget("TOUCHING_CORNERS", 5_000_000,
                           "corners in pairs of buildings that touch", "a map")
 # Radio maps

@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from radiotwin.errors import BadInput, optional_package
-from radiotwin.io.budgets import CELLS, COLUMNS, FILE_BYTES, ROW_BYTES, ROWS
+from radiotwin.io.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS, TABLE_BYTES
 from radiotwin.io.forms import MAX_NUMBER, MAX_POSITION_M
 from radiotwin.io.inputs import open_gzip, open_input
 from radiotwin.io.texts import unquoted, with_quotes, without_quotes
@@ -27,6 +27,7 @@ _WHAT = "table (.csv, .csv.gz, .parquet)"
 _CHUNK_CELLS = 2_000_000  # that are parsed at a time
 _NUMBERS_AT_ONCE = 1_000_000  # pandas makes an object of each
 _MAX_DIGITS = 1000  # of a number
+_CELL_BYTES = 8  # of a number, of the place of a text
 _PARQUET_ROWS, _NESTED_ROWS = 2**17, 2**10  # that are decoded at a time
 _SHOWN_CHARACTERS, _SHOWN_COLUMNS = 80, 50  # of a cell, and of a table, in a message
 _SIGNS = re.compile("(?:^|(?<=[eE]))[\u2212\u2010-\u2014\ufe63\uff0d]")
@@ -159,13 +160,15 @@ class CsvLayout:
 
 
 def read_cells(path: Path, required: Collection[str] = (),
-               optional: Collection[str] | None = None) -> pd.DataFrame:
+               optional: Collection[str] | None = None,
+               binary: Collection[str] = ()) -> pd.DataFrame:
     """Read the cells of a table as they are.
 
     Args:
         path: `.csv`, `.csv.gz` or `.parquet`, in any case.
         required: columns that it must have.
         optional: other columns that are read; None for all.
+        binary: columns of Parquet whose bytes are no text; those of others have to be UTF-8.
 
     Returns:
         columns of texts (`""` where empty) from CSV, typed columns from Parquet; rows are numbered
@@ -177,8 +180,9 @@ def read_cells(path: Path, required: Collection[str] = (),
     """
     check_suffix(path)
     try:
-        read = _read_parquet if path.suffix.lower() == ".parquet" else _read_csv
-        return read(path, required, optional)
+        if path.suffix.lower() == ".parquet":
+            return _read_parquet(path, required, optional, binary)
+        return _read_csv(path, required, optional)
     except BadInput:
         raise
     except UnicodeDecodeError:
@@ -294,8 +298,8 @@ def _selected(path: Path, names: list[str], required: Collection[str],
     return [name for name in names if optional is None or name in required or name in optional]
 
 
-def _read_parquet(path: Path, required: Collection[str],
-                  optional: Collection[str] | None) -> pd.DataFrame:
+def _read_parquet(path: Path, required: Collection[str], optional: Collection[str] | None,
+                  binary: Collection[str]) -> pd.DataFrame:
     """Read Parquet without the index that pandas may have saved.
 
     A table that was filtered or sorted before it was saved would keep its old row labels; messages
@@ -307,23 +311,26 @@ def _read_parquet(path: Path, required: Collection[str],
     from pyarrow.parquet import ParquetFile
 
     with open_input(path, _WHAT) as file:
-        schema, metadata = ParquetFile(file).schema_arrow, ParquetFile(file).metadata
+        content = ParquetFile(file)
+        schema, metadata = content.schema_arrow, content.metadata
         COLUMNS.check(metadata.num_columns, path)
         ROWS.check(metadata.num_rows, path)
         names = _selected(path, schema.names, required, optional)
         CELLS.check(metadata.num_rows * len(names), path)
+        TABLE_BYTES.check(metadata.num_rows * len(names) * _CELL_BYTES, path)
         nested = any(pyarrow.types.is_nested(schema.field(name).type) for name in names)
-        texts = [name for name in names if pyarrow.types.is_string(schema.field(name).type)
-                 or pyarrow.types.is_large_string(schema.field(name).type)]
+        texts = [name for name in names
+                 if name not in binary and _is_text(schema.field(name).type)]
         table = ParquetFile(file, read_dictionary=texts)
         batches, rows, size = [], 0, 0
         for batch in table.iter_batches(_NESTED_ROWS if nested else _PARQUET_ROWS, columns=names):
-            rows, size = rows + len(batch), size + sum(map(_decoded_bytes, batch.columns))
-            ROWS.check(rows, path)
-            FILE_BYTES.check(size, path)
+            size += sum(map(_decoded_bytes, batch.columns))
+            ROWS.check(rows + len(batch), path)
+            TABLE_BYTES.check(size, path)
             batches.append(pyarrow.record_batch(
-                [column.dictionary_decode() if name in texts else column
+                [column if name in binary else _decoded(path, name, column, rows)
                  for name, column in zip(names, batch.columns)], names=names))
+            rows += len(batch)
     if not batches:
         return schema.empty_table().select(names).to_pandas(ignore_metadata=True)
     whole = pyarrow.Table.from_batches(batches)
@@ -331,8 +338,42 @@ def _read_parquet(path: Path, required: Collection[str],
     return whole.to_pandas(ignore_metadata=True, split_blocks=True, self_destruct=True)
 
 
+def _decoded(path: Path, name: str, column: Any, first_row: int) -> Any:
+    """Return a column of a batch without a dictionary, and of bytes their text.
+
+    Raises:
+        BadInput: bytes that are not UTF-8, which a file may call a text, too.
+    """
+    import pyarrow
+    from pyarrow import types
+
+    is_dictionary = types.is_dictionary(column.type)
+    values = column.dictionary if is_dictionary else column
+    if _is_text(values.type):
+        data = values.cast(pyarrow.large_binary())
+        try:
+            values = data.cast(pyarrow.large_string())
+        except pyarrow.ArrowInvalid:
+            cells = data.take(column.indices) if is_dictionary else data
+            for row, cell in enumerate(cells.to_pylist(), start=first_row + 2):
+                if cell is not None and "\ufffd" in cell.decode(errors="replace"):
+                    raise BadInput(f"{path}: row {row}, column {name}: {cell[:60]!r} is not text "
+                                   "in UTF-8; write the table again") from None
+            raise
+    return values.take(column.indices) if is_dictionary else values
+
+
+def _is_text(kind: Any) -> bool:
+    """Return whether cells of an Arrow type are texts, or bytes that may be one."""
+    from pyarrow import types
+
+    return any(is_kind(kind) for is_kind in (
+        types.is_string, types.is_large_string, types.is_string_view, types.is_binary,
+        types.is_large_binary, types.is_binary_view, types.is_fixed_size_binary))
+
+
 def _decoded_bytes(column: Any) -> int:
-    """Return the size of an Arrow array that the number of rows does not bound: of its texts."""
+    """Return the size of an Arrow array in memory, without its dictionary."""
     import pyarrow
     from pyarrow import compute
 
@@ -342,8 +383,9 @@ def _decoded_bytes(column: Any) -> int:
     try:
         lengths = compute.binary_length(column.dictionary if is_dictionary else column)
     except pyarrow.ArrowNotImplementedError:  # numbers
-        return 0
-    return compute.sum(lengths.take(column.indices) if is_dictionary else lengths).as_py() or 0
+        return _CELL_BYTES * len(column)
+    texts = compute.sum(lengths.take(column.indices) if is_dictionary else lengths).as_py() or 0
+    return texts + _CELL_BYTES * len(column)
 
 
 def _read_csv(path: Path, required: Collection[str],

@@ -109,10 +109,18 @@ def read_columns(path: Path, required: list[str], optional: list[str],
 
 def _names(path: Path, name: str, column: pd.Series) -> pd.Series:
     """Return the names in a column without spaces around them."""
-    names = column.astype(str).str.strip()
-    faults = {text: fault for text in names.unique() if (fault := name_fault(text))}
-    for text, fault in faults.items():
-        refuse(path, name, names, names == text, fault)
+    try:
+        codes, known = pd.factorize(column)
+    except TypeError:
+        raise BadInput(f"{path}: column {name} holds lists or records; it needs one name in each "
+                       "row") from None
+    # A column of whole numbers of which some are missing is one of floating ones
+    texts = [str(int(each) if isinstance(each, float) and each.is_integer() else each).strip()
+             for each in known.tolist()]
+    names = pd.Series(np.array([*texts, ""], dtype=object)[codes], column.index, dtype=str)
+    for text in dict.fromkeys([*texts, ""]):
+        if fault := name_fault(text):
+            refuse(path, name, names, names == text, fault)
     return names
 
 

@@ -124,7 +124,7 @@ def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -
                            f"{len(vertices)} (counted from 0); export the mesh again")
     areal = [group for group in polygons if group.ndim == 2 and group.shape[1] >= 3]
     FACES.check(sum(len(group) * (group.shape[1] - 2) for group in areal), path)
-    faces = [_triangulate(vertices, group) for group in areal]
+    faces = [triangulate(vertices, group) for group in areal]
     return RawMesh(vertices, np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64),
                    sum(len(group) for group in areal if group.shape[1] > 3))
 
@@ -143,7 +143,7 @@ def check_vertices(vertices: np.ndarray, source: str) -> None:
                        f"is up to {_MAX_COORDINATE:g}: correct the mesh or its transform")
 
 
-def _triangulate(vertices: np.ndarray, polygons: np.ndarray) -> np.ndarray:
+def triangulate(vertices: np.ndarray, polygons: np.ndarray) -> np.ndarray:
     """Cut (n, k) planar polygons, convex or not, into (t, 3) triangles."""
     k = polygons.shape[1]
     if k == 3:
@@ -175,7 +175,37 @@ def cut_polygon(corners: np.ndarray, ends: Sequence[int]) -> np.ndarray:
     triangles = ears.astype(np.int64).reshape(-1, 3)
     a, b, c = corners[triangles].swapaxes(0, 1)
     turned = np.cross(b - a, c - a).sum(axis=0) @ normal < 0
-    return triangles[:, ::-1] if turned else triangles
+    return _with_left_out_corners(triangles[:, ::-1] if turned else triangles, ends)
+
+
+def _with_left_out_corners(triangles: np.ndarray, ends: Sequence[int]) -> np.ndarray:
+    """Add triangles to the corners that were cut off since they lie on a line, as seen from above.
+
+    Without them a closed surface opens: its neighbour still has these corners.
+    """
+    n = ends[-1]
+    if len(triangles) == n + 2 * len(ends) - 4 or len(triangles) == 0:
+        return triangles
+    start, end = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
+    edges, back = set((start * n + end).tolist()), (end * n + start).tolist()
+    border = edges.difference(back)
+    ahead: dict[int, int] = {}  # corner -> the next one along its ring
+    for first, last in zip((0, *ends[:-1]), ends):
+        ring = list(range(first, last))
+        forth = dict(zip(ring, ring[1:] + ring[:1]))
+        known = sum((a * n + b in border) - (b * n + a in border) for a, b in forth.items())
+        ahead |= forth if known >= 0 else {b: a for a, b in forth.items()}
+    added = []
+    for edge in border:
+        a, b = divmod(edge, n)
+        corner = ahead[a]
+        while corner != b and corner != a:
+            added.append((a, corner, ahead[corner]))
+            corner = ahead[corner]
+    # Only of a ring that crosses itself may more be missing than lies between
+    whole = len(added) <= n
+    return np.concatenate([triangles, np.array(added, dtype=np.int64)]) \
+        if added and whole else triangles
 
 
 def read_obj_groups(path: Path
@@ -281,13 +311,23 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order[new], index
 
 
+def is_closed(faces: np.ndarray) -> bool:
+    """Return whether (f, 3) faces pass every edge as often in one direction as in the other."""
+    there, back = _edges(faces)
+    return len(there) > 0 and bool((there == back).all())
+
+
+def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sorted numbers of all edges (3 f,) of faces, and of the same edges backwards."""
+    start, end = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
+    count = int(faces.max(initial=0)) + 1
+    return np.sort(start * count + end), np.sort(end * count + start)
+
+
 def is_volume(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
     """Return whether triangles enclose a volume: every edge joins two of them, normals outwards."""
-    if len(faces) == 0:
-        return False
-    start, end = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
-    there, back = (np.sort(a * len(vertices_m) + b) for a, b in ((start, end), (end, start)))
-    if (there != back).any() or (there[1:] == there[:-1]).any():
+    there, back = _edges(faces)
+    if len(there) == 0 or (there != back).any() or (there[1:] == there[:-1]).any():
         return False
     a, b, c = (vertices_m - vertices_m[0])[faces].swapaxes(0, 1)
     return bool(np.einsum("ij,ij->", a, np.cross(b, c)) > 0)

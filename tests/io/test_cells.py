@@ -103,7 +103,8 @@ def test_parquet_is_judged_by_its_metadata(tmp_path, monkeypatch):
     path = tmp_path / "t.parquet"
     pd.DataFrame({"a": np.zeros(100_000), "b": "x"}).to_parquet(path)
     monkeypatch.setattr("pyarrow.parquet.ParquetFile.iter_batches", lambda *_, **__: pytest.fail("was read"))
-    for variable, limit in (("ROWS", 99_999), ("COLUMNS", 1), ("CELLS", 199_999), ("FILE_BYTES", 999)):
+    for variable, limit in (("ROWS", 99_999), ("COLUMNS", 1), ("CELLS", 199_999), ("FILE_BYTES", 999),
+                            ("TABLE_BYTES", 1_599_999)):
         monkeypatch.setenv(f"RADIOTWIN_MAX_{variable}", str(limit))
         assert peak_mib(lambda: read_cells(path)) < 5
         monkeypatch.delenv(f"RADIOTWIN_MAX_{variable}")
@@ -116,9 +117,9 @@ def test_a_dictionary_that_stands_for_gigabytes(tmp_path, monkeypatch):
     texts = pyarrow.DictionaryArray.from_arrays(np.zeros(4000, dtype=np.int32), ["x" * (MIB // 4)])
     parquet.write_table(pyarrow.table({"a": texts, "b": np.ones(4000)}), path, store_schema=False)
     assert path.stat().st_size < MIB
-    monkeypatch.setenv("RADIOTWIN_MAX_FILE_BYTES", str(900 * MIB))
+    monkeypatch.setenv("RADIOTWIN_MAX_TABLE_BYTES", str(900 * MIB))
     before = pyarrow.default_memory_pool().max_memory()
-    with pytest.raises(BadInput, match="RADIOTWIN_MAX_FILE_BYTES"):
+    with pytest.raises(BadInput, match="bytes in memory; at most .*RADIOTWIN_MAX_TABLE_BYTES"):
         read_cells(path)
     assert pyarrow.default_memory_pool().max_memory() - before < 100 * MIB
     assert len(read_cells(path, ["b"], [])) == 4000
@@ -131,10 +132,35 @@ def test_parquet_keeps_its_types(tmp_path):
                           "time": pd.to_datetime([0, 1, 2], unit="s", utc=True), "many": [[1], [], None]})
     frame.to_parquet(tmp_path / "t.parquet")
     from pyarrow.parquet import read_table
-    expected = read_table(tmp_path / "t.parquet").to_pandas(ignore_metadata=True)
+    expected = read_table(tmp_path / "t.parquet").to_pandas(ignore_metadata=True).astype({"kind": "str"})
     pd.testing.assert_frame_equal(read_cells(tmp_path / "t.parquet"), expected)
     expected.iloc[:0].to_parquet(tmp_path / "none.parquet")
     assert list(read_cells(tmp_path / "none.parquet").columns) == list(frame.columns)
+
+
+@pytest.mark.parametrize("kind", ["string", "large_string", "string_view", "binary", "large_binary", "binary_view", "dictionary"])
+def test_texts_of_parquet_are_utf_8(tmp_path, kind):
+    """Bytes are a text if they can be one; a file may also call texts what is none."""
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow.parquet import write_table
+
+    def column(*cells):
+        data = pyarrow.array(cells, pyarrow.binary())
+        if kind == "dictionary":
+            return pyarrow.DictionaryArray.from_arrays([0, 1, None], data[:2])
+        if "string" not in kind:
+            return data.cast(getattr(pyarrow, kind)())
+        texts = pyarrow.StringArray.from_buffers(3, *data.buffers()[1:], data.buffers()[0], data.null_count)
+        return texts if kind == "string" else texts.cast(getattr(pyarrow, kind)())
+
+    path = tmp_path / "t.parquet"
+    write_table(pyarrow.table({"a": column("ü".encode(), b"b", None)}), path)
+    assert [None if pd.isna(cell) else cell for cell in read_cells(path)["a"]] == ["ü", "b", None]
+    write_table(pyarrow.table({"a": column(b"a", b"\xffb", None)}), path)
+    with pytest.raises(BadInput, match=r"t.parquet: row 3, column a: b'\\xffb' is not text in UTF-8"):
+        read_cells(path)
+    if kind == "binary":
+        assert list(read_cells(path, ["a"], binary=["a"])["a"]) == [b"a", b"\xffb", None]
 
 
 def test_only_the_columns_that_are_asked_for(write):

@@ -60,6 +60,36 @@ def test_a_parquet_table_that_was_sorted_and_filtered_before_is_read_in_its_own_
                                   [True, False])
 
 
+@pytest.mark.parametrize(("names", "message"), [
+    (["a", None, "a"], "row 3, column device: '' is empty"), ([1, None, 1], "row 3, column device: '' is empty"),
+    ([b"a", b"\xff", b"a"], r"row 3, column device: .* is not text in UTF-8"), ([None] * 3, "row 2, column device: '' is empty"),
+    ([["a"], ["a"], ["a"]], "column device holds lists or records"), ([{"a": 1}] * 3, "column device holds lists or records")])
+@pytest.mark.parametrize("of", ["m", "devices"])
+def test_names_of_a_parquet_table(write, tmp_path, names, message, of):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow.parquet import read_table, write_table
+
+    plain = read_measurements(write(HEADER + ROWS))
+    plain.table.to_parquet(tmp_path / "m.parquet")
+    plain.devices.iloc[[0, 1, 1]].to_parquet(tmp_path / "devices.parquet")
+    path = tmp_path / f"{of}.parquet"
+    table = read_table(path)
+    at = table.column_names.index("device")
+    write_table(table.set_column(at, "device", pyarrow.array(names)), path)
+    with pytest.raises(BadInput, match=f"{of}.parquet: {message}"):
+        read_measurements(tmp_path / "m.parquet", tmp_path / "devices.parquet")
+
+
+def test_whole_numbers_are_names(write, tmp_path):
+    """Beside an empty role a column of numbers is one of floating ones: 17 is no device 17.0."""
+    pytest.importorskip("pyarrow")
+    plain = read_measurements(write(HEADER + ROWS))
+    plain.table.assign(device=[17, 18, 17], flight=[1.0, 1.0, 2.0]).to_parquet(tmp_path / "m.parquet")
+    plain.devices.assign(device=[17.0, 18.0]).to_parquet(tmp_path / "devices.parquet")
+    again = read_measurements(tmp_path / "m.parquet", tmp_path / "devices.parquet")
+    assert list(again.devices["device"]) == ["17", "18"] and again.flights == ["1", "2"]
+
+
 def test_select_keeps_the_devices(write):
     part = read_measurements(write(HEADER + ROWS)).select([False, True, False])
     assert len(part.table) == 1 and len(part.devices) == 2

@@ -38,6 +38,7 @@ from radiotwin.scene.readers.features import (
     Feature,
     MapFile,
     OutlineBudget,
+    check_crowding,
     left_out_problems,
     problems_of,
 )
@@ -222,8 +223,14 @@ def build_scene_from_map(
     else:
         found = READERS[suffix](path, map_options.crs)
     FEATURES.check(len(found.features), path)
+    left_out = left_out_problems(found.left_out, map_options.bbox_deg)
+    if not found.features:
+        raise BadInput("\n".join([
+            f"{path} holds no buildings (closed ways or multipolygons with the tag building or "
+            "building:part; of a table polygons)", *(problem.message for problem in left_out)]))
     features = _within(found.features, map_options.bbox_deg, path)
     SHAPES.check(len(features), path)
+    check_crowding(features, path)
     origin = options.origin or _origin(features, map_options.bbox_deg)
     _check_sizes(features, origin, path)
     if map_options.height_column is not None:
@@ -236,7 +243,7 @@ def build_scene_from_map(
     prisms += bodies
     problems += found_in_bodies
     _check_unit(prisms, found.plan_m, map_options.height_column, path)
-    problems = (found.problems + left_out_problems(found.left_out, map_options.bbox_deg)
+    problems = (found.problems + left_out
                 + problems + _without_height(prisms, features, map_options, path)
                 + implausible_heights([(prism.name, prism.height, prism.site or prism.area)
                                        for prism in prisms],
@@ -345,9 +352,6 @@ def _check_unit(prisms: list[Prism], plan_m: float, declared: HeightColumn | Non
 
 def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
     """Return the features that reach into the box, of 3D models with all parts of the building."""
-    if not features:
-        raise BadInput(f"{path} holds no buildings (closed ways or multipolygons with the tag "
-                       "building or building:part; of a table polygons)")
     bounds_deg = np.array([feature.area.bounds for feature in features])  # NaN of an empty area
     for feature, bounds in zip(features, bounds_deg):
         if (np.abs(bounds) > (180, 90, 180, 90)).any():

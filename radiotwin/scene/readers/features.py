@@ -21,7 +21,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.io.budgets import CROSSINGS, OUTLINE_CORNERS, VERTICES
+from radiotwin.io.budgets import CROSSINGS, OUTLINE_CORNERS, PART_PAIRS, VERTICES
 from radiotwin.scene.checks import Problem, Severity, listed
 from radiotwin.scene.readers.heights import number, parse_length_m
 from radiotwin.scene.vegetation import count_meetings
@@ -180,6 +180,23 @@ def _below_ground(tags: Mapping[str, str]) -> str:
 
 def _is_set(tags: Mapping[str, str], key: str) -> bool:
     return tags.get(key, "").strip().lower() not in ("", "no", "none", "false", "0")
+
+
+def check_crowding(features: Sequence[Feature], source: object) -> None:
+    """Raise BadInput if too many features lie on top of each other.
+
+    In a city the middle of a building lies in the boxes around a few: itself, what it is a part of.
+    """
+    bounds_deg = shapely.bounds([feature.area for feature in features])
+    bounds_deg = bounds_deg[np.isfinite(bounds_deg).all(axis=1)]
+    if len(bounds_deg) == 0:
+        return
+    tree = shapely.STRtree(shapely.box(*bounds_deg.T))  # type: ignore[arg-type]
+    middles: Any = shapely.points((bounds_deg[:, :2] + bounds_deg[:, 2:]) / 2)
+    found = 0
+    for start in range(0, len(bounds_deg), _CHUNK):
+        found += tree.query(middles[start:start + _CHUNK]).shape[1]
+        PART_PAIRS.check(found, source)
 
 
 class OutlineBudget:

@@ -45,6 +45,7 @@ from radiotwin.scene.readers.systems import (
     find_system,
     plane_unit_m,
 )
+from radiotwin.scene.readers.wkb import area_of_wkb
 
 _OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*+)"', re.DOTALL)
 _NAME_LENGTH = 200  # characters of an id that are kept
@@ -52,6 +53,8 @@ _AREAS = ("Polygon", "MultiPolygon", "GeometryCollection")
 NO_AREA = "building(s) are points or lines, without an area: left out"
 _KINDS = ("POLYGON", "MULTIPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE", "MULTISURFACE",
           "CURVEPOLYGON")
+UNREAD = ("building(s) have no geometry, or one that is not read (not finite, a curve, a surface "
+          "in space): left out; `ogr2ogr -nlt CONVERT_TO_LINEAR` makes polygons of curves")
 _ENVELOPE_DOUBLES = (0, 4, 6, 6, 8)  # of a geometry's header, by its code
 
 
@@ -101,16 +104,6 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
     except (TypeError, ValueError, LookupError, OverflowError):
         raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite "
                        "numbers; export the map again") from None
-
-
-def area_of_wkb(data: bytes) -> BaseGeometry | None:
-    """Return a geometry in well-known binary, in the plane; None: not finite.
-
-    Raises:
-        shapely.errors.GEOSException: damaged.
-    """
-    area = shapely.from_wkb(data)
-    return shapely.force_2d(area) if np.isfinite(shapely.get_coordinates(area)).all() else None
 
 
 def _points(coordinates: Any) -> BaseGeometry | None:
@@ -164,7 +157,7 @@ def map_file(
         if below := hidden(name, tags, area):
             left_out.append(below)
         elif area is None or area.geom_type not in _AREAS:
-            left_out.append(LeftOut(name, NO_AREA, area))
+            left_out.append(LeftOut(name, UNREAD if area is None else NO_AREA, area))
         else:
             features.append(Feature(name, tags, area))
     plan_m = 1.0
@@ -241,7 +234,8 @@ def read_geopackage(path: Path, crs: str | None = None, wanted: Sequence[str] = 
                 rows = _rows(path, database, layer, geometry)
                 parts[layer] = map_file(path, rows, chosen_system(path, _system(database, srs),
                                                                   crs))
-    except (sqlite3.Error, shapely.errors.GEOSException, OverflowError) as error:
+    except (sqlite3.Error, shapely.errors.GEOSException, OverflowError,
+            UnicodeDecodeError) as error:  # of a name in a message of SQLite
         raise BadInput(f"{path} is not a readable GeoPackage ({error}); export it again") from None
     return replace(join_layers(path, parts, problems), layers=tuple(others))
 
@@ -279,12 +273,13 @@ def _rows(path: Path, database: sqlite3.Connection, layer: str,
     read = 0
     for number, (blob, *values) in enumerate(
             scan(database, layer, [geometry, *columns]), start=1):
+        name = f"{layer} {number}"
         read += sum(len(value) for value in (blob, *values) if isinstance(value, bytes | str))
         FILE_BYTES.check(read, f"{path}, layer {layer}")
-        yield f"{layer} {number}", dict(zip(columns, values)), _area(blob)
+        yield name, dict(zip(columns, values)), _area(blob, f"{path}: {name}")
 
 
-def _area(blob: Any) -> Any:
+def _area(blob: Any, source: str) -> BaseGeometry | None:
     """Return the geometry of a blob [1, section 2.1.3]; None where there is none."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None
@@ -292,7 +287,7 @@ def _area(blob: Any) -> Any:
     extended, empty, code = flags & 32, flags & 16, (flags >> 1) & 7
     if extended or empty or code >= len(_ENVELOPE_DOUBLES):
         return None
-    return area_of_wkb(blob[8 + 8 * _ENVELOPE_DOUBLES[code]:])
+    return area_of_wkb(blob[8 + 8 * _ENVELOPE_DOUBLES[code]:], source)
 
 
 def _system(database: sqlite3.Connection, number: int) -> str | None:
@@ -323,7 +318,7 @@ def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
     system = chosen_system(path, _name(path, own) if own else None, crs)
     if own is None and system is None:
         system = WGS84[0]
-    cells = read_cells(path, [geometry], names)
+    cells = read_cells(path, [geometry], names, [geometry])
     columns = [name for name in cells.columns if name != geometry]
     values = [cells[name].tolist() for name in columns]
 
@@ -331,7 +326,7 @@ def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
         for number, data in enumerate(cells[geometry], start=1):
             tags = {name: column[number - 1] for name, column in zip(columns, values)}
             yield (f"row {number}", tags,
-                   area_of_wkb(data) if isinstance(data, bytes) else None)
+                   area_of_wkb(data, f"{path}: row {number}") if isinstance(data, bytes) else None)
 
     try:
         return replace(map_file(path, rows(), system), columns={*names, *nested} - {geometry})

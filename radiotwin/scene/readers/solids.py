@@ -20,7 +20,7 @@ from radiotwin.io.budgets import CORNERS, FACES, OVERLAPS, PART_PAIRS, TOUCHING_
 from radiotwin.io.forms import Origin
 from radiotwin.scene.checks import Problem, Severity
 from radiotwin.scene.materials import Material, MaterialTable
-from radiotwin.scene.meshes import clean, cut_polygon
+from radiotwin.scene.meshes import clean, cut_polygon, is_closed, triangulate
 from radiotwin.scene.readers.features import Feature, Shell, problems_of
 from radiotwin.scene.readers.heights import KNOWN, MAX_HEIGHT_M, Height, HeightColumn, height_of
 from radiotwin.scene.surfaces import Surfaces
@@ -336,9 +336,13 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
     """Make a prism with a body from each feature, which all have shells, and list the defects."""
     prisms: list[Prism] = []
     defects, faces_so_far = _Defects(), 0
-    for feature in features:
-        assert feature.shell is not None
-        vertices, faces = _triangulate(feature.shell, origin)
+    shells = [feature.shell for feature in features if feature.shell is not None]
+    points = np.concatenate([np.zeros((0, 3)), *(shell.points for shell in shells)])
+    x_m, y_m = to_local(origin, points[:, 0], points[:, 1])
+    points_m = np.split(np.column_stack([x_m, y_m, points[:, 2]]),
+                        np.cumsum([len(shell.points) for shell in shells])[:-1])
+    for feature, shell, corners_m in zip(features, shells, points_m):
+        vertices, faces = _triangulate(shell, corners_m)
         faces_so_far += len(faces)
         FACES.check(faces_so_far, "the map")
         area = _footprint(vertices, faces)
@@ -375,33 +379,30 @@ def elevation_fact(features: Sequence[Feature]) -> str:
             "vertical datum; each was put on the ground")
 
 
-def _triangulate(shell: Shell, origin: Origin) -> tuple[np.ndarray, np.ndarray]:
-    """Cut the polygons of a shell into triangles.
+def _triangulate(shell: Shell, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cut the polygons of a shell, whose points (n, 3) are at `points_m`, into triangles.
 
     Returns:
         (v, 3) corners in the local frame, above the ground of the building [m], and (f, 3) faces.
     """
-    points = shell.points
-    x_m, y_m = to_local(origin, points[:, 0], points[:, 1])
-    vertices = np.column_stack([x_m, y_m, points[:, 2] - shell.ground_m])
-    vertices, same = np.unique(np.round(vertices, _DECIMALS), axis=0, return_inverse=True)
+    vertices = np.round(points_m - [0, 0, shell.ground_m], _DECIMALS)
+    vertices, same = np.unique(vertices, axis=0, return_inverse=True)
     same = same.reshape(-1)
-    faces = [_cut(vertices, [same[ring] for ring in rings]) for rings in shell.polygons]
-    return vertices, np.concatenate([np.zeros((0, 3), dtype=np.int64), *faces])
-
-
-def _cut(vertices: np.ndarray, rings: list[np.ndarray]) -> np.ndarray:
-    """Return the triangles of a polygon with holes, which turn as its outline does."""
-    rings = [ring[ring != np.roll(ring, 1)] for ring in rings]
-    rings = [rings[0], *(ring for ring in rings[1:] if len(ring) > 2)]
-    if len(rings[0]) < 3:
-        return np.zeros((0, 3), dtype=np.int64)
-    if len(rings[0]) == 3 and len(rings) == 1:
-        return rings[0][None]
-    corners = np.concatenate(rings)
-    CORNERS.check(len(corners), "the map")
-    ends = np.cumsum([len(ring) for ring in rings]).tolist()
-    return corners[cut_polygon(vertices[corners], ends)]
+    whole: dict[int, list[np.ndarray]] = {}  # outlines without holes, by their corners
+    faces = [np.zeros((0, 3), dtype=np.int64)]
+    for rings in shell.polygons:
+        rings = [ring[ring != np.roll(ring, 1)] for ring in (same[each] for each in rings)]
+        rings = [rings[0], *(ring for ring in rings[1:] if len(ring) > 2)]
+        corners = np.concatenate(rings)
+        CORNERS.check(len(corners), "the map")
+        if len(rings) == 1:
+            whole.setdefault(len(corners), []).append(corners)
+        elif len(rings[0]) > 2:
+            ends = np.cumsum([len(ring) for ring in rings]).tolist()
+            faces.append(corners[cut_polygon(vertices[corners], ends)])
+    faces += [triangulate(vertices, np.array(group)) for count, group in whole.items()
+              if count > 2]
+    return vertices, np.concatenate(faces)
 
 
 def _footprint(vertices: np.ndarray, faces: np.ndarray) -> shapely.MultiPolygon:
@@ -435,7 +436,14 @@ def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
 
 
 def _solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold | None:
-    """Return the solid that triangles enclose; None where they do not."""
+    """Return the solid that triangles enclose; None where they do not.
+
+    manifold3d reads beyond its memory where an edge has no partner.
+    """
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    faces = faces[distinct]
+    if not is_closed(faces) or not np.isfinite(vertices).all():
+        return None
     solid = Manifold(Mesh64(vertices, faces.astype(np.uint64)))
     if solid.status() == Error.NoError and solid.volume() < 0:
         solid = Manifold(Mesh64(vertices, faces[:, ::-1].astype(np.uint64)))

@@ -36,7 +36,7 @@ def test_where_buildings_are_marked_other_rows_are_ignored(tmp_path):
                                       {**feature(building="yes"), "geometry": None}))
     assert [one.name for one in found.features] == ["feature 1"]
     (said,) = left_out_problems(found.left_out, None)
-    assert "points or lines" in said.message and "feature 4" in said.message
+    assert "no geometry" in said.message and "feature 4" in said.message
 
 
 def test_courtyards_and_wings(tmp_path):
