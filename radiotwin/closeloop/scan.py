@@ -276,14 +276,13 @@ def compare(readings: Readings, families: list[Family], units: Units) -> list[Co
         for statistic in family.statistics:
             is_base = family.name in BASE_ERRORS and statistic == "level"
             of = "base" if is_base else "level" if statistic == "curve" else statistic
-            parts = {}
+            parts: dict[str, Apart | Curves] = {}
             for name, each in classes[of].items():
                 part = each.compare(family)
                 if part is not None:
                     parts[name] = part
             if len(parts) > 1:
-                join = curves_together if statistic == "curve" else together
-                parts["all"] = join(list(parts.values()))
+                parts["all"] = _together(list(parts.values()))
             elif len(classes["level"]) == 1 and parts:
                 parts["all"] = parts.popitem()[1]
             outlier = ANYWHERE.get(statistic, ANYWHERE_LOG)
@@ -298,6 +297,12 @@ def compare(readings: Readings, families: list[Family], units: Units) -> list[Co
                     log_odds = np.where(part.size > 0, log_odds, -np.inf)
                 found.append(Compared(family, statistic, name, part, log_odds))
     return found
+
+
+def _together(parts: list[Apart | Curves]) -> Apart | Curves:
+    of_groups = [each for each in parts if isinstance(each, Apart)]
+    of_curves = [each for each in parts if isinstance(each, Curves)]
+    return together(of_groups) if of_groups else curves_together(of_curves)
 
 
 def _usual_errors(readings: Readings) -> np.ndarray:

@@ -15,7 +15,7 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Readings, families_of, units_of
 from radiotwin.closeloop.scan import UNITS, Compared, compare, moved
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
-from radiotwin.inference.groups import Units
+from radiotwin.inference.groups import Apart, Units
 
 STATISTICS = ("level", "scatter")
 FIRST, STEP = 3.0, 1.25  # errors of a typical group; each size that is tried over the one before
@@ -50,31 +50,33 @@ def seen_from(model: CrossFit) -> list[Seen]:
     families = [replace(each, statistics=tuple(
         statistic for statistic in STATISTICS if statistic in each.statistics))
                 for each in families_of(readings, units)]
-    sharpest: dict[tuple[str, str], Compared] = {}
+    sharpest: dict[tuple[str, str], tuple[Compared, int, float]] = {}
     for each in compare(readings, families, units):
-        key = each.family.name, each.statistic
-        if key not in sharpest or _typical(each)[1] < _typical(sharpest[key])[1]:
-            sharpest[key] = each
+        if isinstance(each.distance, Apart):
+            key, (group, total) = (each.family.name, each.statistic), _typical(each.distance)
+            if key not in sharpest or total < sharpest[key][2]:
+                sharpest[key] = each, group, total
     found = []
-    for (family, statistic), each in sharpest.items():
-        size = _least_size(each, readings, units)
+    for (family, statistic), (each, group, total) in sharpest.items():
+        size = _least_size(each, group, total, readings, units)
         if np.isfinite(size):
             value = float(np.exp(size)) if statistic == "scatter" else size
             found.append(Seen(family, statistic, value, UNITS[statistic]))
     return found
 
 
-def _typical(compared: Compared) -> tuple[int, float]:
+def _typical(distance: Apart) -> tuple[int, float]:
     """Return the group whose error and spread together are the median, and what they are."""
-    judged = np.isfinite(compared.distance.size)
-    total = np.where(judged, np.hypot(compared.distance.error, compared.distance.spread), np.inf)
+    judged = np.isfinite(distance.size)
+    total = np.where(judged, np.hypot(distance.error, distance.spread), np.inf)
     group = int(np.argsort(total)[(judged.sum() - 1) // 2])
     return group, float(total[group])
 
 
-def _least_size(compared: Compared, readings: Readings, units: Units) -> float:
+def _least_size(compared: Compared, group: int, total: float, readings: Readings,
+                units: Units) -> float:
     """Return the size from which a typical group is surely said; inf if there is none."""
-    (group, total), statistic = _typical(compared), compared.statistic
+    statistic = compared.statistic
     family = replace(compared.family, statistics=(statistic,))
     rows, sure = family.groups.members(group, len(readings)), logit(MIN_SURE)
     size = FIRST * total
