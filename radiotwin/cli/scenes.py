@@ -42,10 +42,10 @@ MAX_BUSY = 1.3  # times the time of an idle machine, from which on a plan says s
 
 def build_scene(
     source: Annotated[str, typer.Argument(
-        metavar="CITY", help="A map (.osm, .osm.pbf, .geojson, .gpkg, .shp, or a .zip of it), a 3D "
-                             "city model (.city.json, .gml), a Mitsuba or Sionna RT XML file, a "
-                             "model (.obj, .glb, .gltf, .stl, .ply), sionna:NAME (munich, etoile, "
-                             "…), or preset:NAME (rbm, rdm, small).")],
+        metavar="CITY", help="A map (.osm, .osm.pbf, .geojson, .gpkg, .shp, or a .zip of it, .json "
+                             "of Overpass), a 3D city model (.city.json, .gml), a Mitsuba or "
+                             "Sionna RT XML file, a model (.obj, .glb, .gltf, .stl, .ply), "
+                             "sionna:NAME (munich, etoile, …), or preset:NAME (rbm, rdm, small).")],
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Scene folder to write [scenes/NAME].")] = None,
     check: Annotated[bool, typer.Option(

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 EARLIER = "scene.toml.old"  # the declarations that a new scene replaced
 SCENE_FILES = frozenset({"scene.toml", EARLIER, "city.xml", "meshes", "preview.png",
                          "buildings.csv"})
-MAP_SUFFIXES = ".osm, .osm.pbf, .geojson, .gpkg, .parquet, .shp, .zip, .city.json, .gml"
+MAP_SUFFIXES = ".osm, .osm.pbf, .geojson, .gpkg, .parquet, .shp, .zip, .json, .jsonl, .gml"
 
 
 @dataclass(frozen=True, eq=False)

@@ -127,6 +127,11 @@ def _write_maps(folder: Path) -> None:
     shape = {"type": "Polygon", "coordinates": [SQUARE]}
     feature = {"type": "Feature", "properties": {"building": "yes", "height": "12"}, "geometry": shape}
     (folder / "town.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    places = [{"lon": lon, "lat": lat} for lon, lat in SQUARE]
+    (folder / "town.json").write_text(json.dumps({"elements": [
+        {"type": "way", "id": 1, "tags": {"building": "yes", "height": "12"}, "geometry": places},
+        {"type": "relation", "id": 2, "tags": {"type": "multipolygon", "building": "yes"},
+         "members": [{"type": "way", "ref": 3, "role": "", "geometry": places}]}]}))
     (folder / "town.osm").write_bytes((Path(__file__).parents[1] / "scene" / "readers" / "town.osm").read_bytes())
     import pyogrio  # an extra, in the test extra, too
     import rasterio

@@ -43,6 +43,7 @@ TARGETS = (
     Target("foreign city", "city.xml", "radiotwin build-scene city.xml -o out"),
     Target("OpenStreetMap", "town.osm", "radiotwin build-scene town.osm -o out"),
     Target("GeoJSON map", "town.geojson", "radiotwin build-scene town.geojson -o out"),
+    Target("Overpass", "town.json", "radiotwin build-scene town.json -o out"),
     Target("GeoPackage", "town.gpkg", "radiotwin build-scene town.gpkg -o out"),
     *(Target("Shapefile", f"town.{suffix}", "radiotwin build-scene town.shp -o out") for suffix in ("shp", "dbf", "prj")),
     Target("Shapefile", "town.zip", "radiotwin build-scene town.zip -o out"),

@@ -31,7 +31,6 @@ from radiotwin.scene.materials import (
 )
 from radiotwin.scene.placement import choose_extent, make_extent
 from radiotwin.scene.readers.citygml import read_citygml
-from radiotwin.scene.readers.cityjson import read_cityjson
 from radiotwin.scene.readers.extrude import make_blocks, split_roof
 from radiotwin.scene.readers.features import (
     READ_TAGS,
@@ -54,6 +53,7 @@ from radiotwin.scene.readers.heights import (
     no_height_text,
 )
 from radiotwin.scene.readers.heights import source_text as height_text
+from radiotwin.scene.readers.json_maps import LINES, read_json_map
 from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml
 from radiotwin.scene.readers.plausible import implausible_heights
 from radiotwin.scene.readers.shapefiles import read_shapefile
@@ -79,9 +79,9 @@ READERS: dict[str, Callable[[Path, str | None], MapFile]] = {
     ".geojson": read_geojson, ".gpkg": read_geopackage,
     ".parquet": read_geoparquet,
     ".shp": read_shapefile, ".zip": read_shapefile,
-    ".city.json": read_cityjson, ".city.json.gz": read_cityjson, ".json": read_cityjson,
-    ".cityjson": read_cityjson, ".jsonl": read_cityjson, ".gml": read_citygml,
-    ".citygml": read_citygml}
+    **dict.fromkeys((".city.json", ".city.json.gz", ".json", ".json.gz", ".cityjson",
+                     ".geojson.gz", *LINES), read_json_map),
+    ".gml": read_citygml, ".citygml": read_citygml}
 LAYERED = {".gpkg": read_geopackage, ".zip": read_shapefile}  # those that may have layers
 GROUND = "ground"  # name of its shape
 GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent

@@ -7,15 +7,14 @@ packages only.
 [1] https://www.cityjson.org/specs/2.0.1
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.io.budgets import DOCUMENT_BYTES, FEATURES, VERTICES
-from radiotwin.io.inputs import decode_text, open_gzip, parse_json
+from radiotwin.io.budgets import VERTICES
 from radiotwin.scene.readers.city_objects import CityObject, Geometry, Polygon, city_features
 from radiotwin.scene.readers.features import MapFile
 
@@ -24,28 +23,18 @@ _DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2
            "CompositeSolid": 2}
 
 
-def read_cityjson(path: Path, crs: str | None = None) -> MapFile:
-    """Read the surfaces of buildings in a CityJSON file; of objects with an outline only, that.
+def cityjson_map(path: Path, documents: Sequence[Any], crs: str | None = None) -> MapFile:
+    """Return the surfaces of buildings in CityJSON; of objects with an outline only, that.
 
-    A `.jsonl` has a feature in each line. A file that names no coordinate reference system needs
-    `crs`.
+    Args:
+        path: of the file, for messages.
+        documents: the model, or of a text sequence its lines, the first of them with metadata.
+        crs: coordinate reference system of a file that names none; None: refuse it.
 
     Raises:
-        BadInput: no such file, not CityJSON, or an impossible value, with the object's name.
+        BadInput: not CityJSON, or an impossible value, with the object's name.
     """
-    with open_gzip(path, "CityJSON file", DOCUMENT_BYTES) as file:
-        text = decode_text(file.read(), path)
-    if path.suffix.lower() == ".jsonl":
-        lines = [line for line in text.split("\n") if line.strip()]
-        FEATURES.check(len(lines), path)
-        documents = [parse_json(line, f"{path}, row {row}") for row, line in
-                     enumerate(lines, start=1)]
-    else:
-        documents = [parse_json(text, path)]
-    head = documents[0] if documents else None
-    if not isinstance(head, dict) or head.get("type") != "CityJSON":
-        raise BadInput(f"{path} is not CityJSON (\"type\": \"CityJSON\"); export the model as "
-                       "CityJSON 1.1 or 2.0")
+    head = documents[0]
     transform = _transform(path, head)
     objects: list[CityObject] = []
     for document in documents:

@@ -59,17 +59,28 @@ _ENVELOPE_DOUBLES = (0, 4, 6, 6, 8)  # of a geometry's header, by its code
 
 
 def read_geojson(path: Path, crs: str | None = None) -> MapFile:
-    """Read the polygons of a GeoJSON file.
+    """Read the polygons of a GeoJSON file, as `geojson_map`.
+
+    Raises:
+        BadInput: also, no such file, or not JSON.
+    """
+    return geojson_map(path, parse_json(read_text(path, "GeoJSON file"), path, allow_nan=True), crs)
+
+
+def geojson_map(path: Path, data: Any, crs: str | None = None) -> MapFile:
+    """Return the polygons of GeoJSON: a collection of features, one, or a geometry.
 
     It is after RFC 7946 (longitude, latitude), or has an older `crs` member; `crs` is the system of
     a file without.
 
     Raises:
-        BadInput: no such file, not GeoJSON, or coordinates that are not numbers; with the
-            feature's number.
+        BadInput: not GeoJSON, or coordinates that are not numbers; with the feature's number.
     """
-    data = parse_json(read_text(path, "GeoJSON file"), path, allow_nan=True)
     features = data.get("features") if isinstance(data, dict) else None
+    if isinstance(data, dict) and data.get("type") == "Feature":
+        features = [data]
+    elif isinstance(data, dict) and data.get("type") in ("Polygon", "MultiPolygon"):
+        features = [{"type": "Feature", "geometry": data, "properties": {}}]
     if not isinstance(features, list):
         raise BadInput(f"{path} is not a GeoJSON FeatureCollection; export polygons as GeoJSON")
     rows = []

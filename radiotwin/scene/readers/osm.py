@@ -2,13 +2,14 @@
 
 A closed way is an area, and so is a relation of type multipolygon whose ways form closed rings [2];
 rings of role `inner` are courtyards. Where a ring has no role, those within an odd number of others
-are. `.osm` files are the XML of OpenStreetMap's API, of Overpass
-and of JOSM. `.osm.pbf` files are read with libosmium [3] in several passes that keep only what is
-needed, so that an extract of a whole region needs little memory.
+are. `.osm` files are the XML of OpenStreetMap's API, of Overpass and of JOSM; the first two also
+answer in JSON [4]. `.osm.pbf` files are read with libosmium [3] in several passes that keep only
+what is needed, so that an extract of a whole region needs little memory.
 
 [1] https://wiki.openstreetmap.org/wiki/Overpass_API
 [2] https://wiki.openstreetmap.org/wiki/Relation:multipolygon
 [3] https://osmcode.org/pyosmium
+[4] https://wiki.openstreetmap.org/wiki/OSM_JSON
 """
 
 import http.client
@@ -17,7 +18,7 @@ import time
 import urllib.parse
 import urllib.request
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -42,9 +43,10 @@ from radiotwin.scene.readers.features import (
 from radiotwin.scene.readers.vegetation import TAGS, kind_of
 
 INCOMPLETE = ("building(s) lack nodes or ways, as where an extract was cut off: left out; take a "
-              "larger extract")
+              "larger extract, or ask Overpass for `out geom;`")
 UNCLOSED = "building(s) have an outline that is not closed: left out"
 NO_VEGETATION = "area(s) of vegetation are incomplete, not closed or too intricate: left out"
+_MADE_UP = -(2**60)  # ids of nodes that have none
 _PLACE_NODES = 1000  # that say where something lies: many relations may name one long way
 MIN_RING_NODES = 4  # a triangle, with the first node again at the end
 _IDS_PER_BLOCK = 100  # elements: 40 kB of the filter for each that is looked for
@@ -125,7 +127,7 @@ def assemble(elements: OsmElements) -> MapFile:
             continue
         if below := hidden(f"way/{number}", way.tags, _place(way, elements)):
             left_out.append(below)
-        elif any(node not in elements.positions for node in way.nodes):
+        elif not way.nodes or any(node not in elements.positions for node in way.nodes):
             left_out.append(LeftOut(f"way/{number}", INCOMPLETE, _place(way, elements)))
         elif len(way.nodes) < MIN_RING_NODES or way.nodes[0] != way.nodes[-1]:
             left_out.append(LeftOut(f"way/{number}", UNCLOSED, _place(way, elements)))
@@ -349,6 +351,87 @@ class _Reader:
             raise BadInput(f"{self.path}, line {line}: a node has {name}={attributes.get(name)!r}; "
                            f"allowed is -{limit} to {limit} degrees; export the map again")
         return value
+
+
+def osm_of_json(path: Path, document: Mapping) -> OsmElements:
+    """Return the elements of OpenStreetMap's JSON.
+
+    Nodes are elements of their own, or, where Overpass was asked for `out geom;`, places in the
+    ways and in the members of relations.
+
+    Raises:
+        BadInput: an impossible value, with the element.
+    """
+    elements = OsmElements()
+    ids: dict[tuple[float, float], int] = {}  # of nodes, by their place
+    by_kind: dict[str, list[tuple[str, Mapping]]] = {"node": [], "way": [], "relation": []}
+    for number, element in enumerate(document["elements"], start=1):
+        if not isinstance(element, dict):
+            raise BadInput(f"{path}: element {number} is not an object; export the map again")
+        if element.get("visible") is not False:
+            by_kind.get(str(element.get("type")), []).append((f"{path}: element {number}", element))
+
+    def place(subject: str, point: Mapping) -> tuple[float, float]:
+        try:
+            found = float(point["lon"]), float(point["lat"])
+        except (KeyError, TypeError, ValueError, OverflowError):
+            found = math.nan, math.nan
+        if not (abs(found[0]) <= 180 and abs(found[1]) <= 90):
+            raise BadInput(f"{subject} has lon={point.get('lon')!r:.20}, lat="
+                           f"{point.get('lat')!r:.20}; allowed are -180 to 180 and -90 to 90 "
+                           "degrees; export the map again")
+        return found
+
+    def way(subject: str, element: Mapping) -> Way:
+        nodes, points = _list(subject, element, "nodes"), _list(subject, element, "geometry")
+        found = [_whole(subject, node) for node in nodes]
+        for row, point in enumerate(points):
+            if isinstance(point, dict):  # of a part outside of a box, null
+                at = place(subject, point)
+                if row < len(found):
+                    ids.setdefault(at, found[row])
+                else:
+                    found.append(ids.setdefault(at, _MADE_UP - len(ids)))
+                elements.positions[found[row]] = at
+            elif row >= len(found):
+                found.append(0)  # a node without a place
+        VERTICES.check(len(elements.positions), path)
+        return Way(found, _tags(element))
+
+    for subject, element in by_kind["node"]:
+        known = _whole(subject, element.get("id"))
+        elements.positions[known] = place(subject, element)
+        ids[elements.positions[known]] = known
+    for subject, element in by_kind["way"]:
+        elements.ways[_whole(subject, element.get("id"))] = way(subject, element)
+    for subject, element in by_kind["relation"]:
+        members = [(_whole(subject, one.get("ref")), str(one.get("role", "")), one)
+                   for one in _list(subject, element, "members")
+                   if isinstance(one, dict) and one.get("type") == "way"]
+        for number, _, member in members:
+            if number not in elements.ways and member.get("geometry"):
+                elements.ways[number] = way(subject, member)
+        elements.relations[_whole(subject, element.get("id"))] = Relation(
+            [(number, role) for number, role, _ in members], _tags(element))
+    return elements
+
+
+def _list(subject: str, element: Mapping, name: str) -> list:
+    found = element.get(name) or []
+    if not isinstance(found, list):
+        raise BadInput(f"{subject}: its {name} are no list; export the map again")
+    return found
+
+
+def _whole(subject: str, value: object) -> int:
+    if type(value) is not int:
+        raise BadInput(f"{subject}: {value!r:.40} is no whole number; export the map again")
+    return value
+
+
+def _tags(element: Mapping) -> dict[str, str]:
+    tags = element.get("tags")
+    return {str(key): str(value) for key, value in tags.items()} if isinstance(tags, dict) else {}
 
 
 def read_osm_pbf(path: Path) -> OsmElements:

@@ -19,8 +19,8 @@ from radiotwin.scene import Scene
 from radiotwin.scene.materials import STANDARD
 from radiotwin.scene.readers import MapOptions, build_scene_from_map, with_pairs
 from radiotwin.scene.readers.citygml import read_citygml
-from radiotwin.scene.readers.cityjson import read_cityjson
 from radiotwin.scene.readers.extrude import make_blocks
+from radiotwin.scene.readers.json_maps import read_json_map
 from radiotwin.scene.readers.solids import find_contacts, make_shell_prisms
 from tests.scene.readers import city_models as made
 
@@ -159,7 +159,7 @@ def test_other_objects_are_counted(tmp_path):
     model["CityObjects"]["T"] = {"type": "TINRelief", "geometry": [
         {"type": "CompositeSurface", "lod": "1", "boundaries": [[[0, 1, 2]]]}]}
     model["CityObjects"]["X"] = {"type": "+Fence", "geometry": model["CityObjects"]["T"]["geometry"]}
-    (problem,) = read_cityjson(write(tmp_path, model)).problems
+    (problem,) = read_json_map(write(tmp_path, model)).problems
     assert "2 objects are neither buildings nor bridges" in problem.message and "'TINRelief: 1'" in problem.message
 
 
@@ -253,8 +253,8 @@ def set_at(*keys, value):
 
 SOLID = ("CityObjects", "B0-0", "geometry", 0)
 BAD_JSON = {
-    "{": "not readable JSON", "[]": "is not CityJSON", "{}": "is not CityJSON", "": "not readable JSON",
-    broken(set_at("type", value="FeatureCollection")): "is not CityJSON",
+    "{": "not readable JSON", "[]": "is neither CityJSON", "{}": "is neither CityJSON", "": "not readable JSON",
+    broken(set_at("type", value="FeatureCollection")): "is not a GeoJSON",
     broken(set_at("transform", value={"scale": [1]})): "transform is not a scale",
     broken(set_at("transform", "scale", value=[1, float("inf"), 1])): "not readable JSON|transform is not",
     broken(set_at("vertices", value=[[1, 2]])): "no vertices of three numbers",
@@ -307,7 +307,7 @@ def test_broken_citygml(tmp_path, text):
 def test_budgets(tmp_path, monkeypatch):
     monkeypatch.setenv(VERTICES.variable, "20")
     with pytest.raises(BadInput, match="vertices; at most 20"):
-        read_cityjson(write(tmp_path, made.cityjson(HOUSES)))
+        read_json_map(write(tmp_path, made.cityjson(HOUSES)))
     with pytest.raises(BadInput, match="vertices; at most 20"):
         read_citygml(write(tmp_path, GOOD_GML, "a.gml"))
 
@@ -326,7 +326,7 @@ def test_roofs_of_a_material_of_their_own(tmp_path):
 
 def test_a_body_stands_where_its_prism_does(tmp_path):
     """As on terrain: 5 m up, with walls that reach 1 m below its own."""
-    (feature,) = read_cityjson(write(tmp_path, made.cityjson([(0, 0, 1.2)]))).features
+    (feature,) = read_json_map(write(tmp_path, made.cityjson([(0, 0, 1.2)]))).features
     origin = Origin(latitude_deg=52.0, longitude_deg=4.37)
     (prism,), _ = make_shell_prisms([feature], origin, STANDARD)
     raised = replace(prism, height=replace(prism.height, bottom_m=4.0, top_m=14.0))

@@ -1,9 +1,13 @@
+import json
+
 import osmium
 import pytest
 import shapely
 
 from radiotwin.errors import BadInput
+from radiotwin.scene.readers import build_scene
 from radiotwin.scene.readers.features import left_out_problems
+from radiotwin.scene.readers.json_maps import read_json_map
 from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml, stitch
 
 
@@ -128,3 +132,50 @@ def test_ways_of_one_ring_without_roles(tmp_path):
                     '<tag k="building" v="yes"/></relation></osm>')
     (one,) = assemble(read_osm_xml(path)).features
     assert one.area.area == pytest.approx(100)
+
+
+def overpass(geometry):
+    """Return a house with a courtyard whose ring is two ways, and a shed, as Overpass answers."""
+    tagged = {"type": "relation", "id": 7, "tags": {"type": "multipolygon", "building": "yes", "height": "9"}}
+    ways = {1: [1, 2, 3], 2: [3, 4, 1], 3: [5, 6, 7, 8, 5], 4: [2, 9, 10, 2]}
+    places = {1: (0, 0), 2: (9, 0), 3: (9, 9), 4: (0, 9), 5: (3, 3), 6: (6, 3), 7: (6, 6), 8: (3, 6), 9: (19, 0), 10: (9, 8)}
+    def points(way):
+        return [{"lon": places[node][0], "lat": places[node][1]} for node in ways[way]]
+    members = [{"type": "way", "ref": way, "role": role} | ({"geometry": points(way)} if geometry else {})
+               for way, role in ((1, "outer"), (2, "outer"), (3, "inner"))]
+    shed = {"type": "way", "id": 4, "nodes": ways[4], "tags": {"building": "shed", "building:levels": "1"}}
+    if geometry:
+        return [tagged | {"members": members}, shed | {"geometry": points(4)}]
+    nodes = [{"type": "node", "id": node, "lon": x, "lat": y} for node, (x, y) in places.items()]
+    return [*nodes, *({"type": "way", "id": way, "nodes": ways[way]} for way in (1, 2, 3)), shed, tagged | {"members": members}]
+
+
+@pytest.mark.parametrize("geometry", [True, False])
+def test_answers_of_overpass_in_json(tmp_path, geometry):
+    (tmp_path / "a.json").write_text(json.dumps({"version": 0.6, "osm3s": {}, "elements": overpass(geometry)}))
+    found = {one.name: one for one in read_json_map(tmp_path / "a.json").features}
+    assert found["relation/7"].area.area == pytest.approx(81 - 9) and found["relation/7"].tags["height"] == "9"
+    assert found["way/4"].area.area == pytest.approx(40) and len(found) == 2
+
+
+@pytest.mark.parametrize(("elements", "message"), [
+    ([{"type": "way", "id": 1, "tags": {"building": "yes"}, "center": {"lat": 1, "lon": 2}}], "out geom"),
+    ([{"type": "way", "id": 1, "tags": {"building": "yes"}, "geometry": [{"lat": 91, "lon": 2}]}], "lat=91; allowed"),
+    ([{"type": "way", "id": "x"}], "element 1: 'x' is no whole number"), ([7], "element 1 is not an object"),
+    ([{"type": "way", "id": 1, "nodes": 5}], "element 1: its nodes are no list"),
+    ([{"type": "node", "id": 1, "lat": 1e999, "lon": None}], "element 1 has lon=None")])
+def test_answers_of_overpass_that_cannot_be_used(tmp_path, elements, message):
+    (tmp_path / "a.json").write_text(json.dumps({"elements": elements}).replace("Infinity", "1e999"))
+    with pytest.raises(BadInput, match=message):
+        build_scene(tmp_path / "a.json", tmp_path / "out")
+
+
+@pytest.mark.parametrize(("name", "text"), [
+    ("a.json", '{"type": "FeatureCollection", "features": [%s]}'), ("a.geojsonl", "%s\n\n"), ("b.ndjson", "%s\n%s\n"),
+    ("a.geojsonseq", "\x1e%s\n\x1e%s\n"), ("a.json", "%s")])
+def test_geojson_under_other_endings(tmp_path, name, text):
+    house = ('{"type": "Feature", "properties": {"height": 7}, "geometry": {"type": "Polygon", "coordinates": '
+             '[[[8, 47], [8.001, 47], [8.001, 47.001], [8, 47]]]}}')
+    (tmp_path / name).write_text(text.replace("%s", house))
+    found = read_json_map(tmp_path / name).features
+    assert len(found) == text.count("%s") and found[0].tags["height"] == "7"
