@@ -123,10 +123,13 @@ def curves_together(parts: list[Curves]) -> Curves:
                   {part: bins for each in parts for part, bins in each.bins.items()})
 
 
-def _log_normal(middle: float, log_sd: float) -> np.ndarray:
-    """Return log probabilities (grid,) of a log-normal standard deviation."""
-    density = norm.logpdf(LOG_GRID, middle, log_sd)
-    return density - logsumexp(density)
+def _log_normal(middle: float | np.ndarray, log_sd: float) -> np.ndarray:
+    """Return log probabilities (…, grid) of a log-normal standard deviation with a middle (…)."""
+    density = norm.logpdf(LOG_GRID, np.expand_dims(middle, -1), log_sd)
+    return density - logsumexp(density, axis=-1, keepdims=True)
+
+
+OF_PEERS = _log_normal(LOG_GRID, PEERS_LOG_SD)  # (grid, grid) by what they have in common
 
 
 def _log_null(log_likelihood: np.ndarray, judged: np.ndarray, prior_sd: float) -> np.ndarray:
@@ -135,8 +138,7 @@ def _log_null(log_likelihood: np.ndarray, judged: np.ndarray, prior_sd: float) -
     What peers have in common is inferred from the prior and all others, some of which may stand
     out themselves.
     """
-    of_peers = np.array([_log_normal(middle, PEERS_LOG_SD) for middle in LOG_GRID])
-    given = logsumexp(log_likelihood[:, None] + of_peers, axis=2)
+    given = logsumexp(log_likelihood[:, None] + OF_PEERS, axis=2)
     anywhere = logsumexp(log_likelihood - np.log(len(SD_GRID)), axis=1)
     robust = np.logaddexp(np.log1p(-OUTLIER_SHARE) + given,
                           np.log(OUTLIER_SHARE) + anywhere[:, None])
