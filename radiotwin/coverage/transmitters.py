@@ -2,7 +2,6 @@
 
 import warnings
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +9,14 @@ import pandas as pd
 
 from radiotwin.display import some
 from radiotwin.errors import BadInput
-from radiotwin.geo import between_frames, is_same_frame, read_frame, to_local
-from radiotwin.io.budgets import DEVICES
-from radiotwin.io.cells import as_numbers, read_cells, refuse
-from radiotwin.io.forms import name_fault
+from radiotwin.geo import read_frame
+from radiotwin.importing.read_source import read_source
 from radiotwin.links.declared import Radio, radios_of
-from radiotwin.links.measurements import RADIO, read_antenna_files, refuse_limits
+from radiotwin.links.measurements import RADIO, read_antenna_files
+from radiotwin.links.site_table import SiteTable, far_notes, high_notes, read_site_table
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna, parse_pattern
 
-_LOCAL, _GLOBAL = ("x_m", "y_m"), ("latitude_deg", "longitude_deg")
 _OPTIONAL = (*RADIO, "load")
 _NAMED = 10  # transmitters in a message
 
@@ -62,52 +59,50 @@ def scene_transmitters(scene: Scene) -> list[Transmitter]:
 def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
     """Read a table of transmitters, such as `devices.csv`.
 
-    Columns: `device`, `x_m, y_m` or `latitude_deg, longitude_deg`, and `z_m` above the ground
-    datum. Optional: `tx_power_dbm` or `eirp_dbm`, `cable_loss_db`, `load`, `frequency_hz`, and
-    `antenna` (a file below the table's folder) with `azimuth_deg` and `tilt_deg` (upwards) as in
-    `scene.toml`.
+    Its columns have the usual names of their quantities, and the unit at the end, see
+    `radiotwin.links.site_table`: of a position with a height above the datum, the ground or the
+    sea, and optionally of power, EIRP, cable loss, load, frequency, and `antenna` (a file below the
+    table's folder) with azimuth and tilt (upwards) as in `scene.toml`.
 
     Args:
-        path: `.csv`, `.csv.gz` or `.parquet`.
+        path: of a table in any format that `import` reads.
         scene: whose frame the positions are converted to, where a `frame.toml` beside the table
             declares theirs.
 
     Returns:
         The transmitters in the order of the table.
 
+    Warns:
+        A column is not used, or a value is probably not meant.
+
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.
     """
     path = Path(path)
-    table = read_cells(path, ("device", "z_m"), (*_LOCAL, *_GLOBAL, *_OPTIONAL, "antenna"))
-    if table.empty:
-        raise BadInput(f"{path}: has no rows; it needs one for each transmitter")
-    DEVICES.check(len(table), path)
-    names = table["device"].astype(str).str.strip()
-    for text in names.unique():
-        if fault := name_fault(text):
-            refuse(path, "device", names, names == text, fault)
-    refuse(path, "device", names, names.duplicated(), "occurs twice; every name must be unique")
-    position_m = _positions(path, table, scene)
-    columns = {name: _column(path, table, name, may_be_empty=True)
-               for name in _OPTIONAL if name in table}
-    if "load" in columns:
-        refuse(path, "load", table["load"], (columns["load"] < 0) | (columns["load"] > 1),
-               "is no load; allowed are 0 to 1")
-    if "antenna" not in table and any(np.nan_to_num(columns.get(name, 0.0)).any()
-                                      for name in ("azimuth_deg", "tilt_deg")):
-        warnings.warn(f"{path}: azimuth_deg and tilt_deg are not used, as no column antenna names "
-                      "the file of a pattern", stacklevel=3)
-    files = table.get("antenna", pd.Series("", table.index)).fillna("").astype(str).str.strip()
+    source = read_source(path)
+    sites = read_site_table(path, source.table, source.where, "device", (*_OPTIONAL, "antenna"))
+    names, values = sites.names, sites.values
+    sites.refuse("device", names.duplicated(), "occurs twice; every name must be unique")
+    position_m, notes = _positions(path, sites, scene)
+    columns = {name: values[name].to_numpy() for name in _OPTIONAL if name in values}
+    load = columns.pop("load", np.full(len(names), np.nan))
+    if "load" in values:
+        sites.refuse("load", (load < 0) | (load > 1), "is no load; allowed are 0 to 1")
+    if "antenna" not in values and any(np.nan_to_num(columns.get(name, 0.0)).any()
+                                       for name in ("azimuth_deg", "tilt_deg")):
+        notes.append(f"{path}: azimuth and tilt are not used, as no column antenna names the file "
+                     "of a pattern")
+    for note in (*source.notes, *sites.notes, *notes):
+        warnings.warn(note, stacklevel=2)
+    files = values.get("antenna", pd.Series("", names.index))
     patterns = {name: parse_pattern(Path(name), content)
                 for name, content in read_antenna_files(path, files).items()}
-    load = columns.pop("load", np.full(len(table), np.nan))
     radios = radios_of(pd.DataFrame({"device": names, "antenna": files, **columns}), patterns, None)
     return [Transmitter(name, place_m, radio.tx_power_dbm, radio.antenna,
                         None if np.isnan(share) else float(share), radio.frequency_hz,
                         radio.cable_loss_db or None)
             for name, place_m, share, radio in zip(names, position_m, load,
-                                                   radios or [Radio()] * len(table))]
+                                                   radios or [Radio()] * len(names))]
 
 
 def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Transmitter]:
@@ -158,34 +153,33 @@ def with_defaults(transmitters: list[Transmitter], scene: Scene, tx_power_dbm: f
             for each in transmitters]
 
 
-def _positions(path: Path, table: pd.DataFrame, scene: Scene) -> np.ndarray:
-    """Return positions (n, 3) in the scene's frame [m]."""
-    z_m = _column(path, table, "z_m")
-    if all(name in table for name in _LOCAL):
-        x_m, y_m = (_column(path, table, name) for name in _LOCAL)
-        position_m = np.column_stack([x_m, y_m, z_m])
-        origin, own = scene.config.origin, read_frame(path.parent)
-        if origin is not None and own is not None and not is_same_frame(own, origin):
-            position_m = between_frames(position_m, own, origin)
-        return position_m
-    if not all(name in table for name in _GLOBAL):
-        raise BadInput(f"{path}: needs the columns {', '.join(_LOCAL)} or {', '.join(_GLOBAL)}")
-    if scene.config.origin is None:
-        raise BadInput(f"{path}: latitude and longitude need the scene's position, and "
-                       f"{scene.folder / 'scene.toml'} has no [origin]; give x_m and y_m, or add "
-                       "it")
-    latitude, longitude = (_column(path, table, name) for name in _GLOBAL)
-    for name, value, limit in zip(_GLOBAL, (latitude, longitude), (90, 180)):
-        refuse(path, name, table[name], np.abs(value) > limit, f"is not within {limit} degrees")
-    return np.column_stack([*to_local(scene.config.origin, longitude, latitude), z_m])
+def _positions(path: Path, sites: SiteTable, scene: Scene) -> tuple[np.ndarray, list[str]]:
+    """Return positions (k, 3) in the scene's frame [m], and notes on odd ones."""
+    names, values = sites.names, sites.values
 
+    def named(row: int) -> str:
+        return f"{path}: {sites.where(names.index[row])}: transmitter {names.iloc[row]!r}"
 
-def _column(path: Path, table: pd.DataFrame, name: str, may_be_empty: bool = False) -> np.ndarray:
-    """Return the numbers (n,) of a column, NaN where it is empty."""
-    text = table[name].fillna("").astype(str).str.strip()
-    numbers = as_numbers(text)
-    refuse(path, name, text, ~np.isfinite(numbers) & ((text != "") | (not may_be_empty)),
-           "is not a finite number")
-    refuse_limits(partial(refuse, path, name, text), name, numbers)
-    return numbers
-
+    place = "latitude, longitude" if "latitude" in values else "x, y"
+    empty = values[place.split(", ")].isna().any(axis=1)
+    sites.refuse_rows(empty, lambda row: (
+        f"transmitter {names.iloc[row]!r} has no {place}; fill them in, or leave the row out"))
+    above_m = values.get("above_ground_m", pd.Series(np.nan, names.index)).to_numpy()
+    position_m = sites.local_m(scene.config.origin, read_frame(path.parent), "the scene")
+    if "latitude" in values and scene.config.origin is not None:
+        middle = np.array([scene.config.origin.latitude_deg, scene.config.origin.longitude_deg])
+        notes = far_notes(values[["latitude", "longitude"]].to_numpy(), middle,
+                          ("latitude", "longitude"), named, "the map")
+    else:
+        west, east, south, north = scene.config.extent.bounds
+        notes = far_notes(position_m[:, :2], np.array([west + east, south + north]) / 2,
+                          ("x", "y"), named, "the map")
+    on_ground = np.isfinite(above_m)
+    position_m[on_ground, 2] = above_m[on_ground] + scene.city.ground_height_m(
+        *position_m[on_ground, :2].T)
+    sites.refuse_rows(np.isnan(position_m[:, 2]), lambda row: (
+        f"transmitter {names.iloc[row]!r} has no height; give it in a column z_m (above the "
+        "datum), above_ground_m or altitude_m (above the sea)"))
+    if not on_ground.any():
+        notes += high_notes(position_m[:, 2] - scene.city.ground_height_m(*position_m[:, :2].T))
+    return position_m, notes

@@ -5,54 +5,39 @@ coordinates are converted. A device of `devices.csv` has one position: one that 
 places over time becomes the devices `NAME@1`, `NAME@2`, ….
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 
 from radiotwin.display import count, some
 from radiotwin.errors import BadInput
-from radiotwin.geo import ALLOWED, reference_system, to_local
+from radiotwin.geo import ALLOWED, reference_system
 from radiotwin.importing.read_source import read_source
-from radiotwin.importing.reading import LIMITS_DEG
-from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings, check_position
+from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings
 from radiotwin.importing.source import Source, Tally
-from radiotwin.importing.units import ISO, METRES, in_metres, seconds
-from radiotwin.io.budgets import DEVICES
-from radiotwin.io.cells import listed, shown
+from radiotwin.importing.units import ISO, seconds
+from radiotwin.io.cells import shown
 from radiotwin.io.forms import MAX_POSITION_M, Origin
-from radiotwin.links.measurements import DEVICE_OPTIONAL, READS, refuse_limits
+from radiotwin.links.cell_limits import READS
+from radiotwin.links.measurements import DEVICE_OPTIONAL
+from radiotwin.links.site_table import (
+    SiteTable,
+    far_notes,
+    local_positions,
+    read_site_table,
+    unmatched_notes,
+)
 
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
 ORIGIN_DECIMALS = 7  # of a computed origin [degrees]: 1 cm
+NAMED = ("receiver", "device")
 SINCE, UNTIL = "since_s", "until_s"
 """Columns of a table of devices: from when until when a device was there [s]; NaN = always."""
 _MAX_PLACES = 1000  # of one device; one that moves all the time has no places
 SAME_BAND = 1.05  # ratio of carriers between which a device hops: 0.4 dB by 20 lg f
 MOVING_M = 1.0  # a device whose positions differ by more than this is not at rest
-
-
-def local_m(positions: pd.DataFrame, origin: Origin | None) -> np.ndarray:
-    """Convert positions, columns of `POSITION` [degrees, m], to x, y, z [m] about an origin.
-
-    NaN in the (n, 3) stands for unknown; without an origin all positions are local already.
-    """
-    places_m = np.full((len(positions), 3), np.nan)
-    for axis, name in enumerate("xy"):
-        if name in positions:
-            places_m[:, axis] = positions[name]
-    ground_m = 0.0 if origin is None else origin.altitude_m
-    for name, zero_m in (("altitude", ground_m), ("z", 0.0), ("height", 0.0)):
-        if name in positions:  # the last one counts
-            height_m = positions[name].to_numpy(dtype=float) - zero_m
-            known = ~np.isnan(height_m)
-            places_m[known, 2] = height_m[known]
-    if origin is not None and "latitude" in positions:
-        known = positions[["latitude", "longitude"]].notna().all(axis=1).to_numpy()
-        places_m[known, 0], places_m[known, 1] = to_local(
-            origin, positions["longitude"][known], positions["latitude"][known])
-    return places_m
 
 
 def find_origin(declared: Origin | None, receivers: pd.DataFrame,
@@ -206,85 +191,49 @@ def _place_names(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     return names
 
 
-def _read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
+def _read_sites(path: str, key: str, settings: Settings, names: Collection[str]) -> SiteTable:
     """Read a table of positions; `key` is the column of the names, `device` or `receiver`.
 
     Several rows of one device are its places over time: column `since`, and `until` where it was
     nowhere in between, in ISO 8601. They become devices `NAME@1`, `NAME@2`, ….
 
-    The position is `latitude, longitude` and `altitude` or `height`, or `x, y, z`. A column's name
-    may end in its unit (`latitude_deg`, `height_m`, `z_ft`); lengths without one are in
-    `length_unit`.
+    Args:
+        path: in any format of a log.
+        key: as above.
+        settings: unit of lengths whose columns do not say theirs, and reference system of x and y.
+        names: in the log.
 
     Returns:
-        columns of `POSITION` [degrees, m] and those of `DEVICE_OPTIONAL` and `antenna` that the
-        table has; the index holds the names.
+        its values are latitude and longitude where x and y are projected; their index holds the
+        names.
     """
     source = read_source(path)
-    DEVICES.check(len(source), path)
-    names = pd.Series(source.names(key, f"the {key}s' names"), index=source.table.index)
-    source.refuse(key, names, names == "", f"is empty; every {key} needs a name")
+    uses = [*DEVICE_OPTIONAL, "antenna", "since", "until"] if key == "device" else []
+    sites = read_site_table(source.path, source.table, source.where, key, uses,
+                            settings.length_unit, settings.crs is not None, names)
     period: dict[str, np.ndarray] = {}
-    if key == "device" and "since" in source.table:
-        period = _period(source, settings)
-        names = _numbered(names, period[SINCE])
-    source.refuse(key, names, names.duplicated(), f"occurs twice; every {key} has one row")
-    columns = {name: (spec, unit) for spec in map(str, source.table)
-               for name, unit in [_quantity_and_unit(spec)] if name}
-    try:
-        check_position(set(columns), "")
-        if not {"latitude", "x"} & set(columns):
-            raise ValueError("there is no position; columns latitude, longitude or x, y are "
-                             f"needed, the table has {listed(source.table.columns)}")
-    except ValueError as error:
-        raise BadInput(f"{path}: {error}") from None
-    positions = pd.DataFrame({name: _quantity(source, name, spec, unit, settings)
-                              for name, (spec, unit) in columns.items()},
-                             index=names.to_numpy(dtype=object))
-    others = {name: source.numbers(name, name) for name in DEVICE_OPTIONAL if name in source.table}
-    files = {"antenna": source.names("antenna", "the antennas' files")} \
-        if "antenna" in source.table else {}
-    for name, numbers in others.items():
-        def refuse(bad: ArrayLike, reason: str, name: str = name) -> None:
-            source.refuse(name, source.table[name], bad, reason)
-
-        refuse_limits(refuse, name, numbers)
-    return to_geographic(positions, settings.crs).assign(**others, **files, **period)
+    unique = sites.names
+    if "since" in sites.values:
+        period = _period(source, sites, settings)
+        unique = _numbered(unique, period[SINCE])
+    sites.refuse(key, unique.duplicated(), f"occurs twice; every {key} has one row")
+    notes = [*source.notes, *sites.notes,
+             *unmatched_notes(path, sites.names, names, key, "the log")]
+    values = to_geographic(sites.values.drop(columns=["since", "until"], errors="ignore"),
+                           settings.crs).assign(**period)
+    return replace(sites, values=values.set_axis(pd.Index(unique, dtype=object)),
+                   notes=tuple(notes))
 
 
-def _period(source: Source, settings: Settings) -> dict[str, np.ndarray]:
+def _period(source: Source, sites: SiteTable, settings: Settings) -> dict[str, np.ndarray]:
     """Return since when, and until when, a device was at a place [s]; NaN where not given."""
-    since_s = seconds(source, "since", ISO, settings.time_zone)
+    since_s = seconds(source, sites.columns["since"], ISO, settings.time_zone)
     until_s = np.full(len(source), np.nan)
-    if "until" in source.table:
-        until_s = seconds(source, "until", ISO, settings.time_zone)
-    source.refuse("until", source.cells("since", "since"), until_s <= since_s,
-                  "is not before the time until which the device was there")
+    if "until" in sites.columns:
+        until_s = seconds(source, sites.columns["until"], ISO, settings.time_zone)
+    sites.refuse("since", until_s <= since_s,
+                 "is not before the time until which the device was there")
     return {SINCE: since_s, UNTIL: until_s}
-
-
-def _quantity_and_unit(spec: str) -> tuple[str | None, str | None]:
-    """Return the quantity of `POSITION` in a column, and the unit at the end of its name."""
-    name, _, ending = spec.rpartition("_")
-    if ending in METRES and name in POSITION and name not in LIMITS_DEG:
-        return name, ending
-    if ending == "deg" and name in LIMITS_DEG:
-        return name, None
-    return (spec, None) if spec in POSITION else (None, None)
-
-
-def _quantity(source: Source, name: str, spec: str, unit: str | None,
-              settings: Settings) -> np.ndarray:
-    """Return the numbers of a column [degrees, m, or the unit of the crs], (n,)."""
-    numbers = source.numbers(spec, name)
-    if name in LIMITS_DEG:
-        limit = LIMITS_DEG[name]
-        source.refuse(spec, source.table[spec], abs(numbers) > limit,
-                      f"is no {name}; allowed are -{limit:g} to {limit:g} degrees")
-        return numbers
-    if settings.crs and name in "xy":
-        return numbers
-    return in_metres(numbers, unit or settings.length_unit, f"{source.path}: column {spec}")
 
 
 @dataclass(frozen=True)
@@ -323,13 +272,17 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     Raises:
         BadInput: a table that cannot be used, a position far from the origin, or a moving device.
     """
-    tables = {name: None if path is None else _read_positions(path, name, settings)
-              for name, path in (("receiver", settings.receivers), ("device", settings.devices))}
+    sites = {name: _read_sites(path, name, settings, set(links[name]))
+             for name, path in (("receiver", settings.receivers), ("device", settings.devices))
+             if path is not None}
+    tables = {name: sites[name].values if name in sites else None for name in NAMED}
     links = _at_times(source, links, tables["device"])
     receivers = _positions(links, "", tables["receiver"], links["receiver"], settings.crs)
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
     origin = find_origin(settings.origin, receivers, devices)
-    receiver_m, device_m = local_m(receivers, origin), local_m(devices, origin)
+    receiver_m, device_m = (local_positions(ends, origin) for ends in (receivers, devices))
+    notes = [note for table in sites.values() for note in table.notes]
+    notes += _far_notes(source, links, receivers, devices, sites)
     del receivers, devices  # as much memory as the links themselves
     if settings.place_m:
         links = links.assign(device=_place_names(source, links, device_m, settings.place_m))
@@ -345,10 +298,26 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
         tally.count(f"no position of receiver {name}", "", len(rows), source.where(rows.index[0]))
     if unknown.any():
         links, device_m = links[~unknown], device_m[~unknown]
-    links, declared_as, notes = _by_carrier(links)
+    links, declared_as, more = _by_carrier(links)
     table = _device_table(source, links, device_m, tables["device"], declared_as,
                           max(MOVING_M, 2 * (settings.place_m or 0.0)))
-    return PositionedLinks(links, table, device_m, origin, notes)
+    return PositionedLinks(links, table, device_m, origin, [*notes, *more])
+
+
+def _far_notes(source: Source, links: pd.DataFrame, receivers: pd.DataFrame,
+               devices: pd.DataFrame, sites: dict[str, SiteTable]) -> list[str]:
+    """Return a note on devices that are odd distances from the receivers."""
+    for axes in (("latitude", "longitude"), ("x", "y")):
+        if all(axis in ends for axis in axes for ends in (receivers, devices)):
+            break
+    else:
+        return []
+    first = ~links["device"].duplicated().to_numpy()
+    names = links["device"].to_numpy()[first]
+    path = sites["device"].path if "device" in sites else source.path
+    middle = receivers[list(axes)].median().to_numpy()
+    return far_notes(devices.loc[first, list(axes)].to_numpy(dtype=float), middle, axes,
+                     lambda row: f"{path}: device {names[row]!r}", "the middle of the receivers")
 
 
 def _by_carrier(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list[str]]:

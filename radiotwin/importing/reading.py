@@ -31,17 +31,16 @@ from radiotwin.importing.source import (
     Source,
     Tally,
     are_few,
-    as_text,
     columns_of,
 )
 from radiotwin.importing.units import LEVEL_COLUMN, calendar_days, in_metres, read_levels, seconds
 from radiotwin.io.budgets import ROWS
-from radiotwin.io.cells import as_numbers, listed, shown
+from radiotwin.io.cells import as_numbers, as_text, listed, shown
 from radiotwin.io.forms import name_fault
-from radiotwin.links.measurements import READS, refuse_limits
+from radiotwin.links.cell_limits import READS, refuse_limits
+from radiotwin.links.site_table import LIMITS_DEG
 
 ANGLES = ("heading", "pitch", "roll")
-LIMITS_DEG = {"latitude": 90.0, "longitude": 360.0}
 NAMES = ("device", "receiver", "flight")
 
 

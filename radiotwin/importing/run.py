@@ -30,12 +30,12 @@ from radiotwin.links.measurements import (
     read_antenna_files,
     read_measurements,
 )
+from radiotwin.links.site_table import FAR_M
 
 SCHEMA = "radiotwin.import/2"
 UNITS = {"_m": "m", "_deg": "°", "_s": "s", "_dbm": "dBm", "_db": "dB"}
 """End of a column's name -> unit."""
 # Limits beyond which a value is legal but worth a warning; chosen by the project.
-FAR_M = 100_000.0  # between receivers, or receivers and devices: more than a city
 HIGH_M = 500.0  # of the lowest receiver: probably above the sea, not above ground
 MAX_MISSED = 0.5  # share of levels that were not detected
 MAX_IMPOSSIBLE = 0.01  # share of levels that no receiver can have meant
@@ -97,18 +97,11 @@ def _ranges(table: pd.DataFrame, links: pd.DataFrame) -> dict[str, dict[str, Any
 
 
 def _position_warnings(measurements: Measurements) -> Iterator[str]:
-    receiver_m, device_m = measurements.receiver_m, measurements.device_m
+    receiver_m = measurements.receiver_m
     extent_m = np.linalg.norm(np.ptp(receiver_m[:, :2], axis=0))
     if extent_m > FAR_M:
         yield (f"the receivers lie {extent_m / 1000:.0f} km apart; is a position wrong, or its "
                "unit?")
-    known_m = device_m[measurements.is_anchor]
-    if len(known_m):
-        apart_m = np.linalg.norm(np.median(receiver_m[:, :2], axis=0)
-                                 - np.median(known_m[:, :2], axis=0))
-        if apart_m > FAR_M:
-            yield (f"devices and receivers lie {apart_m / 1000:.0f} km apart; are latitude and "
-                   "longitude swapped in one of them, or is a sign wrong?")
     z_m = receiver_m[np.isfinite(receiver_m[:, 2]), 2]
     if len(z_m):
         if (z_m == 0).all():
@@ -119,8 +112,8 @@ def _position_warnings(measurements: Measurements) -> Iterator[str]:
                    "the ground's altitude with --origin LATITUDE,LONGITUDE,ALTITUDE")
     unknown = int((~measurements.is_anchor).sum())
     if unknown:
-        yield (f"{unknown} of {len(device_m)} devices have no position: their role is unknown, "
-               "they are to be found")
+        yield (f"{unknown} of {len(measurements.devices)} devices have no position: their role is "
+               "unknown, they are to be found")
 
 
 def _level_warnings(positioned: PositionedLinks, measurements: Measurements, tally: Tally,

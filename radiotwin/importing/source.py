@@ -16,11 +16,9 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from radiotwin.errors import BadInput
-from radiotwin.io.cells import as_numbers, listed, refuse, shown
+from radiotwin.io.cells import as_numbers, as_text, listed, refuse, shown
 from radiotwin.io.forms import name_fault
 
-EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
-"""Texts, in lower case, of cells without a value."""
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
 _ROWS_AT_ONCE = 1_000_000  # of which stripped texts are made
@@ -209,19 +207,6 @@ class Source:
             if len(rows) < len(cells) / 2:  # else it is not the rows that are wrong
                 reason += self.bad_rows.hint(len(rows))
         refuse(self.path, spec, cells, bad, reason, lambda row: self.where(cells.index[row]))
-
-
-def as_text(cells: pd.Series) -> pd.Series:
-    """Convert cells (n,) of any type to stripped texts.
-
-    `""` stands for every spelling of an empty cell; whole numbers have no point.
-    """
-    if cells.dtype.kind == "f":
-        whole = (cells == cells.round()) & (cells.abs() < 2.0**53)  # exact in double precision
-        if (cells.isna() | whole).all():  # an integer column with gaps
-            cells = cells.astype("Int64")
-    text = cells.astype(str).str.strip()
-    return text.mask(cells.isna() | text.str.lower().isin(EMPTY), "")
 
 
 def columns_of(spec: str, header: Iterable[object]) -> list[str]:

@@ -13,10 +13,10 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Settings
-from radiotwin.importing.source import EMPTY, Source, as_text
-from radiotwin.io.cells import as_numbers, shown
+from radiotwin.importing.source import Source
+from radiotwin.io.cells import EMPTY, as_numbers, as_text, shown
+from radiotwin.links.site_table import METRES
 
-METRES = {"m": 1.0, "ft": 0.3048}  # the international foot, exact since 1959
 EPOCH_S = {"epoch s": 1.0, "epoch ms": 1e-3}
 ISO = "ISO 8601"
 ALLOWED = (f"allowed are {', '.join(EPOCH_S)}, {ISO}, or a strftime format, such as "

@@ -6,6 +6,7 @@ typed columns from Parquet.
 
 import csv
 import gzip
+import io
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator
 from itertools import chain
@@ -42,6 +43,10 @@ RESIDUALS = {
 PLANNING = {"method": "text", "trained_in": "text", "real_episodes": "number",
             "truth_ratio": "number"}
 """Column -> kind of its cells; the columns that a table must have."""
+
+
+EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
+"""Texts, in lower case, of cells without a value."""
 
 
 class RaggedRows(BadInput):
@@ -192,6 +197,19 @@ def read_cells(path: Path, required: Collection[str] = (),
                        f"{str(error)[:500]}") from None
 
 
+def column_names(path: Path) -> list[str]:
+    """Return the names of all columns of a table that `read_cells` reads."""
+    if path.suffix.lower() == ".parquet":
+        from pyarrow.parquet import ParquetFile
+
+        with open_input(path, _WHAT) as file:
+            return list(ParquetFile(file).schema_arrow.names)
+    with open_gzip(path, _WHAT) as file, \
+            io.TextIOWrapper(file, "utf-8-sig", newline="") as text:
+        first = next(filter(None, csv.reader(text, skipinitialspace=True)))
+    return [unquoted(name.strip()) for name in first]
+
+
 def write_csv(table: pd.DataFrame, target: Path | IO[bytes], float_format: str | None = None,
               header: bool = True) -> None:
     """Write a table, without its index, as CSV in which a spreadsheet finds no formula.
@@ -268,6 +286,19 @@ def as_numbers(text: pd.Series) -> np.ndarray:
         odd = odd[signs]
         numbers[odd] = as_numbers(text.iloc[odd].str.replace(_SIGNS, "-", regex=True))
     return numbers
+
+
+def as_text(cells: pd.Series) -> pd.Series:
+    """Convert cells (n,) of any type to stripped texts.
+
+    `""` stands for every spelling of an empty cell; whole numbers have no point.
+    """
+    if cells.dtype.kind == "f":
+        whole = (cells == cells.round()) & (cells.abs() < 2.0**53)  # exact in double precision
+        if (cells.isna() | whole).all():  # an integer column with gaps
+            cells = cells.astype("Int64")
+    text = cells.astype(str).str.strip()
+    return text.mask(cells.isna() | text.str.lower().isin(EMPTY), "")
 
 
 def shown(cell: object) -> str:

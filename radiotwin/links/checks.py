@@ -146,18 +146,6 @@ def check_names(measurements: Measurements) -> list[str]:
     return notes
 
 
-def check_tilts(measurements: Measurements) -> list[str]:
-    """Return a note where antennas are said to look upwards, and downtilts are probably meant."""
-    if "tilt_deg" not in measurements.devices:
-        return []
-    tilts_deg = measurements.devices["tilt_deg"].to_numpy(dtype=float)
-    up, known = tilts_deg > 0, np.isfinite(tilts_deg)
-    if not up.any() or (tilts_deg < 0).any():
-        return []
-    return [f"{up.sum()} of {known.sum()} declared tilts are above zero, which is upwards, and "
-            "none is below; where the table counts downtilts, give tilt_deg a minus"]
-
-
 def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
                     scene: Scene | None) -> list[str]:
     """Return a note on each set of positions that are probably in another unit or frame.

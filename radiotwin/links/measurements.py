@@ -36,19 +36,21 @@ from radiotwin.geo import (
     read_frame,
     write_frame,
 )
-from radiotwin.io.budgets import DEVICES, DOCUMENT_BYTES
+from radiotwin.io.budgets import DOCUMENT_BYTES
 from radiotwin.io.cells import (
     as_numbers,
     check_suffix,
+    column_names,
     read_cells,
     refuse,
     require_pyarrow,
-    shown,
     write_csv,
 )
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import MAX_POSITION_M, Origin, name_fault
 from radiotwin.io.inputs import is_within, read_bytes, require_within
+from radiotwin.links.cell_limits import LEVELS, READS, refuse_limits
+from radiotwin.links.site_table import read_site_table, unused_columns
 from radiotwin.links.view import links_dataset, links_table, of_device, plot_links
 from radiotwin.scene.antennas import Pattern, parse_pattern
 
@@ -58,33 +60,19 @@ if TYPE_CHECKING:
 
     from radiotwin.scene import Scene
 
-LEVELS = ["gain_db", "rssi_dbm"]
-_TEXT = {"flight", "receiver", "device", "role"}
-_FILES = {"antenna"}  # columns of names of files, which may be empty
-# Limits that no measurement exceeds: what lies beyond them is another unit or a placeholder.
-MAX_LEVEL_DB = 300.0
-FREQUENCIES_HZ = (1e6, 450e9)  # as of a scene; materials of ITU-R P.2040 end at 450 GHz
-MAX_TIME_S = 1e11  # the year 5138; milliseconds since 1970 lie beyond
-MAX_SPAN_S = 3.2e9  # a century, the longest campaign
-MAX_TILT_DEG = 90.0
-MAX_ANGLE_DEG = 1e6  # thousands of turns in one direction, which some compasses count
-MAX_POWER_DBM = 300.0  # as of a level
-MAX_CABLE_LOSS_DB = 100.0
-MAX_QUALITY = 1e15  # whole numbers are exact up to there
+_TEXT = {"flight", "receiver", "device"}
 # Columns of the two files, as in docs/conventions.md.
 REQUIRED = ["flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device"]
 OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality", "receiver_above_ground_m"]
 DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
 # What is declared of a device's radio, besides its antenna.
 RADIO = ["tx_power_dbm", "eirp_dbm", "cable_loss_db", "frequency_hz", "azimuth_deg", "tilt_deg"]
-READS = "reads_levels"  # 1: levels are read at the device, as by a gateway, of what receivers send
 DEVICE_OPTIONAL = [*RADIO, "above_ground_m", READS]
 ROLES = ("anchor", "unknown")
 _RECEIVER_POSITION = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
 _DEVICE_POSITION = ["x_m", "y_m", "z_m"]
 MAX_APART_M = 1e6  # between an anchor and the receivers' middle: no radio link is so long
 _MAY_BE_EMPTY = {"receiver_z_m", *LEVELS, *OPTIONAL}
-_DEVICE_MAY_BE_EMPTY = {"x_m", "y_m", "z_m", *DEVICE_OPTIONAL}
 
 
 def read_columns(path: Path, required: list[str], optional: list[str],
@@ -98,8 +86,6 @@ def read_columns(path: Path, required: list[str], optional: list[str],
     for name in table.columns:
         if name in _TEXT:
             table[name] = _names(path, name, table[name])
-        elif name in _FILES:
-            table[name] = table[name].fillna("").astype(str).str.strip()
         else:
             cells = table[name]
             table[name] = _numbers(path, name, cells, name in may_be_empty)
@@ -145,54 +131,6 @@ def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd
     return numbers
 
 
-def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
-                  numbers: np.ndarray) -> None:
-    """Refuse numbers of a column that can only be mistakes, such as a wrong unit.
-
-    Args:
-        refuse: called with (n,) bool and the reason; raises where one is true.
-        name: of the column, as in `measurements.csv` or `devices.csv`.
-        numbers: (n,) in its unit; NaN where empty.
-    """
-    if name in LEVELS:
-        refuse(np.abs(numbers) > MAX_LEVEL_DB,
-               f"is no level; allowed are -{MAX_LEVEL_DB:g} to {MAX_LEVEL_DB:g}")
-    if name == "gain_db":
-        refuse(numbers > 0,
-               "is above 0 dB, which no channel gain is; received power [dBm] goes into a column "
-               "rssi_dbm, and a path loss needs a minus sign")
-    if name == "frequency_hz":
-        low, high = FREQUENCIES_HZ
-        refuse((numbers < low) | (numbers > high),
-               f"is no frequency; allowed are {low:g} to {high:g} Hz; the unit is Hz")
-    if name.endswith("_m"):
-        refuse(np.abs(numbers) > MAX_POSITION_M,
-               f"is too far away; allowed are -{MAX_POSITION_M:g} to {MAX_POSITION_M:g} m in "
-               "the scene's frame")
-    if name == "time_s":
-        refuse(np.abs(numbers) > MAX_TIME_S,
-               f"is no time; allowed are -{MAX_TIME_S:g} to {MAX_TIME_S:g} s; the unit is s, not "
-               "ms")
-        if np.isfinite(numbers).any():
-            refuse(numbers - np.nanmin(numbers) > MAX_SPAN_S,
-                   f"is more than a century ({MAX_SPAN_S:g} s) after the first time, "
-                   f"{np.nanmin(numbers):g} s; is one of them wrong, or in another unit?")
-    if name == "tilt_deg":
-        refuse(np.abs(numbers) > MAX_TILT_DEG,
-               f"is no tilt; allowed are -{MAX_TILT_DEG:g} (down) to {MAX_TILT_DEG:g} (up)")
-    if name == READS:
-        refuse(~np.isin(numbers, (0, 1)) & ~np.isnan(numbers),
-               "is neither 0 (levels are read at the receiver) nor 1 (at the device)")
-    if name == "cable_loss_db":
-        refuse((numbers < 0) | (numbers > MAX_CABLE_LOSS_DB),
-               f"is no loss; allowed are 0 to {MAX_CABLE_LOSS_DB:g} dB")
-    for ending, limit in (("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM),
-                          ("eirp_dbm", MAX_POWER_DBM), ("quality", MAX_QUALITY)):
-        if name.endswith(ending):
-            refuse(np.abs(numbers) > limit,
-                   f"is out of range; allowed are -{limit:g} to {limit:g}")
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurements(Summarised):
     """Levels of links between devices and receivers.
@@ -202,12 +140,14 @@ class Measurements(Summarised):
         devices: one row per device, columns as in `devices.csv`; NaN x, y where unknown.
         origin: of the local frame of both; None where it is not known.
         antenna_files: content of the devices' antenna files, by their names in `devices`.
+        notes: on columns of the files that are not used, and values that are probably not meant.
     """
 
     table: pd.DataFrame
     devices: pd.DataFrame
     origin: Origin | None = None
     antenna_files: Mapping[str, bytes] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def level_column(self) -> str:
@@ -470,7 +410,8 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
     if not named and not is_within(devices_path, path.parent):
         raise BadInput(f"{devices_path} is a link out of its folder; name the table that it leads "
                        "to with --devices")
-    devices = read_devices(devices_path)
+    origin, of_devices = read_frame(path.parent), read_frame(devices_path.parent)
+    devices, notes = _read_devices(devices_path, origin, of_devices)
     if table.empty:
         raise BadInput(f"{path}: has no rows; it needs at least one measured link")
     undeclared = ~table["device"].isin(devices["device"])
@@ -479,43 +420,47 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
         raise BadInput(f"{path}: row {row + 2}, column device: {table['device'][row]!r} is not in "
                        f"{devices_path} (it has {_enumerate(devices['device'])}); add it there or "
                        "correct the name")
-    origin, of_devices = read_frame(path.parent), read_frame(devices_path.parent)
-    if origin is not None and of_devices is not None and not is_same_frame(origin, of_devices):
-        devices = moved_positions(devices, _DEVICE_POSITION,
-                                  lambda position_m: between_frames(position_m, of_devices, origin))
     _check_spread(path, table, devices_path, devices)
+    unused = unused_columns(path, column_names(path), table.columns, REQUIRED + OPTIONAL + LEVELS)
     return Measurements(table, devices, origin, read_antenna_files(
-        devices_path, devices.get("antenna", ())))
+        devices_path, devices.get("antenna", ())), (*unused, *notes))
 
 
 def read_devices(path: Path | str) -> pd.DataFrame:
-    """Read a table of devices with the columns of `DEVICE_REQUIRED`, one row each.
+    """Read a table of devices, one row each, with the columns of `DEVICE_REQUIRED`.
+
+    Its columns may have other names, and positions may be latitudes and longitudes where a
+    `frame.toml` beside it declares the frame; see `radiotwin.links.site_table`.
 
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.
     """
     path = Path(path)
-    devices = read_columns(path, DEVICE_REQUIRED, [*DEVICE_OPTIONAL, "antenna"],
-                           _DEVICE_MAY_BE_EMPTY)
-    if devices.empty:
-        raise BadInput(f"{path}: has no rows; it needs one for each device")
-    DEVICES.check(len(devices), path)
-    repeated = devices["device"].duplicated()
-    if repeated.any():
-        row = int(np.flatnonzero(repeated)[0])
-        raise BadInput(f"{path}: row {row + 2}, column device: {devices['device'][row]!r} occurs "
-                       "twice; every device needs one row, and a name of its own")
-    wrong = ~devices["role"].isin(ROLES)
-    if wrong.any():
-        row = int(np.flatnonzero(wrong)[0])
-        raise BadInput(f"{path}: row {row + 2}, column role: {shown(devices['role'][row])}; "
-                       f"allowed are {' and '.join(ROLES)}")
-    unplaced = (devices["role"] == "anchor") & devices[["x_m", "y_m"]].isna().any(axis=1)
-    if unplaced.any():
-        row = int(np.flatnonzero(unplaced)[0])
-        raise BadInput(f"{path}: row {row + 2}: anchor {devices['device'][row]!r} has no x_m, y_m; "
-                       "fill them in or give it the role unknown")
-    return devices
+    own = read_frame(path.parent)
+    return _read_devices(path, own, own)[0]
+
+
+def _read_devices(path: Path, origin: Origin | None,
+                  own: Origin | None) -> tuple[pd.DataFrame, tuple[str, ...]]:
+    """Return devices in the frame about an origin, and notes; `own` is that of the table's x, y."""
+    sites = read_site_table(path, read_cells(path), lambda row: f"row {row + 2}", "device",
+                            [*DEVICE_OPTIONAL, "antenna", "role"])
+    names, values = sites.names, sites.values
+    sites.refuse("device", names.duplicated(),
+                 "occurs twice; every device needs one row, and a name of its own")
+    position_m = sites.local_m(origin or own, own, "the measurements")
+    sites.refuse_rows((np.abs(position_m) > MAX_POSITION_M).any(axis=1), lambda row: (
+        f"device {names[row]!r} is too far away; allowed are {MAX_POSITION_M:g} m"))
+    placed = np.isfinite(position_m[:, :2]).all(axis=1)
+    role = values.get("role", pd.Series(np.where(placed, *ROLES)))
+    if "role" in values:
+        sites.refuse("role", ~role.isin(ROLES), f"is no role; allowed are {' and '.join(ROLES)}")
+    sites.refuse_rows((role == "anchor") & ~placed, lambda row: (
+        f"anchor {names[row]!r} has no x_m, y_m; fill them in or give it the role unknown"))
+    devices = pd.DataFrame({"device": names, **dict(zip(_DEVICE_POSITION, position_m.T)),
+                            "role": role})
+    others = [name for name in (*DEVICE_OPTIONAL, "antenna") if name in values]
+    return devices.assign(**{name: values[name] for name in others}), sites.notes
 
 
 def read_antenna_files(path: Path, names: Iterable[str], are_rows: bool = True

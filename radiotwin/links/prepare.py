@@ -5,13 +5,13 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.io.texts import percent
+from radiotwin.links.cell_limits import READS
 from radiotwin.links.checks import (
     COPIED,
     MIN_LINKS,
     ceiling_notes,
     check_names,
     check_positions,
-    check_tilts,
     copied_rows,
     find_fill_value,
     outside_map,
@@ -26,7 +26,7 @@ from radiotwin.links.correlation import devices_move
 from radiotwin.links.declared import Declared, Radio, antenna_of_uavs, complete, radios_of
 from radiotwin.links.limits import estimate_limits
 from radiotwin.links.links import RESTART_NOTE, Columns, Ends, Flown, Links, World
-from radiotwin.links.measurements import READS, Measurements
+from radiotwin.links.measurements import Measurements
 from radiotwin.links.sites import end_notes
 from radiotwin.scene import Scene
 
@@ -54,7 +54,8 @@ def join_links(measurements: Measurements, scene: Scene) -> Links:
     device_m = measurements.device_m.copy()
     device_m[~measurements.is_anchor, :2] = np.nan
     receiver_m = measurements.receiver_m
-    notes, outside = receiver_notes(receiver_m, scene), outside_map(receiver_m, scene)
+    notes = [*measurements.notes, *receiver_notes(receiver_m, scene)]
+    outside = outside_map(receiver_m, scene)
     if outside.any():
         notes.append(f"{outside.sum():,} of {len(outside):,} links have their receiver outside the "
                      "3D map")
@@ -86,7 +87,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     device_index = measurements.device_index
     require_one_frame(measurements, scene)
     refuse_empty_levels(level_db, measurements.level_column)
-    notes: list[str] = []
+    notes = list(measurements.notes)
     keep = np.ones(len(table), dtype=bool)
 
     def leave_out(bad: np.ndarray, why: str) -> None:
@@ -101,7 +102,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     if scene is not None and scene.city.terrain is not None:
         low = np.flatnonzero(np.isnan(declared_z_m))
         device_m[low, 2] += _ground_m(scene, device_m[low], receiver_m)
-    notes += check_names(measurements) + check_tilts(measurements)
+    notes += check_names(measurements)
     notes += check_positions(receiver_m, device_m, scene)
     from_middle_m = np.abs(receiver_m[:, :2] - np.median(receiver_m[:, :2], axis=0)).max(axis=1)
     leave_out(from_middle_m > MAX_EXTENT_M,

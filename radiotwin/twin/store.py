@@ -20,15 +20,15 @@ from radiotwin.errors import BadInput
 from radiotwin.io.files import require_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import parse_json
-from radiotwin.links.declared import NOTHING, Declared, Radio
-from radiotwin.links.links import Columns, Ends, Flown, Links, World
-from radiotwin.links.measurements import (
+from radiotwin.links.cell_limits import (
     FREQUENCIES_HZ,
     MAX_ANGLE_DEG,
     MAX_CABLE_LOSS_DB,
     MAX_POWER_DBM,
     MAX_TILT_DEG,
 )
+from radiotwin.links.declared import NOTHING, Declared, Radio
+from radiotwin.links.links import Columns, Ends, Flown, Links, World
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB, require_array, require_names
 from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_channel

@@ -140,7 +140,7 @@ def test_many_columns_of_levels_by_options(run, tmp_path):
     (GOOD, "--origin here", ["--origin 'here'", "LATITUDE,LONGITUDE"]),
     (GOOD, "--origin 91,0", ["--origin", "latitude_deg", "91"]),
     (GOOD, "--average mode", ["average", "mode", "median"]),
-    (GOOD, "--devices data.csv", ["data.csv", "column 'device'", "missing"]),
+    (GOOD, "--devices data.csv", ["data.csv", "row 3, column cell", "occurs twice"]),
     (GOOD, "-o data.csv", ["data.csv is a file"]),
 ])
 def test_bad_input_is_one_message_and_no_folder(run, tmp_path, text, change, parts):

@@ -203,14 +203,6 @@ def test_a_sector_without_a_declared_tilt_has_that_of_the_others():
     np.testing.assert_allclose(np.subtract(tilts_deg, tilts_deg[0]), [0, 0, 0, -17, 0, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize(("tilts_deg", "told"), [([6.0] * 5 + [0.0], True), ([6.0] * 5 + [-2.0], False), ([-6.0] * 6, False)])
-def test_tilts_that_are_probably_downtilts_are_told(tilts_deg, told):
-    measurements = network(3, points=50)
-    devices = measurements.devices.assign(tilt_deg=tilts_deg)
-    notes = prepare_links(replace(measurements, devices=devices), None).notes
-    assert any("5 of 6 declared tilts are above zero, which is upwards" in note for note in notes) == told
-
-
 def test_one_declared_azimuth_is_too_few():
     measurements = network(3)
     devices = measurements.devices.assign(azimuth_deg=[20.0] + [np.nan] * 5)

@@ -71,18 +71,18 @@ def test_those_of_the_scene(scene):
 
 @pytest.mark.parametrize(("text", "message"), [
     ("device,x_m,y_m,z_m\n", "has no rows"),
-    ("device,x_m,y_m\ns,1,2\n", "column 'z_m' is missing"),
-    ("device,x_m,z_m\ns,1,2\n", "needs the columns x_m, y_m or latitude_deg, longitude_deg"),
+    ("device,x_m,y_m\ns,1,2\n", "row 2: transmitter 's' has no height; give it in a column z_m"),
+    ("device,x_m,z_m\ns,1,2\n", "x and y are given together or not at all"),
     ("device,x_m,y_m,z_m\ns,1,2,3\ns,1,2,3\n", "row 3, column device: 's' occurs twice"),
-    ("device,x_m,y_m,z_m\ns,1,,3\n", "row 2, column y_m: '' is not a finite number"),
-    ("device,x_m,y_m,z_m\ns,1,inf,3\n", "row 2, column y_m: 'inf' is not a finite number"),
+    ("device,x_m,y_m,z_m\ns,1,,3\n", "row 2: transmitter 's' has no x, y"),
+    ("device,x_m,y_m,z_m\ns,1,inf,3\n", "row 2, column y_m: 'inf' is not finite"),
     ("device,x_m,y_m,z_m,load\ns,1,2,3,1.2\n", "row 2, column load: '1.2' is no load; allowed are 0 to 1"),
-    ("device,x_m,y_m,z_m,tx_power_dbm\ns,1,2,3,loud\n", "row 2, column tx_power_dbm: 'loud' is not a finite number"),
+    ("device,x_m,y_m,z_m,tx_power_dbm\ns,1,2,3,loud\n", "row 2, column tx_power_dbm: 'loud' is not a number"),
     ("device,x_m,y_m,z_m,frequency_hz\ns,1,2,3,2.4\n", "row 2, column frequency_hz: '2.4' is no frequency"),
     ("device,x_m,y_m,z_m,antenna,tilt_deg\ns,1,2,3,,95\n", "row 2, column tilt_deg: '95' is no tilt"),
     ("device,x_m,y_m,z_m,antenna\ns,1,2,3,../secret.msi\n", "row 2: .* leads out of"),
     ("device,x_m,y_m,z_m,antenna\ns,1,2,3,none.msi\n", "none.msi does not exist"),
-    ("device,latitude_deg,longitude_deg,z_m\ns,95,2,3\n", "column latitude_deg: '95' is not within 90 degrees")])
+    ("device,latitude_deg,longitude_deg,z_m\ns,95,2,3\n", "column latitude_deg: '95' is no latitude")])
 def test_a_bad_cell_is_named(scene, tmp_path, text, message):
     with pytest.raises(BadInput, match=message):
         read_transmitters(written(tmp_path, text), scene)

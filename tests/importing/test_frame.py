@@ -6,8 +6,9 @@ import pytest
 from scipy.integrate import quad
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.positions import find_origin, local_m, to_geographic
+from radiotwin.importing.positions import find_origin, to_geographic
 from radiotwin.io.forms import Origin
+from radiotwin.links.site_table import local_positions
 
 A_M, F = 6378137.0, 1 / 298.257223563
 E2 = F * (2 - F)
@@ -25,7 +26,7 @@ def origin(latitude, longitude, altitude=0.0):
 def test_north_is_the_arc_of_the_meridian(latitude):
     radius_m = lambda phi: A_M * (1 - E2) / (1 - E2 * np.sin(phi) ** 2) ** 1.5  # noqa: E731
     arc_m, _ = quad(radius_m, np.radians(latitude), np.radians(latitude + 0.2))
-    x_m, y_m, _ = local_m(positions(latitude=latitude + 0.2, longitude=11.5), origin(latitude, 11.5))[0]
+    x_m, y_m, _ = local_positions(positions(latitude=latitude + 0.2, longitude=11.5), origin(latitude, 11.5))[0]
     assert y_m == pytest.approx(arc_m, abs=1e-4) and x_m == pytest.approx(0, abs=1e-6)
 
 
@@ -34,7 +35,7 @@ def test_east_is_the_circle_of_the_prime_vertical(latitude):
     """Over a hundred metres the ellipsoid is the circle with the prime vertical's radius; x is east, not north."""
     step_deg = 0.001
     radius_m = A_M / np.sqrt(1 - E2 * np.sin(np.radians(latitude)) ** 2)
-    x_m, y_m, _ = local_m(positions(latitude=latitude, longitude=-179.9995), origin(latitude, 179.9995))[0]
+    x_m, y_m, _ = local_positions(positions(latitude=latitude, longitude=-179.9995), origin(latitude, 179.9995))[0]
     assert x_m == pytest.approx(radius_m * np.cos(np.radians(latitude)) * np.radians(step_deg), abs=1e-4)
     assert abs(y_m) < 2e-3
 
@@ -43,21 +44,21 @@ def test_heights_are_kept_above_the_declared_ground():
     mixed = pd.concat([positions(latitude=48.2, longitude=11.5, altitude=540.0),
                        positions(latitude=48.1, longitude=11.5, height=7.0),
                        positions(latitude=48.1, longitude=11.5)])
-    np.testing.assert_array_equal(local_m(mixed, origin(48.1, 11.5, 519.0))[:, 2], [21.0, 7.0, np.nan])
+    np.testing.assert_array_equal(local_positions(mixed, origin(48.1, 11.5, 519.0))[:, 2], [21.0, 7.0, np.nan])
 
 
 def test_the_origin_is_the_median_of_the_receivers():
     receivers = positions(latitude=[48.0, 48.1, 49.9], longitude=[11.0, 11.3, 11.2])
     found = find_origin(None, receivers, positions(latitude=10.0, longitude=10.0))
     assert found == Origin(latitude_deg=48.1, longitude_deg=11.2)
-    np.testing.assert_allclose(local_m(positions(latitude=48.1, longitude=11.2), found)[0, :2], 0, atol=1e-9)
+    np.testing.assert_allclose(local_positions(positions(latitude=48.1, longitude=11.2), found)[0, :2], 0, atol=1e-9)
 
 
 def test_the_median_across_the_date_line():
     receivers = positions(latitude=[-17.0, -17.0, -17.0], longitude=[179.9, -179.9, -179.8])
     found = find_origin(None, receivers, receivers)
     assert found.longitude_deg == -179.9
-    assert np.abs(local_m(receivers, found)[:, 0]).max() < 30_000
+    assert np.abs(local_positions(receivers, found)[:, 0]).max() < 30_000
 
 
 def test_utm_gives_the_same_metres_as_degrees():
@@ -66,7 +67,7 @@ def test_utm_gives_the_same_metres_as_degrees():
                         "EPSG:32632")
     np.testing.assert_allclose(utm["longitude"], 9.0, atol=1e-9)
     found = find_origin(Origin(latitude_deg=utm["latitude"][0], longitude_deg=9.0), utm, utm)
-    np.testing.assert_allclose(local_m(utm, found), [[0, 0, 3], [0, 1000 / 0.9996, 4]], atol=1e-4)
+    np.testing.assert_allclose(local_positions(utm, found), [[0, 0, 3], [0, 1000 / 0.9996, 4]], atol=1e-4)
 
 
 def test_local_and_geographic_positions_need_an_origin():
@@ -74,7 +75,7 @@ def test_local_and_geographic_positions_need_an_origin():
     with pytest.raises(BadInput, match="--origin"):
         find_origin(None, receivers, devices)
     declared = find_origin(Origin(latitude_deg=48, longitude_deg=11), receivers, devices)
-    np.testing.assert_array_equal(local_m(devices, declared), [[5, 6, 7]])
+    np.testing.assert_array_equal(local_positions(devices, declared), [[5, 6, 7]])
 
 
 @pytest.mark.parametrize(("crs", "x", "y", "message"), [

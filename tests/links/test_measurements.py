@@ -5,6 +5,8 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
+from radiotwin.geo import write_frame
+from radiotwin.io.forms import Origin
 from radiotwin.links.measurements import Measurements, read_measurements
 
 DEVICES = "device,x_m,y_m,z_m,role\na,10,20,1.5,anchor\nb,,,1.5,unknown\n"
@@ -125,8 +127,7 @@ def test_bad_rows_name_file_row_and_column(write, text, message):
 
 
 @pytest.mark.parametrize(("devices", "message"), [
-    ("device,x_m,y_m,z_m\na,1,2,3\n", "column 'role' is missing"),
-    ("device,x_m,y_m,z_m,role\na,1,2,3,anchr\n", r"row 2, column role: 'anchr'; allowed are"),
+    ("device,x_m,y_m,z_m,role\na,1,2,3,anchr\n", r"row 2, column role: 'anchr' is no role; allowed are"),
     ("device,x_m,y_m,z_m,role\na,,2,3,anchor\n", r"row 2: anchor 'a' has no x_m, y_m"),
     ("device,x_m,y_m,z_m,role\na,1,2,3e7,anchor\n", r"row 2, column z_m: '3e7' is too far away"),
     ("device,x_m,y_m,z_m,role,tilt_deg\na,1,2,3,anchor,-91\n", r"row 2, column tilt_deg: '-91' is no tilt; allowed are -90"),
@@ -283,3 +284,31 @@ def test_heights_above_the_ground():
         Measurements(table.assign(receiver_z_m=1.0), devices).on_ground(None)
     with pytest.raises(BadInput, match="devices, row 3: above_ground_m needs a known position"):
         Measurements(table, devices.assign(above_ground_m=2.0, z_m=np.nan)).on_ground(lambda x_m, y_m: x_m)
+
+
+def test_columns_that_are_not_used_are_noted(tmp_path):
+    path = tmp_path / "measurements.csv"
+    path.write_text(HEADER.strip() + ",remark\n0,f,u,0,0,5,a,-80,fine\n")
+    (tmp_path / "devices.csv").write_text("cell,Easting,x_ft,y_ft,antenna_height,owner\na,1,10,20,30,me\n")
+    with pytest.raises(BadInput, match="'antenna_height': the unit of its numbers from 30 to 30 is not known"):
+        read_measurements(path)
+    (tmp_path / "devices.csv").write_text("cell,x_ft,y_ft,antenna_height_m,downtilt,owner\na,10,20,30,6,me\n")
+    found = read_measurements(path)
+    assert found.devices.to_dict("records")[0] == {
+        "device": "a", "x_m": 3.048, "y_m": 6.096, "z_m": pytest.approx(np.nan, nan_ok=True), "role": "anchor",
+        "above_ground_m": 30.0, "tilt_deg": -6.0}
+    assert found.notes == (f"{path.name}: column not used: remark", "devices.csv: column not used: owner")
+    path.write_text(HEADER.replace("gain_db", "gain_db,heading_degs").strip() + "\n0,f,u,0,0,5,a,-80,9\n")
+    with pytest.raises(BadInput, match="column 'heading_degs' is nearly 'heading_deg'"):
+        read_measurements(path)
+
+
+def test_devices_on_the_globe_need_the_origin_of_the_measurements(tmp_path):
+    path = tmp_path / "measurements.csv"
+    path.write_text(HEADER + "0,f,u,0,0,5,a,-80\n")
+    (tmp_path / "devices.csv").write_text("device,lat,lon,altitude_m\na,48.1,11.5,530\n")
+    with pytest.raises(BadInput, match="devices.csv: latitude and longitude need the origin"):
+        read_measurements(path)
+    write_frame(Origin(latitude_deg=48.1, longitude_deg=11.5, altitude_m=520.0), tmp_path / "frame.toml")
+    devices = read_measurements(path).devices
+    np.testing.assert_allclose(devices[["x_m", "y_m", "z_m"]], [[0, 0, 10]], atol=1e-6)
