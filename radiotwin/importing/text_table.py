@@ -16,9 +16,9 @@ import pandas as pd
 from radiotwin.errors import BadInput
 from radiotwin.importing.log_files import Lines, LogFile
 from radiotwin.importing.settings import BLANKS, DELIMITERS, Settings
-from radiotwin.importing.source import EMPTY, BadRows
+from radiotwin.importing.source import BadRows
 from radiotwin.io.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS
-from radiotwin.io.cells import shown
+from radiotwin.io.cells import EMPTY, shown
 from radiotwin.io.texts import unquoted, without_quotes
 
 _BLOCK_BYTES, _TAIL_BYTES = 2**18, 2**16

@@ -287,6 +287,10 @@ def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int]
     used = {*POSITION, "above_ground_m", *uses}
     unused |= {name: "not used here" for quantity, name in columns.items() if quantity not in used}
     columns = {quantity: name for quantity, name in columns.items() if quantity in used}
+    for name in (key, *columns.values()):
+        if cells[name].map(lambda cell: isinstance(cell, (list, dict, tuple, np.ndarray))).any():
+            raise BadInput(f"{path}: column {name} holds lists or records; it needs one value in "
+                           "each row")
     text = cells[key] if isinstance(cells[key].dtype, pd.StringDtype) else as_text(cells[key])
     text = text.fillna("").str.strip()
     table = SiteTable(path, text, pd.DataFrame(index=cells.index), columns, cells, where)

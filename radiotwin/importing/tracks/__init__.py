@@ -14,8 +14,9 @@ from radiotwin.importing.tracks.fixes import COLUMNS, Fixes, make_fixes
 from radiotwin.importing.tracks.gnss import read_gpx, read_nmea
 from radiotwin.importing.tracks.rosbag import is_rosbag, read_rosbag
 from radiotwin.importing.tracks.ulog import read_ulog
-from radiotwin.importing.units import ISO, METRES, seconds
+from radiotwin.importing.units import ISO, seconds
 from radiotwin.io.cells import listed
+from radiotwin.links.site_table import METRES
 
 _READERS = {".gpx": read_gpx, ".nmea": read_nmea, ".nma": read_nmea, ".ulg": read_ulog}
 
