@@ -11,6 +11,7 @@ from radiotwin.cli.options import (
     Cluster,
     DeviceTable,
     FitSeed,
+    Force,
     MeasurementFile,
     OnlyDevices,
     OptionalScene,
@@ -98,12 +99,13 @@ def map_(
     devices: OnlyDevices = None,
     altitudes: Annotated[str | None, typer.Option(
         metavar="Z,…", help="Only these of the lattice's altitudes [m].")] = None,
+    force: Force = False,
 ) -> None:
     """Predict a radio map, or convert one.
 
     It holds the gain of every device over the scene's lattice.
     """
-    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.maps.form import is_map
     from radiotwin.report import check_map_target, export_map
     from radiotwin.scene import Scene
@@ -115,6 +117,7 @@ def map_(
     world = Scene.load(scene)
     check_map_target(out, world)
     keep_inputs(out, twin, *world.files)
+    keep_others(out, force, "device", "x_m", "y_m", "z_m", "gain_db", "los")
     with open_model(twin) as source:
         written = export_map(source, world, out, devices=split_names(devices),
                              altitudes_m=_altitudes(altitudes), name=str(twin), tell=notice)
@@ -326,6 +329,7 @@ def locate(
     shift: Shift = None,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Table of the positions.")] = Path("located.csv"),
+    force: Force = False,
 ) -> None:
     """Locate unknown devices with a twin of close-loop, or of fit.
 
@@ -333,7 +337,7 @@ def locate(
     """
     from radiotwin.io.cells import write_csv
     from radiotwin.io.files import atomic_path, require_suffix, require_writable
-    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.links.measurements import read_measurements
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
@@ -347,6 +351,7 @@ def locate(
 
     require_suffix(out, ".csv", ".csv.gz")
     keep_inputs(out, measurements, devices or measurements.parent / "devices.csv", truth)
+    keep_others(out, force, "device", "x_m", "y_m", "radius_m")
     known, world = Twin.load(twin), Scene.load(scene) if scene else None
     keep_inputs(out, *(world.files if world else []))
     check_can_locate(known, world)  # before a file is read that may be large

@@ -35,6 +35,8 @@ PointsFile = Annotated[Path, typer.Option(
 Shift = Annotated[str | None, typer.Option(
     metavar="DX,DY", help="Metres to add to x and y of measurements and devices for the scene's "
                           "frame; 0,0 says that it is theirs.")]
+Force = Annotated[bool, typer.Option(
+    "--force", help="Replace a file that radiotwin did not write.")]
 OnlyDevices = Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")]
 Quality = Annotated[str | None, typer.Option(help="fast, default or high [default].")]
 TargetDb = Annotated[float | None, typer.Option(

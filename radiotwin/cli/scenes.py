@@ -12,6 +12,7 @@ from radiotwin.cli.options import (
     Combining,
     ComputeDevice,
     Diffraction,
+    Force,
     OnlyDevices,
     PointsFile,
     Quality,
@@ -139,12 +140,16 @@ def export_scene(
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="A folder (city.xml and meshes/*.ply for sionna.rt.load_scene, "
                             "devices.csv), or NAME.glb, NAME.gltf (y up), NAME.obj (z up).")],
+    force: Force = False,
 ) -> None:
     """Write a scene's city in a format of other programs."""
+    from radiotwin.io.inputs import keep_others
     from radiotwin.scene import Scene
     from radiotwin.scene.export import export_scene as export
 
     scene = Scene.load(folder)
+    for written in (out, *[out.with_suffix(".mtl")] * (out.suffix.lower() == ".obj")):
+        keep_others(written, force)
     export(scene, out)
     say(f"wrote {out}" + (f": {', '.join(_content(out))}" if out.is_dir() else ""))
 
@@ -158,12 +163,13 @@ def export(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for nodes.csv and losses.csv.")],
     to: Annotated[str, typer.Option("--to", help="Program to write for: ns3.")] = "ns3",
     devices: OnlyDevices = None,
+    force: Force = False,
 ) -> None:
     """Write the losses between devices and points for a network simulator.
 
     One loss for each pair: nothing moves.
     """
-    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.scene import Scene
     from radiotwin.trace import read_points
     from radiotwin.twin.point_gains import export_ns3
@@ -171,8 +177,9 @@ def export(
     if to != "ns3":
         raise BadInput(f"--to {to!r} is unknown; allowed is ns3")
     world = Scene.load(scene)
-    for name in ("nodes.csv", "losses.csv"):
+    for name, mark in (("nodes.csv", "node"), ("losses.csv", "loss_db")):
         keep_inputs(out / name, points, *world.files)
+        keep_others(out / name, force, mark)
     ends_m = read_points(points, world.config.origin, world.city)
     with open_model(source) as model:
         pairs = export_ns3(model, world, ends_m, out, devices=split_names(devices))
@@ -224,12 +231,13 @@ def trace(
     plan: Annotated[bool, typer.Option(
         "--plan", help="Only estimate time and memory, from a few batches: takes some seconds, and "
                        "the batches are kept for the run.")] = False,
+    force: Force = False,
 ) -> None:
     """Ray-trace the truth with Sionna RT.
 
     A killed run is resumed, a finished one is reused.
     """
-    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.runtime.cuda import tracing_device
     from radiotwin.runtime.execution import open_executor, worker_count
     from radiotwin.scene import Scene
@@ -239,6 +247,7 @@ def trace(
     scene, names = Scene.load(folder), split_names(devices)
     out = out or truth_path(scene, names)
     keep_inputs(out, *scene.files)
+    keep_others(out, force)
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
                          combining=combining, diffraction=diffraction, seed=seed,
                          radius_m=radius, compute_device=used)
@@ -296,12 +305,13 @@ def gains(
     workers: Workers = "auto",
     cluster: Cluster = None,
     device: ComputeDevice = "auto",
+    force: Force = False,
 ) -> None:
     """Ray-trace gains at any points.
 
     An empty gain has a reason, such as no path.
     """
-    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.runtime.cuda import tracing_device
     from radiotwin.runtime.execution import open_executor
     from radiotwin.runtime.pieces import keep_pieces
@@ -311,6 +321,7 @@ def gains(
     used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
     keep_inputs(out, points, *scene.files)
+    keep_others(out, force, "device", "gain_db", "reason")
     points_m = read_points(points, scene.config.origin, scene.city)
     settings = _settings(scene, points_m, names, quality, target_db, combining=combining,
                          diffraction=diffraction, seed=seed, radius_m=radius, compute_device=used)
@@ -333,18 +344,20 @@ def paths(
                                  "shifts.")] = None,
     bandwidth_hz: Annotated[float | None, typer.Option(
         help="Add impulse responses of this bandwidth.")] = None,
+    force: Force = False,
 ) -> None:
     """List the paths to any points: powers, delays, angles, interactions.
 
     Each link gets its delay spread, K factor and angular spreads. No ray tracer is needed.
     """
-    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.propagation.paths.listing import list_paths
     from radiotwin.scene import Scene
     from radiotwin.trace import read_points
 
     scene = Scene.load(folder)
     keep_inputs(out, points, *scene.files)
+    keep_others(out, force)
     points_m = read_points(points, scene.config.origin, scene.city)
     found = list_paths(scene, points_m, out, split_names(devices),
                        None if velocity is None else _speeds(velocity), bandwidth_hz)
@@ -408,18 +421,20 @@ def survey(
              "shadowing of its own, as segmented has].")] = None,
     seed: Annotated[int, typer.Option(
         min=0, max=MAX_SEED, help="Seed of paths and noise.")] = 0,
+    force: Force = False,
 ) -> None:
     """Fly the scene's UAVs through a truth map.
 
     Their measurements are written, with a table of the devices.
     """
-    from radiotwin.io.inputs import keep_inputs
+    from radiotwin.io.inputs import keep_inputs, keep_others
     from radiotwin.maps.survey import fly_survey, read_truth
     from radiotwin.scene import Scene
 
     scene = Scene.load(folder)
     for written in (out, out.parent / "devices.csv"):
         keep_inputs(written, *scene.files)
+    keep_others(out, force, "flight", "receiver", "receiver_x_m", "device", "gain_db")
     measurements = fly_survey(scene, read_truth(scene, truth), flights=flights, pattern=pattern,
                               seed=seed, noise_db=noise_db)
     measurements.write(out)

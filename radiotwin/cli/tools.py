@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.options import MAX_SEED, ComputeDevice
+from radiotwin.cli.options import MAX_SEED, ComputeDevice, Force
 from radiotwin.runtime.console import console, notice, print_rows, result, say
 
 
@@ -86,16 +86,19 @@ def report(
         help="segmented, or the file of a radio map [SCENE/truth.nc, if it exists].")] = None,
     measurements: Annotated[Path | None, typer.Option(
         help="Measurements of the flights to show, where the run does not hold them.")] = None,
+    force: Force = False,
 ) -> None:
     """Write one HTML page of a run.
 
     It shows the city in 3D with maps, flights and devices, and tables, and needs no network.
     """
     from radiotwin.io.files import require_suffix, require_writable
+    from radiotwin.io.inputs import keep_others
     from radiotwin.report import read_run, write_report
 
     out = out or run / "report.html"
     require_suffix(out, ".html", ".htm")
+    keep_others(out, force)
     found = read_run(run, scene, truth, measurements)
     require_writable(out)
     write_report(found, out)

@@ -10,13 +10,14 @@ gigabytes of text ("billion laughs"), or include another file of this machine.
 import gzip
 import io
 import json
+import mmap
 import os
 import re
 import stat
 import tomllib
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import IO, Any
 from xml.parsers import expat
@@ -34,6 +35,9 @@ from radiotwin.io.budgets import (
 _KEY_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _KEY_DOT = r"[ \t]*+\.[ \t]*+"
 _BLOCK_BYTES = 2**20
+_PROGRAM = b"radiotwin"
+_TABLES = (".csv", ".csv.gz", ".parquet")
+_HEADER_BYTES = 2**16
 
 
 def is_within(path: Path, *folders: Path) -> bool:
@@ -71,6 +75,35 @@ def keep_inputs(out: Path, *read: Path | None) -> None:
         if path is not None and is_within(path, out):
             raise BadInput(f"cannot write {out}: the command reads {path}, which would be lost; "
                            "choose another output path")
+
+
+def keep_others(out: Path, force: bool, *marks: str) -> None:
+    """Check that a file that is replaced was written by this program; call it before long work.
+
+    Args:
+        out: output of a command.
+        force: replace whatever is there.
+        marks: what is in the first line of a table that this command writes, by which it is
+            recognised; other files have the name of this program in them.
+
+    Raises:
+        BadInput: another file is there.
+    """
+    path, suffix = out / "zarr.json" if out.is_dir() else out, out.suffix.lower()
+    if force or not path.is_file() or not path.stat().st_size:
+        return
+    names = [mark.encode() for mark in marks if out.name.lower().endswith(_TABLES)]
+    with suppress(OSError, EOFError, zlib.error), open(path, "rb") as file:
+        if names and suffix != ".parquet":
+            with gzip.open(file) if suffix == ".gz" else nullcontext(file) as table:
+                if {*names} <= {*re.split(rb"[,\r\n]", table.readline(_HEADER_BYTES))}:
+                    return
+        else:
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                if all(content.find(name) >= 0 for name in names or [_PROGRAM]):
+                    return
+    raise BadInput(f"{out} is there, and this command did not write it: choose another output "
+                   "path, or replace it with --force")
 
 
 def require_plain(folder: Path) -> None:

@@ -172,7 +172,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 def save(figure: Figure, path: Path | str) -> None:
     """Write a figure as a PNG file, completely or not at all."""
     data = io.BytesIO()  # Pillow loses the reason of a write to a file that fails
-    figure.savefig(data, dpi=DPI, format="png")
+    figure.savefig(data, dpi=DPI, format="png", metadata={"Software": "radiotwin"})
     with atomic_file(path) as file:
         file.write(data.getbuffer())
 

@@ -47,7 +47,7 @@ def export_scene(scene: Scene, out: Path | str) -> None:
     if out.suffix:
         raise BadInput(f"{out}: unknown format {out.suffix!r}; allowed are a folder (XML and PLY), "
                        f"{', '.join('NAME' + suffix for suffix in _MODEL_SUFFIXES)}")
-    check_target(out, {"city.xml", "meshes", "devices.csv"})
+    check_target(out, {"city.xml", "meshes", "devices.csv"}, mark="devices.csv")
     shapes = read_city(scene.xml_path)
     with atomic_folder(out) as folder:
         write_city(folder, shapes)
@@ -77,26 +77,32 @@ def _write_gltf(shapes: list[CityShape], path: Path) -> None:
         mesh.apply_transform(Y_UP)
         model.add_geometry(mesh, node_name=shape.name, geom_name=shape.name)
     if path.suffix.lower() == ".glb":
-        data = trimesh.exchange.gltf.export_glb(model, include_normals=False)
+        data = trimesh.exchange.gltf.export_glb(model, include_normals=False,
+                                                tree_postprocessor=_sign)
     else:
         data = trimesh.exchange.gltf.export_gltf(model, include_normals=False,
-                                                 embed_buffers=True)["model.gltf"]
+                                                 embed_buffers=True,
+                                                 tree_postprocessor=_sign)["model.gltf"]
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
+def _sign(tree: dict) -> None:
+    tree["asset"]["generator"] = "radiotwin"
+
+
 def _write_obj(shapes: list[CityShape], path: Path) -> None:
     """Write one object per shape; single precision needs nine digits."""
-    lines, first = [f"mtllib {path.stem}.mtl"], 1
+    lines, first = ["# radiotwin", f"mtllib {path.stem}.mtl"], 1
     for shape in shapes:
         lines += [f"o {shape.name}", f"usemtl {shape.material.name}"]
         lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in shape.mesh.vertices]
         lines += [f"f {a} {b} {c}" for a, b, c in shape.mesh.faces + first]
         first += len(shape.mesh.vertices)
     colours = {shape.material.name: _colour(shape.material) for shape in shapes}
-    library = [line for name, rgb in colours.items()
+    library = ["# radiotwin", *(line for name, rgb in colours.items()
                for line in (f"newmtl {name}",
-                            "Kd " + " ".join(f"{value / 255:.3f}" for value in rgb), "")]
+                            "Kd " + " ".join(f"{value / 255:.3f}" for value in rgb), ""))]
     with atomic_path(path) as model, atomic_path(path.with_suffix(".mtl")) as colour_file:
         # Neither is renamed before both are written
         model.write_text("\n".join(lines) + "\n", encoding="utf-8")

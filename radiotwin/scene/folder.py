@@ -193,9 +193,10 @@ def _meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
     return meshes
 
 
-def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | None = None) -> None:
+def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | None = None,
+                 mark: str = "scene.toml") -> None:
     """Raise BadInput if writing a folder would erase more than the allowed names, or the source."""
-    require_folder(folder, allowed)
+    require_folder(folder, allowed, mark)
     if source is not None and is_within(source, folder):
         raise BadInput(f"{source} lies in {folder}, which the new scene would replace; choose "
                        "another output folder")

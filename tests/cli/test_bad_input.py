@@ -107,7 +107,7 @@ def test_a_device_inside_a_building(run, here):
     ("fit no.csv --scene scene -o twin", ["no.csv does not exist"]),
     ("fit measurements.csv --scene nowhere -o twin", ["nowhere is not a folder"]),
     ("fit measurements.csv --scene scene --model magic -o twin", ["'magic' is unknown; allowed are"]),
-    ("fit measurements.csv --scene scene -o scene", ["scene holds city.xml, which is not a twin's"]),
+    ("fit measurements.csv --scene scene -o scene", ["scene holds city.xml, meshes, preview.png, scene.toml, and no twin.json"]),
     ("survey scene --truth traced -o s.csv", ["truth.nc does not exist", "radiotwin trace"]),
     ("survey scene --truth segmented --pattern spiral -o s.csv", ["'spiral' is unknown; allowed are"]),
     ("survey scene --truth segmented -o s.xlsx", ["unknown format"]),

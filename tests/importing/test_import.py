@@ -227,10 +227,10 @@ def test_tables_of_positions_that_cannot_be_used(bring_in, local, tmp_path, tabl
 def test_another_folder_is_not_replaced(bring_in, local, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years")
-    with pytest.raises(BadInput, match="not empty and not an earlier import .it has thesis.tex"):
+    with pytest.raises(BadInput, match="holds thesis.tex, and no import.json of an earlier run"):
         bring_in(HEAD + "a,0,0,-80\n", columns=local, length_unit="m")
     (tmp_path / "out" / "thesis.tex").rename(tmp_path / "out" / "measurements.csv")
-    with pytest.raises(BadInput, match="not empty and not an earlier import"):
+    with pytest.raises(BadInput, match="holds measurements.csv, and no import.json"):
         bring_in(HEAD + "a,0,0,-80\n", columns=local, length_unit="m")
 
 

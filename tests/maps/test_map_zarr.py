@@ -111,13 +111,13 @@ def test_a_run_that_fails_leaves_the_older_map(folder):
 def test_a_folder_with_other_things_is_not_replaced(tmp_path):
     (tmp_path / "map.zarr").mkdir()
     (tmp_path / "map.zarr" / "diary.txt").write_text("dear")
-    with pytest.raises(BadInput, match="other content than a radio map"):
+    with pytest.raises(BadInput, match="holds diary.txt, and no zarr.json of an earlier run"):
         example().save(tmp_path / "map.zarr")
     assert (tmp_path / "map.zarr" / "diary.txt").read_text() == "dear"
     with pytest.raises(BadInput, match="no part of a radio map"):
         RadioMap.load(tmp_path / "map.zarr")
     (tmp_path / "file.zarr").touch()
-    with pytest.raises(BadInput, match="is a file; a radio map in Zarr is a folder"):
+    with pytest.raises(BadInput, match="is a file; give the name of a folder"):
         example().save(tmp_path / "file.zarr")
 
 

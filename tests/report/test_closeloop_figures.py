@@ -34,6 +34,7 @@ from radiotwin.report.closeloop_figures import (
     write_closeloop_figures,
 )
 from radiotwin.report.closeloop_page import write_closeloop_page
+from radiotwin.report.folders import write_closeloop_folder
 from radiotwin.report.labels import save
 from radiotwin.report.map_figures import MapBackground, residual_map_figure
 
@@ -92,13 +93,14 @@ def drawn(loop, scene=None):
 def test_every_figure_is_written_without_a_map(loop, tmp_path):
     content = make_report(loop)
     assert [effect["name"] for effect in content["effects"]] == ["receiver_gain_offset"]
-    (tmp_path / "effect_7_of_an_earlier_run.png").write_bytes(b"")
-    write_closeloop_figures(loop, None, content, tmp_path)
+    for name in ("closeloop.json", "effect_7_of_an_earlier_run.png", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+    write_closeloop_folder(loop, None, tmp_path)
+    assert (tmp_path / "notes.txt").exists()
     found = sorted(path.name for path in tmp_path.glob("*.png"))
     assert found == ["drivers.png", "effect_1_receiver_gain_offset.png", "groups.png", "level_map.png",
                      "residual_map.png", "waterfall.png"]
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in found)
-    write_closeloop_page(content, tmp_path, "page")
     assert (tmp_path / "closeloop.html").read_text().count("data:image/png;base64,") == 6
 
 

@@ -204,7 +204,7 @@ def test_a_full_disk_is_one_message_and_the_old_page_stays(run_folder, tmp_path)
     def small_files():
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
 
-    done = subprocess.run([sys.executable, "-c", code, "report", str(run_folder), "-o", str(page)],
+    done = subprocess.run([sys.executable, "-c", code, "report", str(run_folder), "--force", "-o", str(page)],
                           capture_output=True, text=True, preexec_fn=small_files, env=os.environ)
     assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
     assert len(done.stderr.strip().splitlines()) == 1 and str(page) in done.stderr

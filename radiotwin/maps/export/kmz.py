@@ -126,6 +126,7 @@ def write_overlays(path: Path, scene: Scene, bounds_m: tuple[float, float, float
     ET.indent(document)
     text = ET.tostring(document, encoding="utf-8", xml_declaration=True)
     with atomic_file(path) as out, zipfile.ZipFile(out, "w") as archive:
+        archive.comment = b"radiotwin"
         _store(archive, "doc.kml", text)  # which must be the first
         _store(archive, "legend.png", legend)
         for file, each in files.items():

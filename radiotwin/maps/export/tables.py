@@ -7,6 +7,7 @@ with time [1].
 """
 
 import warnings
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,8 @@ def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     arrays |= {name: dataset[name].values for name in radio_map.variables}
     with atomic_file(path) as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle
+        with zipfile.ZipFile(file, "a") as archive:
+            archive.comment = b"radiotwin"
 
 
 def check_map_place(name: str, attributes: dict[str, Any], scene: Scene) -> None:
