@@ -59,6 +59,8 @@ def import_(
         "--no-quotes", help="Quotation marks of a text are letters.")] = False,
     level_unit: Annotated[str | None, typer.Option(
         help="dBm, mW, W (received power), or dB (gain).")] = None,
+    path_loss: Annotated[bool, typer.Option(
+        "--path-loss", help="Levels are path losses, positive numbers in dB.")] = False,
     level_offset_db: Annotated[float | None, typer.Option(
         help="Added to each level, such as a cable's loss.")] = None,
     band_hz: Annotated[str | None, typer.Option(
@@ -125,6 +127,7 @@ def import_(
         "delimiter": {"tab": "\t", "\\t": "\t", "space": " ", "spaces": "  "}.get(
             delimiter or "", delimiter),
         "skip_bad_rows": skip_bad_rows, "quotes": False if no_quotes else None,
+        "path_loss": path_loss or None,
         "lines_before_header": lines_before_header, "lines_after_table": lines_after_table,
         "header": header.split(",") if header else None,
         "level_offset_db": level_offset_db,

@@ -34,6 +34,7 @@ _STACK = "https://www.thethingsindustries.com/docs/the-things-stack/concepts/dat
 _CHIRPSTACK = "https://docs.rs/crate/chirpstack_api (integration.proto, gw.proto; JSON of proto3)"
 _UNITS = {"level_unit": "dBm", "length_unit": "m", "time_format": "ISO 8601"}
 _GATEWAYS = {**_UNITS, "read_at": "device"}
+_TELEPHONE = "times are those of the telephone: give its --time-zone"
 _UNKNOWN = 2147483647  # of Android's telephony, CellInfo.UNAVAILABLE
 _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ by more than "
           "10 dB and are no one quantity; keep one with --only {}=LTE")
@@ -128,6 +129,7 @@ class Format:
         source: of the description.
         settings: others than `columns`.
         caution: of the units, which is printed at every import.
+        zone_caution: of the time zone, which is printed where none is declared.
         without_header: how a file without a header is recognised and read, or None.
     """
 
@@ -139,6 +141,7 @@ class Format:
     source: str
     settings: Mapping[str, Any] = field(default_factory=dict)
     caution: str = ""
+    zone_caution: str = ""
     without_header: WithoutHeader | None = None
     needs: tuple[str, ...] = ()
 
@@ -173,7 +176,7 @@ def _found(name: str, actual: Mapping[str, str]) -> str:
     if "*" not in name:
         return actual.get(name, "")
     pattern = re.compile(".*".join(map(re.escape, name.split("*"))))
-    return next((actual[each] for each in reversed(actual) if pattern.fullmatch(each)), "")
+    return next((actual[each] for each in reversed(list(actual)) if pattern.fullmatch(each)), "")
 
 
 def _place_in(payload: str) -> dict[str, str | tuple[str, ...]]:
@@ -256,7 +259,8 @@ LORA = (
         _LEVEL,
         "https://ttnmapper.org, export of a user; header and two rows quoted in a public README",
         {**_GATEWAYS, "time_zone": "UTC"},
-        caution=_MAPPER + ". Times are taken for UTC. alt may be 0 where the node has no height"),
+        caution=_MAPPER + ". alt may be 0 where the node has no height",
+        zone_caution="times are taken for UTC"),
     *_things_stack(""),
     *_things_stack("result."),
     Format(
@@ -297,9 +301,9 @@ PHONE = (
         "RSSI of the beacon, dBm", "https://api.wigle.net/csvFormat.html",
         {"level_unit": "dBm", "length_unit": "m", "time_format": "%Y-%m-%d %H:%M:%S",
          "time_zone": "UTC"},
-        caution="times are read as UTC, which the format's description leaves open; a shift does "
-                "no harm within one telephone. Wi-Fi, Bluetooth and cells are in one file: keep "
-                "one with --only Type=WIFI"),
+        caution="Wi-Fi, Bluetooth and cells are in one file: keep one with --only Type=WIFI",
+        zone_caution="times are read as UTC, which the format's description leaves open; a shift "
+                     "does no harm within one telephone"),
     Format(
         "tower-collector", "Tower Collector, CSV export",
         {"level": "dbm", "device": "{net_type} {mcc}-{mnc}-{lac}-{cell_id}", "time": "measured_at",
@@ -334,8 +338,7 @@ PHONE = (
         "https://gyokovsolutions.com/g-nettrack/; columns as in public readers of its logs",
         {"level_unit": "dBm", "length_unit": "m", "time_format": "%Y.%m.%d_%H.%M.%S",
          "not_measured": ["empty", _UNKNOWN]},
-        caution="times are those of the telephone: give its --time-zone. "
-                + _MIXED.format("NetworkTech").replace("=LTE", "=4G")),
+        caution=_MIXED.format("NetworkTech").replace("=LTE", "=4G"), zone_caution=_TELEPHONE),
     Format(
         "netmonitor", "NetMonitor (Cell Signal Logging), CSV session",
         {"level": "rssi", "device": "{tech} {mcc}-{mnc}-{lac_tac}-{node_id}-{cid}",
@@ -345,8 +348,8 @@ PHONE = (
         "header as in public readers of its files; no description by its author was found",
         {"level_unit": "dBm", "time_format": "%Y%m%d%H%M%S",
          "not_measured": ["empty", "null", 0, _UNKNOWN]},
-        caution="times are those of the telephone: give its --time-zone. "
-                "gps = 0 is a row without a fix: --only gps=1. " + _MIXED.format("tech")),
+        caution="gps = 0 is a row without a fix: --only gps=1. " + _MIXED.format("tech"),
+        zone_caution=_TELEPHONE),
     Format(
         "g-mon", "G-MoN, text log of Wi-Fi networks",
         {"level": "RXL", "device": "BSSID", "time": "{Date} {Time}", "latitude": "LAT",
@@ -357,9 +360,9 @@ PHONE = (
         "header and rows as in public readers of its files; no description by its author was found",
         {"level_unit": "dBm", "time_format": "%Y/%m/%d %H:%M:%S",
          "not_measured": ["empty", "?"]},
-        caution="times are those of the telephone: give its --time-zone. The files that are known "
-                "have few rows of a network, over months: a fit needs many. Its log of cells is "
-                "not known, and needs --columns"),
+        caution="the files that are known have few rows of a network, over months: a fit needs "
+                "many. Its log of cells is not known, and needs --columns",
+        zone_caution=_TELEPHONE),
 )
 
 

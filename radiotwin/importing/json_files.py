@@ -80,7 +80,7 @@ class _Table:
         table = pd.DataFrame({name: pd.Series([self.rows[row].get(name, "") for row in kept],
                                               dtype=str) for name in self._columns})
         numbers = np.array([self.numbers[row] for row in kept], dtype=np.int64)
-        notes = ()
+        notes: tuple[str, ...] = ()
         if self.unread:
             lists_text = listed(f"{name} ({number} values)"
                                 for name, number in self.unread.items())
@@ -278,12 +278,11 @@ def _of_columns(value: dict[str, Any]) -> list[dict[str, Any]] | None:
             return [dict(zip(map(str, names), row)) for row in rows]
         return None
     columns = [list(each.values()) if isinstance(each, dict) else each for each in value.values()]
-    keys = {tuple(each) if isinstance(each, dict) else len(each)
+    keys = {tuple(each) if isinstance(each, dict) else (str(len(each)),)
             for each in value.values() if isinstance(each, (dict, list))}
-    is_table = len(keys) == 1 and all(isinstance(each, list) for each in columns)
+    is_table = (len(keys) == 1 and all(isinstance(each, list) for each in columns)
+                and all(key.isdigit() for key in next(iter(keys))))
     if not is_table or any(isinstance(cell, (dict, list)) for each in columns for cell in each):
-        return None
-    if isinstance(next(iter(keys)), tuple) and not all(key.isdigit() for key in next(iter(keys))):
         return None
     return [dict(zip(value, row)) for row in zip(*columns)]
 

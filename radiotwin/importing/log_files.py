@@ -80,6 +80,22 @@ class LogFile:
                            "UTF-8") from None
 
 
+@dataclass(frozen=True)
+class Sheet(LogFile):
+    """The text of a sheet, comma-separated; each row is a line.
+
+    Attributes:
+        text: in UTF-8.
+    """
+
+    text: bytes = b""
+
+    @contextmanager
+    def open(self) -> Iterator[IO[bytes]]:
+        """Open it for reading."""
+        yield io.BytesIO(self.text)
+
+
 def list_files(paths: Iterable[Path | str],
                without: Iterable[Path | str]) -> tuple[list[LogFile], int]:
     """List the files to import: in the order of `paths`, and by name in each.

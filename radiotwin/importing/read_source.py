@@ -1,24 +1,32 @@
 """Opening of a file of measurements: its format is known by its name and its first line.
 
-A sheet of a workbook (.xlsx) becomes the text of a table.
+Each sheet of a workbook (.xlsx) becomes the text of a table.
 """
 
 import csv
 import io
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import date, datetime, time
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput, optional_package
 from radiotwin.importing.json_files import read_json_log
-from radiotwin.importing.log_files import BINARIES, JSON, TEXTS, LogFile, open_archive, open_member
+from radiotwin.importing.log_files import (
+    BINARIES,
+    JSON,
+    TEXTS,
+    LogFile,
+    Sheet,
+    open_archive,
+    open_member,
+)
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.source import BadRows, Source
 from radiotwin.importing.text_table import find_dialect, has_other_lines, read_text_table
@@ -31,96 +39,6 @@ _PICTURES = ("xl/media/", "xl/embeddings/")
 _DOCTYPES = tuple("<!DOCTYPE".encode(name) for name in ("utf-8", "utf-16-le", "utf-16-be",
                                                         "utf-32-le", "utf-32-be"))
 _HEAD_BYTES = 2**16  # in which the first line is looked for
-
-
-@dataclass(frozen=True)
-class Sheet(LogFile):
-    """The text of a sheet, comma-separated; each row is a line.
-
-    Attributes:
-        text: in UTF-8.
-    """
-
-    text: bytes = b""
-
-    @contextmanager
-    def open(self) -> Iterator[IO[bytes]]:
-        """Open it for reading."""
-        yield io.BytesIO(self.text)
-
-
-def _read_sheet(file: LogFile, sheet: str | None) -> Sheet:
-    """Read a sheet, or the first, by openpyxl; formulas have the values saved with them."""
-    _check(file)
-    openpyxl = optional_package(
-        "openpyxl", f"{file}: workbooks need the package openpyxl; `pip install radiotwin[xlsx]`, "
-                    "or save the sheet as CSV")
-    try:
-        book = openpyxl.load_workbook(file.path, read_only=True, data_only=True, keep_links=False)
-        try:
-            names = book.sheetnames
-            if sheet is not None and sheet not in names:
-                raise BadInput(f"{file} has no sheet {sheet!r}; it has {listed(names)}")
-            return Sheet(file.path, file.name, text=_text(file, book[sheet or names[0]]))
-        finally:
-            book.close()
-    except BadInput:
-        raise
-    except Exception as error:  # openpyxl raises those of zipfile, XML and its own
-        raise BadInput(f"{file} cannot be read as a workbook ({str(error)[:200]}); save it again, "
-                       "or as CSV") from None
-
-
-def _check(file: LogFile) -> None:
-    """Refuse a workbook that is large when unpacked, or that declares XML entities."""
-    with open_archive(file.path) as archive:
-        # A part may have any name: what it is, others say of it.
-        entries = archive.infolist()
-        DOCUMENT_BYTES.check(sum(entry.file_size for entry in entries
-                                 if not entry.filename.startswith(_PICTURES)), file)
-        for entry in entries:
-            last, is_named_xml = b"", entry.filename.lower().endswith((".xml", ".rels"))
-            with open_member(archive, entry.filename, file) as content:
-                while block := content.read(_BLOCK_BYTES):
-                    # Entities can stand for any amount of text; UTF-16 would hide them.
-                    text = last + block
-                    if any(each in text for each in _DOCTYPES) or is_named_xml and b"\0" in block:
-                        raise BadInput(f"{file}: {entry.filename[:100]!r} is no XML of a workbook "
-                                       "(it has a DOCTYPE or null characters); save it again")
-                    last = block[-64:]
-
-
-def _text(file: LogFile, sheet: Any) -> bytes:
-    if not hasattr(sheet, "reset_dimensions"):
-        raise BadInput(f"{file}: its sheet {sheet.title!r} is a chart; name one with --sheet")
-    sheet.reset_dimensions()  # which a file may declare as it likes
-    text = io.BytesIO()
-    wrapper = io.TextIOWrapper(text, "utf-8", newline="", write_through=True)
-    writer = csv.writer(wrapper)
-    cells = 0
-    for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
-        if number > _MAX_ROWS:
-            raise BadInput(f"{file}: more than {_MAX_ROWS:,} rows, the most that a sheet has")
-        COLUMNS.check(len(row), f"{file}: row {number}")
-        cells += len(row)
-        CELLS.check(cells, file)
-        writer.writerow([_shown(value) for value in row])
-        FILE_BYTES.check(text.tell(), file)
-    wrapper.flush()
-    return text.getvalue()
-
-
-def _shown(value: object) -> str:
-    """Return a cell as text; dates without a time, and whole numbers without a point."""
-    if value is None:
-        return ""
-    if isinstance(value, datetime):
-        return str(value.date()) if value.time() == time() else value.isoformat(sep=" ")
-    if isinstance(value, (date, time)):
-        return value.isoformat()
-    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
-        return str(int(value))
-    return " ".join(str(value).split("\n")).replace("\r", " ")
 
 
 @dataclass(frozen=True)
@@ -151,6 +69,142 @@ class Expected:
     without_header: tuple[WithoutHeader, ...] = ()
 
 
+def _read_sheets(file: LogFile, declared: str | None) -> Iterator[tuple[str, Sheet]]:
+    """Yield the declared sheet, or all that are no charts, by openpyxl.
+
+    Formulas have the values saved with them.
+    """
+    _check(file)
+    openpyxl = optional_package(
+        "openpyxl", f"{file}: workbooks need the package openpyxl; `pip install radiotwin[xlsx]`, "
+                    "or save the sheet as CSV")
+    try:
+        book = openpyxl.load_workbook(file.path, read_only=True, data_only=True, keep_links=False)
+        try:
+            names = book.sheetnames
+            if declared is not None and declared not in names:
+                raise BadInput(f"{file} has no sheet {declared!r}; it has {listed(names)}")
+            tables = [name for name in names if hasattr(book[name], "reset_dimensions")]
+            if not tables or declared is not None and declared not in tables:
+                raise BadInput(f"{file}: its sheet {declared or names[0]!r} is a chart; name one "
+                               "with --sheet")
+            for name in [declared] if declared is not None else tables:
+                yield name, Sheet(file.path, file.name, text=_text(file, book[name]))
+        finally:
+            book.close()
+    except BadInput:
+        raise
+    except Exception as error:  # openpyxl raises those of zipfile, XML and its own
+        raise BadInput(f"{file} cannot be read as a workbook ({str(error)[:200]}); save it again, "
+                       "or as CSV") from None
+
+
+def _read_workbook(file: LogFile, settings: Settings, expected: Expected,
+                   bad_rows: BadRows | None) -> Source:
+    """Read the sheets with the declared columns, or with those of the first that has rows."""
+    settings = settings.model_copy(update={"delimiter": ","})
+    sources: dict[str, Source] = {}
+    failed: dict[str, BadInput] = {}
+    prefix = bad_rows.prefix if bad_rows is not None else ""
+    for name, sheet in _read_sheets(file, settings.sheet):
+        if bad_rows is not None and settings.sheet is None:
+            bad_rows.prefix = f"{prefix}sheet {name}: "
+        try:
+            source = _read_text(sheet, settings, expected, bad_rows)
+            if len(source):
+                sources[name] = source
+        except BadInput as error:  # as of one without a table
+            failed[name] = error
+    if bad_rows is not None:
+        bad_rows.prefix = prefix
+    if not sources:
+        raise next(iter(failed.values()), BadInput(f"{file}: has no rows; it needs at least one "
+                                                   "measurement"))
+    declared = expected.columns[0] if expected.columns else frozenset()
+    columns = {name: {str(column).lower() for column in source.table}
+               for name, source in sources.items()}
+    chosen = [name for name in sources if declared and declared <= columns[name]] \
+        or [name for name in sources if columns[name] == next(iter(columns.values()))]
+    others = [*(name for name in sources if name not in chosen), *failed]
+    notes = (f"{file.name}: sheets with other columns are not read: {listed(others)}; name one "
+             "with --sheet",) if others else ()
+    if len(chosen) == 1:
+        only = sources[chosen[0]]
+        return replace(only, notes=(*only.notes, *notes))
+    return _joined(file, {name: sources[name] for name in chosen}, notes)
+
+
+def _joined(file: LogFile, sources: dict[str, Source], notes: tuple[str, ...]) -> Source:
+    """Return the rows of several sheets, one after the other."""
+    starts = np.cumsum([0, *map(len, sources.values())])
+    parts = list(sources.items())
+
+    def where(index: int) -> str:
+        part = int(np.searchsorted(starts, index, side="right")) - 1
+        return f"sheet {parts[part][0]}: {parts[part][1].where(index - int(starts[part]))}"
+
+    table = pd.concat([source.table for source in sources.values()], ignore_index=True).fillna("")
+    joined = f"{file.name}: the sheets {listed(sources)} have the same columns and are read"
+    return Source(
+        file.path, table, where,
+        (*dict.fromkeys(note for source in sources.values() for note in source.notes), joined,
+         *notes),
+        {int(start) + row: count for start, source in zip(starts, sources.values())
+         for row, count in source.fields.items()},
+        tuple((reason, number, f"sheet {name}: {place}") for name, source in sources.items()
+              for reason, number, place in source.left_out))
+
+
+def _check(file: LogFile) -> None:
+    """Refuse a workbook that is large when unpacked, or that declares XML entities."""
+    with open_archive(file.path) as archive:
+        # A part may have any name: what it is, others say of it.
+        entries = archive.infolist()
+        DOCUMENT_BYTES.check(sum(entry.file_size for entry in entries
+                                 if not entry.filename.startswith(_PICTURES)), file)
+        for entry in entries:
+            last, is_named_xml = b"", entry.filename.lower().endswith((".xml", ".rels"))
+            with open_member(archive, entry.filename, file) as content:
+                while block := content.read(_BLOCK_BYTES):
+                    # Entities can stand for any amount of text; UTF-16 would hide them.
+                    text = last + block
+                    if any(each in text for each in _DOCTYPES) or is_named_xml and b"\0" in block:
+                        raise BadInput(f"{file}: {entry.filename[:100]!r} is no XML of a workbook "
+                                       "(it has a DOCTYPE or null characters); save it again")
+                    last = block[-64:]
+
+
+def _text(file: LogFile, sheet: Any) -> bytes:
+    sheet.reset_dimensions()  # which a file may declare as it likes
+    text = io.BytesIO()
+    wrapper = io.TextIOWrapper(text, "utf-8", newline="", write_through=True)
+    writer = csv.writer(wrapper)
+    cells = 0
+    for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
+        if number > _MAX_ROWS:
+            raise BadInput(f"{file}: more than {_MAX_ROWS:,} rows, the most that a sheet has")
+        COLUMNS.check(len(row), f"{file}: row {number}")
+        cells += len(row)
+        CELLS.check(cells, file)
+        writer.writerow([_shown(value) for value in row])
+        FILE_BYTES.check(text.tell(), file)
+    wrapper.flush()
+    return text.getvalue()
+
+
+def _shown(value: object) -> str:
+    """Return a cell as text; dates without a time, and whole numbers without a point."""
+    if value is None:
+        return ""
+    if isinstance(value, datetime):
+        return str(value.date()) if value.time() == time() else value.isoformat(sep=" ")
+    if isinstance(value, (date, time)):
+        return value.isoformat()
+    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
+        return str(int(value))
+    return " ".join(str(value).split("\n")).replace("\r", " ")
+
+
 def read_source(file: LogFile | Path | str, settings: Settings | None = None,
                 expected: Expected = Expected(), bad_rows: BadRows | None = None) -> Source:
     """Open a file of measurements of one of the formats of `log_files`.
@@ -166,8 +220,7 @@ def read_source(file: LogFile | Path | str, settings: Settings | None = None,
     if file.suffix == ".parquet":
         source = Source(file.path, read_cells(file.path), lambda index: f"row {index + 1}")
     elif file.suffix == ".xlsx" and file.member is None:
-        settings = (settings or Settings()).model_copy(update={"decimal": ".", "delimiter": ","})
-        source = _read_text(_read_sheet(file, settings.sheet), settings, expected, bad_rows)
+        source = _read_workbook(file, settings or Settings(), expected, bad_rows)
     elif file.suffix in TEXTS:
         source = _read_text(file, settings or Settings(), expected, bad_rows)
     else:

@@ -33,7 +33,14 @@ from radiotwin.importing.source import (
     are_few,
     columns_of,
 )
-from radiotwin.importing.units import LEVEL_COLUMN, calendar_days, in_metres, read_levels, seconds
+from radiotwin.importing.units import (
+    LEVEL_COLUMN,
+    calendar_days,
+    in_metres,
+    past_midnights,
+    read_levels,
+    seconds,
+)
 from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, shown
 from radiotwin.io.forms import name_fault
@@ -73,6 +80,14 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
         source.require({name: spec for name, spec in columns.items()
                         if spec not in (BY_DAY, BY_POSITION)})
     shared = _shared(source, columns, settings, problems)
+    if "time_s" in shared and len(shared) and not problems:
+        ends = [name for name in ("device", "receiver") if name in shared]
+        shared["time_s"], note = past_midnights(
+            source, columns["time"], shared["time_s"].to_numpy(),
+            lambda: shared.groupby(ends, sort=False).ngroup().to_numpy())
+        tally.notes += [note] * bool(note)
+        if columns["flight"] == BY_DAY:
+            shared["flight"] = calendar_days(shared["time_s"].to_numpy(), settings.time_zone)
     bad_rows = source.bad_rows or BadRows()
     if not problems:
         shared = bad_rows.without(shared, tally, len(levels), source.where)
@@ -102,14 +117,9 @@ def _shared(source: Source, columns: dict[str, str], settings: Settings,
             shared["time_s"] = seconds(source, columns["time"], settings.time_format,
                                        settings.time_zone)
     quantities = [prefix + name for prefix in ("device_", "") for name in QUANTITIES]
-    without_unit = False
     for name in (*quantities, *ANGLES, "quality", "frequency_hz", "snr"):
         if name not in present:
             continue
-        is_length = _is_length(name, settings)
-        if is_length and settings.length_unit is None and without_unit:
-            continue  # it is reported once
-        without_unit = without_unit or is_length
         with problems.noted():
             column = f"{name}_deg" if name in ANGLES else name
             shared[column] = _quantity(source, name, columns[name], settings)
@@ -376,8 +386,8 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
         links = _without_copies(whole, links, starts, tally)
     return Logs(whole, links, level_column, sum(record["rows"] for record in records),
                 sum(record["readings"] for record in records), records,
-                list(dict.fromkeys(notes)), formats.pop() if len(formats) == 1 else None,
-                list(bad_rows.rows.values()))
+                list(dict.fromkeys([*notes, *tally.notes])),
+                formats.pop() if len(formats) == 1 else None, list(bad_rows.rows.values()))
 
 
 def _declared_columns(settings: Settings) -> set[str]:
@@ -410,7 +420,10 @@ def _settings_of(source: Source, settings: Settings,
             defaults.pop("read_at", None)
     own = merged(settings, defaults)
     own.require_columns(str(source.path), header)
-    return own, found.name if found else None, found.caution if found else ""
+    if found is None:
+        return own, None, ""
+    zone = "" if settings.time_zone else found.zone_caution
+    return own, found.name, ". ".join(filter(None, [found.caution, zone]))
 
 
 def _numbered_from(source: Source, first: int, prefix: str) -> Source:

@@ -1,6 +1,7 @@
 """The whole import, from files to a folder, and its report: counts, ranges, implausible data."""
 
 import json
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -41,10 +42,14 @@ MAX_MISSED = 0.5  # share of levels that were not detected
 MAX_IMPOSSIBLE = 0.01  # share of levels that no receiver can have meant
 MAX_SMALLEST = 0.1  # share of levels that equal the smallest: probably a placeholder
 MIN_SAMPLE = 20  # values from which a share or a range says something
+ISOLATED_DB = 30.0  # between the smallest or largest level and all others: rather a code
+_IMPOSSIBLE = ("Is level_unit right? Path losses, positive, need --path-loss; uncalibrated levels "
+               "above 0 dBm --level-offset-db; codes --not-measured")
 YEARS = (1990, 2100)
 ANTENNAS = "antennas"  # folder of the patterns that the table of devices names
 FILES = {"measurements.csv", "measurements.csv.gz", "devices.csv", FRAME_FILE, "import.toml",
          "import.json", ANTENNAS}
+_CUT_NUMBER = re.compile(r"(?:.* )?\d(?:[.,]\d+)?[eE]\+\d+")
 DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}
 """End of a column's name -> decimals that are written; all finer than any measurement."""
 
@@ -72,7 +77,7 @@ def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Ta
         "ranges": _ranges(table, positioned.links),
         "warnings": [*notes, *["1 file of another format is left out"] * (others == 1),
                      *[f"{others} files of other formats are left out"] * (others > 1),
-                     *_position_warnings(measurements),
+                     *_name_warnings(measurements), *_position_warnings(measurements),
                      *_level_warnings(positioned, measurements, tally, logs.readings),
                      *_time_and_angle_warnings(table),
                      *_averaging_warnings(measurements, settings)],
@@ -116,6 +121,14 @@ def _position_warnings(measurements: Measurements) -> Iterator[str]:
                "unknown, they are to be found")
 
 
+def _name_warnings(measurements: Measurements) -> Iterator[str]:
+    for end in ("device", "receiver"):
+        cut = [name for name in measurements.table[end].unique() if _CUT_NUMBER.fullmatch(name)]
+        if cut:
+            yield (f"{end} {cut[0]!r} is a number whose last digits a spreadsheet has cut "
+                   f"({len(cut)} such names): several may be one; export the column as text")
+
+
 def _level_warnings(positioned: PositionedLinks, measurements: Measurements, tally: Tally,
                     readings: int) -> Iterator[str]:
     missed = np.isnan(measurements.level_db).mean()
@@ -124,14 +137,22 @@ def _level_warnings(positioned: PositionedLinks, measurements: Measurements, tal
     impossible = sum(number for (reason, _), number in tally.left_out.items()
                      if reason == "impossible level")
     if impossible > MAX_IMPOSSIBLE * readings:
-        yield (f"{impossible / readings:.0%} of the levels are impossible; is level_unit right? A "
-               "path loss needs a minus sign")
+        yield f"{impossible / readings:.0%} of the levels are impossible. {_IMPOSSIBLE}"
     detected = positioned.links["level_db"].dropna()
     if len(detected) > MIN_SAMPLE and detected.min() < detected.max():
         share = (detected == detected.min()).mean()
         if share > MAX_SMALLEST:
             yield (f"{share:.0%} of the levels are {detected.min():g}, the smallest; if that means "
                    "not detected, put it into not_detected")
+        levels_db = np.unique(detected)
+        for i, other, side in ((0, 1, "below"), (-1, -2, "above")):
+            apart_db = abs(levels_db[i] - levels_db[other])
+            if apart_db >= ISOLATED_DB:
+                number = int((detected == levels_db[i]).sum())
+                yield (f"{number} of the levels {'is' if number == 1 else 'are'} "
+                       f"{levels_db[i]:g}, {apart_db:.0f} dB {side} all others; if that is a code "
+                       f"for unknown, give --not-measured {levels_db[i]:g}, if for too weak, "
+                       f"--not-detected {levels_db[i]:g}")
 
 
 def _time_and_angle_warnings(table: pd.DataFrame) -> Iterator[str]:
@@ -198,8 +219,9 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
         positioned = positioned.select(keep)
     if positioned.links.empty:
         reasons = "; ".join(f"{number} {reason}" for (reason, _), number in tally.left_out.items())
+        hint = f". {_IMPOSSIBLE}" if "impossible level" in reasons else ""
         raise BadInput(f"{logs.source.path}: nothing is left of {logs.readings} readings: "
-                       f"{reasons}")
+                       f"{reasons}{hint}")
     kept = len(positioned.links)
     table = positioned.links
     if settings.average_m:

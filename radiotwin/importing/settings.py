@@ -163,6 +163,7 @@ class Settings(Table):
     band_hz: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = Field(
         None, description="edges of the band whose power counts, of a spectrum scan")
     level_unit: Literal["dBm", "dB", "mW", "W"] | None = None
+    path_loss: bool = Field(False, description="levels are path losses, positive [dB]")
     level_offset_db: Number = Field(0.0, description="added to each level")
     read_at: Literal["receiver", "device"] = Field(
         "receiver", description="which end reads the levels: of a node that sends to gateways, "
@@ -197,6 +198,13 @@ class Settings(Table):
     columns: Columns = Columns()
     wide: list[Wide] = []
 
+    @model_validator(mode="before")
+    @classmethod
+    def _losses_are_in_db(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("path_loss") and data.get("level_unit") is None:
+            return {**data, "level_unit": "dB"}
+        return data
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if self.wide and self.columns.level:
@@ -205,6 +213,8 @@ class Settings(Table):
         if self.average_m and self.columns.quality:
             raise ValueError("average_m writes the number of readings into quality; leave "
                              "columns.quality out")
+        if self.path_loss and self.level_unit not in (None, "dB"):
+            raise ValueError(f"path_loss is in dB; leave level_unit = {self.level_unit} out")
         if self.band_hz and self.band_hz[0] >= self.band_hz[1]:
             raise ValueError("band_hz: give the lower edge first, such as [433.05e6, 434.79e6]")
         for low, high in (("min_level", "max_level"), ("min_distance_m", "max_distance_m")):

@@ -219,6 +219,11 @@ def columns_of(spec: str, header: Iterable[object]) -> list[str]:
     return _TEMPLATE.findall(spec) if _TEMPLATE.search(spec) and spec not in header else [spec]
 
 
+def constants_of(spec: str) -> list[str]:
+    """Return the texts between the columns of an entry such as `2024-05-01 {Time}`."""
+    return _TEMPLATE.split(spec)[::2]
+
+
 class Problems:
     """Collects messages of `BadInput`, so that reading goes on and finds the others."""
 
@@ -256,8 +261,10 @@ class Tally:
     Attributes:
         left_out: (reason, column) -> number of readings, in the order of the reasons' first use.
         first: (reason, column) -> the first of them, such as `row 7`.
+        notes: on what was found in the values.
     """
 
+    notes: list[str] = field(default_factory=list)
     left_out: dict[tuple[str, str], int] = field(default_factory=dict)
     first: dict[tuple[str, str], str] = field(default_factory=dict)
 

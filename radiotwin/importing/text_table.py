@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.log_files import Lines, LogFile
+from radiotwin.importing.log_files import Lines, LogFile, Sheet
 from radiotwin.importing.settings import BLANKS, DELIMITERS, Settings
 from radiotwin.importing.source import BadRows
 from radiotwin.io.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS
@@ -107,7 +107,7 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
         header = _fields(lines[before], delimiter) if before < len(lines) else []
         first = before + 1
     rows = [_fields(line, delimiter) for line in lines[first:]]
-    decimal = settings.decimal or _decimal(file, delimiter, rows)
+    decimal = settings.decimal or _decimal(file, delimiter, rows, isinstance(file, Sheet))
     after = settings.lines_after_table
     if after is None:
         last = _split(tail.decode(encoding, "replace"))
@@ -286,8 +286,11 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _decimal(file: LogFile, delimiter: str, rows: list[list[str]]) -> str:
-    """Return the decimal mark; a comma that may separate thousands is ambiguous."""
+def _decimal(file: LogFile, delimiter: str, rows: list[list[str]], is_typed: bool) -> str:
+    """Return the decimal mark; a comma that may separate thousands is ambiguous.
+
+    Where numbers are typed, as in a sheet, those that are texts have a mark of their own.
+    """
     cells = [cell.strip() for row in rows for cell in row]
     commas = [cell for cell in cells if COMMA.fullmatch(cell)]
     if not commas:
@@ -296,7 +299,8 @@ def _decimal(file: LogFile, delimiter: str, rows: list[list[str]]) -> str:
         raise BadInput(f"{file}: {shown(commas[0])} may be a number with a decimal comma, or one "
                        "with separated thousands; give --decimal , for the first, or --decimal . "
                        "and write the number without its comma")
-    return "." if delimiter == "," and any(map(_POINT.fullmatch, cells)) else ","
+    has_points = delimiter == "," and not is_typed and any(map(_POINT.fullmatch, cells))
+    return "." if has_points else ","
 
 
 def _trailer(lines: list[str], delimiter: str, header: list[str], lengths: set[int]) -> int:

@@ -5,6 +5,7 @@ at two places at once.
 """
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from zoneinfo import ZoneInfo, available_timezones
 
@@ -13,16 +14,25 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Settings
-from radiotwin.importing.source import Source
+from radiotwin.importing.source import Source, constants_of
 from radiotwin.io.cells import EMPTY, as_numbers, as_text, shown
 from radiotwin.links.site_table import METRES
 
-EPOCH_S = {"epoch s": 1.0, "epoch ms": 1e-3}
+_UNIT_IN_NAME = re.compile(r"(?:[_ (\[]|(?<=[a-z])(?=[MF]))((?i:m|met(?:er|re)s?|ft|feet))[)\]]?$")
+EPOCH_S = {"epoch s": 1.0, "epoch ms": 1e-3, "epoch us": 1e-6, "epoch ns": 1e-9}
 ISO = "ISO 8601"
-ALLOWED = (f"allowed are {', '.join(EPOCH_S)}, {ISO}, or a strftime format, such as "
-           "'%d.%m.%Y %H:%M:%S'")
+SERIAL = "serial date"
+"""Days since 1899-12-30, as spreadsheets have times (ECMA-376-1, 18.17.4.1)."""
+ALLOWED = (f"allowed are {', '.join(EPOCH_S)}, {ISO}, {SERIAL} (days, of a spreadsheet), or a "
+           "strftime format, such as '%d.%m.%Y %H:%M:%S'")
+_NO_DATE = "it has no date: put the date before it, in the time and its format, as in " \
+           "--columns 'time=2024-05-01 {Time}' --time-format '%Y-%m-%d %H:%M:%S'"
+_DATES = re.compile("%[YymbBdjDFcxsGUVWuw]")
+HALF_DAY_S, DAY_S = 43_200.0, 86_400.0
+MAX_STEPS_BACK = 5  # more are no midnights, but rows in another order
 YEARS = (1900, 2200)  # of plausible times; milliseconds that are read as seconds lie outside
 _ROWS_AT_ONCE = 1_000_000  # of which texts are made
+_MAX_DAYS = 100_000  # since 1899; the year 2173
 SECONDS_PER_YEAR = 31_556_952  # Gregorian mean
 UTC_OFFSET = r"[Tt ]\d\d(?::?\d\d){0,2}(?:\.\d+)? ?(?:[Zz]|[+-]\d\d(?::?\d\d)?)$"
 """At the end of an ISO 8601 text, extended or basic; from the hour on, as a date ends in -31."""
@@ -35,9 +45,10 @@ LEVEL_COLUMN = {"dBm": "rssi_dbm", "mW": "rssi_dbm", "W": "rssi_dbm", "dB": "gai
 """Unit in the file -> column of `measurements.csv`."""
 NOT_A_NUMBER = "nan"
 MILLIWATTS = {"mW": 1.0, "W": 1e3}
-POSSIBLE_DB = (-250.0, 0.0)
-"""Open interval [dBm or dB]: thermal noise in 1 Hz is -174 dBm, no receiver gets a milliwatt
-(0 dBm), and no channel amplifies."""
+POSSIBLE_DB = {"rssi_dbm": (-174.0, 0.0), "gain_db": (-250.0, 0.0)}
+"""Column of levels -> open interval [dBm or dB]: thermal noise at 290 K is -174 dBm in 1 Hz (k T of
+Johnson and Nyquist) and more in any wider channel, no receiver gets a milliwatt (0 dBm), and no
+channel amplifies."""
 
 
 def seconds(source: Source, spec: str, time_format: str | None, zone: str | None) -> np.ndarray:
@@ -64,10 +75,16 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
     if time_format in EPOCH_S and not typed:
         time_s = source.numbers(spec, "time") * EPOCH_S[time_format]
         return _plausible(source, spec, cells, time_s)
-    if not typed and time_format != ISO and "%" not in str(time_format):
-        raise BadInput(f"time_format {time_format!r} is unknown; {ALLOWED}")
     text = as_text(cells)
-    parsed = cells if typed else _parse(source, spec, text, str(time_format))
+    if typed:
+        parsed = cells
+    elif time_format == SERIAL:
+        days = pd.Series(source.numbers(spec, "time"), index=cells.index)
+        parsed = pd.Timestamp("1899-12-30") + pd.to_timedelta(
+            (days.where(days.abs() < _MAX_DAYS) * DAY_S).round(3), unit="s")
+        source.refuse(spec, text, parsed.isna() & days.notna(), "is no serial date")
+    else:
+        parsed = _parse(source, spec, text, str(time_format))
     if parsed.dt.tz is None:
         if zone is None:
             raise BadInput(f"{source.path}: column {spec}: the times, such as "
@@ -77,6 +94,46 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
     utc = parsed.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy(dtype="datetime64[us]")
     time_s = (utc - np.datetime64(0, "us")) / np.timedelta64(1, "s")
     return _plausible(source, spec, text, time_s)
+
+
+def past_midnights(source: Source, spec: str, time_s: np.ndarray,
+                   ends: Callable[[], np.ndarray]) -> tuple[np.ndarray, str]:
+    """Find where a clock goes back by about a day, which it does at midnight under a fixed date.
+
+    Args:
+        source: the file.
+        spec: of the times; a date that it has as a constant does not change with the rows.
+        time_s: (n,) [s].
+        ends: returns (n,) numbers of the ends of each row; a file may hold one after the other.
+
+    Returns:
+        the times (n,), a day later after each midnight under a fixed date; and a note, or `""`.
+    """
+    known = np.flatnonzero(np.isfinite(time_s))
+    step_s = np.diff(time_s[known])
+    falls = step_s < -HALF_DAY_S
+    if falls.any():
+        falls &= np.diff(ends()[known]) == 0
+    back = known[1:][falls]
+    if not 0 < len(back) <= MAX_STEPS_BACK:
+        return time_s, ""
+    first = int(back[0])
+    by_s = time_s[known[np.searchsorted(known, first) - 1]] - time_s[first]
+    place = source.where(int(source.table.index[first]))
+    is_fixed = spec not in source.table and any(
+        re.search(r"\d", constant) for constant in constants_of(spec))
+    if not is_fixed:
+        return time_s, (f"{place}: the clock goes back by {_clock(by_s)} ({len(back)} times in the "
+                        "file); is the date of the later rows right?")
+    days = np.zeros(len(time_s))
+    days[back] = 1
+    return time_s + DAY_S * np.cumsum(days), (
+        f"{place}: the clock passes midnight under the date that was given ({len(back)} times in "
+        "the file): the rows from there on count as the next day")
+
+
+def _clock(duration_s: float) -> str:
+    return f"{int(duration_s // 3600)}:{int(duration_s // 60 % 60):02}:{int(duration_s % 60):02}"
 
 
 def calendar_days(time_s: np.ndarray, zone: str | None) -> np.ndarray:
@@ -109,6 +166,13 @@ def _check_zone(zone: str) -> None:
 def _parse(source: Source, spec: str, text: pd.Series, time_format: str) -> pd.Series:
     """Return time stamps, with a zone where the texts carry offsets."""
     iso = time_format == ISO
+    if not iso and "%" not in time_format:
+        raise BadInput(f"time_format {time_format!r} is unknown; {ALLOWED}")
+    if ("%p" in time_format) != ("%I" in time_format):
+        raise BadInput(f"time_format {time_format!r}: %p (AM, PM) belongs to %I (1 to 12), %H (0 "
+                       "to 23) to neither; write %I with %p, or %H alone")
+    if re.search("%[HIMSTX]", time_format) and not _DATES.search(time_format):
+        raise BadInput(f"{source.path}: column {spec}: time_format {time_format!r}: {_NO_DATE}")
     has_offset = "%z" in time_format or (iso and text.str.contains(UTC_OFFSET))
     with_offset = np.broadcast_to(has_offset, len(text)) & (text != "")
     if iso and with_offset.any():
@@ -125,8 +189,10 @@ def _parse(source: Source, spec: str, text: pd.Series, time_format: str) -> pd.S
     except (ValueError, re.error) as error:  # pandas makes a regular expression of it
         raise BadInput(f"time_format {time_format!r} is not a strftime format: {error}; {ALLOWED}"
                        ) from None
-    source.refuse(spec, text, parsed.isna() & (text != ""),
-                  f"is no time in the form {time_format}; {ALLOWED}")
+    bad = parsed.isna() & (text != "")
+    is_clock = bad.any() and re.fullmatch(r"\d\d?:\d\d.*", text[bad].iloc[0])
+    source.refuse(spec, text, bad, f"is no time in the form {time_format}; "
+                                   f"{_NO_DATE if is_clock else ALLOWED}")
     return parsed
 
 
@@ -135,7 +201,7 @@ def _plausible(source: Source, spec: str, text: pd.Series, time_s: np.ndarray) -
     year = 1970 + time_s / SECONDS_PER_YEAR
     source.refuse(spec, text, (year < YEARS[0]) | (year > YEARS[1]),
                   f"lies outside of the years {YEARS[0]} to {YEARS[1]}; is time_format right "
-                  "(epoch s, epoch ms)?")
+                  f"({', '.join(EPOCH_S)}, {SERIAL})?")
     return time_s
 
 
@@ -187,15 +253,19 @@ def clock_notes(links: pd.DataFrame) -> list[str]:
 def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
     """Convert lengths (n,) in a unit of `METRES` to metres; `column` is for the message.
 
+    Where none is declared, the name of the column may end in it: `alt_m`, `Height (ft)`.
+
     Raises:
         BadInput: the unit is not declared.
     """
-    if unit is None:
-        known = numbers[np.isfinite(numbers)]
+    if unit is None and (named := _UNIT_IN_NAME.search(column)):
+        unit = "ft" if named[1].lower().startswith("f") else "m"
+    known = numbers[np.isfinite(numbers)]
+    if unit is None and (known != 0).any():  # zero is so in any unit
         values = f"run from {known.min():g} to {known.max():g}" if len(known) else "are all empty"
-        raise BadInput(f"{column}: length_unit is not given; allowed are {' and '.join(METRES)}. "
-                       f"The values {values}")
-    return numbers * METRES[unit]
+        raise BadInput(f"{column}: length_unit is not given; allowed are "
+                       f"{' and '.join(METRES)}. The values {values}")
+    return numbers * METRES[unit or "m"]
 
 
 @dataclass(frozen=True)
@@ -238,13 +308,16 @@ def read_levels(source: Source, spec: str, settings: Settings,
                   "is not a number; if it means that the level was not detected, put it into "
                   "not_detected; if nobody listened, into not_measured")
     _check_unit(source, spec, numbers[~declared], settings.level_unit)
-    if settings.not_detected_at_or_below is not None:
-        not_detected |= ~declared & (numbers <= settings.not_detected_at_or_below)
+    sign = -1.0 if settings.path_loss else 1.0
+    if settings.not_detected_at_or_below is not None:  # of a loss, at or above
+        limit = settings.not_detected_at_or_below
+        not_detected |= ~declared & (sign * numbers <= sign * limit)
+    numbers = sign * numbers
     factor = MILLIWATTS.get(str(settings.level_unit))
     with np.errstate(divide="ignore", invalid="ignore"):  # power <= 0 is found to be impossible
         db = numbers if factor is None else 10 * np.log10(numbers * factor)
     db = db + offset_db
-    low, high = POSSIBLE_DB
+    low, high = POSSIBLE_DB[LEVEL_COLUMN[str(settings.level_unit)]]
     impossible = ~not_measured & ~not_detected & ~((db > low) & (db < high))
     db = np.where(not_measured | not_detected | impossible, np.nan, db)
     return Levels(db, not_measured, impossible)
@@ -272,5 +345,5 @@ def _check_unit(source: Source, spec: str, numbers: np.ndarray, unit: str | None
             values = (f"run from {numbers.min():g} to {numbers.max():g}, median "
                       f"{np.median(numbers):g}")
         raise BadInput(f"{source.path}: column {spec}: level_unit is not given; allowed are dBm, "
-                       "mW and W (received power) and dB (channel gain, negative). The values "
-                       f"{values}")
+                       "mW and W (received power) and dB (channel gain, negative; with --path-loss "
+                       f"a loss, positive). The values {values}")

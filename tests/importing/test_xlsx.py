@@ -91,3 +91,37 @@ def test_a_sheet_of_another_name_is_checked_as_well(bring_in, book, tmp_path, en
             new.writestr(name.replace("sheet1.xml", "sheet1.dat"), data.replace(b"sheet1.xml", b"sheet1.dat"))
     with pytest.raises(BadInput, match="is no XML of a workbook .it has a DOCTYPE"):
         bring_in(out.read_bytes(), "log.xlsx", columns=COLUMNS, length_unit="m")
+
+
+def sheets(path, tables):
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for title, rows in tables.items():
+        sheet = book.create_sheet(title)
+        for row in rows:
+            sheet.append(row)
+    book.save(path)
+    return path.read_bytes()
+
+
+DAY = [["Zelle", "x", "y", "RSRP"], [7, 1.5, 2, -80.5], [8, 3.0, 4, -91]]
+
+
+def test_sheets_of_the_same_columns_are_one_table(bring_in, tmp_path):
+    days = {"cover": [["Messfahrt"]], "1": DAY, "2": [DAY[0], [7, 9, 2, -82]], "notes": [["a", "b"], [1, 2]], "empty": []}
+    result = bring_in(sheets(tmp_path / "days.xlsx", days), "log.xlsx", columns=COLUMNS, length_unit="m")
+    assert list(result.table["rssi_dbm"]) == [-80.5, -91, -82]
+    assert any("sheets 1, 2 have the same columns" in note for note in result.report["warnings"])
+    assert any("are not read: notes" in note for note in result.report["warnings"])
+    days["2"].append([7, "far", 2, -83])
+    with pytest.raises(BadInput, match="sheet 2: line 3, column x: 'far' is not a number"):
+        bring_in(sheets(tmp_path / "days.xlsx", days), "log.xlsx", columns=COLUMNS, length_unit="m")
+
+
+@pytest.mark.parametrize("decimal", [None, ","])
+def test_texts_with_decimal_commas_and_serial_dates(bring_in, tmp_path, decimal):
+    rows = [["t", *DAY[0]], [45350.5, 7, "1,5", 2, "-80,5"], [45350.75, 8, 3.25, 4, -91]]
+    result = bring_in(sheets(tmp_path / "made.xlsx", {"a": rows}), "log.xlsx", columns=COLUMNS | {"time": "t"}, length_unit="m",
+                      time_format="serial date", time_zone="UTC", decimal=decimal)
+    assert list(result.table["receiver_x_m"]) == [1.5, 3.25] and list(result.table["rssi_dbm"]) == [-80.5, -91]
+    assert list(result.table["time_s"] % 86_400) == [43_200, 64_800]

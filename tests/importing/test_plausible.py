@@ -1,0 +1,104 @@
+"""Values that contradict physics, or the rest of their file: left out, read as what they are, or told."""
+
+import numpy as np
+import pytest
+
+from radiotwin.errors import BadInput
+
+MAPPING = {"columns": {"time": "2024-02-28 {t}", "x": "x", "y": "always 0", "level": "l", "device": "d"}, "length_unit": "m",
+           "time_format": "%Y-%m-%d %H:%M:%S", "time_zone": "UTC"}
+
+
+def rows(times, levels=None, device="a"):
+    levels = levels or [-80 - i % 20 for i in range(len(times))]
+    return "t,x,l,d\n" + "".join(f"{time},{i},{level},{device}\n" for i, (time, level) in enumerate(zip(times, levels)))
+
+
+MIDNIGHT = ["23:59:58", "23:59:59", "00:00:00", "00:00:01"]
+
+
+def test_rows_after_midnight_are_of_the_next_day(bring_in):
+    result = bring_in(rows(MIDNIGHT), **MAPPING)
+    assert list(np.diff(result.table["time_s"])) == [1, 1, 1]
+    assert any("row 4: the clock passes midnight" in text for text in result.report["warnings"])
+    flights = bring_in(rows(MIDNIGHT), **{**MAPPING, "columns": MAPPING["columns"] | {"flight": "by day"}}).table["flight"]
+    assert list(flights) == ["2024-02-28", "2024-02-28", "2024-02-29", "2024-02-29"]
+
+
+def test_a_clock_with_a_date_that_goes_back_is_told(bring_in):
+    given = {**MAPPING, "columns": MAPPING["columns"] | {"time": "t"}}
+    result = bring_in(rows([f"2024-02-28 {time}" for time in MIDNIGHT]), **given)
+    assert result.table["time_s"].max() - result.table["time_s"].min() == 86_399
+    assert any("row 4: the clock goes back by 23:59:59 (1 times" in text for text in result.report["warnings"])
+
+
+def test_devices_one_after_the_other_are_no_midnight(bring_in):
+    text = rows(MIDNIGHT[:2]) + rows(["00:00:00", "00:00:01"], device="b").partition("\n")[2]
+    assert bring_in(text, **MAPPING).table["time_s"].max() - bring_in(text, **MAPPING).table["time_s"].min() == 86_399
+
+
+@pytest.mark.parametrize(("form", "message"), [
+    ("%H:%M:%S", "it has no date: put the date before it.*--columns 'time=2024-05-01 {Time}'"),
+    ("ISO 8601", "it has no date: put the date before it"), ("%Y-%m-%d %H:%M:%S %p", "%p .AM, PM. belongs to %I"),
+    ("%Y-%m-%d %I:%M:%S", "%p .AM, PM. belongs to %I")])
+def test_formats_that_lack_something(bring_in, form, message):
+    with pytest.raises(BadInput, match=message):
+        bring_in(rows(MIDNIGHT), **{**MAPPING, "time_format": form, "columns": MAPPING["columns"] | {"time": "t"}})
+
+
+@pytest.mark.parametrize(("form", "values"), [
+    ("serial date", ["45350.5", "45350.50001157407"]), ("epoch us", ["1709121600000000", "1709121601000000"]),
+    ("epoch ns", ["1709121600000000000", "1709121601000000000"])])
+def test_times_of_spreadsheets_and_data_bases(bring_in, form, values):
+    """Day 45350 of a spreadsheet is 28 February 2024."""
+    given = {**MAPPING, "time_format": form, "columns": MAPPING["columns"] | {"time": "t"}}
+    assert list(bring_in(rows(values), **given).table["time_s"]) == pytest.approx([1709121600, 1709121601], abs=0.01)
+
+
+def test_what_is_below_thermal_noise_is_no_level(bring_in):
+    levels = [-80 - i for i in range(30)] + [-200, -174]
+    report = bring_in(rows([f"10:00:{i:02}" for i in range(32)], levels), **MAPPING).report
+    assert report["left_out"][0]["reason"] == "impossible level" and report["left_out"][0]["readings"] == 2
+
+
+@pytest.mark.parametrize(("code", "side"), [(-1, "above"), (-160, "below")])
+def test_a_level_far_from_all_others_is_told(bring_in, code, side):
+    levels = [-80 - i for i in range(30)] + [code, code]
+    text = rows([f"10:00:{i:02}" for i in range(32)], levels)
+    assert any(f"2 of the levels are {code}," in note and side in note and f"--not-measured {code}" in note
+               for note in bring_in(text, **MAPPING).report["warnings"])
+    assert len(bring_in(text, **MAPPING, not_measured=[code]).table) == 30
+
+
+def test_path_losses(bring_in):
+    losses = rows(MIDNIGHT, [120, 125.5, 139, 141])
+    with pytest.raises(BadInput, match="nothing is left.*--path-loss"):
+        bring_in(losses, **MAPPING, level_unit="dB")
+    with pytest.raises(BadInput, match="path_loss is in dB"):
+        bring_in(losses, **MAPPING, path_loss=True)
+    given = {**MAPPING, "level_unit": None}
+    np.testing.assert_allclose(bring_in(losses, **given, path_loss=True, level_offset_db=3.0).table["gain_db"],
+                               [-117, -122.5, -136, -138])
+    assert list(bring_in(losses, **given, path_loss=True, not_detected_at_or_below=139.0).table["gain_db"].isna()) == \
+        [False, False, True, True]
+
+
+def test_names_whose_digits_were_cut_are_told(bring_in):
+    notes = bring_in(rows(MIDNIGHT, device="2.62013E+13"), **MAPPING).report["warnings"]
+    assert any("device '2.62013E+13' is a number whose last digits" in note for note in notes)
+
+
+def test_a_column_may_name_its_unit(bring_in):
+    text = "x_m,Height (ft),l,d\n1,10,-80,a\n"
+    columns = {"x": "x_m", "y": "always 0", "z": "Height (ft)", "level": "l", "device": "d"}
+    result = bring_in(text, columns=columns)  # and zero is so in any unit
+    assert list(result.table["receiver_z_m"]) == [3.048] and list(result.table["receiver_y_m"]) == [0]
+    with pytest.raises(BadInput, match="always 1.5: length_unit is not given"):
+        bring_in(text, columns=columns | {"z": "always 1.5"})
+
+
+def test_the_note_on_time_zones_is_of_undeclared_ones(bring_in):
+    text = ("WigleWifi-1.4,appRelease=2\nMAC,SSID,AuthMode,FirstSeen,Channel,RSSI,CurrentLatitude,CurrentLongitude,"
+            "AltitudeMeters,AccuracyMeters,Type\n02:00,net,[W],2020-01-31 11:44:00,6,-60,48.1,11.5,520.5,4.0,WIFI\n")
+    assert any("are read as UTC" in note for note in bring_in(text).report["warnings"])
+    assert not any("are read as UTC" in note for note in bring_in(text, time_zone="Europe/Berlin").report["warnings"])
