@@ -23,7 +23,9 @@ from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.cell_limits import READS
 from radiotwin.links.measurements import DEVICE_OPTIONAL
 from radiotwin.links.site_table import (
+    FAR_M,
     SiteTable,
+    distances_m,
     far_notes,
     local_positions,
     read_site_table,
@@ -37,6 +39,8 @@ SINCE, UNTIL = "since_s", "until_s"
 """Columns of a table of devices: from when until when a device was there [s]; NaN = always."""
 _MAX_PLACES = 1000  # of one device; one that moves all the time has no places
 SAME_BAND = 1.05  # ratio of carriers between which a device hops: 0.4 dB by 20 lg f
+MIN_SPREAD_DEG = 0.5  # of positions of which some are 100 km from others
+MIN_PLACES, MIN_REPEATS = 4, 3  # of a receiver that moves, and of readings at a place of none
 MOVING_M = 1.0  # a device whose positions differ by more than this is not at rest
 
 
@@ -279,6 +283,14 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     links = _at_times(source, links, tables["device"])
     receivers = _positions(links, "", tables["receiver"], links["receiver"], settings.crs)
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
+    no_fix = _without_fix(receivers, links["receiver"])
+    for place, rows in no_fix.items():
+        tally.count(f"no fix: a receiver that moves elsewhere stays at {place}", "", len(rows),
+                    source.where(links.index[rows[0]]))
+    if no_fix:
+        fixed = np.ones(len(links), dtype=bool)
+        fixed[np.concatenate(list(no_fix.values()))] = False
+        links, receivers, devices = links[fixed], receivers[fixed], devices[fixed]
     origin = find_origin(settings.origin, receivers, devices)
     receiver_m, device_m = (local_positions(ends, origin) for ends in (receivers, devices))
     notes = [note for table in sites.values() for note in table.notes]
@@ -302,6 +314,39 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     table = _device_table(source, links, device_m, tables["device"], declared_as,
                           max(MOVING_M, 2 * (settings.place_m or 0.0)))
     return PositionedLinks(links, table, device_m, origin, [*notes, *more])
+
+
+def _without_fix(receivers: pd.DataFrame, names: pd.Series) -> dict[str, np.ndarray]:
+    """Return places that stand for readings without a position, and the rows of their readings.
+
+    Programs write one place for all of them, such as that of their maker: it repeats to the last
+    digit, far from all others of a receiver that moves.
+
+    Args:
+        receivers: (n,) positions, as of `local_positions`.
+        names: (n,) of the receivers.
+    """
+    if "latitude" not in receivers:
+        return {}
+    place = receivers[["latitude", "longitude"]].to_numpy(dtype=float)
+    spread_deg = np.nan_to_num(np.nanmax(place, axis=0) - np.nanmin(place, axis=0)) \
+        if np.isfinite(place).any() else np.zeros(2)
+    if spread_deg.max() < MIN_SPREAD_DEG:
+        return {}
+    found: dict[str, np.ndarray] = {}
+    for rows in names.groupby(names.to_numpy(), sort=False).indices.values():
+        rows = rows[np.isfinite(place[rows]).all(axis=1)]
+        different, number, times = np.unique(place[rows], axis=0, return_inverse=True,
+                                             return_counts=True)
+        if len(different) < MIN_PLACES:
+            continue
+        middle = np.median(different, axis=0)  # however many readings have no place
+        apart_m = distances_m(different, middle)
+        for i in np.flatnonzero((apart_m > FAR_M) & (times >= MIN_REPEATS)):
+            text = f"{different[i, 0]:.10g}, {different[i, 1]:.10g}"
+            own = rows[number.ravel() == i]
+            found[text] = np.concatenate([found[text], own]) if text in found else own
+    return found
 
 
 def _far_notes(source: Source, links: pd.DataFrame, receivers: pd.DataFrame,

@@ -1,5 +1,6 @@
 """The files of an import as links, each by its own format: a row per receiver, device, reading."""
 
+import re
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
@@ -45,10 +46,15 @@ from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, shown
 from radiotwin.io.forms import name_fault
 from radiotwin.links.cell_limits import READS, refuse_limits
-from radiotwin.links.site_table import LIMITS_DEG
+from radiotwin.links.site_table import LIMITS_DEG, METRES
 
 ANGLES = ("heading", "pitch", "roll")
 NAMES = ("device", "receiver", "flight")
+_HZ = {"mhz": 1e6, "ghz": 1e9}
+_FIXED_LENGTH = re.compile(rf"{ALWAYS}([-+]?\d+(?:\.\d+)?) (m|ft)")
+FILE_DATE = "{file date}"
+_DATE = r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])(?!\d)"
+_DOTTED_DATE = r"(?<!\d)(0[1-9]|[12]\d|3[01])\.(0[1-9]|1[0-2])\.((?:19|20)\d\d)(?!\d)"
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
         pitch_deg, roll_deg, quality, frequency_hz` where given.
     """
     columns = settings.columns.model_dump(exclude_none=True)
-    columns = {name: f"{ALWAYS}{file_name}" if spec == BY_FILE else spec
+    columns = {name: _from_file_name(source, name, spec, file_name)
                for name, spec in columns.items()}
     levels: list[LevelColumn] = []
     with problems.noted():
@@ -103,6 +109,37 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
         return shared, 0
     links = parts[0] if len(parts) == 1 else pd.concat(parts).sort_index(kind="stable")
     return links, len(levels)
+
+
+def _from_file_name(source: Source, name: str, spec: str, file_name: str) -> str:
+    """Return the entry of a mapping with what the name of the file says: a name, a number, a date.
+
+    Raises:
+        BadInput: the file's name does not say it, or in two ways.
+    """
+    if spec == BY_FILE and name in NAMES:
+        return f"{ALWAYS}{file_name}"
+    if spec == BY_FILE:
+        pattern = r"(?<![\d.])(\d+(?:\.\d+)?) ?(" + (
+            "mhz|ghz" if name == "frequency_hz" else "m|ft") + r")(?![a-z])"
+        found = {(float(number), unit) for number, unit in
+                 re.findall(pattern, file_name.lower().replace("_", " "))}
+        if len(found) == 1:
+            number, unit = found.pop()
+            return f"{ALWAYS}{number * _HZ.get(unit, 1.0):.12g} {unit if unit in METRES else ''}"
+        example = "868MHz" if name == "frequency_hz" else "30m, 100ft"
+        raise BadInput(f"{source.path}: {name} = {BY_FILE!r} needs one number with its unit in the "
+                       f"file's name, such as {example}; it has {len(found)}. Give a column, or "
+                       f"{ALWAYS}VALUE")
+    if FILE_DATE not in spec:
+        return spec
+    dates = {"-".join(parts) for parts in re.findall(_DATE, file_name)}
+    dates |= {f"{year}-{month}-{day}" for day, month, year in re.findall(_DOTTED_DATE, file_name)}
+    if len(dates) != 1:
+        raise BadInput(f"{source.path}: {FILE_DATE} needs one date in the file's name, such as "
+                       f"2024-05-01, 20240501 or 01.05.2024; it has {len(dates)}. Write the date "
+                       "in place of it")
+    return spec.replace(FILE_DATE, dates.pop())
 
 
 def _shared(source: Source, columns: dict[str, str], settings: Settings,
@@ -189,6 +226,8 @@ def _is_length(name: str, settings: Settings) -> bool:
 
 def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.ndarray:
     """Return the numbers of a column in the project's units, (n,)."""
+    if _is_length(name, settings) and (fixed := _FIXED_LENGTH.fullmatch(spec)):
+        return np.full(len(source), float(fixed[1]) * METRES[fixed[2]])
     numbers = source.numbers(spec, name)
     if _is_length(name, settings):
         return in_metres(numbers, settings.length_unit, f"{source.path}: column {spec}")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from radiotwin.display import some
 from radiotwin.errors import BadInput
 from radiotwin.geo import FRAME_FILE
 from radiotwin.importing.log_files import list_files
@@ -77,7 +78,8 @@ def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Ta
         "ranges": _ranges(table, positioned.links),
         "warnings": [*notes, *["1 file of another format is left out"] * (others == 1),
                      *[f"{others} files of other formats are left out"] * (others > 1),
-                     *_name_warnings(measurements), *_position_warnings(measurements),
+                     *_name_warnings(measurements),
+                     *_position_warnings(measurements, settings.devices),
                      *_level_warnings(positioned, measurements, tally, logs.readings),
                      *_time_and_angle_warnings(table),
                      *_averaging_warnings(measurements, settings)],
@@ -101,7 +103,7 @@ def _ranges(table: pd.DataFrame, links: pd.DataFrame) -> dict[str, dict[str, Any
     return result
 
 
-def _position_warnings(measurements: Measurements) -> Iterator[str]:
+def _position_warnings(measurements: Measurements, devices: str | None) -> Iterator[str]:
     receiver_m = measurements.receiver_m
     extent_m = np.linalg.norm(np.ptp(receiver_m[:, :2], axis=0))
     if extent_m > FAR_M:
@@ -115,6 +117,13 @@ def _position_warnings(measurements: Measurements) -> Iterator[str]:
         if z_m.min() > HIGH_M:
             yield (f"the lowest receiver is at {z_m.min():.0f} m; if that is above the sea, give "
                    "the ground's altitude with --origin LATITUDE,LONGITUDE,ALTITUDE")
+    heights = measurements.devices.reindex(columns=["z_m", "above_ground_m"])
+    low = measurements.devices["device"][heights.isna().all(axis=1)]
+    if len(low):
+        table = Path(devices).name if devices else "a table of devices"
+        yield (f"{len(low)} of {len(measurements.devices)} devices have no height "
+               f"({some(low)}): give it in {table} (above_ground_m); "
+               "without a 3D map they count as 1.5 m above the ground, with one they are refused")
     unknown = int((~measurements.is_anchor).sum())
     if unknown:
         yield (f"{unknown} of {len(measurements.devices)} devices have no position: their role is "

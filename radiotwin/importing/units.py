@@ -25,8 +25,9 @@ SERIAL = "serial date"
 """Days since 1899-12-30, as spreadsheets have times (ECMA-376-1, 18.17.4.1)."""
 ALLOWED = (f"allowed are {', '.join(EPOCH_S)}, {ISO}, {SERIAL} (days, of a spreadsheet), or a "
            "strftime format, such as '%d.%m.%Y %H:%M:%S'")
-_NO_DATE = "it has no date: put the date before it, in the time and its format, as in " \
-           "--columns 'time=2024-05-01 {Time}' --time-format '%Y-%m-%d %H:%M:%S'"
+_NO_DATE = "it has no date: put the date before it ({file date}: that of the file's name), in " \
+           "the time and its format, as in --columns 'time=2024-05-01 {Time}' --time-format " \
+           "'%Y-%m-%d %H:%M:%S'"
 _DATES = re.compile("%[YymbBdjDFcxsGUVWuw]")
 HALF_DAY_S, DAY_S = 43_200.0, 86_400.0
 MAX_STEPS_BACK = 5  # more are no midnights, but rows in another order
@@ -44,6 +45,8 @@ MIN_SHARE = 0.02  # of the pairs of readings that follow each other so fast
 LEVEL_COLUMN = {"dBm": "rssi_dbm", "mW": "rssi_dbm", "W": "rssi_dbm", "dB": "gain_db"}
 """Unit in the file -> column of `measurements.csv`."""
 NOT_A_NUMBER = "nan"
+MAX_OVER, MIN_OVER, MAX_GAP_DB = 0.01, 5, 10.0
+"""Share, and different values, of levels that are too strong, and how far they are from others."""
 MILLIWATTS = {"mW": 1.0, "W": 1e3}
 POSSIBLE_DB = {"rssi_dbm": (-174.0, 0.0), "gain_db": (-250.0, 0.0)}
 """Column of levels -> open interval [dBm or dB]: thermal noise at 290 K is -174 dBm in 1 Hz (k T of
@@ -319,8 +322,34 @@ def read_levels(source: Source, spec: str, settings: Settings,
     db = db + offset_db
     low, high = POSSIBLE_DB[LEVEL_COLUMN[str(settings.level_unit)]]
     impossible = ~not_measured & ~not_detected & ~((db > low) & (db < high))
+    _refuse_uncalibrated(source, spec, db[~not_measured & ~not_detected], high)
     db = np.where(not_measured | not_detected | impossible, np.nan, db)
     return Levels(db, not_measured, impossible)
+
+
+def _refuse_uncalibrated(source: Source, spec: str, db: np.ndarray, high_db: float) -> None:
+    """Refuse a column whose strongest levels would all be left out, as no receiver reads them.
+
+    A code for "no reading" is one value or two, and stands apart.
+
+    Args:
+        source: the file.
+        spec: the column.
+        db: (n,) levels.
+        high_db: from which on they are impossible.
+    """
+    over = np.unique(db[db >= high_db])
+    share = float(np.mean(db >= high_db)) if len(db) else 0.0
+    below = db[db < high_db]
+    if share <= MAX_OVER or len(over) < MIN_OVER or not len(below) \
+            or over[0] - below.max() > MAX_GAP_DB:
+        return
+    raise BadInput(f"{source.path}: column {spec}: {share:.0%} of the levels are {high_db:g} dB or "
+                   f"more, up to {over[-1]:g}, which no calibrated receiver reads; all the "
+                   f"strongest would be left out. Give a level_offset_db, such as "
+                   f"{-10 * np.ceil((over[-1] + 1) / 10):g}, that makes them negative: which one "
+                   "does not matter where transmit powers are not known. Path losses need "
+                   "path_loss, and codes not_measured")
 
 
 def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str],

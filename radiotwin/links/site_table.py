@@ -538,14 +538,21 @@ def _slip(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> str:
 
 
 def _apart_m(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> np.ndarray:
-    """Return distances (k,) of places (k, 2) from one [m]; on the sphere, of degrees."""
-    if "latitude" not in axes:
-        return np.linalg.norm(place - middle, axis=1)
-    (north, east), (middle_north, middle_east) = np.radians(place).T, np.radians(middle)
+    if "latitude" in axes:
+        return distances_m(place, middle)
+    return np.linalg.norm(place - middle, axis=1)
+
+
+def distances_m(place_deg: np.ndarray, middle_deg: np.ndarray) -> np.ndarray:
+    """Return distances (k,) on the sphere of latitudes and longitudes (k, 2) from one [m].
+
+    They are infinite where a latitude is none.
+    """
+    (north, east), (middle_north, middle_east) = np.radians(place_deg).T, np.radians(middle_deg)
     chord = (np.sin((north - middle_north) / 2)**2
              + np.cos(north) * np.cos(middle_north) * np.sin((east - middle_east) / 2)**2)
     apart_m = 2 * _EARTH_M * np.arcsin(np.sqrt(np.clip(chord, 0, 1)))
-    return np.where(np.abs(place[:, 0]) > LIMITS_DEG["latitude"], np.inf, apart_m)
+    return np.where(np.abs(place_deg[:, 0]) > LIMITS_DEG["latitude"], np.inf, apart_m)
 
 
 def unmatched_notes(path: Path | str, names: Iterable[str], others: Collection[str], end: str,

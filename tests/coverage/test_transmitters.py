@@ -86,3 +86,29 @@ def test_those_of_the_scene(scene):
 def test_a_bad_cell_is_named(scene, tmp_path, text, message):
     with pytest.raises(BadInput, match=message):
         read_transmitters(written(tmp_path, text), scene)
+
+
+def test_any_spelling_and_height(scene, tmp_path):
+    (tmp_path / "sector.csv").write_text(PATTERN)
+    longitude, latitude = to_geographic(scene.config.origin, [100.0], [-50.0])
+    path = written(tmp_path, "Site;Lat;Lng;Antenna Height (ft);Power (W);Antenna;Azimuth;Downtilt;Owner\n"
+                             f"s1;{latitude[0]:.9f};{longitude[0]:.9f};100;20;sector.csv;90;8;me\n")
+    with pytest.warns(UserWarning, match="sites.csv: column not used: Owner"):
+        (found,) = read_transmitters(path, scene)
+    np.testing.assert_allclose(found.position_m, [100, -50, 30.48], atol=1e-3)
+    assert found.tx_power_dbm == pytest.approx(43.01, abs=0.01)
+    assert (found.antenna.azimuth_deg, found.antenna.tilt_deg) == (90, -8)
+
+
+def test_what_is_probably_not_meant_is_told(scene, tmp_path):
+    (tmp_path / "sector.csv").write_text(PATTERN)
+    path = written(tmp_path, "device,x_m,y_m,z_m,antenna,tilt\ns1,10,-20,530,sector.csv,8\n")
+    with pytest.warns(UserWarning) as told:
+        read_transmitters(path, scene)
+    texts = [str(each.message) for each in told]
+    assert any("1 of 1 declared tilts are above zero" in text for text in texts)
+    assert any("lowest of 1 sites is 530 m above the ground" in text for text in texts)
+    origin = scene.config.origin
+    path = written(tmp_path, f"device,lat,lon,z_m\ns1,{origin.longitude_deg},{origin.latitude_deg},30\n")
+    with pytest.raises(BadInput, match="row 2: transmitter 's1' at latitude .* km from the map.*swapped"):
+        read_transmitters(path, scene)

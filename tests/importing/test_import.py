@@ -267,3 +267,60 @@ def test_a_site_table_declares_the_radios_and_brings_the_files_of_antennas(tmp_p
     first, second = radios_of(found.devices, found.patterns, None)
     assert (first.tx_power_dbm, first.cable_loss_db) == (40.0, 2.0)  # 45 - 7 + 2
     assert (first.antenna.azimuth_deg, first.antenna.tilt_deg) == (30.0, -4.0) and second.antenna is None
+
+
+def test_a_dummy_place_is_no_position(bring_in):
+    mapping = {"device": "d", "latitude": "lat", "longitude": "lon", "level": "l", "receiver": "r"}
+    moving = "".join(f"a,48.10{i},11.50{i},phone,-8{i}\n" for i in range(5))
+    dummy, mast = "a,37.751,-97.822,phone,-70\n" * 20, "a,52.5,13.4,mast,-90\n" * 20
+    rows = (moving + dummy + mast).splitlines()
+    text = "d,lat,lon,r,l,n\n" + "".join(f"{row},{i}\n" for i, row in enumerate(rows))
+    result = bring_in(text, columns=mapping)
+    assert len(result.table) == 25 and set(result.table["receiver"]) == {"phone", "mast"}
+    left_out = result.report["left_out"][0]
+    assert left_out["readings"] == 20 and "37.751, -97.822" in left_out["reason"]
+
+
+def test_devices_without_a_height_are_named(bring_in, local, tmp_path):
+    (tmp_path / "sites.csv").write_text("device,x_m,y_m,agl_m\na,1,2,\nb,1,2,30\n")
+    result = bring_in(HEAD + "a,0,0,-80\nb,0,0,-80\n", columns=local, length_unit="m", devices=str(tmp_path / "sites.csv"))
+    assert any(note.startswith("1 of 2 devices have no height (a): give it in") and "sites.csv" in note
+               for note in result.report["warnings"])
+
+
+def test_tables_of_sites_in_words_of_their_own(bring_in, tmp_path):
+    (tmp_path / "sites.csv").write_text("Cell ID;Lat;Long;Antenna Height (ft);Azimuth;Downtilt;EIRP (W);Freq (MHz);Owner\n"
+                                        "262-1-9;48,105;11,5;100;120;6;1000;1800;me\n262-1-8;48,1;11,5;90;0;0;100;800;me\n")
+    (tmp_path / "roofs.csv").write_text("Station,lat,lng,mast height ft,colour\nr1,48.1,11.5,10,red\n")
+    result = bring_in("d,l,r\n262-01-9,-80,r1\n262-1-8,-81,r1\n", columns={"device": "d", "level": "l", "receiver": "r"},
+                      devices=str(tmp_path / "sites.csv"), receivers=str(tmp_path / "roofs.csv"))
+    devices = result.devices.set_index("device")
+    assert devices.loc["262-1-8", ["above_ground_m", "azimuth_deg", "tilt_deg", "eirp_dbm", "frequency_hz"]].tolist() == [
+        27.432, 0, 0, 50, 8e8]
+    assert result.table["receiver_above_ground_m"].tolist() == [3.048, 3.048]
+    notes = "\n".join(result.report["warnings"])
+    for text in ("sites.csv: column not used: Owner", "roofs.csv: column not used: colour",
+                 "1 of 2 names occur in no row of the log: 262-1-9 (262-01-9 there)"):
+        assert text in notes
+
+
+@pytest.mark.parametrize("place", ["-3.489,-56.16", "34.89,-56.16", "-56.16,-34.89"])
+def test_sites_with_a_slip_are_refused(bring_in, tmp_path, place):
+    (tmp_path / "sites.csv").write_text(f"device,lat,lon\na,{place}\n")
+    with pytest.raises(BadInput, match=r"sites.csv: device 'a' at latitude .* km from the middle .*(slipped|sign|swapped)"):
+        bring_in("d,l,la,lo\na,-80,-34.9,-56.2\n", columns={"device": "d", "level": "l", "latitude": "la", "longitude": "lo"},
+                 devices=str(tmp_path / "sites.csv"))
+
+
+def test_heights_frequencies_and_dates_of_a_file_name(bring_in, local):
+    columns = local | {"above_ground": "by file", "frequency_hz": "by file", "time": "{file date} {t}"}
+    text = "device,x,y,level,t\na,0,0,-80,10:00:00\n"
+    for name, metres in (("log_2024-05-01_30m_868MHz.csv", 30.0), ("100ft 868.0mhz 20240501.csv", 30.48)):
+        table = bring_in(text, name, columns=columns, time_format="ISO 8601", time_zone="UTC").table
+        assert table["receiver_above_ground_m"].tolist() == [metres] and table["time_s"].tolist() == [1714557600]
+    assert bring_in(text, "a_01.05.2024_3m_3.5GHz.csv", columns=columns, time_format="ISO 8601",
+                    time_zone="UTC").devices["frequency_hz"].tolist() == [3.5e9]
+    for name, message in (("30m_868MHz.csv", "{file date} needs one date"), ("20240501_868MHz.csv", "above_ground = 'by file' needs"),
+                          ("20240501_30m_5m_868MHz.csv", "it has 2"), ("20240501_30min_868MHz.csv", "it has 0")):
+        with pytest.raises(BadInput, match=message):
+            bring_in(text, name, columns=columns, time_format="ISO 8601", time_zone="UTC")

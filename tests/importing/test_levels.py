@@ -64,3 +64,12 @@ def test_levels_that_cannot_be_used(bring_in, local, tmp_path, given, levels, me
     with pytest.raises(BadInput, match=message):
         bring_in(rows(*levels), columns=local, length_unit="m", **given)
     assert not (tmp_path / "out").exists()
+
+
+def test_uncalibrated_levels_are_not_dropped(bring_in, local):
+    rows = "".join(f"a,{i},0,{-25 + i}\n" for i in range(50))
+    with pytest.raises(BadInput, match=r"column level: 50% of the levels are 0 dB or more, up to 24.*level_offset_db, such as -30"):
+        bring_in("device,x,y,level\n" + rows, columns=local, length_unit="m")
+    assert len(bring_in("device,x,y,level\n" + rows, columns=local, length_unit="m", level_offset_db=-30.0).table) == 50
+    few = "".join(f"a,{i},0,{-80 - i % 7}\n" for i in range(50)) + "a,51,0,99\na,52,0,0\n"
+    assert bring_in("device,x,y,level\n" + few, columns=local, length_unit="m").report["left_out"][0]["readings"] == 2
