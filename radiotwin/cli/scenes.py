@@ -68,7 +68,7 @@ def build_scene(
         metavar="M", help="Height of buildings without one in a map [10].")] = None,
     height_column: Annotated[str | None, typer.Option(
         metavar="NAME[:UNIT]", help="Column of a map with the buildings' heights above ground; "
-                                    "UNIT is m [default], ft, cm or storeys.")] = None,
+                                    "UNIT is m [default], ft, cm, mm or storeys.")] = None,
     ground_column: Annotated[str | None, typer.Option(
         metavar="NAME", help="Column with the elevation of the ground, where that of "
                              "--height-column is an elevation, too.")] = None,

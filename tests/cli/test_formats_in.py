@@ -100,7 +100,7 @@ BAD = {
     "scale of a map": ("a.gml", "--scale 2", ["a.gml is a map: --scale cannot be used"]),
     "heights of a model": ("a.stl", "--height-column HGT", ["a.stl is not a map", "--height-column cannot be used"]),
     "an axis": ("a.glb", "--up w", ["up axis 'w' is not possible"]),
-    "elsewhere": ("a.city.json", "--bbox 4,51,5,53", ["no building reaches into the bbox", "seem to be swapped: --bbox is LAT_MIN,LON_MIN"]),
+    "elsewhere": ("a.city.json", "--bbox 4,51,5,53", ["no building reaches into --bbox", "seem to be swapped: --bbox is LAT_MIN,LON_MIN"]),
     "another material": ("a.obj", "--material roof=metal", ["'roof' is to be replaced, but the city does not use it"]),
 }
 

@@ -227,7 +227,8 @@ def build_scene_from_map(
     if not found.features:
         raise BadInput("\n".join([
             f"{path} holds no buildings (closed ways or multipolygons with the tag building or "
-            "building:part; of a table polygons)", *(problem.message for problem in left_out)]))
+            "building:part; of a table polygons); export an area or a layer that has some",
+            *(problem.message for problem in left_out)]))
     features = _within(found.features, map_options.bbox_deg, path)
     SHAPES.check(len(features), path)
     check_crowding(features, path)
@@ -243,13 +244,14 @@ def build_scene_from_map(
     prisms += bodies
     problems += found_in_bodies
     _check_unit(prisms, found.plan_m, map_options.height_column, path)
-    problems = (found.problems + left_out
-                + problems + _without_height(prisms, features, map_options, path)
+    problems = (found.problems + left_out + problems
+                + _without_height(prisms, features, map_options, path)
                 + implausible_heights([(prism.name, prism.height, prism.site or prism.area)
                                        for prism in prisms],
                                       {feature.name: feature.tags for feature in features}))
     if not prisms:
-        raise BadInput("\n".join([f"{path}: none of its {len(features)} buildings can be used:",
+        raise BadInput("\n".join([f"{path}: none of its {len(features)} buildings can be used; "
+                                  "correct what is wrong with them:",
                                   *(problem.message for problem in problems)]))
     around = choose_extent(_bounds_m(prisms, origin, map_options.bbox_deg))
     extent = around if options.extent_m is None else make_extent(options.extent_m)
@@ -379,7 +381,7 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
         hint = ("; latitude and longitude seem to be swapped: --bbox is "
                 "LAT_MIN,LON_MIN,LAT_MAX,LON_MAX; if it is right, the file's are swapped"
                 ) if swapped else ""
-        raise BadInput(f"{path}: no building reaches into the bbox "
+        raise BadInput(f"{path}: no building reaches into --bbox "
                        f"{south:g},{west:g},{north:g},{east:g}; the file's lie in "
                        f"{south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} "
                        f"(south,west,north,east){hint}")

@@ -27,9 +27,9 @@ from radiotwin.errors import BadInput
 LEVEL_M = 3.0  # [m], a usual storey
 FOOT_M = 0.3048
 STOREYS = "storeys"
-UNITS_M = {"m": 1.0, "ft": FOOT_M, "cm": 0.01, STOREYS: LEVEL_M}
+UNITS_M = {"m": 1.0, "ft": FOOT_M, "cm": 0.01, "mm": 0.001, STOREYS: LEVEL_M}
 MAX_LISTED = 20  # columns in a message
-_UNIT = re.compile(r"(.+):(m|ft|cm|storeys)", re.IGNORECASE | re.DOTALL)
+_UNIT = re.compile(r"(.+):(m|ft|cm|mm|storeys)", re.IGNORECASE | re.DOTALL)
 # A comma may separate decimals, where it cannot separate thousands
 _DECIMAL = r"\d+(?:\.\d*|,\d{1,2})?|\.\d+"
 _NUMBER = re.compile(rf"\s*([+-]?(?:{_DECIMAL}))\s*")
@@ -161,9 +161,9 @@ def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
                          if _NUMBER.fullmatch(tags.get(column.name, "")))
             return (f"no building has a height that can be used: column {column.name!r} holds none "
                     f"above 0 and up to 1,000 m, only such as {value.strip()[:20]}. Correct it, "
-                    "name another column with --height-column NAME, or give all buildings one "
-                    "height with --height-default M. Its columns of numbers are: "
-                    f"{listed_columns(numeric)}")
+                    "name another column or unit with --height-column NAME (NAME:ft, NAME:cm, "
+                    "NAME:mm), or give all buildings one height with --height-default M. Its "
+                    f"columns of numbers are: {listed_columns(numeric)}")
     elevations = [f"{column.name} is an elevation, from which the ground's ({column.ground}) has "
                   "to be subtracted, and the file has none"
                   for column in KNOWN if column.ground and column.name in counts

@@ -1,15 +1,16 @@
 """Values of maps and terrains that can be read, and that can hardly be meant.
 
 A building of more than 300 m is rare: some 200 of them exist [1]; the most slender is 24 times as
-tall as wide [2]. No city has a median above 60 m. Rasters that were clipped or warped without a
-value for no data have zeros there [3]. Single pixels that differ by more than 100 m from those
-around them were taken for errors where SRTM was edited [4].
+tall as wide [2]. No city has a median above 60 m, and a room is 2.1 m high at least [5]. Rasters
+that were clipped or warped without a value for no data have zeros there [3]. Single pixels that
+differ by more than 100 m from those around them were taken for errors where SRTM was edited [4].
 
 [1] Council on Tall Buildings and Urban Habitat, height criteria ("supertall").
 [2] https://skyscraper.org/super-slenders/slenderness
 [3] https://gdal.org/en/stable/programs/gdalwarp.html (-dstnodata)
 [4] Slater et al., "The SRTM data 'finishing' process and products", Photogrammetric Engineering and
     Remote Sensing 72(3), 2006.
+[5] International Residential Code, R305.1.
 """
 
 import math
@@ -25,7 +26,8 @@ from radiotwin.scene.readers.features import problems_of
 from radiotwin.scene.readers.heights import KNOWN, STOREYS, Height, number
 
 RARE_M, RARE_SLENDERNESS = 300.0, 24.0  # of a building: [1]; height over width: [2]
-VOID_STEP_M, VOID_SLOPE = 30.0, math.tan(math.radians(60.0))  # around zeros that are no heights
+ROOM_M = 2.1  # [5]
+VOID_STEP_M, VOID_SLOPE = 30.0, 1.0  # around zeros that are no heights
 VOID_BORDER = 0.9  # share of the pixels around them that are so much higher
 KERNEL_PIXELS = 3  # that a cubic interpolation mixes with a void
 STEP_M, STEP_SLOPE = 100.0, math.tan(math.radians(80.0))  # between pixels, that is told: [4]
@@ -52,7 +54,12 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
         return []
     wide_m = np.array([_width_m(site) for _, _, site in known])
     rare = (tops_m > RARE_M) | (tops_m > RARE_SLENDERNESS * np.maximum(wide_m, 1.0))
-    shifted = len(tops_m) > 1 and float(np.median(tops_m)) > MAX_MEDIAN_M
+    median_m = float(np.median(tops_m)) if len(tops_m) > 1 else ROOM_M
+    shifted = median_m > MAX_MEDIAN_M
+    if median_m < ROOM_M:
+        return problems_of([f"{name}: {height.top_m:.3g} m" for name, height, _ in known],
+                           f"building(s) have a median height of {median_m:.3g} m, less than a "
+                           "room has. If a column counts storeys, say --height-column NAME:storeys")
     if not (rare.any() or shifted):
         return []
     named = np.flatnonzero(rare if rare.any() else tops_m > MAX_MEDIAN_M)
@@ -102,7 +109,7 @@ def _ground_column(known: Sequence[tuple[str, Height, BaseGeometry]],
 def zero_voids(height_m: np.ndarray, pixel_m: float) -> np.ndarray:
     """Return which pixels (rows, columns) [m] are zeros that stand for no data, or mixed with them.
 
-    These are regions of zeros with a wall of 30 m and of 60 degrees around nine tenths of them, and
+    These are regions of zeros with a wall of 30 m and of 45 degrees around nine tenths of them, and
     the pixels that an interpolation has mixed with them.
     """
     region, count = ndimage.label(height_m == 0.0, _AROUND)

@@ -133,7 +133,7 @@ def _opened(path: Path) -> Iterator[Any]:
 def _check(path: Path, file: Any) -> None:
     if file.count != 1:
         raise BadInput(f"{path} has {file.count} bands, as a picture has; give a GeoTIFF with one "
-                       "band of heights")
+                       "band of heights (`gdal_translate -b 1` takes out the first)")
     if not re.fullmatch("u?int[0-9]+|float[0-9]+", file.dtypes[0]):  # numpy lacks some of GDAL's
         raise BadInput(f"{path} has pixels of type {file.dtypes[0]}, which are no heights; give a "
                        "GeoTIFF of integers or real numbers")
@@ -193,7 +193,8 @@ def _vertical(path: Path, file: Any, system: "CRS",
     elif unit in _FEET:
         factor = _FEET[unit]
     else:
-        raise BadInput(f"{path} has heights in {unit[:40]!r}; allowed are metres and feet")
+        raise BadInput(f"{path} has heights in {unit[:40]!r}; allowed are metres and feet: convert "
+                       "them (`gdal_calc.py`), or correct the unit (`gdal_edit.py -units m`)")
     if vertical is not None:
         kind: Kind = "ellipsoid" if "ellipsoid" in vertical.name.lower() else "geoid"
         return factor, vertical.name, kind

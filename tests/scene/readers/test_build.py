@@ -140,7 +140,7 @@ def test_the_table_of_materials_is_used(tmp_path):
 
 @pytest.mark.parametrize(("options", "message"), [
     ({"bbox_deg": (1, 2, 0, 3)}, "bbox .* is not possible"), ({"bbox_deg": (float("nan"), 0, 1, 1)}, "not possible"),
-    ({"bbox_deg": (0, 0, 1, 1)}, r"no building reaches into the bbox .*the file's lie in 47\.\d+,8\.\d+"),
+    ({"bbox_deg": (0, 0, 1, 1)}, r"no building reaches into --bbox .*the file's lie in 47\.\d+,8\.\d+"),
     ({"default_height_m": 0.0}, "default height of 0 m"), ({"default_height_m": float("inf")}, "default height")])
 def test_impossible_options(tmp_path, options, message):
     with pytest.raises(BadInput, match=message):
@@ -166,5 +166,5 @@ def test_a_ring_of_three_points_is_no_building(tmp_path):
 
 def test_nothing_usable_gives_the_reasons(tmp_path, empty_map):
     path = empty_map.box(0, 0, 0, 20).write(tmp_path / "a.osm")
-    with pytest.raises(BadInput, match="none of its 1 buildings can be used:\n.*have no area"):
+    with pytest.raises(BadInput, match="none of its 1 buildings can be used; correct what is wrong with them:\n.*have no area"):
         build_scene_from_map(path, tmp_path / "out")

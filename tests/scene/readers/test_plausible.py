@@ -22,6 +22,7 @@ BOX_M = (-300.0, 300.0, -200.0, 200.0)
     ([535.5, 541.0], {"ground": [520.0, 521.0]}, "--height-column height --ground-column ground"),
     ([650, 900], {}, "'feature 2: 900 m tall, 12 m wide'"), ([8, 12, 330], {}, "1 building(s) are taller than 300 m"),
     ([8, 12, 295], {}, "1 building(s) are taller than 300 m, or than 24 times their width"),  # 12 m wide
+    ([1, 2, 2], {}, "median height of 2 m, less than a room has. If a column counts storeys, say --height-column NAME:st"),
     ([80, 90, 20], {}, "2 of 3 building(s) are taller than 60 m, more than half, as in no city")])
 def test_heights_that_no_city_has_are_told(tmp_path, heights, more, said):
     rows = [(100 * row, {"height": height} | {key: values[row] for key, values in more.items()})
