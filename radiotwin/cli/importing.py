@@ -101,10 +101,16 @@ def import_(
     receivers: Annotated[str | None, typer.Option(
         help="Table of fixed receivers, in the same form.")] = None,
     track: Annotated[list[str] | None, typer.Option(
-        metavar="[RECEIVER=]FILE", help="Positions over time, where the log has none: .gpx, .nmea, "
-                                        "PX4 .ulg, ROS .bag, .mcap, .db3 or the folder of a ROS "
-                                        "2 bag, or a table with time, latitude, longitude, "
-                                        "altitude; may be repeated.")] = None,
+        metavar="[RECEIVER=]FILE", help="Positions over time, where the log has none: .gpx, .kml, "
+                                        ".nmea, PX4 .ulg, ArduPilot .bin and .tlog, ROS .bag, "
+                                        ".mcap, .db3 or the folder of a ROS 2 bag, or a table, "
+                                        "such as those of Airdata, Litchi and DJI; may be "
+                                        "repeated.")] = None,
+    track_columns: Annotated[str | None, typer.Option(
+        metavar="NAME=COLUMN,…", help="Columns of tracks that are tables: time=…,latitude=…,"
+                                      "longitude=…,altitude=… [found].")] = None,
+    track_time_format: Annotated[str | None, typer.Option(
+        help="Of such a track, as --time-format [found].")] = None,
     track_topic: Annotated[str | None, typer.Option(
         metavar="NAME", help="Topic of the tracks that are ROS bags [the only one with "
                              "positions].")] = None,
@@ -140,7 +146,10 @@ def import_(
         "min_distance_m": min_distance_m, "max_distance_m": max_distance_m,
         "thin_m": thin_m, "place_m": place_m, "average_m": average_m, "average": average,
         "origin": parse_origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
-        "track": _tracks(track, track_topic), "track_max_gap_s": track_max_gap_s,
+        "track": _tracks(track, {
+            "topic": track_topic, "time_format": track_time_format,
+            "columns": parse_columns(track_columns) if track_columns else None}),
+        "track_max_gap_s": track_max_gap_s,
         "wide": [parse_columns(text) for text in wide] if wide else None}
     mapping = columns
     if columns is not None and "=" in columns and not columns.lower().endswith(".toml"):
@@ -198,7 +207,9 @@ def _tables(settings: "Settings") -> list[str]:
     options = [text for name in ("devices", "receivers") if (table := getattr(settings, name))
                for text in (f"--{name}", table)]
     tracks, topics = settings.track, {track.topic for track in settings.track}
-    if len(topics) != 1 or any(track.time_offset_s or "=" in track.file for track in tracks):
+    if len(topics) != 1 or any(track.time_offset_s or track.columns or track.time_format
+                               or track.time_zone or track.length_unit or "=" in track.file
+                               for track in tracks):
         return options  # none, or what only a file can say
     for track in tracks:
         options += ["--track", f"{track.receiver}={track.file}" if track.receiver else track.file]
@@ -206,15 +217,17 @@ def _tables(settings: "Settings") -> list[str]:
     return [*options, "--track-topic", topic] if topic else options
 
 
-def _tracks(texts: list[str] | None, topic: str | None) -> list[dict[str, str]] | None:
-    """Parse `FILE` or `RECEIVER=FILE`."""
+def _tracks(texts: list[str] | None, given: dict[str, Any]) -> list[dict[str, Any]] | None:
+    """Parse `FILE` or `RECEIVER=FILE`; what is given besides holds for all."""
+    given = {name: value for name, value in given.items() if value is not None}
     if texts is None:
-        if topic is not None:
-            raise BadInput(f"--track-topic {topic!r} is of a ROS bag; give that with --track, too")
+        if given:
+            raise BadInput(f"--track-{next(iter(given)).replace('_', '-')} is of a track; give "
+                           "that with --track, too")
         return None
     pairs = [(text.rpartition("=")[2], text.rpartition("=")[0]) for text in texts]
     return [{"file": file, **({"receiver": receiver} if receiver else {}),
-             **({"topic": topic} if topic else {})}
+             **given}
             for file, receiver in pairs]
 
 

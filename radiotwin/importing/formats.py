@@ -22,6 +22,8 @@ from radiotwin.importing.source import columns_of
 from radiotwin.io.budgets import CELLS, COLUMNS, ROWS
 
 _FIRST = 6  # fields before the bins
+_NO_LEVEL = re.compile(r"-?(1\.#|nan|inf)", re.IGNORECASE)
+"""Of a bin without power; `-1.#J` and `-1.#IND` are those of Windows."""
 _EDGE = 1e-6  # of a step: an edge of the band on that of a bin
 SEMTECH = "Semtech, SX1276/77/78/79 data sheet, rev. 4, 5.5.5"
 _LEVEL = "power of the packet, dBm: RSSI, plus SNR where that is below 0"
@@ -43,7 +45,8 @@ _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ
 def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np.ndarray]:
     """Return the power of each sweep in the band of the settings, or of all bins.
 
-    A bin counts where its centre lies in the band.
+    A bin counts where its centre lies in the band; of bins that are wider than the band the one
+    with its middle, whose edges then are the name of the band.
 
     Returns:
         texts `date, time, band, power_db, bins`, `power_db` empty where a sweep does not cover the
@@ -54,7 +57,7 @@ def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np
     numbers: list[int] = []
     low_hz = power = 0.0
     high_hz, bins, cells = 0.0, 0, 0
-    all_hz = [np.inf, -np.inf]
+    all_hz, edges_hz = [np.inf, -np.inf], [np.inf, -np.inf]
 
     def finish() -> None:
         covered = bins and (band_hz is None or (low_hz <= band_hz[0] and high_hz >= band_hz[1]))
@@ -85,13 +88,21 @@ def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np
             inside = np.ones(len(db), dtype=bool)
             if band_hz is not None:
                 inside = (centre_hz >= band_hz[0]) & (centre_hz <= band_hz[1])
+                if band_hz[1] - band_hz[0] < step_hz:  # the bin that has its middle
+                    offset_hz = (band_hz[0] + band_hz[1]) / 2 - centre_hz + step_hz / 2
+                    inside = (offset_hz >= 0) & (offset_hz < step_hz)
+                if inside.any():
+                    edges_hz = [min(edges_hz[0], centre_hz[inside][0] - step_hz / 2),
+                                max(edges_hz[1], centre_hz[inside][-1] + step_hz / 2)]
             power += float((10 ** (db[inside] / 10)).sum())  # NaN where a bin was not measured
             bins += int(inside.sum())
     if not sweeps:
         raise BadInput(f"{file} is empty")
     finish()
-    edges_hz = band_hz or all_hz
-    name = f"{edges_hz[0] / 1e6:.6g}-{edges_hz[1] / 1e6:.6g} MHz"
+    named_hz = band_hz or all_hz
+    if band_hz and edges_hz[1] - edges_hz[0] > 1.5 * np.ptp(band_hz):  # a bin is wider than it
+        named_hz = edges_hz
+    name = f"{named_hz[0] / 1e6:.6g}-{named_hz[1] / 1e6:.6g} MHz"
     if all(int(sweep[3]) == 0 for sweep in sweeps):
         raise BadInput(f"{file}: no bin lies in the band {name} (band_hz); the file has "
                        f"{all_hz[0] / 1e6:.6g} to {all_hz[1] / 1e6:.6g} MHz")
@@ -104,7 +115,8 @@ def _bins(file: LogFile, number: int, fields: list[str]) -> tuple[np.ndarray, np
     """Return the centres [Hz] and levels [dB] of the bins of a line, and their width [Hz]."""
     try:
         low_hz, high_hz, step_hz = map(float, fields[2:5])
-        db = np.array(fields[_FIRST:], dtype=float)
+        levels = fields[_FIRST:] if fields[-1] else fields[_FIRST:-1]
+        db = np.array([np.nan if _NO_LEVEL.match(each) else float(each) for each in levels])
         count = round((high_hz - low_hz) / step_hz)
     except (ValueError, ZeroDivisionError, OverflowError):
         count = 0
@@ -368,17 +380,19 @@ PHONE = (
 
 SCANNER = (
     Format(
-        "rtl-power", "rtl_power",
+        "rtl-power", "rtl_power, rx_power, hackrf_sweep, soapy_power",
         {"level": "power_db", "device": "band", "time": "{date} {time}"},
         ("date", "time", "band", "power_db", "bins"),
         "power in the band (`--band-hz`, or all of a sweep), the sum of its bins; relative dB",
         "http://kmkeen.com/rtl-power/ and csv_dbm() of rtl_power.c (osmocom rtl-sdr)",
         {"level_unit": "dBm", "time_format": "%Y-%m-%d %H:%M:%S", "not_measured": ["empty"]},
         caution="levels are relative to the receiver's full scale, not dBm: calibrate with "
-                "--level-offset-db, and never compare files with different gains or bins. Times "
-                "are those of the computer: give its --time-zone. Positions come from a --track",
+                "--level-offset-db, and never compare files with different gains or bins. "
+                "Positions come from a --track",
+        zone_caution="times are those of the computer: give its --time-zone",
         without_header=WithoutHeader(
-            r"\d{4}-\d\d-\d\d, \d\d:\d\d:\d\d, \d+, \d+, [\d.]+, \d+, .*", read=_read_rtl_power)),
+            r"\d{4}-\d\d-\d\d, *\d\d:\d\d:\d\d(\.\d+)?(, *[\d.]+){4}, *.*",
+            read=_read_rtl_power)),
 )
 
 

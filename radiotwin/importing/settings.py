@@ -131,6 +131,10 @@ class TrackFile(Table):
     file: Spec
     receiver: Spec | None = None
     topic: Spec | None = Field(None, description="of a ROS bag with several")
+    columns: dict[str, Spec] = Field({}, description="time, latitude, … -> column, of a table")
+    time_format: str | None = Field(None, max_length=200, description="of a table")
+    time_zone: str | None = Field(None, description="of a table whose times have no offset")
+    length_unit: Literal["m", "ft"] | None = Field(None, description="of a table; metres")
     time_offset_s: Number = 0.0
 
 

@@ -188,7 +188,7 @@ def _parse(source: Source, spec: str, text: pd.Series, time_format: str) -> pd.S
         if parsed.isna().any() and time_format.endswith("%S"):  # some seconds have decimals
             fine = pd.to_datetime(text.where(text != ""), errors="coerce",
                                   format=f"{time_format}.%f", utc=bool(with_offset.any()))
-            parsed = parsed.fillna(fine)
+            parsed = fine.where(parsed.isna(), parsed)
     except (ValueError, re.error) as error:  # pandas makes a regular expression of it
         raise BadInput(f"time_format {time_format!r} is not a strftime format: {error}; {ALLOWED}"
                        ) from None

@@ -234,3 +234,20 @@ def test_the_documented_table_is_that_of_the_code():
         fields = ", ".join(dict.fromkeys(name.rpartition(".")[2] for name in entries))
         row = f"| `{each.name}` | {each.title} | {fields} | {each.level} | {each.source} | made-up |"
         assert row in text, row
+
+
+@pytest.mark.parametrize("head", [
+    "2024-03-01, 10:00:{}.123456, 868000000, 868300000, 100000.00, 8192", "2024-03-01, 10:00:{}, 868000000.0, 868300000.0, 100000.0, 20"])
+def test_sweeps_of_other_programs(bring_in, head):
+    """A bin of Windows without power spoils a sweep where it is in the band."""
+    text = "".join(head.format(f"1{i}") + f", -30, {'-1.#J' if i == 2 else -40}, -1.#IND\n" for i in range(4))
+    given = {"time_zone": "UTC", "columns": {"x": "always 1", "y": "always 2"}, "length_unit": "m", "format": "rtl-power"}
+    assert len(imported(bring_in, text, band_hz=[868.1e6, 868.2e6], **given)[1]) == 3
+    assert list(imported(bring_in, text, band_hz=[868.0e6, 868.1e6], **given)[1]["rssi_dbm"]) == [-30] * 4
+
+
+def test_a_band_within_a_bin_has_its_power_and_its_name(bring_in):
+    text = "".join(f"2024-03-01, 10:00:1{i}, 860000000, 870000000, 5000000.00, 8192, -50, -30\n" for i in range(2))
+    given = {"time_zone": "UTC", "columns": {"x": "always 1", "y": "always 2"}, "length_unit": "m"}
+    _, table, _ = imported(bring_in, text, band_hz=[868.0e6, 868.2e6], **given)
+    assert list(table["rssi_dbm"]) == [-30, -30] and set(table["device"]) == {"865-870 MHz"}

@@ -1,24 +1,26 @@
 """Positions of receivers from tracks of their own, at the times of a log's readings."""
 
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.read_source import read_source
+from radiotwin.importing.log_files import BINARIES, TEXTS
 from radiotwin.importing.settings import HEIGHTS, Settings, TrackFile
 from radiotwin.importing.source import Source, Tally
-from radiotwin.importing.tracks.fixes import COLUMNS, Fixes, make_fixes
+from radiotwin.importing.tracks.autopilots import is_dataflash_text, read_dataflash, read_tlog
+from radiotwin.importing.tracks.fixes import COLUMNS, Fixes
 from radiotwin.importing.tracks.gnss import read_gpx, read_nmea
+from radiotwin.importing.tracks.maps import read_geojson, read_kml
 from radiotwin.importing.tracks.rosbag import is_rosbag, read_rosbag
+from radiotwin.importing.tracks.tables import read_track_table
 from radiotwin.importing.tracks.ulog import read_ulog
-from radiotwin.importing.units import ISO, seconds
 from radiotwin.io.cells import listed
-from radiotwin.links.site_table import METRES
 
-_READERS = {".gpx": read_gpx, ".nmea": read_nmea, ".nma": read_nmea, ".ulg": read_ulog}
+_READERS = {".gpx": read_gpx, ".kml": read_kml, ".nmea": read_nmea, ".nma": read_nmea,
+            ".ulg": read_ulog, ".bin": read_dataflash, ".tlog": read_tlog}
 
 
 def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
@@ -48,7 +50,7 @@ def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
         if name in links:
             without &= links[name].isna().to_numpy()
     for track in settings.track:
-        fixes = _read(track)
+        fixes = _read(track, settings.time_zone)
         notes += fixes.notes
         own = without & (links["receiver"].to_numpy() == track.receiver
                          if track.receiver else np.True_)
@@ -68,7 +70,7 @@ def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
                                    "s", "time", source.where), notes
 
 
-def _read(track: TrackFile) -> Fixes:
+def _read(track: TrackFile, zone: str | None) -> Fixes:
     path = Path(track.file)
     if is_rosbag(path):
         return read_rosbag(path, track.topic)
@@ -77,18 +79,15 @@ def _read(track: TrackFile) -> Fixes:
                        "out, or give a .bag, .mcap or .db3 file")
     if path.suffix.lower() in _READERS:
         return _READERS[path.suffix.lower()](path)
-    source = read_source(path)
-    units = {f"{name}_{unit}": (name, factor) for name in ("altitude",)
-             for unit, factor in METRES.items()}
-    units |= {f"{name}_deg": (name, 1.0) for name in ("latitude", "longitude")}
-    units |= {name: (name, 1.0) for name in COLUMNS} | {"altitude": ("altitude", 1.0)}
-    time = next((name for name in ("time_s", "time") if name in source.table), "time")
-    source.require({"time": time} | {name: name for name in ("latitude", "longitude")
-                                     if f"{name}_deg" not in source.table})
-    time_s = seconds(source, time, "epoch s" if time == "time_s" else ISO, "UTC")
-    values = {name: source.numbers(spec, name) * factor for spec, (name, factor) in units.items()
-              if spec in source.table}
-    return make_fixes(path, time_s, values)
+    if path.suffix.lower() in (".geojson", ".json") and (fixes := read_geojson(path)):
+        return fixes
+    if path.suffix.lower() in (".log", ".txt") and is_dataflash_text(path):
+        return read_dataflash(path)
+    kind = PurePath(path.name.lower().removesuffix(".gz")).suffix
+    if kind not in (*TEXTS, *BINARIES):
+        raise BadInput(f"{path}: unknown format of a track; allowed are "
+                       f"{', '.join((*_READERS, '.bag', '.mcap', '.db3', *TEXTS, *BINARIES))}")
+    return read_track_table(path, track, zone)
 
 
 def _check_common(source: Source, track: TrackFile, time_s: np.ndarray, fixes: Fixes) -> None:

@@ -1,0 +1,213 @@
+"""Tracks of ArduPilot: DataFlash logs, binary (.bin) and as text (.log), and MAVLink (.tlog).
+
+A DataFlash log describes itself: FMT messages have the name, length and fields of each kind [1].
+A telemetry log has MAVLink packets [2], each behind the time of its arrival [us, UTC].
+
+[1] ArduPilot, libraries/AP_Logger/LogStructure.h: the letters of formats
+[2] https://mavlink.io/en/guide/serialization.html and message_definitions/common.xml
+"""
+
+import math
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from radiotwin.errors import BadInput
+from radiotwin.importing.tracks.fixes import Fixes, make_fixes
+from radiotwin.io.budgets import FILE_BYTES, ROWS
+from radiotwin.io.inputs import open_input
+
+_LETTERS = {"a": "64s", "b": "b", "B": "B", "h": "h", "H": "H", "i": "i", "I": "I", "f": "f",
+            "d": "d", "n": "4s", "N": "16s", "Z": "64s", "c": "h", "C": "H", "e": "i", "E": "I",
+            "L": "i", "M": "B", "q": "q", "Q": "Q", "g": "e"}
+_FACTORS = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}
+_MAGIC, _FMT, _FMT_BYTES = b"\xa3\x95", 128, 89
+_GPS_EPOCH_S = 315_964_800  # 1980-01-06 in UTC
+_WEEK_S = 604_800.0
+_LEAPS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (1_230_768_000, 15),
+          (1_136_073_600, 14), (915_148_800, 13))
+"""Since when [s, UTC], and by how much GPS time is ahead [s] (IERS Bulletin C)."""
+_FIX_3D = 3  # GPS_Status: below it there is no height
+_POSITION, _ATTITUDE = 33, 30  # GLOBAL_POSITION_INT, ATTITUDE
+_PACKETS = {_POSITION: ("<IiiiihhhH", 104), _ATTITUDE: ("<Iffffff", 39)}
+"""Message -> its fields, and the byte that its check sum begins from (CRC_EXTRA)."""
+_ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
+
+
+def _content(path: Path) -> bytes:
+    with open_input(path, "flight log of ArduPilot", FILE_BYTES) as file:
+        return file.read()
+
+
+def is_dataflash_text(path: Path) -> bool:
+    """Return whether a text is a DataFlash log."""
+    with open_input(path, "flight log") as file:
+        return file.read(4) == b"FMT,"
+
+
+def read_dataflash(path: Path) -> Fixes:
+    """Read the positions and the attitude of a DataFlash log, binary or a text.
+
+    Raises:
+        BadInput: it has no positions with a time of GPS.
+    """
+    content = _content(path)
+    is_text = content[:4] == b"FMT,"
+    gps: list[list[float]] = []  # since start, week, since its start, place
+    attitude: list[list[float]] = []  # since start, roll, pitch, yaw
+    for name, fields in _text_messages(content) if is_text else _messages(content):
+        clock_s = fields.get("TimeUS", fields.get("TimeMS", math.nan) * 1e3) / 1e6
+        if name == "ATT":
+            attitude.append([clock_s, *(fields.get(each, math.nan)
+                                        for each in ("Roll", "Pitch", "Yaw"))])
+        elif fields.get("Status", 0) >= _FIX_3D and fields.get("I", 0) == 0:
+            gps.append([clock_s, fields.get("GWk", fields.get("Week", math.nan)),
+                        fields.get("GMS", fields.get("TimeMS", math.nan)) / 1e3,
+                        *(fields.get(each, math.nan) for each in ("Lat", "Lng", "Alt"))])
+        ROWS.check(len(gps) + len(attitude), path)
+    if not gps:
+        raise BadInput(f"{path} has no message GPS with a fix in three dimensions; is it a "
+                       "DataFlash log of ArduPilot?")
+    columns = np.array(gps, dtype=float).T
+    time_s = _GPS_EPOCH_S + columns[1] * _WEEK_S + columns[2]
+    leap_s = np.full(len(time_s), float(_LEAPS[-1][1]))
+    for since_s, number in reversed(_LEAPS):
+        leap_s[time_s - number >= since_s] = number
+    values = dict(zip(("latitude", "longitude", "altitude"), columns[3:]))
+    values |= _nearest(np.array(attitude, dtype=float).reshape(-1, 4), columns[0])
+    return make_fixes(path, time_s - leap_s, values)
+
+
+def _nearest(attitude: np.ndarray, clock_s: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the angles (n,) [degrees] at the nearest of the times of an attitude (m, 4)."""
+    if not len(attitude):
+        return {}
+    after = np.searchsorted(attitude[:, 0], clock_s).clip(0, len(attitude) - 1)
+    before = (after - 1).clip(0)
+    nearer = np.abs(attitude[before, 0] - clock_s) < np.abs(attitude[after, 0] - clock_s)
+    return dict(zip(_ANGLES, attitude[np.where(nearer, before, after), 1:].T))
+
+
+def _messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
+    """Yield the GPS and ATT messages of a binary log; damage is passed over."""
+    lengths = {_FMT: _FMT_BYTES}
+    kinds: dict[int, tuple[str, str, list[str]]] = {}
+    at = content.find(_MAGIC)
+    while 0 <= at <= len(content) - 3:
+        length = lengths.get(content[at + 2], 0)
+        if content[at:at + 2] != _MAGIC or not length:
+            at = content.find(_MAGIC, at + 1)
+            continue
+        body = content[at + 3:at + length]
+        if len(body) < length - 3:
+            return  # cut off
+        if content[at + 2] == _FMT:
+            number, own, name, letters, labels = struct.unpack("<BB4s16s64s", body)
+            lengths[number] = max(own, 3)
+            text = [part.rstrip(b"\0").decode("ascii", "replace")
+                    for part in (name, letters, labels)]
+            if text[0] in ("GPS", "ATT") and all(letter in _LETTERS for letter in text[1]):
+                kinds[number] = text[0], text[1], text[2].split(",")
+        elif content[at + 2] in kinds:
+            name_, letters_, labels_ = kinds[content[at + 2]]
+            form = "<" + "".join(_LETTERS[letter] for letter in letters_)
+            if struct.calcsize(form) == len(body):
+                yield name_, {
+                    label: value * _FACTORS.get(letter, 1.0) for label, value, letter in
+                    zip(labels_, struct.unpack(form, body), letters_)
+                    if isinstance(value, (int, float))}
+        at += length
+
+
+def _text_messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
+    """Yield the GPS and ATT messages of a log as text, whose numbers have their units."""
+    labels: dict[str, list[str]] = {}
+    for line in content.decode("ascii", "replace").splitlines():
+        fields = [field.strip() for field in line.split(",")]
+        if fields[0] == "FMT" and len(fields) > 5:
+            labels[fields[3]] = fields[5:]
+        elif fields[0] in ("GPS", "ATT") and fields[0] in labels:
+            numbers = {}
+            for label, field in zip(labels[fields[0]], fields[1:]):
+                try:
+                    numbers[label] = float(field)
+                except ValueError:
+                    continue
+            yield fields[0], numbers
+
+
+def read_tlog(path: Path) -> Fixes:
+    """Read the positions and the attitude of a telemetry log, of the vehicle with most of them.
+
+    Raises:
+        BadInput: it has no two positions.
+    """
+    positions: dict[int, list[list[float]]] = {}
+    attitudes: dict[int, list[list[float]]] = {}
+    damaged = 0
+    for time_s, system, number, body in _packets(_content(path)):
+        if body is None:
+            damaged += 1
+            continue
+        fields = struct.unpack(_PACKETS[number][0], body)
+        if number == _ATTITUDE:
+            roll, pitch, yaw = (math.degrees(value) for value in fields[1:4])
+            attitudes.setdefault(system, []).append([time_s, roll, pitch, yaw % 360])
+        else:
+            positions.setdefault(system, []).append(
+                [time_s, fields[1] * 1e-7, fields[2] * 1e-7, fields[3] * 1e-3])
+        ROWS.check(sum(map(len, positions.values())) + sum(map(len, attitudes.values())), path)
+    if not positions:
+        raise BadInput(f"{path} has no message GLOBAL_POSITION_INT; is it a telemetry log (.tlog) "
+                       "of MAVLink?")
+    system = Counter({each: len(rows) for each, rows in positions.items()}).most_common(1)[0][0]
+    columns = np.array(positions[system], dtype=float).T
+    notes = [f"{path.name}: {damaged} damaged messages are left out"] if damaged else []
+    if len(positions) > 1:
+        notes.append(f"{path.name}: of {len(positions)} vehicles number {system} is read")
+    values = dict(zip(("latitude", "longitude", "altitude"), columns[1:]))
+    values |= _nearest(np.array(attitudes.get(system, []), dtype=float).reshape(-1, 4), columns[0])
+    return make_fixes(path, columns[0], values, tuple(notes))
+
+
+def _packets(content: bytes) -> Iterator[tuple[float, int, int, bytes | None]]:
+    """Yield time [s], vehicle, message and content of the packets that are needed.
+
+    The content is None where the check sum is wrong.
+    """
+    at = 0
+    while at + 16 < len(content):
+        magic, length = content[at + 8], content[at + 9]
+        if magic == 0xFE:
+            header, number, system, end = 6, content[at + 13], content[at + 11], 2
+        elif magic == 0xFD:
+            header, system = 10, content[at + 13]
+            number = int.from_bytes(content[at + 15:at + 18], "little")
+            end = 15 if content[at + 10] & 1 else 2
+        else:
+            at += 1
+            continue
+        start = at + 8 + header
+        packet = content[at + 9:start + length]
+        check = content[start + length:start + length + 2]
+        if number in _PACKETS and len(check) == 2:
+            form, extra = _PACKETS[number]
+            size = struct.calcsize(form)
+            whole = _checksum(packet + bytes([extra])) == int.from_bytes(check, "little")
+            body = packet[header - 1:].ljust(size, b"\0")[:size]  # zeros at its end are cut off
+            time_s = int.from_bytes(content[at:at + 8], "big") / 1e6
+            yield time_s, system, number, body if whole else None
+        at = start + length + end
+
+
+def _checksum(data: bytes) -> int:
+    """Return the check sum of MAVLink, CRC-16/MCRF4XX."""
+    value = 0xFFFF
+    for byte in data:
+        low = byte ^ (value & 0xFF)
+        low = (low ^ (low << 4)) & 0xFF
+        value = (value >> 8) ^ (low << 8) ^ (low << 3) ^ (low >> 4)
+    return value
