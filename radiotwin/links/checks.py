@@ -34,6 +34,7 @@ CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions so close to each other are 
 MIN_HEAP, HEAP_RATIO = 10, 5  # equal levels that no tail has, and how far above the next values
 MAX_NAMED = 5  # names in a message
 MAX_OUTSIDE = 0.5  # share of the links
+ELSEWHERE_M = 50_000.0  # of receivers from a map: no mistake of frames or units within one place
 GROUND_M, ROOFS = 0.5, 0.95  # above it something is built; share of its corners that are roofs
 BURIED = "its height, or that of the map's ground, is off; z counts from the scene's datum"
 COPIED = "they are in the file twice"
@@ -173,15 +174,29 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
         raise BadInput(notes[both])
     if scene is None:
         return list(notes.values())
+    require_on_map(receiver_m, scene)
+    return [*notes.values(), *receiver_notes(receiver_m, scene)]
+
+
+def require_on_map(receiver_m: np.ndarray, scene: Scene) -> np.ndarray:
+    """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool, of which few may be.
+
+    Raises:
+        BadInput: most are.
+    """
     outside = outside_map(receiver_m, scene)
     if outside.mean() > MAX_OUTSIDE:
-        low, high = map_corners_m(scene)
+        low_m, high_m = map_corners_m(scene)
+        apart_m = np.hypot(*(np.nanmedian(receiver_m[:, :2], axis=0) - (low_m + high_m) / 2))
+        remedy = (f"they are {apart_m / 1000:,.0f} km from it, so it is a map of another place, or "
+                  "an origin is wrong: give the scene of the place of the measurements"
+                  if apart_m > ELSEWHERE_M else "give measurements and scene in one frame, in "
+                  "metres; feet and degrees are not converted")
         raise BadInput(
             f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, "
-            f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
-            "give measurements and scene in one frame, in metres; "
-            "feet and degrees are not converted")
-    return [*notes.values(), *receiver_notes(receiver_m, scene)]
+            f"which goes from ({low_m[0]:.0f}, {low_m[1]:.0f}) to ({high_m[0]:.0f}, "
+            f"{high_m[1]:.0f}) m: {remedy}")
+    return outside
 
 
 def unmapped_ends(receiver_m: np.ndarray, device_m: np.ndarray, scene: Scene) -> np.ndarray:

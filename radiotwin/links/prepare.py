@@ -14,9 +14,9 @@ from radiotwin.links.checks import (
     check_positions,
     copied_rows,
     find_fill_value,
-    outside_map,
     receiver_notes,
     refuse_empty_levels,
+    require_on_map,
     require_one_frame,
     unheard_devices,
     unmapped_ends,
@@ -48,14 +48,14 @@ def join_links(measurements: Measurements, scene: Scene) -> Links:
         n links; positions of unknown devices are NaN in x and y, whatever the file gives.
 
     Raises:
-        BadInput: measurements and scene are in different frames.
+        BadInput: measurements and scene are in different frames, or most receivers off the map.
     """
     require_one_frame(measurements, scene)
     device_m = measurements.device_m.copy()
     device_m[~measurements.is_anchor, :2] = np.nan
     receiver_m = measurements.receiver_m
+    outside = require_on_map(receiver_m, scene)
     notes = [*measurements.notes, *receiver_notes(receiver_m, scene)]
-    outside = outside_map(receiver_m, scene)
     if outside.any():
         notes.append(f"{outside.sum():,} of {len(outside):,} links have their receiver outside the "
                      "3D map")

@@ -93,10 +93,13 @@ def test_an_anchor_just_below_a_roof_of_the_map_stands_on_it(small_scene, flown)
     np.testing.assert_allclose(below_db, above_db, atol=0.02)
 
 
-def test_receivers_off_the_map_are_mentioned(small_scene, flown):
-    table = flown.table.assign(receiver_x_m=flown.table["receiver_x_m"] + 5000)
-    with pytest.warns(UserWarning, match="outside the 3D map"):
-        fit_twin(Measurements(table, flown.devices), small_scene, model="log_distance", seed=0)
+def test_few_receivers_off_the_map_are_mentioned_and_a_map_of_another_place_is_refused(small_scene, flown):
+    few = np.arange(len(flown.table)) % 5 == 0
+    for moved_m, off, said in ((9e6, True, r"\(\d+, \d+\) m: they are 9,000 km from it, so it is a map of another place"),
+                               (5e3, True, "give measurements and scene in one frame"), (5e3, few, None)):
+        table = flown.table.assign(receiver_x_m=flown.table["receiver_x_m"] + moved_m * off)
+        with pytest.raises(BadInput, match=said) if said else pytest.warns(UserWarning, match="outside the 3D map"):
+            fit_twin(Measurements(table, flown.devices), small_scene, model="log_distance", seed=0)
 
 
 def test_a_twin_of_another_scene_is_warned_of(small_scene, flown, twin):
