@@ -231,9 +231,10 @@ def clock_notes(links: pd.DataFrame) -> list[str]:
         own = own.dropna().drop_duplicates(columns[0:1] + columns[2:]).sort_values("time_s",
                                                                                  kind="stable")
         step_s = np.diff(own["time_s"].to_numpy())
+        between_s = step_s + _resolution_s(own["time_s"].to_numpy())
         step_m = np.linalg.norm(np.diff(own[columns[2:]].to_numpy(), axis=0), axis=1)
         near = step_s <= NEAR_S
-        apart = near & (step_m > ELSEWHERE_M + FAST_M_S * step_s)
+        apart = near & (step_m > ELSEWHERE_M + FAST_M_S * between_s)
         if apart.sum() < max(MIN_PAIRS, MIN_SHARE * near.sum()):
             continue
         flight = own["flight"].to_numpy()
@@ -251,6 +252,11 @@ def clock_notes(links: pd.DataFrame) -> list[str]:
                 f"flight {flight[at[0]]!r}): its clock began anew, or it is several receivers; "
                 "split the log where the clock goes back, or name them")
     return notes
+
+
+def _resolution_s(time_s: np.ndarray) -> float:
+    """Return the unit that times (n,) are cut to [s]: 1 or 60, else 0."""
+    return next((unit_s for unit_s in (60.0, 1.0) if not np.any(time_s % unit_s)), 0.0)
 
 
 def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:

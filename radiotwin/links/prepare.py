@@ -142,8 +142,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     least, heard = 1 if to_locate else MIN_LINKS, int(np.isfinite(level_db[keep]).sum())
     if keep.sum() < least or heard < least // 2:
         raise BadInput(f"{int(keep.sum())} links can be used, {heard} of them detected; at least "
-                       f"{least} are needed, {least // 2} of them detected: "
-                       + ("; ".join(notes) or "measure more"))
+                       f"{least} are needed" + f", {least // 2} of them detected" * (least > 1)
+                       + ": " + ("; ".join(notes) or "measure more"))
     refuse_empty_levels(level_db[keep], measurements.level_column)
     device = (np.cumsum(placed) - 1)[device_index[keep]]
     links = _join(measurements, table[keep], scene, level_db[keep], receiver_m[keep],

@@ -10,7 +10,7 @@ import pandas as pd
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_geographic, to_local
 from radiotwin.inference.student import sd_of_scale
-from radiotwin.io.cells import as_numbers, read_cells, refuse
+from radiotwin.io.cells import as_numbers, listed, read_cells, refuse
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, link_geometry, prepare_links
 from radiotwin.links.alignment import in_known_frame
@@ -19,12 +19,14 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import TwinDevice, locate, misfit, whole_area
+from radiotwin.twin.localize.without_map import MIN_LINKS
 from radiotwin.twin.model.model import CHANNEL_DOF, FittedModel
 from radiotwin.twin.twin import Twin
 
 NOT_BY_PATHS = ("and following paths from every position where a device may be takes too long: "
-                "locate cannot use such a twin. close-loop --base twin makes one for it, and "
-                "fit --model raytrace locates devices along with the twin")
+                "locate uses its law of distance and line of sight alone. close-loop --base twin "
+                "makes one whose effects it uses, too, and fit --model raytrace locates devices "
+                "along paths")
 MAX_NAMED = 5  # receivers in a note
 TRUTH_COLUMNS = ("x_m", "y_m"), ("latitude", "longitude")
 MAX_PROBES = 2000  # links by which a channel's error scale is looked up
@@ -39,11 +41,8 @@ def check_can_locate(twin: Twin, scene: Scene | None) -> None:
         scene: the 3D map that devices are to be located with.
 
     Raises:
-        BadInput: it follows paths, or it was fitted with a map and none is given, or the other way
-            round.
+        BadInput: it was fitted with a map and none is given, or the other way round.
     """
-    if twin.channel.follows_paths:
-        raise BadInput(f"the twin's base is 'raytrace', {NOT_BY_PATHS}")
     twin.require_map(scene)
 
 
@@ -68,6 +67,7 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
     check_can_locate(twin, scene)
     measurements = in_known_frame(measurements, twin.origin, "the twin")
     unknown = measurements.select(~measurements.is_anchor[measurements.device_index])
+    unknown = replace(unknown, devices=unknown.devices[~unknown.is_anchor].reset_index(drop=True))
     if unknown.table.empty:
         raise BadInput("no link is to a device of role unknown; set the role of those that are to "
                        "be found in devices.csv")
@@ -77,11 +77,13 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
     links = prepare_links(unknown, scene, to_locate=True)
     declared, assumed = as_learnt(links.device_names, links.declared, twin.declared, scene)
     links = links.with_ends(declared=declared).with_notes(*assumed)
-    alone = twin.fitted.is_channel_alone
+    alone = twin.fitted.is_channel_alone or twin.channel.follows_paths
     model = _by_channel(twin, links) if alone else twin.fitted.for_positions()
     strangers = [name for name in links.receiver_names if name not in model.receivers]
     notes = list(links.notes)
-    if alone:
+    if twin.channel.follows_paths:
+        notes.append(f"the twin follows paths, {NOT_BY_PATHS}")
+    elif alone:
         notes.append("the twin is of `radiotwin fit`, which does not learn how far links of one "
                      "device err alike: the devices may be farther away than their radii say. "
                      "Radii of a twin of `radiotwin close-loop` allow for it")
@@ -105,6 +107,11 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
         found = [replace(each, credible_radius_m=widening * each.credible_radius_m)
                  for each in found]
     count = dict(zip(links.device_names, np.bincount(links.device)))
+    lost = [f"{name} ({links_of})" for name, links_of in count.items()
+            if links_of and name not in {each.device for each in found}]
+    if lost:
+        notes.append(f"not located, for want of links (at least {MIN_LINKS} are needed): "
+                     f"{listed(lost)}")
     table = pd.DataFrame({"device": [each.device for each in found],
                           "x_m": [each.x_m for each in found], "y_m": [each.y_m for each in found],
                           "radius_m": [each.credible_radius_m for each in found],
@@ -130,11 +137,12 @@ def _by_channel(twin: Twin, links: Links) -> FittedModel:
     """Return a channel with the errors that it states, as it was fitted, for devices anywhere.
 
     Args:
-        twin: of `radiotwin fit`.
+        twin: of `radiotwin fit`, or one that follows paths, whose law is returned.
         links: to be located by; the channel's errors are those of the twin's devices at their
             receivers.
     """
-    channel, known = twin.channel.trend, np.isfinite(twin.device_m).all(axis=1)
+    channel = twin.channel.quick if twin.channel.follows_paths else twin.channel.trend
+    known = np.isfinite(twin.device_m).all(axis=1)
     rows = np.unique(np.linspace(0, len(links) - 1, MAX_PROBES).astype(int))
     device = np.flatnonzero(known)[np.arange(len(rows)) % known.sum()]
     probes = link_geometry(twin.device_m, links.receiver_m[rows], device, links.city,
@@ -218,7 +226,8 @@ def position_errors(positions: pd.DataFrame, truth: pd.DataFrame) -> dict[str, f
     both = positions.merge(truth[["device", "x_m", "y_m"]].dropna(), on="device",
                            suffixes=("", "_true"))
     if both.empty:
-        raise BadInput("the table of true positions has none of the located devices")
+        raise BadInput("the table of true positions has none of the located devices: it has "
+                       f"{listed(truth['device'])}, and located are {listed(positions['device'])}")
     error_m = np.hypot(both["x_m"] - both["x_m_true"], both["y_m"] - both["y_m_true"])
     return {"devices": len(both), "median_m": float(error_m.median()),
             "ninety_m": float(error_m.quantile(0.9)),

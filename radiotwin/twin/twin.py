@@ -393,10 +393,11 @@ class Twin(Summarised):
         """
         if scene is not None:
             self.require_frame(scene)
-        if self.channel.follows_paths or not self.channel.uses_map:
+        if not self.channel.uses_map:
             return
         # A level and a slope for each class; without any, `radiotwin fit` made it with a map.
-        with_map = self.fitted.is_channel_alone or len(self.fitted.level_coefficients) > 2
+        with_map = (self.channel.follows_paths or self.fitted.is_channel_alone
+                    or len(self.fitted.level_coefficients) > 2)
         if with_map and scene is None:
             raise BadInput(f"the twin was made with a 3D map (scene "
                            f"{self.provenance.get('scene', 'unknown')}), and none is given; give "

@@ -106,6 +106,8 @@ def test_clocks_that_are_right_are_not_told():
     assert not clock_notes(links_of(x_m, np.full(200, -80.0)))
     twice = pd.concat([links_of(x_m, np.full(200, -80.0)), links_of(x_m, np.full(200, -70.0), device="e", flight="g")])
     assert not clock_notes(twice)  # two files of one drive
+    fast = links_of(np.arange(600) * 45.0, np.full(600, -80.0), time_s=np.arange(600) // 2)  # 90 m/s, two a second
+    assert not clock_notes(fast) and clock_notes(fast.assign(time_s=fast["time_s"] + 0.01))
     jump = links_of(np.r_[x_m, 1e5], np.full(201, -80.0))
     assert not clock_notes(jump)  # one bad fix
     assert not clock_notes(links_of([0, 1], [-80, -80]).drop(columns="time_s"))
