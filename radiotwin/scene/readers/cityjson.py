@@ -8,6 +8,7 @@ packages only.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,11 @@ def cityjson_map(path: Path, documents: Sequence[Any], crs: str | None = None) -
         objects += _objects(path, document, *transform)
     metadata = head.get("metadata")
     system = metadata.get("referenceSystem") if isinstance(metadata, dict) else None
-    return city_features(path, objects, [system] if isinstance(system, str) else [], crs)
+    found = city_features(path, objects, [system] if isinstance(system, str) else [], crs)
+    known = [one.get("attributes") for document in documents
+             for one in document["CityObjects"].values()]
+    return replace(found, columns={str(key) for each in known if isinstance(each, dict)
+                                   for key in each})
 
 
 def _transform(path: Path, head: Mapping) -> tuple[np.ndarray, np.ndarray]:
@@ -93,12 +98,11 @@ def _names(value: Any) -> list[str]:
 
 
 def _attributes(known: Any) -> dict[str, str]:
-    """Return what is a number or a text."""
+    """Return what is a number, a text, or true or false."""
     if not isinstance(known, dict):
         return {}
     return {str(key).lower(): f"{value:g}" if isinstance(value, float) else str(value)
-            for key, value in known.items()
-            if isinstance(value, str | int | float) and not isinstance(value, bool)}
+            for key, value in known.items() if isinstance(value, str | int | float)}
 
 
 def _geometries(geometry: Mapping, corners: np.ndarray) -> Iterator[Geometry]:

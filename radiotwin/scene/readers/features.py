@@ -33,7 +33,8 @@ _BELOW = {  # tag or column -> its values of what lies below the ground
     "location": ("underground",), "is_underground": ("true", "yes", "1"),
     "tunnel": ("yes", "true", "1"), "relativetoterrain": ("entirelybelowterrain",),
     "ofl": ("1200",), "lagezurerdoberflaeche": ("1200",)}
-_LEVELS = ("layer", "level", "relatievehoogteligging", "relatieve_hoogteligging")  # 0: the ground
+# At the ground: 0
+_LEVELS = ("layer", "level", "max_level", "relatievehoogteligging", "relatieve_hoogteligging")
 READ_TAGS = frozenset((*BUILDING_KEYS, *_BELOW, *_LEVELS, "indoor", "has_parts", "building_id",
                        "building:levels:underground", "other_tags"))
 _LEVEL_RANGE = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*(?:-\s*(-?\d+(?:\.\d+)?)\s*)?")

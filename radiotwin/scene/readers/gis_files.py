@@ -101,6 +101,12 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
     """Return the polygons of a GeoJSON geometry, or the points of another type; None: none."""
     kind = geometry.get("type")
     coordinates: Any = geometry.get("coordinates")  # unchecked: no list raises TypeError below
+    members = geometry.get("geometries")
+    if kind == "GeometryCollection" and isinstance(members, list):
+        areas = [_polygons(path, number, one) for one in members if isinstance(one, dict)
+                 and one.get("type") in ("Polygon", "MultiPolygon")]
+        return shapely.MultiPolygon([part for area in areas for part in shapely.get_parts(area)]
+                                    ) if areas else None
     if kind not in ("Polygon", "MultiPolygon"):
         return _points(coordinates)
     try:

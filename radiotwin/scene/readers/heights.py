@@ -40,6 +40,7 @@ ALIASES = {key.replace(":", "_"): key for key in (
     "min_floor": "building:min_level", "num_floors_underground": "building:levels:underground",
     "facade_material": "building:material", "hasparts": "has_parts", "minheight": "min_height"}
 ESTIMATED = "est_height"
+HIGHEST = "max_level"  # storey, of which the one at the ground is 0: Simple Indoor Tagging
 ROOFLESS = ("building:levels", "num_floors")  # storeys that do not count those of the roof
 TAG_SD_M, STOREYS_SD_M = 1.5, 3.0  # of a height that is given in metres; counted from storeys
 GUESS_SD_M = 6.0  # of a default, where few heights of the map are known
@@ -94,7 +95,7 @@ KNOWN = (
     *(HeightColumn(name, STOREYS) for name in (
         "building:levels", "num_floors", "storeysaboveground", "b3_bouwlagen", "numfloors",
         "nombre_d_etages", "nb_etages", "numberoffloorsaboveground", "aog", "geschosse",
-        "storeys", "stories", "floors", "levels")))
+        "storeys", "stories", "floors", "levels", HIGHEST)))
 """Known columns; of a building, the first usable one counts."""
 READ_COLUMNS = frozenset(name for column in KNOWN for name in (column.name, column.ground)) | {
     "roof:height", "roof:levels", "min_height", "building:min_level"}
@@ -289,6 +290,7 @@ def _top_m(column: HeightColumn, tags: Mapping[str, str]) -> float:
     """Return the top above the ground [m]; NaN where a text is no number."""
     unit_m = UNITS_M[column.unit]
     top = parse_length_m(tags[column.name]) if column.unit == "m" else number(tags[column.name])
+    top += column.name == HIGHEST
     ground = parse_length_m(tags[column.ground]) if column.ground else 0.0
     return unit_m * (top - ground)
 

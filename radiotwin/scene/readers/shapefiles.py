@@ -24,7 +24,7 @@ from shapely.geometry.base import BaseGeometry
 from radiotwin.errors import BadInput, optional_package
 from radiotwin.io.budgets import COLUMNS, ENTRIES, FEATURES, FILE_BYTES, OUTLINE_CORNERS, VERTICES
 from radiotwin.io.inputs import open_input, read_bytes, require_within
-from radiotwin.scene.checks import Problem
+from radiotwin.scene.checks import Problem, listed
 from radiotwin.scene.readers.city_objects import (
     CityObject,
     Geometry,
@@ -183,11 +183,13 @@ def _beside(path: Path) -> dict[str, bytes]:
 def _archived(path: Path) -> dict[str, dict[str, bytes]]:
     """Return name and parts of each Shapefile in a ZIP archive."""
     layers: dict[str, dict[str, bytes]] = {}
+    names: list[str] = []
     read = 0
     try:
         with open_input(path, "ZIP archive of Shapefiles") as file, \
                 zipfile.ZipFile(file) as archive:
             ENTRIES.check(len(archive.infolist()), path)
+            names = archive.namelist()
             for info in archive.infolist():
                 name = PurePosixPath(info.filename)
                 if name.suffix.lower() not in _PARTS or name.parts[0] == "__MACOSX":
@@ -202,7 +204,8 @@ def _archived(path: Path) -> dict[str, dict[str, bytes]]:
         raise BadInput(f"{path} is not a readable ZIP archive ({error}); pack it again") from None
     found = {name: files for name, files in layers.items() if ".shp" in files}
     if not found:
-        raise BadInput(f"{path} holds no .shp file; give an archive of a Shapefile")
+        raise BadInput(f"{path} holds no .shp file; give an archive of a Shapefile, or unpack it "
+                       f"and give what it holds ({listed(names)})")
     return found
 
 

@@ -46,6 +46,13 @@ def test_courtyards_and_wings(tmp_path):
     assert [len(part.interiors) for part in one.area.geoms] == [1, 0]
 
 
+def test_polygons_of_a_collection_of_geometries(tmp_path):
+    parts = [{"type": "Point", "coordinates": SQUARE[0]}, {"type": "Polygon", "coordinates": [SQUARE]}]
+    (one,) = read(tmp_path, collection({"type": "Feature", "properties": {}, "geometry": {
+        "type": "GeometryCollection", "geometries": parts}})).features
+    assert one.area.bounds == pytest.approx((8.7, 47.5, 8.7002, 47.5001))
+
+
 @pytest.mark.parametrize(("text", "message"), [
     ("{", "not readable JSON"), ("[]", "not a GeoJSON FeatureCollection"), ("[" * 100_000, "levels of nesting"),
     (collection(1), "feature 1 is not a GeoJSON feature"),

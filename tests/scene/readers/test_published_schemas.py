@@ -7,6 +7,7 @@ import pytest
 
 from radiotwin.scene.readers import build_scene
 from radiotwin.scene.readers.features import INDOORS, UNDERGROUND, hidden
+from tests.scene.readers import city_models
 from tests.scene.readers.test_height_columns import box
 
 
@@ -28,7 +29,7 @@ def geojson(tmp_path, rows):
     {"location": "underground", "height": "8"}, {"layer": "-1", "building:levels": "1"}, {"level": "-2;-1"},
     {"level": "-3--1"}, {"tunnel": "yes"}, {"building:levels": "0", "building:levels:underground": "3"},
     {"min_height": "-6", "height": "0"}, {"min_height": "-9", "height": "-3"}, {"is_underground": "True"},
-    {"relativetoterrain": "entirelyBelowTerrain"}, {"ofl": "1200"}, {"relatievehoogteligging": "-1"}])
+    {"max_level": "-1", "min_level": "-3"}, {"relativetoterrain": "entirelyBelowTerrain"}, {"ofl": "1200"}, {"relatievehoogteligging": "-1"}])
 def test_what_lies_below_the_ground(tags):
     found = hidden("way/1", {"building": "yes"} | tags, None)
     assert found is not None and found.reason == UNDERGROUND and found.name.startswith("way/1: ")
@@ -90,3 +91,16 @@ def test_parts_of_overture_replace_their_building(tmp_path):
 def test_a_building_id_of_a_city_makes_no_part(tmp_path):
     table, _ = built(tmp_path, geojson(tmp_path, [(0, {"building_id": 7, "height": 9})]))
     assert table["top_m"].to_dict() == {"feature 1": 9.0}
+
+
+def test_the_highest_storey_of_indoor_tagging(tmp_path, empty_map):
+    table, _ = built(tmp_path, empty_map.box(0, 0, 20, 20, min_level="-2", max_level="4").write(tmp_path / "a.osm"))
+    assert table["top_m"].to_dict() == {"way/1": 15.0}  # 0 to 4
+
+
+def test_what_a_city_model_has_below_the_ground(tmp_path):
+    model = city_models.cityjson([(0, 0, 1.2), (50, 0, 1.2)])
+    model["CityObjects"][max(model["CityObjects"])]["attributes"] = {"relativeToTerrain": "entirelyBelowTerrain"}
+    (tmp_path / "a.city.json").write_text(json.dumps(model))
+    table, told = built(tmp_path, tmp_path / "a.city.json")
+    assert len(table) == 1 and "1 building(s) lie below the ground" in told
