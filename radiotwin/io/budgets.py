@@ -103,7 +103,7 @@ TERRAIN_BLOCK_BYTES = Budget("TERRAIN_BLOCK_BYTES", 512 * 2**20, "bytes",
                              "one block of a terrain raster")
 CROSSINGS = Budget("CROSSINGS", 2_000, "crossings of outlines with themselves", "a map")
 OVERLAPS = Budget("OVERLAPS", 20_000, "pairs of buildings that overlap", "a map")
-PART_PAIRS = Budget("PART_PAIRS", 2_000_000, "pairs of a building or part and one around it",
+PART_PAIRS = Budget("PART_PAIRS", 2_000_000, "pairs of a building, part or roof and one around it",
                     "a map: so many lie on top of each other")
 TOUCHING_CORNERS = Budget("TOUCHING_CORNERS", 5_000_000,
                           "corners in pairs of buildings that touch", "a map")

@@ -59,6 +59,19 @@ def _embree_scene(triangles: np.ndarray) -> Any:
     return scene
 
 
+def _distinct(triangles: np.ndarray) -> np.ndarray:
+    """Return the indices of triangles (n, 3, 3) in single precision without their copies.
+
+    Embree looks at all copies of a triangle for every ray that meets one.
+    """
+    words = np.ascontiguousarray(triangles).reshape(len(triangles), 9).view(np.uint32)
+    factors = np.random.default_rng().integers(1, 2**63, 9, dtype=np.uint64)
+    _, first, kind = np.unique(words @ factors, return_index=True, return_inverse=True)
+    original = first[kind]
+    is_copy = (original < np.arange(len(words))) & (words == words[original]).all(axis=1)
+    return np.flatnonzero(~is_copy)
+
+
 class CityMap:
     """Triangles of a city with outward normals, and queries along rays.
 
@@ -91,7 +104,8 @@ class CityMap:
             np.asarray(terrain, dtype=bool)
         self.height_sd_m = None if height_sd_m is None else np.asarray(height_sd_m, dtype=float)
         triangles = self.vertices[self.faces]
-        self._scene = _embree_scene(triangles)
+        self._drawn = _distinct(triangles.astype(np.float32))
+        self._scene = _embree_scene(triangles[self._drawn])
         self._normals = np.cross(triangles[:, 1] - triangles[:, 0],
                                  triangles[:, 2] - triangles[:, 0])
         self._top_m = float(self.vertices[:, 2].max()) + 1.0
@@ -405,7 +419,7 @@ class CityMap:
                                     length_m[part].astype(np.float32), query="INTERSECT",
                                     output=True)
             hit = np.flatnonzero(found["primID"] >= 0)
-            face[start + hit] = faces = found["primID"][hit]
+            face[start + hit] = faces = self._drawn[found["primID"][hit]]
             distance[start + hit] = found["tfar"][hit]
             cosine[start + hit] = np.einsum("ij,ij->i", towards[hit], self._normals[faces])
         return distance, face, cosine

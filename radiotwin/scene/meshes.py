@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from radiotwin.errors import BadInput
-from radiotwin.io.budgets import CORNERS, DOCUMENT_BYTES, FACES, SHAPES, VERTICES
+from radiotwin.io.budgets import CORNERS, CROSSINGS, DOCUMENT_BYTES, FACES, SHAPES, VERTICES
 from radiotwin.io.inputs import read_bytes
 from radiotwin.scene.mitsuba_xml import DeclaredShape, read_vector
 from radiotwin.scene.ply import read_ply
@@ -23,6 +23,8 @@ WELD_M = 1e-4  # vertices equal when rounded to this are one; float32 resolves 6
 # Height of a triangle over its longest side below which its normal is numerical noise
 _MIN_ASPECT = 1e-6
 _MAX_NAME = 200  # characters of an object or a material
+_FEW_CORNERS = 200  # of a face: cutting it takes a hundredth of a second, however it crosses itself
+_SEGMENTS_AT_ONCE = 256
 # In the file's units: a city in UTM coordinates and millimetres reaches 10^10
 _MAX_COORDINATE = 1e11
 
@@ -171,11 +173,29 @@ def cut_polygon(corners: np.ndarray, ends: Sequence[int]) -> np.ndarray:
     # Twice its area, as a vector (Newell)
     normal = np.cross(outline - outline[0], np.roll(outline, -1, axis=0) - outline[0]).sum(axis=0)
     flat = np.ascontiguousarray(np.delete(corners, int(np.abs(normal).argmax()), axis=1))
+    if len(flat) > _FEW_CORNERS:
+        _check_crossings([flat[first:last] for first, last in zip((0, *ends[:-1]), ends)])
     ears: Any = mapbox_earcut.triangulate_float64(flat, np.array(ends, dtype=np.uint32))
     triangles = ears.astype(np.int64).reshape(-1, 3)
     a, b, c = corners[triangles].swapaxes(0, 1)
     turned = np.cross(b - a, c - a).sum(axis=0) @ normal < 0
     return _with_left_out_corners(triangles[:, ::-1] if turned else triangles, ends)
+
+
+def _check_crossings(rings: list[np.ndarray]) -> None:
+    """Raise BadInput if a polygon (rings of (n, 2) corners) crosses itself too often.
+
+    Earcut takes a time by the square of the corners then, or more.
+    """
+    import shapely
+
+    from radiotwin.scene.vegetation import count_meetings
+
+    if not shapely.Polygon(rings[0], rings[1:]).is_valid:
+        segments: Any = shapely.linestrings(np.concatenate(
+            [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings]))
+        count_meetings(segments, _SEGMENTS_AT_ONCE, lambda count: CROSSINGS.check(
+            count, f"a face of {len(segments):,} corners"))
 
 
 def _with_left_out_corners(triangles: np.ndarray, ends: Sequence[int]) -> np.ndarray:

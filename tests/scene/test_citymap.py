@@ -129,3 +129,15 @@ def test_metres_inside_count_overlapping_solids_once():
     city = CityMap(both.vertices, both.faces)
     np.testing.assert_allclose(city.metres_inside([[3, 3, 5.0], [-1, 3, 5]], [[13, 3, 5.0], [13, 3, 5]]), [7, 10],
                                atol=0.1)
+
+
+def test_copies_of_a_building_change_nothing(random_links):
+    """Two boxes, and each twenty times in the same place, in any order: the same sight, heights and insides."""
+    boxes = [(100, 100, 200, 220, 30), (300, 400, 380, 500, 45)]
+    city, copies = city_of(boxes), city_of([*boxes, *boxes[::-1] * 10])
+    a_m, b_m = (end[:3000] for end in random_links)
+    np.testing.assert_array_equal(copies.line_of_sight(a_m, b_m), city.line_of_sight(a_m, b_m))
+    np.testing.assert_array_equal(copies.height_at(a_m[:, 0], a_m[:, 1]), city.height_at(a_m[:, 0], a_m[:, 1]))
+    np.testing.assert_array_equal(copies.inside(a_m), city.inside(a_m))
+    first = copies.first_face(a_m, b_m)
+    assert set(first.tolist()) <= {-1, *range(24)} and (first >= 0).any()

@@ -231,7 +231,7 @@ def build_scene_from_map(
             *(problem.message for problem in left_out)]))
     features = _within(found.features, map_options.bbox_deg, path)
     SHAPES.check(len(features), path)
-    check_crowding(features, path)
+    check_crowding(shapely.bounds([feature.area for feature in features]), path)
     origin = options.origin or _origin(features, map_options.bbox_deg)
     _check_sizes(features, origin, path)
     if map_options.height_column is not None:

@@ -11,12 +11,13 @@ import mapbox_earcut
 import numpy as np
 import shapely
 import trimesh
-from manifold3d import Manifold, Mesh64, OpType
+from manifold3d import Manifold, OpType
 
+from radiotwin.errors import BadInput
 from radiotwin.runtime.console import progress
 from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import clean, connected, is_volume
-from radiotwin.scene.readers.solids import GRID_M, Contacts, Prism
+from radiotwin.scene.readers.solids import GRID_M, Contacts, Prism, closed_solid
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 MIN_ROOF_COSINE = 0.2  # of a roof's normal to the vertical: the steepest have about 78 degrees
@@ -146,7 +147,11 @@ def _extruded(area: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
     height_m = np.repeat([bottom_m, top_m], n)
     vertices = np.column_stack([np.tile(points, (2, 1)), height_m])
     faces = np.concatenate([roof[:, ::-1], roof + n, walls])
-    return Manifold(Mesh64(vertices, faces.astype(np.uint64)))
+    solid = closed_solid(vertices, faces)
+    if solid is None:
+        raise BadInput(f"the outline around x = {points[0, 0]:.1f} m, y = {points[0, 1]:.1f} m "
+                       "cannot be cut into triangles; simplify it in the map, or leave it out")
+    return solid
 
 
 def _mesh(solid: Manifold) -> trimesh.Trimesh:

@@ -183,19 +183,16 @@ def _is_set(tags: Mapping[str, str], key: str) -> bool:
     return tags.get(key, "").strip().lower() not in ("", "no", "none", "false", "0")
 
 
-def check_crowding(features: Sequence[Feature], source: object) -> None:
-    """Raise BadInput if too many features lie on top of each other.
+def check_crowding(bounds: np.ndarray, source: object) -> None:
+    """Raise BadInput if too many things, by their bounds (n, 4), lie on top of each other.
 
     In a city the middle of a building lies in the boxes around a few: itself, what it is a part of.
     """
-    bounds_deg = shapely.bounds([feature.area for feature in features])
-    bounds_deg = bounds_deg[np.isfinite(bounds_deg).all(axis=1)]
-    if len(bounds_deg) == 0:
-        return
-    tree = shapely.STRtree(shapely.box(*bounds_deg.T))  # type: ignore[arg-type]
-    middles: Any = shapely.points((bounds_deg[:, :2] + bounds_deg[:, 2:]) / 2)
-    found = 0
-    for start in range(0, len(bounds_deg), _CHUNK):
+    bounds = bounds[np.isfinite(bounds).all(axis=1)]
+    boxes: Any = shapely.box(*bounds.T)
+    middles: Any = shapely.points((bounds[:, :2] + bounds[:, 2:]) / 2)
+    tree, found = shapely.STRtree(boxes), 0
+    for start in range(0, len(bounds), _CHUNK):
         found += tree.query(middles[start:start + _CHUNK]).shape[1]
         PART_PAIRS.check(found, source)
 

@@ -21,7 +21,7 @@ from radiotwin.io.forms import Origin
 from radiotwin.scene.checks import Problem, Severity
 from radiotwin.scene.materials import Material, MaterialTable
 from radiotwin.scene.meshes import clean, cut_polygon, is_closed, triangulate
-from radiotwin.scene.readers.features import Feature, Shell, problems_of
+from radiotwin.scene.readers.features import Feature, Shell, check_crowding, problems_of
 from radiotwin.scene.readers.heights import KNOWN, MAX_HEIGHT_M, Height, HeightColumn, height_of
 from radiotwin.scene.surfaces import Surfaces
 
@@ -345,7 +345,7 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
         vertices, faces = _triangulate(shell, corners_m)
         faces_so_far += len(faces)
         FACES.check(faces_so_far, "the map")
-        area = _footprint(vertices, faces)
+        area = _footprint(vertices, faces, feature.name)
         if area.area < SLIVER_AREA_M2:
             defects.add("no footprint", feature.name)
             continue
@@ -389,9 +389,13 @@ def _triangulate(shell: Shell, points_m: np.ndarray) -> tuple[np.ndarray, np.nda
     vertices, same = np.unique(vertices, axis=0, return_inverse=True)
     same = same.reshape(-1)
     whole: dict[int, list[np.ndarray]] = {}  # outlines without holes, by their corners
-    faces = [np.zeros((0, 3), dtype=np.int64)]
-    for rings in shell.polygons:
-        rings = [ring[ring != np.roll(ring, 1)] for ring in (same[each] for each in rings)]
+    faces, seen = [np.zeros((0, 3), dtype=np.int64)], set()
+    for polygon in shell.polygons:
+        rings = [same[ring] for ring in polygon]
+        if (key := tuple(ring.tobytes() for ring in rings)) in seen:  # it is in the file twice
+            continue
+        seen.add(key)
+        rings = [ring[ring != np.roll(ring, 1)] for ring in rings]
         rings = [rings[0], *(ring for ring in rings[1:] if len(ring) > 2)]
         corners = np.concatenate(rings)
         CORNERS.check(len(corners), "the map")
@@ -405,14 +409,16 @@ def _triangulate(shell: Shell, points_m: np.ndarray) -> tuple[np.ndarray, np.nda
     return vertices, np.concatenate(faces)
 
 
-def _footprint(vertices: np.ndarray, faces: np.ndarray) -> shapely.MultiPolygon:
+def _footprint(vertices: np.ndarray, faces: np.ndarray, name: str) -> shapely.MultiPolygon:
     """Return what a building covers, seen from above."""
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     level = np.abs(normals[:, 2]) > _WALL_SINE * np.linalg.norm(normals, axis=1)
     if not level.any():
         return shapely.MultiPolygon()
-    flat: Any = shapely.polygons(corners[level][:, :, :2])
+    plan = corners[level][:, :, :2]
+    check_crowding(np.concatenate([plan.min(axis=1), plan.max(axis=1)], axis=1), name)
+    flat: Any = shapely.polygons(plan)
     area = shapely.union_all(shapely.set_precision(flat, GRID_M))
     parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
     return shapely.MultiPolygon(parts)
@@ -422,12 +428,12 @@ def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
     """Return the surfaces, as a solid where they are closed, and whether they are."""
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], faces.reshape(-1, 3)
-    solid = _solid(vertices, faces)
+    solid = closed_solid(vertices, faces)
     if solid is None:  # surfaces that stand beside a solid may face either way
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         trimesh.repair.fix_winding(mesh)
         faces = np.asarray(mesh.faces)
-        solid = _solid(vertices, faces)
+        solid = closed_solid(vertices, faces)
     if solid is not None:
         return Body(solid, None), True
     cleaned = clean(vertices, faces)[:2]
@@ -435,7 +441,7 @@ def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
     return Body(None, (cleaned[0], surfaces.turned(surfaces.inward()).faces)), False
 
 
-def _solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold | None:
+def closed_solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold | None:
     """Return the solid that triangles enclose; None where they do not.
 
     manifold3d reads beyond its memory where an edge has no partner.

@@ -102,6 +102,30 @@ def test_empty_flat_and_repeated_shells(tmp_path, shell):
         pass
 
 
+def test_surfaces_that_are_in_the_file_many_times_count_once(tmp_path):
+    model = without_semantics()
+    model["CityObjects"]["B0-0"]["geometry"][0]["boundaries"][0] = surfaces(model) * 2000
+    report = city(tmp_path, model)
+    assert not report.problems and dict(report.facts)["buildings"] == "1 in 1 blocks"
+
+
+def test_surfaces_on_top_of_each_other(tmp_path):
+    rng, model = np.random.default_rng(0), without_semantics()
+    model["vertices"] = rng.integers(0, 10_000, (9000, 3)).tolist()
+    model["CityObjects"]["B0-0"]["geometry"] = [{
+        "type": "MultiSurface", "lod": "2", "boundaries": np.arange(9000).reshape(-1, 1, 3).tolist()}]
+    with pytest.raises(BadInput, match="B0: .* pairs of a building, part or roof and one around it"):
+        city(tmp_path, model)
+
+
+def test_a_face_that_crosses_itself_everywhere(tmp_path):
+    rng = np.random.default_rng(0)
+    lines = [f"v {x:g} {y:g} 5" for x, y in 100 * rng.random((1000, 2))] + ["f " + " ".join(map(str, range(1, 1001)))]
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    with pytest.raises(BadInput, match="a face of 1,000 corners: .* crossings of outlines with themselves; at most 2,000"):
+        build_scene(tmp_path / "a.obj", tmp_path / "out", check_only=True)
+
+
 @pytest.mark.parametrize("count", [3, 4, 7, 40])
 def test_a_cut_polygon_has_all_its_corners(count):
     """Corners on its edges, and a hole in either direction: all edges of all rings are edges of its triangles."""
@@ -216,7 +240,7 @@ def test_many_buildings_in_one_place(tmp_path):
     model = without_semantics()
     part = model["CityObjects"].pop("B0-0")
     model["CityObjects"] = {f"B{number}": {"type": "Building", "geometry": part["geometry"]} for number in range(1500)}
-    with pytest.raises(BadInput, match="pairs of a building or part and one around it; at most 2,000,000"):
+    with pytest.raises(BadInput, match="pairs of a building, part or roof and one around it; at most 2,000,000"):
         city(tmp_path, model)
 
 
