@@ -163,20 +163,25 @@ def _below_ground(tags: Mapping[str, str]) -> str:
     for key, values in _BELOW.items():
         if tags.get(key, "").strip().lower() in values:
             return f"{key}={tags[key]}"
-    for key in _LEVELS:
-        found = [_LEVEL_RANGE.fullmatch(part) for part in tags.get(key, "").split(";")]
-        ends = [float(end) for each in found if each for end in each.groups() if end]
-        if all(found) and max(ends) < 0:
-            return f"{key}={tags[key]}"
     storeys, below = (number(tags.get(key, "")) for key in (
         "building:levels", "building:levels:underground"))
     top_m, roof_m = (parse_length_m(tags.get(key, "")) for key in ("height", "roof:height"))
+    for key in _LEVELS:  # a layer only says what it is below; a height counts from the ground
+        if is_below_zero(tags, key) and not (key == "layer" and top_m > 0):
+            return f"{key}={tags[key]}"
     rises = top_m > 0 or roof_m > 0 or number(tags.get("roof:levels", "")) > 0
     if below > 0 and storeys == 0 and not rises:
         return f"building:levels=0, building:levels:underground={below:g}"
     if top_m <= 0 and parse_length_m(tags.get("min_height", "")) < 0:
         return f"min_height={tags['min_height']}, height={tags['height']}"
     return ""
+
+
+def is_below_zero(tags: Mapping[str, str], key: str) -> bool:
+    """Return whether all levels or layers of a tag, such as `-2;-1` or `-2--1`, are below zero."""
+    found = [_LEVEL_RANGE.fullmatch(part) for part in tags.get(key, "").split(";")]
+    ends = [float(end) for each in found if each for end in each.groups() if end]
+    return all(found) and max(ends) < 0
 
 
 def _is_set(tags: Mapping[str, str], key: str) -> bool:

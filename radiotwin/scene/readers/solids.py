@@ -21,7 +21,13 @@ from radiotwin.io.forms import Origin
 from radiotwin.scene.checks import Problem, Severity
 from radiotwin.scene.materials import Material, MaterialTable
 from radiotwin.scene.meshes import clean, cut_polygon, is_closed, triangulate
-from radiotwin.scene.readers.features import Feature, Shell, check_crowding, problems_of
+from radiotwin.scene.readers.features import (
+    Feature,
+    Shell,
+    check_crowding,
+    is_below_zero,
+    problems_of,
+)
 from radiotwin.scene.readers.heights import KNOWN, MAX_HEIGHT_M, Height, HeightColumn, height_of
 from radiotwin.scene.surfaces import Surfaces
 
@@ -103,6 +109,8 @@ def make_prisms(
     lowest_m: dict[str, float] = {}  # by building
     for feature, area, (whole, site) in _resolve_parts(wholes, parts, defects):
         height = height_of(feature.tags, default_height_m, height_column)
+        if is_below_zero(feature.tags, "layer"):
+            defects.add("layer", feature.name)
         if height.unusable:
             defects.add("height", f"{feature.name}: {', '.join(height.unusable)}")
         if height.bottom_m >= height.top_m:
@@ -145,6 +153,8 @@ class _Defects:
                                 "--material NAME=ITU"),
         "rest": ("warning", f"outline(s) are covered to less than {MIN_COVERED_SHARE:.0%} by their "
                             "parts: the rest keeps the outline's own height"),
+        "layer": ("warning", "building(s) have a layer below zero, and a height, which counts from "
+                             "the ground: built"),
         "no parts": ("warning", "building(s) have parts (has_parts) that the file does not hold: "
                                 "built as their outline. Give the parts (building_part of "
                                 "Overture Maps) as another layer of one GeoPackage"),
