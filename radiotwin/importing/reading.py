@@ -349,7 +349,7 @@ class Logs:
         level_column: of `measurements.csv`.
         rows: of all files.
         readings: in these rows.
-        files: name, rows, readings and format of each file, for the report.
+        files: name, rows, readings, format and unused columns of each file, for the report.
         notes: on how files were read.
         format: of all files, or None.
         bad_rows: those that were left out, as of `BadRows`.
@@ -409,10 +409,12 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
             formats.add(format_name)
             level_column = LEVEL_COLUMN[str(own.level_unit)]  # one for all files
             records.append({"file": file.name, "rows": count, "readings": count * per_row,
-                            "format": format_name})
+                            "format": format_name, "not_used": _unused(source, own)})
             notes += [*source.notes, *_naming_notes(source, own),
                       *([f"{file.name}: {caution}"] if caution else [])]
     problems.check()
+    if unused := dict.fromkeys(name for record in records for name in record["not_used"]):
+        notes.append(f"columns that are not used: {listed(unused)}")
     links = parts[0] if len(parts) == 1 else pd.concat(parts)
     starts = [start for start, _ in wheres]
 
@@ -427,6 +429,17 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
                 sum(record["readings"] for record in records), records,
                 list(dict.fromkeys([*notes, *tally.notes])),
                 formats.pop() if len(formats) == 1 else None, list(bad_rows.rows.values()))
+
+
+def _unused(source: Source, settings: Settings) -> list[str]:
+    """Return the columns of a file that nothing is read from."""
+    header = list(map(str, source.table))
+    used = {name for spec in settings.columns.model_dump(exclude_none=True).values()
+            for name in columns_of(spec, header)} | set(settings.only)
+    for block in settings.wide:
+        for level in _wide_columns(source, block):
+            used |= {level.spec, *level.own.values()}
+    return [name for name in header if name not in used]
 
 
 def _declared_columns(settings: Settings) -> set[str]:

@@ -107,7 +107,8 @@ def _times(source: Source, header: list[str], track: TrackFile,
     """Return the times (n,) [s since 1970 UTC], and what they are from."""
     zone = track.time_zone or zone
     if spec := track.columns.get("time"):
-        return seconds(source, spec, track.time_format or _form(source, spec), zone or "UTC"), spec
+        time_s = seconds(source, spec, track.time_format or _form(source, spec), zone or "UTC")
+        return _finer(source, header, time_s), spec
     if "time_s" in header:
         return seconds(source, "time_s", "epoch s", "UTC"), "time_s"
     spec = _find(header, "time", "utc")
@@ -147,7 +148,8 @@ def _finer(source: Source, header: list[str], time_s: np.ndarray) -> np.ndarray:
     names = {_split(name): name for name in header}
     spec = next((names[key] for key in names if key[0] == "time"
                  and key[1] in ("millisecond", "milliseconds", "ms")), None)
-    if spec is None or (np.nan_to_num(time_s) % 1 != 0).any():
+    known = time_s[np.isfinite(time_s)]
+    if spec is None or not len(known) or (known % 1 != 0).any():
         return time_s
     since_s = source.numbers(spec, "time") / 1e3
     return since_s + np.nanmax(time_s - since_s)

@@ -1,0 +1,114 @@
+"""Nothing is left out without a word, and what is refused is read with the setting that the message names."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from radiotwin.errors import BadInput
+from radiotwin.importing.settings import Columns, Settings
+
+HEAD = "t,x,y,d,l\n"
+ROWS = "".join(f"2024-05-01T10:00:0{i}Z,{i},0,a,{-80 - i}\n" for i in range(6))
+COLUMNS = {"time": "t", "x": "x", "y": "y", "device": "d", "level": "l"}
+GIVEN = {"columns": COLUMNS, "length_unit": "m", "time_format": "ISO 8601"}
+
+
+def with_cell(text, column, cell, rows=range(1, 2)):
+    lines = [line.split(",") for line in text.splitlines()]
+    place = lines[0].index(column)
+    for row in rows:
+        lines[row][place] = cell
+    return "".join(",".join(line) + "\n" for line in lines)
+
+
+LOG = HEAD + ROWS
+REFUSALS = [  # content, settings that are refused, settings that help, what the message names of them
+    (LOG, {"length_unit": None}, {"length_unit": "m"}, ["length_unit"]),
+    (LOG, {"level_unit": None}, {"level_unit": "dBm"}, ["level_unit"]),
+    (LOG, {"time_format": None}, {"time_format": "ISO 8601"}, ["time_format"]),
+    (LOG.replace("Z,", ","), {}, {"time_zone": "UTC"}, ["time_zone"]),
+    (LOG, {"columns": COLUMNS | {"level": None}}, {"columns": COLUMNS}, ["columns.level"]),
+    (LOG, {"columns": COLUMNS | {"device": None}}, {"columns": COLUMNS}, ["columns.device"]),
+    (LOG, {"columns": COLUMNS | {"device": "cell"}}, {"columns": COLUMNS}, ["mapping"]),
+    (with_cell(LOG, "l", ""), {}, {"not_measured": ["empty"]}, ["not_measured", "not_detected"]),
+    (with_cell(LOG, "l", "N/A"), {}, {"not_detected": ["empty"]}, ["not_measured", "not_detected", "N/A"]),
+    (with_cell(LOG, "l", "weak"), {}, {"not_detected": ["weak"]}, ["not_measured", "not_detected", "--skip-bad-rows"]),
+    (with_cell(LOG, "l", "weak"), {}, {"skip_bad_rows": 1}, ["--skip-bad-rows 1"]),
+    (with_cell(LOG, "x", "east"), {}, {"skip_bad_rows": 1}, ["--skip-bad-rows 1"]),
+    (with_cell(LOG, "t", "soon"), {}, {"skip_bad_rows": 1}, ["--skip-bad-rows 1"]),
+    (with_cell(LOG, "t", "1800-01-01T00:00Z"), {}, {"skip_bad_rows": 1}, ["--skip-bad-rows 1"]),
+    (with_cell(LOG, "d", "a\x01"), {}, {"skip_bad_rows": 1}, ["--skip-bad-rows 1"]),
+    (with_cell(LOG, "d", "a,b"), {}, {"skip_bad_rows": 1}, ["--skip-bad-rows 1"]),
+    (with_cell(LOG, "d", '"a'), {}, {"quotes": False}, ["--no-quotes"]),
+    (LOG.replace("-8", "12"), {"level_unit": "dB"}, {"level_unit": "dB", "path_loss": True}, ["--path-loss"]),
+    (LOG.replace("-8", "8"), {}, {"level_offset_db": -120.0}, ["--level-offset-db"]),
+    (LOG.replace("2024-05-01T", "").replace("Z,", ","), {"time_zone": "UTC"},
+     {"columns": COLUMNS | {"time": "2024-05-01 {t}"}, "time_zone": "UTC"}, ["--columns 'time="]),
+    (LOG.replace(",", ";").replace("-80", "-80,123"), {}, {"decimal": ","}, ["--decimal"]),
+    (LOG.replace(",0,a", ",\"0,5\",a").replace("x,", "x,"), {}, {"decimal": ","}, ["is not a number"]),
+    (LOG.replace("a,-", "ä,-").encode("utf-16-le"), {}, {"encoding": "utf-16-le"}, ["--encoding"]),
+]
+
+
+@pytest.mark.parametrize(("content", "refused", "helps", "named"), REFUSALS)
+def test_a_refusal_names_a_setting_that_helps(bring_in, content, refused, helps, named):
+    given = {name: value for name, value in (GIVEN | refused).items()}
+    given["columns"] = {name: spec for name, spec in given["columns"].items() if spec}
+    if "is not a number" in named:  # a quoted decimal comma is found, and nothing is refused
+        assert len(bring_in(content, **given).table) == 6
+        return
+    with pytest.raises(BadInput) as refusal:
+        bring_in(content, **given)
+    assert all(name in str(refusal.value) for name in named), str(refusal.value)
+    result = bring_in(content, **given | helps)
+    assert 5 <= len(result.table) <= 6
+
+
+def test_options_that_messages_name_exist():
+    """Every `--option` in a text of the import is one of its command, and every setting is one of the file."""
+    from radiotwin.cli.importing import import_
+
+    app = typer.Typer()
+    app.command()(import_)
+    options = set(re.findall(r"--[a-z][a-z-]+", CliRunner().invoke(app, ["--help"], env={"COLUMNS": "300", "NO_COLOR": "1"}).output))
+    package = Path(__file__).parents[2] / "radiotwin" / "importing"
+    for path in package.rglob("*.py"):
+        for name in re.findall(r"(?<![\w-])--[a-z][a-z-]+", path.read_text(encoding="utf-8")):
+            assert name in options, (path.name, name)
+    assert {name for name in Settings.model_fields if name not in ("columns", "wide", "track", "origin")} >= {
+        "skip_bad_rows", "quotes", "path_loss", "list_name"} and "level" in Columns.model_fields
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_column_a_list_a_sheet_that_is_not_used_is_told(bring_in, tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    name = "".join(rng.choice(list("abcdefghijk_ "), size=8)).strip() + "q"
+    lines = LOG.splitlines()
+    place = int(rng.integers(0, 6))
+    text = "".join(",".join([*parts[:place], cell, *parts[place:]]) + "\n"
+                   for parts, cell in ((line.split(","), name if i == 0 else str(rng.integers(100))) for i, line in enumerate(lines)))
+    report = bring_in(text, **GIVEN).report
+    assert report["files"][0]["not_used"] == [name] and any(name in note for note in report["warnings"])
+    record = {"t": "2024-05-01T10:00:00Z", "x": 1, "y": 0, "d": "a", "l": -80, "more": {name: [{"a": 1}, {"a": 2}]}}
+    report = bring_in(json.dumps(record) + "\n" + json.dumps(record | {"x": 2}) + "\n", "log.jsonl", **GIVEN).report
+    assert report["kept"] == 2 and any(f"more.{name} (4 values)" in note for note in report["warnings"])
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    for row in (line.split(",") for line in lines):
+        book.active.append([float(cell) if re.fullmatch(r"-?\d+", cell) else cell for cell in row])
+    book.create_sheet(name).append(["other"])
+    book[name].append([1])
+    book.save(tmp_path / "made.xlsx")
+    report = bring_in((tmp_path / "made.xlsx").read_bytes(), "log.xlsx", **GIVEN).report
+    assert report["kept"] == 6 and any(f"not read: {name}" in note for note in report["warnings"])
+
+
+def test_rows_that_are_kept_and_left_out_add_up(bring_in):
+    text = HEAD + ROWS + "2024-05-01T10:01:00Z,7,0\n" + ROWS.splitlines()[0] + "\n" + ROWS.replace(",a,", ",b,").replace("-8", "20")
+    report = bring_in(text + "2024-05-01T10:01:09Z,9,0,a,-99\n", **GIVEN).report
+    assert report["readings"] == report["kept"] + sum(each["readings"] for each in report["left_out"]) == 15
