@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from radiotwin.trace import SolverSettings
 
 Bounds = tuple[float, float, float, float]
+SAME_HEIGHT_M = 5.0  # of receivers: one altitude of the lattice is enough
 MAX_BUSY = 1.3  # times the time of an idle machine, from which on a plan says so
 
 
@@ -52,7 +53,11 @@ def build_scene(
     check: Annotated[bool, typer.Option(
         "--check", help="Report only; exit status 2 if tracing would fail.")] = False,
     frequency_hz: Annotated[float | None, typer.Option(
-        help="Frequency of the scene's radio [2.4e9].")] = None,
+        help="Frequency of the scene's radio [that of --measurements, or 2.4e9].")] = None,
+    measurements: Annotated[Path | None, typer.Option(
+        metavar="FILE", help="Measurements that the scene is for: their devices' frequency and "
+                             "their receivers' heights are its own, unless options say others.")
+        ] = None,
     material: Annotated[list[str] | None, typer.Option(
         metavar="NAME=ITU", help="Use an ITU material for the file's material NAME; of a map, for "
                                  "the value NAME of building:material, or default, ground or roof. "
@@ -115,6 +120,10 @@ def build_scene(
     from radiotwin.scene.build import print_report
     from radiotwin.scene.readers import build_scene as build
 
+    heights_m = None if altitudes is None else parse_numbers("--altitudes", altitudes)
+    if measurements is not None:
+        measured_hz, measured_m = _measured(measurements, terrain is not None)
+        frequency_hz, heights_m = frequency_hz or measured_hz, heights_m or measured_m
     report = build(source, out, frequency_hz=frequency_hz, materials=_pairs(material or []),
                    bbox=_bounds(bbox), devices=devices, uavs=uavs, seed=seed,
                    origin=parse_origin(origin), scale=scale, up=up,
@@ -122,8 +131,7 @@ def build_scene(
                    ground_column=ground_column, material_table=material_table,
                    terrain=terrain, terrain_unit=terrain_unit, crs=crs, layers=layer or (),
                    overpass=overpass, step_m=step,
-                   altitudes_m=None if altitudes is None else
-                   parse_numbers("--altitudes", altitudes),
+                   altitudes_m=heights_m,
                    extent_m=parse_extent(extent), check_only=check)
     if overpass:
         say(f"wrote {source} (© OpenStreetMap contributors, ODbL)")
@@ -133,6 +141,30 @@ def build_scene(
         say(f"wrote {report.folder}: {', '.join(_content(report.folder))}")
     if report.tracing_would_fail:
         raise typer.Exit(2)
+
+
+def _measured(path: Path, on_terrain: bool) -> tuple[float | None, list[float] | None]:
+    """Return the frequency [Hz] and the lattice's altitudes [m] of measurements; None: unknown."""
+    import numpy as np
+
+    from radiotwin.links.measurements import read_measurements
+
+    data = read_measurements(path)
+    frequency_hz = None
+    if "frequency_hz" in data.devices and data.devices["frequency_hz"].notna().any():
+        frequency_hz = float(data.devices["frequency_hz"].median())
+    above = "receiver_above_ground_m" in data.table
+    height_m = data.table["receiver_above_ground_m" if above else "receiver_z_m"].dropna()
+    height_m = height_m[height_m > 0]
+    altitudes_m = None
+    if len(height_m) and (above or not on_terrain):
+        few_m = np.quantile(height_m, (0.1, 0.5, 0.9)).round(1)
+        altitudes_m = np.unique(few_m if np.ptp(few_m) > SAME_HEIGHT_M else few_m[1]).tolist()
+    for what, value in (("frequency", frequency_hz), ("height that counts from the ground",
+                                                      altitudes_m)):
+        if value is None:
+            say(f"note: {path} has no {what}: that of the scene is the default")
+    return frequency_hz, altitudes_m
 
 
 def export_scene(

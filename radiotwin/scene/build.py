@@ -29,6 +29,7 @@ from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import (
     Extent,
     LatticeConfig,
+    RadioConfig,
     SceneConfig,
     parse_config,
     write_config,
@@ -61,6 +62,7 @@ from radiotwin.scene.terrain import TerrainConfig
 from radiotwin.scene.vegetation import VegetationConfig
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "fixed": "green"}
+_RADIO = RadioConfig()  # a scene is built with all of its defaults but the frequency
 _TITLE: dict[str, Any] = {"title_justify": "left", "title_style": "bold"}
 MIN_STEP_M = 0.01  # of a lattice
 
@@ -170,6 +172,11 @@ def print_report(report: BuildReport, console: Console) -> None:
         if report.step_m:
             facts.add_row("lattice step", f"{report.step_m:g} m")
         facts.add_row("devices, UAVs", f"{report.devices}, {report.uavs}")
+    facts.add_row("radio", f"{report.frequency_hz / 1e9:g} GHz" + "   (default: --frequency-hz or "
+                  "--measurements)" * (report.frequency_hz == BuildOptions().frequency_hz)
+                  + f"; bandwidth {_RADIO.bandwidth_hz / 1e6:g} MHz, noise "
+                  f"{_RADIO.noise_dbm:g} dBm, power {_RADIO.tx_power_dbm:g} dBm, least "
+                  f"{_RADIO.sensitivity_dbm:g} dBm   (defaults: table radio of scene.toml)")
     for subject, finding in report.facts:
         facts.add_row(subject, escape(finding))
     print_table(facts, console)

@@ -19,7 +19,7 @@ from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import LawError, LocalizeSettings, TwinDevice, localize
 from radiotwin.twin.model.model import FittedModel
-from radiotwin.twin.twin import Twin
+from radiotwin.twin.twin import Twin, measured_heights
 
 MAX_POWER_APART_DB = 3.0  # between declared and fitted powers; more hints at a loss
 
@@ -177,6 +177,7 @@ def make_twin(links: Links, scene: Scene | None, channel: ChannelModel,
         if scene.config.origin is not None:
             provenance["origin"] = scene.config.origin.model_dump()
     provenance |= {"links": len(links), "radiotwin_version": radiotwin.__version__}
+    provenance |= measured_heights(links)
     level = "gain_db" if links.is_gain else "rssi_dbm"
     return Twin(FittedModel.of_channel(channel), devices, level, links.usual_limit_db, provenance,
                 links.declared)

@@ -18,7 +18,7 @@ from radiotwin.effects.params import Seconds
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
 from radiotwin.io.files import require_folder
-from radiotwin.io.forms import Origin
+from radiotwin.io.forms import Origin, Real
 from radiotwin.io.inputs import parse_json
 from radiotwin.links.cell_limits import (
     FREQUENCIES_HZ,
@@ -139,6 +139,7 @@ class _Provenance(BaseModel):
     scene: str | None = None
     scene_hash: str | None = None
     origin: Origin | None = None
+    receiver_heights_m: Annotated[list[Real], Field(min_length=2, max_length=2)] | None = None
 
 
 class TwinRecord(_Strict):

@@ -92,6 +92,9 @@ def plot_positions(devices: list[TwinDevice], ax: Axes | None, origin: Origin | 
     missing = len(devices) - len(placed)
     ax.set_title(f"{len(devices)} devices" + f", {missing} without a position" * bool(missing))
     return ax
+HEIGHTS = "receiver_heights_m"  # in the provenance: 10 and 90 % of the links, above the ground
+MAX_SAMPLED = 10_000  # links that tell these
+MIN_GAP_M = 10.0  # between these and a lattice: no other map, for drones and phones alike
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -217,6 +220,7 @@ class Twin(Summarised):
         self.require_map(scene)
         scene_hash = scene.content_hash()
         self.warn_of_another_scene(scene, scene_hash)
+        self.warn_of_other_heights(scene)
         known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
         rows = {self.devices[i].device: int(i) for i in known}
         power_dbm = self.power_dbm(scene)
@@ -369,6 +373,17 @@ class Twin(Summarised):
                           f"than {scene.folder}, or this one has changed since: geometry, radio or "
                           "declared devices differ", stacklevel=3)
 
+    def warn_of_other_heights(self, scene: Scene) -> None:
+        """Warn where the lattice of a scene is far above or below what the twin was learnt from."""
+        low_m, high_m = self.provenance.get(HEIGHTS) or (-np.inf, np.inf)
+        first_m, *_, last_m = np.repeat(np.sort(scene.config.lattice.altitudes_m), 2)
+        gap_m = max(first_m - high_m, low_m - last_m)
+        if gap_m > max(MIN_GAP_M, min(high_m, last_m)):
+            warnings.warn(f"the twin was learnt at {low_m:g} to {high_m:g} m above the ground, and "
+                          f"the lattice of {scene.folder} is at {first_m:g} to {last_m:g} m: its "
+                          "map is an extrapolation; build the scene with --measurements, or with "
+                          f"--altitudes {(low_m + high_m) / 2:g}", stacklevel=3)
+
     def require_frame(self, scene: Scene) -> None:
         """Check that the positions of the twin are not known to be in another frame than a scene's.
 
@@ -406,3 +421,12 @@ class Twin(Summarised):
             raise BadInput(f"the twin was made without a 3D map, and cannot use that of "
                            f"{scene.folder}: locate devices without --scene, or run close-loop "
                            "with --scene first")
+
+
+def measured_heights(links: Links) -> dict[str, list[float]]:
+    """Return the entry of the provenance on how high receivers were; none without a map."""
+    if links.city is None:
+        return {}
+    some_m = links.receiver_m[::max(len(links) // MAX_SAMPLED, 1)]
+    above_m = some_m[:, 2] - links.city.ground_height_m(*some_m[:, :2].T)
+    return {HEIGHTS: np.quantile(above_m, (0.1, 0.9)).round(1).tolist()}

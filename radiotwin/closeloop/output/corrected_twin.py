@@ -10,7 +10,7 @@ from radiotwin.closeloop.predict.predictor import served
 from radiotwin.closeloop.run import Loop
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import RadiusCalibration, calibrate_radii, whole_area
-from radiotwin.twin.twin import Twin
+from radiotwin.twin.twin import Twin, measured_heights
 
 
 def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
@@ -28,6 +28,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
                      **vars(_calibration(loop, scene)))
     provenance: dict[str, Any] = {"links": len(model.links),
                                   "radiotwin_version": radiotwin.__version__}
+    provenance |= measured_heights(model.links)
     if loop.origin is not None:
         provenance |= {"origin": loop.origin.model_dump()}
     if scene is not None:
