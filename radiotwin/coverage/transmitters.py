@@ -12,8 +12,9 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import read_frame
 from radiotwin.importing.read_source import read_source
 from radiotwin.links.declared import Radio, radios_of
+from radiotwin.links.implausible import far_notes, high_notes
 from radiotwin.links.measurements import RADIO, read_antenna_files
-from radiotwin.links.site_table import SiteTable, far_notes, high_notes, read_site_table
+from radiotwin.links.site_table import SiteTable, read_site_table
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna, parse_pattern
 

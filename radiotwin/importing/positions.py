@@ -21,16 +21,9 @@ from radiotwin.importing.units import ISO, seconds
 from radiotwin.io.cells import shown
 from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.cell_limits import READS
+from radiotwin.links.implausible import FAR_M, distances_m, far_notes, unmatched_notes
 from radiotwin.links.measurements import DEVICE_OPTIONAL
-from radiotwin.links.site_table import (
-    FAR_M,
-    SiteTable,
-    distances_m,
-    far_notes,
-    local_positions,
-    read_site_table,
-    unmatched_notes,
-)
+from radiotwin.links.site_table import SiteTable, local_positions, read_site_table
 
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
 ORIGIN_DECIMALS = 7  # of a computed origin [degrees]: 1 cm
@@ -214,7 +207,7 @@ def _read_sites(path: str, key: str, settings: Settings, names: Collection[str])
     source = read_source(path)
     uses = [*DEVICE_OPTIONAL, "antenna", "since", "until"] if key == "device" else []
     sites = read_site_table(source.path, source.table, source.where, key, uses,
-                            settings.length_unit, settings.crs is not None, names)
+                            settings.length_unit or "", settings.crs is not None, True, names)
     period: dict[str, np.ndarray] = {}
     unique = sites.names
     if "since" in sites.values:

@@ -46,7 +46,8 @@ from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, shown
 from radiotwin.io.forms import name_fault
 from radiotwin.links.cell_limits import READS, refuse_limits
-from radiotwin.links.site_table import LIMITS_DEG, METRES
+from radiotwin.links.implausible import LIMITS_DEG
+from radiotwin.links.site_table import METRES
 
 ANGLES = ("heading", "pitch", "roll")
 NAMES = ("device", "receiver", "flight")

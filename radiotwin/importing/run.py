@@ -25,6 +25,7 @@ from radiotwin.importing.units import clock_notes
 from radiotwin.io.files import atomic_folder, require_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
+from radiotwin.links.implausible import FAR_M
 from radiotwin.links.measurements import (
     OPTIONAL,
     REQUIRED,
@@ -32,7 +33,6 @@ from radiotwin.links.measurements import (
     read_antenna_files,
     read_measurements,
 )
-from radiotwin.links.site_table import FAR_M
 
 SCHEMA = "radiotwin.import/2"
 UNITS = {"_m": "m", "_deg": "°", "_s": "s", "_dbm": "dBm", "_db": "dB"}

@@ -16,23 +16,19 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from radiotwin.display import some
 from radiotwin.errors import BadInput
 from radiotwin.geo import between_frames, is_same_frame, to_local
-from radiotwin.io.budgets import DEVICES
+from radiotwin.io.budgets import DEVICES, ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, refuse, shown
 from radiotwin.io.forms import Origin, name_fault
 from radiotwin.links.cell_limits import refuse_limits
+from radiotwin.links.implausible import LIMITS_DEG, high_notes, tilt_notes
 
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
 HEIGHTS = ("altitude", "height", "z", "above_ground_m")
-LIMITS_DEG = {"latitude": 90.0, "longitude": 360.0}
 METRES = {"m": 1.0, "ft": 0.3048}  # the international foot, exact since 1959
-FAR_M, MAX_APART_M = 100_000.0, 1e6  # from what is measured or mapped: odd, longer than any link
-HIGH_M = 200.0  # above the ground: an altitude above the sea is suspected; masts are lower
 ERP_DB = 2.15  # EIRP less ERP, which refers to a half-wave dipole (ITU-R V.573-6, A43)
-_EARTH_M = 6_371_008.8  # mean radius (Moritz 2000, GRS80)
-_NAMED = 5  # names in a message
+MAX_TWICE_APART_M = 1.0  # between two positions of a site in a table, rounded to 1e-5 degrees
 _MIN_LETTERS, _LONG = 5, 9  # of a name of which one letter, or two, may be mistaken
 
 Convert = Callable[[np.ndarray], np.ndarray]
@@ -77,6 +73,7 @@ _QUANTITIES: dict[str, tuple[Mapping[str, Convert], str]] = {
     "above_ground_m": (_LENGTHS, "above ground, height above ground, height above ground level, "
                                  "agl, height agl, agl height, antenna agl, antenna height agl, "
                                  "antenna height, ant height, height of antenna, antenna hgt, "
+                                 "antenna ht, ant ht, antenna height above ground, "
                                  "rad center, radiation center, rad centre, center line, "
                                  "centerline, mast height, tower height, structure height"),
     "tx_power_dbm": (_POWERS, "tx power, transmit power, transmitter power, transmitted power, "
@@ -93,25 +90,34 @@ _QUANTITIES: dict[str, tuple[Mapping[str, Convert], str]] = {
                              "pointing direction, heading"),
     "tilt_deg": (_ANGLES, "tilt, antenna tilt, total tilt, downtilt, total downtilt, "
                           "antenna downtilt, mechanical tilt, mechanical downtilt, mech tilt, "
-                          "mtilt, dtilt"),
+                          "tilt mech, tilt mechanical, mtilt, dtilt"),
     "load": (_SHARES, "load, duty cycle"),
     "antenna": (_NO_UNIT, "antenna, antenna file, antenna pattern, pattern file"),
     "role": (_NO_UNIT, "role"), "reads_levels": (_NO_UNIT, "reads levels"),
     "since": (_NO_UNIT, "since"), "until": (_NO_UNIT, "until")}
 """Quantity -> units, and names in the order in which they count."""
 _TEXTS = ("antenna", "role", "since", "until")
-_TURNED = ("downtilt", "mechanicaltilt", "mechtilt", "mtilt", "dtilt")
+_TURNED = ("downtilt", "mechanicaltilt", "mechtilt", "tiltmech", "tiltmechanical", "mtilt", "dtilt")
 """Names of tilts that count downwards, as planning programs do."""
 _ENDS = ("device", "site", "cell", "sector", "antenna", "ant", "tx", "transmitter", "gateway",
          "station", "bs", "node", "receiver", "rx")
 """What may stand before the name of a position or a direction."""
-_OF_ENDS = ("latitude", "longitude", "x", "y", "z", "height", "altitude", "azimuth_deg",
+_OF_ENDS = ("latitude", "longitude", "x", "y", "z", "height", "altitude", "azimuth_deg", "tilt_deg",
             "frequency_hz")
+_UNUSED = {"electricaltilt": "it is in the pattern of the antenna",
+           "electricaldowntilt": "it is in the pattern of the antenna",
+           "etilt": "it is in the pattern of the antenna",
+           "tiltel": "it is in the pattern of the antenna",
+           "gain": "give an EIRP, or the pattern of the antenna",
+           "antennagain": "give an EIRP, or the pattern of the antenna",
+           "groundelevation": "of the ground", "siteelevation": "of the ground"}
+"""Names of columns that look as if they were used -> why they are not."""
 _ANY_NAME = ("name, id, label, site, site id, site name, station, station id, station name, node, "
              "node id")
 _NAMES = {
     "device": "device, device id, cell, cell id, cell name, sector, sector id, sector name, "
-              "transmitter, transmitter id, transmitter name, gateway, gateway id, tx, "
+              "transmitter, transmitter id, transmitter name, gateway, gateway id, gtw id, "
+              "gateway eui, eui, tx, "
               f"base station, bs, enb, gnb, beacon, bssid, {_ANY_NAME}",
     "receiver": f"receiver, receiver id, receiver name, rx, sensor, sensor id, probe, {_ANY_NAME}"}
 _IN_PARTS = re.compile(r"(lat|lon|long|latitude|longitude)(min|minute|minutes|sec|second|seconds)")
@@ -242,13 +248,20 @@ class SiteTable:
         Raises:
             BadInput: latitudes without an origin, or a site far outside the frame.
         """
-        if "latitude" in self.values and origin is None:
+        if "latitude" in self.values and origin is None and "x" not in self.values:
             raise BadInput(f"{self.path}: latitude and longitude need the origin of the frame of "
                            f"{what}, which is not known; give x_m and y_m, or add its [origin]")
-        position_m = local_positions(self.values, origin)
-        if own is not None and origin is not None and not is_same_frame(own, origin) \
-                and "x" in self.values:
+        on_globe_m = local_positions(self.values.drop(columns=["x", "y"], errors="ignore"), origin)
+        if "x" not in self.values:
+            return on_globe_m
+        position_m = local_positions(self.values, None)
+        position_m[:, 2] = on_globe_m[:, 2]  # of an altitude, above the origin
+        if own is not None and origin is not None and not is_same_frame(own, origin):
             position_m = between_frames(position_m, own, origin)
+        apart_m = np.linalg.norm(position_m[:, :2] - on_globe_m[:, :2], axis=1)
+        self.refuse_rows(apart_m > MAX_TWICE_APART_M, lambda row: (
+            f"x, y = {position_m[row, 0]:g}, {position_m[row, 1]:g} is {apart_m[row]:,.0f} m from "
+            f"its latitude and longitude about {what}'s origin; leave out the wrong two columns"))
         return position_m
 
 
@@ -258,8 +271,9 @@ def _refuse(table: SiteTable, column: str, bad: ArrayLike, reason: str) -> None:
            lambda row: table.where(cells.index[row]))
 
 
-def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int], str], end: str,
-                    uses: Collection[str], length_unit: str | None = None, crs: bool = False,
+def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int], str],
+                    end: str | None, uses: Collection[str] = (), length_unit: str | None = None,
+                    crs: bool = False, prefers_globe: bool = False,
                     names: Collection[str] = ()) -> SiteTable:
     """Read the cells of a table of sites.
 
@@ -267,10 +281,12 @@ def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int]
         path: of the file, for messages.
         cells: of the file: texts, or typed columns.
         where: index of a row -> its place in the file.
-        end: `device` or `receiver`: the column of the names.
+        end: `device` or `receiver`: the column of the names; None: points without names.
         uses: other quantities than positions that the command uses.
-        length_unit: of columns without one in their name; None: such are refused.
+        length_unit: of columns without one in their name; without one such are refused. None where
+            a command has no setting for it.
         crs: whether x and y are of a projected system, in its unit.
+        prefers_globe: whether x and y are not used where there are latitude and longitude.
         names: that are expected; of several columns of names that with most of them counts.
 
     Raises:
@@ -278,32 +294,40 @@ def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int]
             nearly a known one.
     """
     if cells.empty:
-        raise BadInput(f"{path}: has no rows; it needs one for each {end}")
-    DEVICES.check(len(cells), path)
+        raise BadInput(f"{path}: has no rows; it needs one for each {end or 'point'}")
+    (ROWS if end is None else DEVICES).check(len(cells), path)
     header = list(map(str, cells.columns))
     columns, unused = _columns(path, header, crs)
-    key, others = _key(path, cells, end, names, set(columns.values()))
-    unused = {name: why for name, why in unused.items() if name != key} | others
+    for quantity in _unneeded_place(columns.keys(), crs, prefers_globe):
+        unused[columns.pop(quantity)] = "the position is known already"
+    key = None
+    if end is not None:
+        key, others = _key(path, cells, end, names, set(columns.values()))
+        unused = {name: why for name, why in unused.items() if name != key} | others
     used = {*POSITION, "above_ground_m", *uses}
     unused |= {name: "not used here" for quantity, name in columns.items() if quantity not in used}
     columns = {quantity: name for quantity, name in columns.items() if quantity in used}
-    for name in (key, *columns.values()):
-        if cells[name].map(lambda cell: isinstance(cell, (list, dict, tuple, np.ndarray))).any():
+    for name in filter(None, (key, *columns.values())):
+        if cells[name].dtype == object and cells[name].map(
+                lambda cell: isinstance(cell, (list, dict, tuple, np.ndarray))).any():
             raise BadInput(f"{path}: column {name} holds lists or records; it needs one value in "
                            "each row")
-    text = cells[key] if isinstance(cells[key].dtype, pd.StringDtype) else as_text(cells[key])
+    text = pd.Series(cells.index, cells.index) if key is None else cells[key]
+    text = text if isinstance(text.dtype, pd.StringDtype) else as_text(text)
     text = text.fillna("").str.strip()
     table = SiteTable(path, text, pd.DataFrame(index=cells.index), columns, cells, where)
-    for name in text.unique():
-        if fault := name_fault(name):
-            _refuse(table, key, text == name, fault)
+    if key is not None:
+        for name in text.unique():
+            if fault := name_fault(name):
+                _refuse(table, key, text == name, fault)
     known = _known_names(crs)
     values = {quantity: as_text(cells[name]) if quantity in _TEXTS else
               _numbers(table, quantity, known[_plain(name)].convert, length_unit, crs)
               for quantity, name in columns.items()}
     table = replace(table, values=pd.DataFrame(values, index=cells.index))
     _check_positions(table)
-    table.columns[end] = key
+    if end is not None and key is not None:
+        table.columns[end] = key
     return replace(table, notes=(*_unused_note(path, unused), *_implausible(table)))
 
 
@@ -327,8 +351,18 @@ def unused_columns(path: Path | str, header: Iterable[str], used: Collection[str
 def _unused_note(path: Path | str, unused: Mapping[str, str]) -> list[str]:
     if not unused:
         return []
-    columns = listed(f"{name} ({why})" if why else name for name, why in unused.items())
+    reasons = {name: why or next((why for word, why in _UNUSED.items() if re.fullmatch(
+        f"{word}(deg|dbi?|dbd|m|ft)?", _plain(name))), "") for name, why in unused.items()}
+    columns = listed(f"{name} ({why})" if why else name for name, why in reasons.items())
     return [f"{Path(path).name}: column{'s' * (len(unused) > 1)} not used: {columns}"]
+
+
+def _unneeded_place(given: Collection[str], crs: bool, prefers_globe: bool) -> tuple[str, ...]:
+    """Return the quantities of the position that is not used of two."""
+    if not {"latitude", "x"} <= set(given) or not (crs or prefers_globe):
+        return ()
+    pair = ("latitude", "longitude") if crs else ("x", "y")
+    return tuple(name for name in pair if name in given)
 
 
 def _columns(path: Path | str, header: Sequence[str],
@@ -358,10 +392,6 @@ def _columns(path: Path | str, header: Sequence[str],
             raise BadInput(f"{path}: column {shown(name)} is nearly one of a "
                            f"{known[near].quantity}; correct its name, or leave the column out. "
                            f"The table has {listed(header)}")
-    if {"latitude", "x"} <= found.keys():
-        for quantity in ("latitude", "longitude") if crs else ("x", "y"):
-            if quantity in found:
-                unused[found.pop(quantity)] = "the position is known already"
     return found, unused
 
 
@@ -392,7 +422,7 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
         units = _QUANTITIES[quantity][0]
         if units is _LENGTHS and crs and quantity in "xy":
             convert = _SAME
-        elif units is _LENGTHS and length_unit is not None:
+        elif units is _LENGTHS and length_unit:
             convert = _LENGTHS[length_unit]
         elif units is _FREQUENCIES and np.nanmin(numbers, initial=np.inf) >= 1e6:
             convert = _SAME  # so many MHz are no radio
@@ -403,7 +433,8 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
                 unit for unit in ("ft", "w", "mhz") if unit in units])
             raise BadInput(f"{table.path}: column {shown(name)}: the unit of its numbers{span} is "
                            f"not known; end its name in it: {endings}"
-                           + (", or give length_unit" if units is _LENGTHS else ""))
+                           + (", or give length_unit" if units is _LENGTHS
+                              and length_unit is not None else ""))
     numbers = convert(numbers)
     _refuse(table, name, np.isinf(numbers) | (np.isnan(numbers) & (text != "")),
             "is no power above zero")
@@ -447,25 +478,6 @@ def _implausible(table: SiteTable) -> list[str]:
     return [f"{Path(table.path).name}: {note}" for note in notes]
 
 
-def tilt_notes(tilt_deg: np.ndarray) -> list[str]:
-    """Return a note where antennas (k,) are said to look upwards, and downtilts are meant."""
-    up, known = tilt_deg > 0, np.isfinite(tilt_deg)
-    if not up.any() or (tilt_deg < 0).any():
-        return []
-    return [f"{up.sum()} of {known.sum()} declared tilts are above zero, which is upwards, and "
-            "none is below; where the table counts downtilts, call the column downtilt_deg"]
-
-
-def high_notes(above_ground_m: np.ndarray) -> list[str]:
-    """Return a note where all sites (k,) are higher above the ground than masts are [m]."""
-    known_m = above_ground_m[np.isfinite(above_ground_m)]
-    if not len(known_m) or known_m.min() < HIGH_M:
-        return []
-    return [f"the lowest of {len(known_m)} sites is {known_m.min():.0f} m above the ground; if "
-            "those are altitudes above the sea, call the column altitude_m, and give the ground's "
-            "in the origin"]
-
-
 def local_positions(values: pd.DataFrame, origin: Origin | None) -> np.ndarray:
     """Convert columns of `POSITION` [degrees, m] to x, y, z (k, 3) [m] about an origin.
 
@@ -486,103 +498,3 @@ def local_positions(values: pd.DataFrame, origin: Origin | None) -> np.ndarray:
         places_m[known, 0], places_m[known, 1] = to_local(
             origin, values["longitude"][known], values["latitude"][known])
     return places_m
-
-
-def far_notes(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str],
-              where: Callable[[int], str], what: str) -> list[str]:
-    """Return a note on sites that are odd distances away.
-
-    Args:
-        place: (k, 2) latitude and longitude [degrees], or x and y [m], of sites; NaN where unknown.
-        middle: (2,) of what they belong to.
-        axes: names of the two.
-        where: row -> the file and the site, for messages.
-        what: they belong to, such as `the readings`.
-
-    Raises:
-        BadInput: one is farther away than any link is long, or where a slip explains it: swapped
-            coordinates, a wrong sign, a decimal point at a wrong place.
-    """
-    apart_m = _apart_m(place, middle, axes)
-    far = np.flatnonzero(apart_m > FAR_M)  # not of NaN
-    if not len(far):
-        return []
-    row = int(far[np.argmax(apart_m[far])])
-    slip = _slip(place[row], middle, axes)
-    text = (f"{where(row)} at {axes[0]} {place[row, 0]:.10g}, {axes[1]} {place[row, 1]:.10g} is "
-            f"{apart_m[row] / 1000:,.0f} km from {what} ({axes[0]} {middle[0]:.10g}, {axes[1]} "
-            f"{middle[1]:.10g})" + (f"; {len(far)} are so far away" if len(far) > 1 else ""))
-    if slip or apart_m[row] > MAX_APART_M:
-        raise BadInput(f"{text}: {slip or 'both need one frame, and one unit'}")
-    return [text]
-
-
-def _slip(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> str:
-    """Return the slip that brings a place (2,) to where it belongs, or `""`.
-
-    Of local metres none is known: every decimal point that slips brings a place near the origin.
-    """
-    if "latitude" not in axes and np.linalg.norm(middle) <= FAR_M:
-        return ""
-    tries = [(place[::-1], f"are {axes[0]} and {axes[1]} swapped?")]
-    for sign in ([-1, 1], [1, -1], [-1, -1]):
-        turned = place * sign
-        tries.append((turned, f"is a sign wrong ({turned[0]:.10g}, {turned[1]:.10g})?"))
-    for power in (1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6):
-        for axis in ([1, 0], [0, 1], [1, 1]):
-            moved = place * 10.0 ** (power * np.array(axis))
-            tries.append((moved, f"has a decimal point slipped ({moved[0]:.10g}, "
-                                 f"{moved[1]:.10g})?"))
-    return next((text for moved, text in tries
-                 if _apart_m(moved[None], middle, axes)[0] <= FAR_M), "")
-
-
-def _apart_m(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> np.ndarray:
-    if "latitude" in axes:
-        return distances_m(place, middle)
-    return np.linalg.norm(place - middle, axis=1)
-
-
-def distances_m(place_deg: np.ndarray, middle_deg: np.ndarray) -> np.ndarray:
-    """Return distances (k,) on the sphere of latitudes and longitudes (k, 2) from one [m].
-
-    They are infinite where a latitude is none.
-    """
-    (north, east), (middle_north, middle_east) = np.radians(place_deg).T, np.radians(middle_deg)
-    chord = (np.sin((north - middle_north) / 2)**2
-             + np.cos(north) * np.cos(middle_north) * np.sin((east - middle_east) / 2)**2)
-    apart_m = 2 * _EARTH_M * np.arcsin(np.sqrt(np.clip(chord, 0, 1)))
-    return np.where(np.abs(place_deg[:, 0]) > LIMITS_DEG["latitude"], np.inf, apart_m)
-
-
-def unmatched_notes(path: Path | str, names: Iterable[str], others: Collection[str], end: str,
-                    what: str) -> list[str]:
-    """Return notes on names of a table that occur in no row of something, and those that it lacks.
-
-    Args:
-        path: of the table.
-        names: in the table.
-        others: names that occur.
-        end: what they are of, such as `device`.
-        what: they occur in, such as `the log`.
-    """
-    idle = list(dict.fromkeys(name for name in names if name not in others))
-    lacking = sorted(set(others) - set(names))
-    notes, file = [], Path(path).name
-    if idle:
-        loose = {_loosely(name): name for name in lacking}
-        pairs = [f"{name} ({loose[_loosely(name)]} there)" for name in idle
-                 if _loosely(name) in loose]
-        notes.append(f"{file}: {len(idle)} of {len(set(names)):,} names occur in no row of {what}: "
-                     f"{some(pairs or idle, _NAMED)}"
-                     + ("; names are compared letter by letter: make them equal" if pairs else ""))
-    if lacking and idle:
-        notes.append(f"{file}: {len(lacking)} of {len(others):,} {end}s of {what} are not in it: "
-                     f"{some(lacking, _NAMED)}")
-    return notes
-
-
-def _loosely(name: str) -> tuple[str, ...]:
-    """Return a name without case, marks, zeros before its numbers, and decimals that are zero."""
-    parts = re.findall(r"\d+|[^\W\d_]+", re.sub(r"(?<=\d)\.0+$", "", name.casefold()))
-    return tuple(part.lstrip("0") or "0" if part.isdigit() else part for part in parts)

@@ -1,5 +1,6 @@
 """Gains at any points in space."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,11 +9,11 @@ import pandas as pd
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
-from radiotwin.geo import to_local
 from radiotwin.io.budgets import ROWS
-from radiotwin.io.cells import as_numbers, listed, read_cells, write_csv
+from radiotwin.io.cells import read_cells, write_csv
 from radiotwin.io.files import atomic_path, require_suffix, require_writable
 from radiotwin.io.forms import MAX_COORDINATE_M, Origin
+from radiotwin.links.site_table import read_site_table
 from radiotwin.runtime.execution import Executor
 from radiotwin.runtime.pieces import KeptParts
 from radiotwin.scene import Scene
@@ -23,8 +24,6 @@ from radiotwin.trace.run import device_indices, warn_of_terrain
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB
 from radiotwin.trace.tiles import with_radius
-
-MAX_APART_M = 1.0  # two positions of a point in a file, rounded to 1e-5 degrees
 
 
 def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
@@ -133,75 +132,37 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
 
 def read_points(path: Path | str, origin: Origin | None = None,
                 city: CityMap | None = None) -> np.ndarray:
-    """Read points from a CSV file; columns other than those of the position are ignored.
+    """Read points from a CSV file.
 
     Args:
-        path: File with the columns x_m, y_m and z_m, or latitude_deg, longitude_deg and z_m (above
-            the ground datum); above_ground_m may stand for z_m.
+        path: File with x and y, or latitude and longitude, and a height, see
+            `radiotwin.links.site_table`.
         origin: Origin of the local frame, which latitude and longitude need.
         city: 3D map with the ground; None: the ground is at z = 0.
 
     Returns:
         (n, 3) positions [m].
 
+    Warns:
+        A column is not used.
+
     Raises:
         BadInput: No such file, a missing column, no rows, a cell that is not a number or more than
             1000 km away, or latitudes where there is no origin.
     """
     path = Path(path)
-    raw = read_cells(path)
-    geographic = "x_m" not in raw and "latitude_deg" in raw
-    height = "above_ground_m" if "above_ground_m" in raw and "z_m" not in raw else "z_m"
-    columns = (["latitude_deg", "longitude_deg", height] if geographic else ["x_m", "y_m", height])
-    missing = [name for name in columns if name not in raw]
-    if missing:
-        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {', '.join(columns)}, "
-                       f"it has {listed(raw.columns)}")
-    if raw.empty:
-        raise BadInput(f"{path}: has no rows; it needs at least one point")
-    points = np.column_stack([_numbers(path, raw, name) for name in columns])
-    if origin is not None and not geographic and {"latitude_deg", "longitude_deg"} <= set(raw):
-        _check_agreement(path, raw, points, origin)
-    if geographic:
-        if origin is None:
-            raise BadInput(f"{path} gives latitude and longitude, and the scene has no [origin] in "
-                           "scene.toml; add one, or give x_m and y_m")
-        points[:, :2] = np.column_stack(to_local(origin, points[:, 1], points[:, 0]))
-    if height == "above_ground_m" and city is not None:
-        points[:, 2] += city.ground_height_m(*points[:, :2].T)
-    far = ~(np.abs(points) <= MAX_COORDINATE_M).all(axis=1)
-    if far.any():
-        row = int(np.flatnonzero(far)[0])
-        position = ", ".join(f"{value:g}" for value in points[row])
-        raise BadInput(f"{path}: row {row + 2}: ({position}) m lies too far from the origin of the "
-                       f"local frame; allowed are {-MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g} m")
+    sites = read_site_table(path, read_cells(path), lambda row: f"row {row + 2}", None)
+    for note in sites.notes:
+        warnings.warn(note, stacklevel=2)
+    points = sites.local_m(origin, None, "the scene")
+    sites.refuse_rows(np.isnan(points[:, :2]).any(axis=1), lambda row: "has no position")
+    if "above_ground_m" in sites.values:
+        above_m = sites.values["above_ground_m"].to_numpy()
+        ground_m = city.ground_height_m(*points[:, :2].T) if city is not None else 0.0
+        points[:, 2] = np.where(np.isnan(above_m), points[:, 2], above_m + ground_m)
+    sites.refuse_rows(np.isnan(points[:, 2]), lambda row: (
+        "has no height; give it in a column z_m (above the datum), above_ground_m or altitude_m"))
+    sites.refuse_rows(~(np.abs(points) <= MAX_COORDINATE_M).all(axis=1), lambda row: (
+        f"({', '.join(f'{value:g}' for value in points[row])}) m lies too far from the origin of "
+        f"the local frame; allowed are {-MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g} m"))
     return points
-
-
-def _check_agreement(path: Path, raw: pd.DataFrame, points: np.ndarray, origin: Origin) -> None:
-    """Raise BadInput where x, y (n, 3) are not where latitude and longitude are."""
-    latitude_deg, longitude_deg = (as_numbers(raw[name].astype(str).str.strip())
-                                   for name in ("latitude_deg", "longitude_deg"))
-    known = np.flatnonzero((np.abs(latitude_deg) <= 90) & (np.abs(longitude_deg) <= 360))
-    other_m = np.column_stack(to_local(origin, longitude_deg[known], latitude_deg[known]))
-    apart_m = np.linalg.norm(points[known, :2] - other_m, axis=1)
-    if (apart_m > MAX_APART_M).any():
-        i = int(np.argmax(apart_m > MAX_APART_M))
-        raise BadInput(
-            f"{path}: row {known[i] + 2}: x_m, y_m = {points[known[i], 0]:g}, "
-            f"{points[known[i], 1]:g} is {apart_m[i]:,.0f} m from latitude_deg, longitude_deg = "
-            f"{latitude_deg[known[i]]:g}, {longitude_deg[known[i]]:g} about the scene's origin "
-            f"({(apart_m > MAX_APART_M).sum()} such rows); leave out the wrong two columns")
-
-
-def _numbers(path: Path, raw: pd.DataFrame, name: str) -> np.ndarray:
-    """Return the (n,) finite numbers of a column; degrees within their range."""
-    values = as_numbers(raw[name].astype(str).str.strip())
-    limit = {"latitude_deg": 90, "longitude_deg": 180}.get(name, np.inf)
-    bad = ~np.isfinite(values) | (np.abs(values) > limit)
-    if bad.any():
-        row = int(np.flatnonzero(bad)[0])
-        allowed = ("a finite number [m]" if np.isinf(limit) else
-                   f"a number from -{limit} to {limit} [degrees]")
-        raise BadInput(f"{path}: row {row + 2}, column {name}: {raw[name][row]!r} is not {allowed}")
-    return values

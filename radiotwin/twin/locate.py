@@ -1,5 +1,6 @@
 """Devices of unknown position in a file of measurements, located by a twin."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -8,14 +9,15 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.geo import to_geographic, to_local
+from radiotwin.geo import to_geographic
 from radiotwin.inference.student import sd_of_scale
-from radiotwin.io.cells import as_numbers, listed, read_cells, refuse
+from radiotwin.io.cells import listed, read_cells
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, link_geometry, prepare_links
 from radiotwin.links.alignment import in_known_frame
 from radiotwin.links.declared import as_learnt
 from radiotwin.links.measurements import Measurements
+from radiotwin.links.site_table import read_site_table
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import TwinDevice, locate, misfit, whole_area
@@ -28,7 +30,6 @@ NOT_BY_PATHS = ("and following paths from every position where a device may be t
                 "makes one whose effects it uses, too, and fit --model raytrace locates devices "
                 "along paths")
 MAX_NAMED = 5  # receivers in a note
-TRUTH_COLUMNS = ("x_m", "y_m"), ("latitude", "longitude")
 MAX_PROBES = 2000  # links by which a channel's error scale is looked up
 MIN_WIDENING = 1.2  # of residuals, from which a file's links are unlike those learnt from
 
@@ -171,42 +172,25 @@ def read_truth(path: Path, origin: Origin | None) -> pd.DataFrame:
     """Read true positions of devices.
 
     Args:
-        path: table with the column `device`, and `x_m` and `y_m`, or `latitude` and `longitude`;
-            other columns do not matter.
+        path: a table of sites, see `radiotwin.links.site_table`.
         origin: of the frame that devices are located in; None: not known.
 
     Returns:
         `device, x_m, y_m`; NaN where a position is not known.
 
+    Warns:
+        A column is not used.
+
     Raises:
-        BadInput: none of these columns, no device twice, a value that is no number, or degrees
-            without an origin.
+        BadInput: no position, a device twice, a value that is no number, or degrees without an
+            origin.
     """
-    table = read_cells(path, ["device"])
-    names = next((each for each in TRUTH_COLUMNS if set(each) <= set(table)), None)
-    if names is None:
-        raise BadInput(f"{path}: true positions are not there; allowed are the columns x_m and "
-                       "y_m, or latitude and longitude")
-    if table["device"].duplicated().any():
-        raise BadInput(f"{path}: a device occurs twice; every device needs one row")
-    first, second = (_known_numbers(path, table, name) for name in names)
-    if names == TRUTH_COLUMNS[0]:
-        return pd.DataFrame({"device": table["device"], "x_m": first, "y_m": second})
-    if origin is None:
-        raise BadInput(f"{path}: positions are latitude and longitude, and where the frame of the "
-                       "twin lies is not known; give x_m and y_m in its frame")
-    x_m, y_m = to_local(origin, second, first)
-    known = np.isfinite(x_m) & np.isfinite(y_m)
-    return pd.DataFrame({"device": table["device"], "x_m": np.where(known, x_m, np.nan),
-                         "y_m": np.where(known, y_m, np.nan)})
-
-
-def _known_numbers(path: Path, table: pd.DataFrame, name: str) -> np.ndarray:
-    """Return the numbers (n,) of a column, NaN where it is empty."""
-    numbers = as_numbers(table[name])
-    empty = table[name].isna() | (table[name].astype(str).str.strip() == "")
-    refuse(path, name, table[name], ~np.isfinite(numbers) & ~empty.to_numpy(), "is no number")
-    return numbers
+    sites = read_site_table(path, read_cells(path), lambda row: f"row {row + 2}", "device")
+    sites.refuse("device", sites.names.duplicated(), "occurs twice; every device needs one row")
+    for note in sites.notes:
+        warnings.warn(note, stacklevel=2)
+    x_m, y_m, _ = sites.local_m(origin, None, "the twin").T
+    return pd.DataFrame({"device": sites.names, "x_m": x_m, "y_m": y_m})
 
 
 def position_errors(positions: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:

@@ -23,11 +23,11 @@ def test_reads_the_columns_it_needs(tmp_path):
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    ("x_m,y_m\n1,2\n", "column 'z_m' is missing"),
-    ("x_m,y_m,z_m\n1,2,3\n1,two,3\n", "row 3, column y_m: 'two' is not a finite number"),
-    ("x_m,y_m,z_m\n1,2,inf\n", "row 2, column z_m: 'inf' is not a finite number"),
-    ("x_m,y_m,z_m\n1,,3\n", "row 2, column y_m: '' is not a finite number"),
-    ("x_m,y_m,z_m\nnan,2,3\n", "row 2, column x_m: 'nan' is not a finite number"),
+    ("x_m,y_m\n1,2\n", "row 2: has no height"),
+    ("x_m,y_m,z_m\n1,2,3\n1,two,3\n", "row 3, column y_m: 'two' is not a number"),
+    ("x_m,y_m,z_m\n1,2,inf\n", "row 2, column z_m: 'inf' is not finite"),
+    ("x_m,y_m,z_m\n1,,3\n", "row 2: has no position"),
+    ("x_m,y_m,z_m\nnan,2,3\n", "row 2: has no position"),
     ("x_m,y_m,z_m\n", "has no rows"),
     ("", "is empty"),
     ("x_m,y_m,z_m\n1,2,3\n10,20,1.5,7\n", "row 3 has 4 fields, the header has 3"),
@@ -104,7 +104,7 @@ def test_two_positions_of_a_point_agree(tmp_path):
     text = "x_m,y_m,z_m,latitude_deg,longitude_deg\n0,111.19,3,47.501,8.7\n0,0,3,,\n{},0,3,47.5,8.7\n"
     same = write(tmp_path / "same.csv", text.format(0.3))
     assert read_points(same, origin).tolist() == read_points(same).tolist() == [[0, 111.19, 3], [0, 0, 3], [0.3, 0, 3]]
-    with pytest.raises(BadInput, match=r"row 4: x_m, y_m = 50, 0 is 50 m from latitude_deg.* \(1 such rows\)"):
+    with pytest.raises(BadInput, match=r"row 4: x, y = 50, 0 is 50 m from its latitude and longitude"):
         read_points(write(tmp_path / "other.csv", text.format(50)), origin)
 
 
@@ -113,18 +113,18 @@ def test_points_in_degrees(tmp_path):
     path = write(tmp_path / "points.csv", "longitude_deg,latitude_deg,z_m\n8.7,47.5,3\n8.7,47.501,4\n")
     points_m = read_points(path, origin)
     assert points_m == pytest.approx(np.array([[0, 0, 3], [0, 111.19, 4]]), abs=0.02)
-    with pytest.raises(BadInput, match=r"the scene has no \[origin\]"):
+    with pytest.raises(BadInput, match=r"need the origin of the frame of the scene"):
         read_points(path)
-    with pytest.raises(BadInput, match="row 3, column latitude_deg: '91' is not a number from -90 to 90"):
+    with pytest.raises(BadInput, match="row 3, column latitude_deg: '91' is no latitude; allowed are -90 to 90"):
         read_points(write(tmp_path / "far.csv", "latitude_deg,longitude_deg,z_m\n1,1,1\n91,0,1\n"), origin)
-    with pytest.raises(BadInput, match="column 'longitude_deg' is missing"):
+    with pytest.raises(BadInput, match="latitude and longitude are given together or not at all"):
         read_points(write(tmp_path / "half.csv", "latitude_deg,z_m\n1,1\n"), origin)
 
 
 @pytest.mark.parametrize("row", ["1e7,0,1", "0,-1e308,1", "0,0,1e308"])
 def test_points_that_are_too_far_away(tmp_path, row):
     path = write(tmp_path / "far.csv", f"x_m,y_m,z_m\n0,0,0\n{row}\n")
-    with pytest.raises(BadInput, match=r"far.csv: row 3: .* too far from the origin .* -1e\+06 to 1e\+06 m"):
+    with pytest.raises(BadInput, match=r"far.csv: row 3.* too far "):
         read_points(path)
 
 

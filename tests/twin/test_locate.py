@@ -135,10 +135,10 @@ def test_true_positions_are_metres_or_degrees(tmp_path):
 
 
 @pytest.mark.parametrize("text, message", [
-    ("device,x\na,1\n", "allowed are the columns x_m and y_m, or latitude and longitude"),
-    ("device,x_m,y_m\na,1,2\na,3,4\n", "a device occurs twice"),
-    ("device,x_m,y_m\na,1,two\n", "row 2, column y_m: 'two' is no number"),
-    ("device,latitude,longitude\na,48,11\n", "where the frame of the twin lies is not known")])
+    ("device,x\na,1\n", "column 'x': the unit of its numbers from 1 to 1 is not known"),
+    ("device,x_m,y_m\na,1,2\na,3,4\n", "row 3, column device: 'a' occurs twice"),
+    ("device,x_m,y_m\na,1,two\n", "row 2, column y_m: 'two' is not a number"),
+    ("device,latitude,longitude\na,48,11\n", "need the origin of the frame of the twin")])
 def test_a_table_of_true_positions_that_is_none_is_one_message(tmp_path, text, message):
     (tmp_path / "truth.csv").write_text(text)
     with pytest.raises(BadInput, match=message):
