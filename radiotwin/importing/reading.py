@@ -155,12 +155,18 @@ def _shared(source: Source, columns: dict[str, str], settings: Settings,
             shared["time_s"] = seconds(source, columns["time"], settings.time_format,
                                        settings.time_zone)
     quantities = [prefix + name for prefix in ("device_", "") for name in QUANTITIES]
+    without_unit = False
     for name in (*quantities, *ANGLES, "quality", "frequency_hz", "snr"):
         if name not in present:
             continue
+        is_length = settings.length_unit is None and _is_length(name, settings)
+        if is_length and without_unit:
+            continue  # it is reported once
+        before = len(problems)
         with problems.noted():
             column = f"{name}_deg" if name in ANGLES else name
             shared[column] = _quantity(source, name, columns[name], settings)
+        without_unit |= is_length and len(problems) > before
     if problems:
         return shared
     for name in NAMES:

@@ -212,8 +212,8 @@ def test_all_that_is_wrong_is_in_one_message(logs, bring_all):
     with pytest.raises(BadInput) as raised:
         bring_all(logs, columns=MAPPING | {"z": "height", "heading": "yaw"}, time_format=None, length_unit=None)
     text = str(raised.value)
-    assert text.startswith("7 things are wrong:\n")
+    assert text.startswith("6 things are wrong:\n")
     for part in ("columns 'height' (z), 'yaw' (heading) are missing", "two.csv: columns 'height' (z), 'level' (level), 'yaw'",
-                 "one.csv: column t: time_format is not given", "one.csv: column x: length_unit is not given"):
+                 "one.csv: column t: time_format is not given", "one.csv: column y: length_unit is not given"):
         assert part in text
     assert text.count("length_unit") == 2  # once for each file
