@@ -166,8 +166,10 @@ def _below_ground(tags: Mapping[str, str]) -> str:
     storeys, below = (number(tags.get(key, "")) for key in (
         "building:levels", "building:levels:underground"))
     top_m, roof_m = (parse_length_m(tags.get(key, "")) for key in ("height", "roof:height"))
-    for key in _LEVELS:  # a layer only says what it is below; a height counts from the ground
-        if is_below_zero(tags, key) and not (key == "layer" and top_m > 0):
+    # A layer only says what it is below, and a level may be that of a shop in the building
+    stands = {"layer": top_m > 0, "level": _is_set(tags, "building") and (top_m > 0 or storeys > 0)}
+    for key in _LEVELS:
+        if is_below_zero(tags, key) and not stands.get(key):
             return f"{key}={tags[key]}"
     rises = top_m > 0 or roof_m > 0 or number(tags.get("roof:levels", "")) > 0
     if below > 0 and storeys == 0 and not rises:

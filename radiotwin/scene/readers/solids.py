@@ -109,7 +109,7 @@ def make_prisms(
     lowest_m: dict[str, float] = {}  # by building
     for feature, area, (whole, site) in _resolve_parts(wholes, parts, defects):
         height = height_of(feature.tags, default_height_m, height_column)
-        if is_below_zero(feature.tags, "layer"):
+        if is_below_zero(feature.tags, "layer") or is_below_zero(feature.tags, "level"):
             defects.add("layer", feature.name)
         if height.unusable:
             defects.add("height", f"{feature.name}: {', '.join(height.unusable)}")
@@ -153,8 +153,8 @@ class _Defects:
                                 "--material NAME=ITU"),
         "rest": ("warning", f"outline(s) are covered to less than {MIN_COVERED_SHARE:.0%} by their "
                             "parts: the rest keeps the outline's own height"),
-        "layer": ("warning", "building(s) have a layer below zero, and a height, which counts from "
-                             "the ground: built"),
+        "layer": ("warning", "building(s) have a layer or level below zero, and a height or "
+                             "storeys, which count from the ground: built"),
         "no parts": ("warning", "building(s) have parts (has_parts) that the file does not hold: "
                                 "built as their outline. Give the parts (building_part of "
                                 "Overture Maps) as another layer of one GeoPackage"),

@@ -36,7 +36,7 @@ def test_what_lies_below_the_ground(tags):
 
 
 @pytest.mark.parametrize("tags", [
-    {}, {"location": "roof"}, {"layer": "1"}, {"layer": "roofs"}, {"layer": "-1", "height": "8"}, {"level": "-1;0"}, {"level": "-1-2"}, {"level": "0-3"},
+    {}, {"location": "roof"}, {"layer": "1"}, {"layer": "roofs"}, {"layer": "-1", "height": "8"}, {"level": "-1", "amenity": "restaurant", "building:levels": "4"}, {"level": "-1;0"}, {"level": "-1-2"}, {"level": "0-3"},
     {"tunnel": "building_passage"}, {"tunnel": "no"}, {"building:levels": "0"},
     {"building:levels": "0", "building:levels:underground": "2", "roof:levels": "1"},
     {"building:levels": "0", "building:levels:underground": "2", "height": "4"},
@@ -58,7 +58,7 @@ def test_what_lies_below_is_left_out_and_told_and_does_not_replace_what_stands_a
              .box(40, 0, 60, 20, layer="-1").box(80, 0, 99, 20, layer="-1", height="8"))
     table, told = built(tmp_path, drawn.write(tmp_path / "a.osm"))
     assert table["top_m"].to_dict() == {"way/1": 20.0, "way/4": 8.0}
-    assert "1 building(s) have a layer below zero, and a height" in told and "2 building(s) lie below the ground: left out" in told and "'way/3: layer=-1'" in told
+    assert "1 building(s) have a layer or level below zero, and a height" in told and "2 building(s) lie below the ground: left out" in told and "'way/3: layer=-1'" in told
 
 
 def test_a_part_with_storeys_of_its_own_has_not_the_roof_of_the_whole(tmp_path, empty_map):
