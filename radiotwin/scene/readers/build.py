@@ -49,7 +49,7 @@ from radiotwin.scene.readers.heights import (
     check_declared,
     column_name,
     height_sds_m,
-    listed_columns,
+    listed_names,
     no_height_text,
 )
 from radiotwin.scene.readers.heights import source_text as height_text
@@ -303,8 +303,8 @@ def _not_used(found: MapFile, features: list[Feature],
         {declared.name, declared.ground} if declared else set())
     names = {key for feature in features for key in feature.tags} | {
         column_name(name) for name in found.columns}
-    unused = [f"tags or columns {listed_columns(names - used)}"] * bool(names - used)
-    unused += [f"layers {listed_columns(found.layers)}"] * bool(found.layers)
+    unused = [f"tags or columns {listed_names(names - used)}"] * bool(names - used)
+    unused += [f"layers {listed_names(found.layers)}"] * bool(found.layers)
     return (("not used", "; ".join(unused)),) if unused else ()
 
 

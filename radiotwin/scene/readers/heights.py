@@ -144,7 +144,7 @@ def check_declared(column: HeightColumn, rows: Iterable[Mapping[str, str]], sour
     for name in (column.name, column.ground):
         if name and name not in there:
             raise BadInput(f"{source} has no column {name!r}; its columns are: "
-                           f"{listed_columns(there)}")
+                           f"{listed_names(there)}")
 
 
 def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
@@ -164,7 +164,7 @@ def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
                     f"above 0 and up to 1,000 m, only such as {value.strip()[:20]}. Correct it, "
                     "name another column or unit with --height-column NAME (NAME:ft, NAME:cm, "
                     "NAME:mm), or give all buildings one height with --height-default M. Its "
-                    f"columns of numbers are: {listed_columns(numeric)}")
+                    f"columns of numbers are: {listed_names(numeric)}")
     elevations = [f"{column.name} is an elevation, from which the ground's ({column.ground}) has "
                   "to be subtracted, and the file has none"
                   for column in KNOWN if column.ground and column.name in counts
@@ -173,10 +173,10 @@ def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
     return ("none of its columns is known to hold heights" + hint + ". Name one with "
             "--height-column NAME (metres above ground; NAME:ft, NAME:cm or NAME:storeys; of an "
             "elevation, with --ground-column NAME), or give all buildings one height with "
-            f"--height-default M. Its columns of numbers are: {listed_columns(numeric)}")
+            f"--height-default M. Its columns of numbers are: {listed_names(numeric)}")
 
 
-def listed_columns(names: Iterable[str]) -> str:
+def listed_names(names: Iterable[str]) -> str:
     """Return names in order, of many the first twenty."""
     ordered = sorted(names)
     more = len(ordered) - MAX_LISTED

@@ -18,7 +18,7 @@ import shapely
 from radiotwin.errors import BadInput
 from radiotwin.scene.checks import Problem, listed, warning
 from radiotwin.scene.readers.features import BUILDING_KEYS, MapFile
-from radiotwin.scene.readers.heights import KNOWN, column_name
+from radiotwin.scene.readers.heights import KNOWN, column_name, listed_names
 
 WHOLE, GROUND_COLUMNS = "pand", ("b3_h_maaiveld", "h_maaiveld")  # of 3D BAG
 IDENTIFIER = "identificatie"  # of its buildings
@@ -47,22 +47,17 @@ def choose_layers(path: Path, columns: Mapping[str, Sequence[str]],
     names = list(columns)
     if unknown := [name for name in wanted if name not in columns]:
         raise BadInput(f"{path} has no layer of areas called {unknown[0]!r}; its layers are: "
-                       f"{listed_all(names)}")
+                       f"{listed_names(names)}")
     chosen = [name for name in names if name in wanted] if wanted else _meant(columns)
     if not chosen and names:
         raise BadInput(f"{path} has {len(names)} layers of areas, and none is known to hold "
                        "buildings by its name or columns; choose with --layer NAME: "
-                       f"{listed_all(names)}")
+                       f"{listed_names(names)}")
     left = [name for name in names if name not in chosen]
     if wanted or not left:
         return chosen, []
     return chosen, [warning(f"{len(left)} layer(s) were not read ({listed(left)}): buildings are "
-                            f"taken from {listed_all(chosen)}; --layer NAME reads another")]
-
-
-def listed_all(names: Sequence[str]) -> str:
-    """Return `'a', 'b'`, of many the first twenty."""
-    return ", ".join(repr(name[:60]) for name in names[:20]) + ", …" * (len(names) > 20)
+                            f"taken from {listed_names(chosen)}; --layer NAME reads another")]
 
 
 def _meant(columns: Mapping[str, Sequence[str]]) -> list[str]:

@@ -15,6 +15,7 @@ differ by more than 100 m from those around them were taken for errors where SRT
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import shapely
@@ -52,7 +53,12 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
     tops_m = np.array([height.top_m for _, height, _ in known])
     if not len(tops_m):
         return []
-    wide_m = np.array([_width_m(site) for _, _, site in known])
+    sites: Any = np.array([site for _, _, site in known], dtype=object)
+    bounds_m = shapely.bounds(sites)
+    # No narrower than its area over its longest diagonal: the width of few has to be measured
+    least_m = shapely.area(sites) / np.hypot(*(bounds_m[:, 2:] - bounds_m[:, :2]).T)
+    wide_m = np.array([_width_m(site) if top_m > RARE_SLENDERNESS * low_m else math.inf
+                       for site, top_m, low_m in zip(sites, tops_m, least_m)])
     rare = (tops_m > RARE_M) | (tops_m > RARE_SLENDERNESS * np.maximum(wide_m, 1.0))
     median_m = float(np.median(tops_m)) if len(tops_m) > 1 else ROOM_M
     shifted = median_m > MAX_MEDIAN_M
@@ -63,7 +69,7 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
     if not (rare.any() or shifted):
         return []
     named = np.flatnonzero(rare if rare.any() else tops_m > MAX_MEDIAN_M)
-    said = [f"{known[row][0]}: {tops_m[row]:.4g} m tall, {wide_m[row]:.3g} m wide"
+    said = [f"{known[row][0]}: {tops_m[row]:.4g} m tall, {_width_m(sites[row]):.3g} m wide"
             for row in sorted(named, key=lambda row: -tops_m[row])]
     what = (f"building(s) are taller than {RARE_M:g} m, or than {RARE_SLENDERNESS:g} times their "
             "width, as hardly any building is" if rare.any() else

@@ -57,7 +57,7 @@ def test_of_3d_bag_the_most_detailed_roofs_and_outlines_without_roofs(tile, tmp_
 
 def test_a_layer_can_be_chosen(tile, tmp_path):
     assert built(tile, tmp_path, layers=["pand"])[0] == [(400, 5.0), (600, 18.0)]
-    with pytest.raises(BadInput, match=r"no layer of areas called 'roofs'; its layers are: 'pand', 'lod12_2d'"):
+    with pytest.raises(BadInput, match=r"no layer of areas called 'roofs'; its layers are: 'lod12_2d', 'lod22_2d'"):
         built(tile, tmp_path, layers=["roofs"])
 
 
