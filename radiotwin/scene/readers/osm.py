@@ -96,6 +96,16 @@ class OsmElements:
     ways: dict[int, Way] = field(default_factory=dict)
     relations: dict[int, Relation] = field(default_factory=dict)
 
+    def add(self, number: int, element: Way | Relation) -> None:
+        """Add a way or relation; Overpass may give one twice, once without its tags."""
+        if isinstance(element, Way):
+            known = self.ways.get(number, element)
+            self.ways[number] = Way(element.nodes or known.nodes, element.tags or known.tags)
+        else:
+            other = self.relations.get(number, element)
+            self.relations[number] = Relation(element.members or other.members,
+                                              element.tags or other.tags)
+
 
 def assemble(elements: OsmElements) -> MapFile:
     """Assemble the areas of buildings and building parts, ways first, and of vegetation.
@@ -295,6 +305,7 @@ class _Reader:
         self.depth = 0
         self.most = VERTICES.limit  # read once: there are millions of nodes
         self.open: Way | Relation | None = None
+        self.number = 0  # of the one that is open
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         self.depth += 1
@@ -303,7 +314,6 @@ class _Reader:
                            "give a map in OpenStreetMap's XML, as its export, Overpass "
                            "([out:xml]) or JOSM make it")
         if self.depth == 2:
-            self.open = None
             if attributes.get("action") != "delete" and attributes.get("visible") != "false":
                 self._element(tag, attributes, line)
         elif self.depth == 3 and self.open is not None:
@@ -311,6 +321,9 @@ class _Reader:
 
     def end(self, tag: str) -> None:
         self.depth -= 1
+        if self.depth == 1 and self.open is not None:
+            self.elements.add(self.number, self.open)
+            self.open = None
 
     def _element(self, tag: str, attributes: dict[str, str], line: int) -> None:
         if tag == "node":
@@ -319,10 +332,9 @@ class _Reader:
             self.elements.positions[self._integer(attributes, "id", line)] = position
             if len(self.elements.positions) > self.most:
                 VERTICES.check(len(self.elements.positions), self.path)
-        elif tag == "way":
-            self.open = self.elements.ways[self._integer(attributes, "id", line)] = Way([])
-        elif tag == "relation":
-            self.open = self.elements.relations[self._integer(attributes, "id", line)] = Relation()
+        elif tag in ("way", "relation"):
+            self.open = Way([]) if tag == "way" else Relation()
+            self.number = self._integer(attributes, "id", line)
 
     def _content(self, tag: str, attributes: dict[str, str], line: int) -> None:
         assert self.open is not None
@@ -403,7 +415,7 @@ def osm_of_json(path: Path, document: Mapping) -> OsmElements:
         elements.positions[known] = place(subject, element)
         ids[elements.positions[known]] = known
     for subject, element in by_kind["way"]:
-        elements.ways[_whole(subject, element.get("id"))] = way(subject, element)
+        elements.add(_whole(subject, element.get("id")), way(subject, element))
     for subject, element in by_kind["relation"]:
         members = [(_whole(subject, one.get("ref")), str(one.get("role", "")), one)
                    for one in _list(subject, element, "members")
@@ -411,8 +423,8 @@ def osm_of_json(path: Path, document: Mapping) -> OsmElements:
         for number, _, member in members:
             if number not in elements.ways and member.get("geometry"):
                 elements.ways[number] = way(subject, member)
-        elements.relations[_whole(subject, element.get("id"))] = Relation(
-            [(number, role) for number, role, _ in members], _tags(element))
+        elements.add(_whole(subject, element.get("id")), Relation(
+            [(number, role) for number, role, _ in members], _tags(element)))
     return elements
 
 

@@ -179,3 +179,16 @@ def test_geojson_under_other_endings(tmp_path, name, text):
     (tmp_path / name).write_text(text.replace("%s", house))
     found = read_json_map(tmp_path / name).features
     assert len(found) == text.count("%s") and found[0].tags["height"] == "7"
+
+
+def test_ways_that_overpass_gives_twice_keep_their_tags(tmp_path):
+    """As of `out body; >; out skel qt;`, which the page of Overpass proposes."""
+    nodes, way = ring(1, 0, 10)
+    text = f'<osm>{way}<tag k="building" v="yes"/><tag k="height" v="7"/></way>{nodes}{way}</way></osm>'
+    (tmp_path / "a.osm").write_text(text)
+    (one,) = assemble(read_osm_xml(tmp_path / "a.osm")).features
+    assert one.tags["height"] == "7" and one.area.area == pytest.approx(100)
+    elements = overpass(False)
+    elements.append({key: value for key, value in elements[-2].items() if key != "tags"})  # the shed
+    (tmp_path / "a.json").write_text(json.dumps({"elements": elements}))
+    assert {one.name for one in read_json_map(tmp_path / "a.json").features} == {"relation/7", "way/4"}
