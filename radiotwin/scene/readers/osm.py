@@ -90,11 +90,21 @@ class OsmElements:
         positions: node -> longitude and latitude [degrees].
         ways: at least the buildings, and the ways of relations that are buildings.
         relations: at least those of type multipolygon.
+        nodes_at: place -> node, of places that stand in ways and relations.
     """
 
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
     ways: dict[int, Way] = field(default_factory=dict)
     relations: dict[int, Relation] = field(default_factory=dict)
+    nodes_at: dict[tuple[float, float], int] = field(default_factory=dict)
+
+    def node_at(self, place: tuple[float, float], number: int | None = None) -> int:
+        """Return the node at a place, with that number, or one that is made up."""
+        known = self.nodes_at.setdefault(
+            place, _MADE_UP - len(self.nodes_at) if number is None else number)
+        known = known if number is None else number
+        self.positions[known] = place
+        return known
 
     def add(self, number: int, element: Way | Relation) -> None:
         """Add a way or relation; Overpass may give one twice, once without its tags."""
@@ -306,6 +316,7 @@ class _Reader:
         self.most = VERTICES.limit  # read once: there are millions of nodes
         self.open: Way | Relation | None = None
         self.number = 0  # of the one that is open
+        self.member: Way | None = None  # of the relation that is open
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         self.depth += 1
@@ -318,18 +329,23 @@ class _Reader:
                 self._element(tag, attributes, line)
         elif self.depth == 3 and self.open is not None:
             self._content(tag, attributes, line)
+        elif self.depth == 4 and tag == "nd" and self.member is not None:  # of `out geom;`
+            self.member.nodes.append(self.elements.node_at(self._place(attributes, line)))
 
     def end(self, tag: str) -> None:
         self.depth -= 1
+        if self.depth == 2 and self.member is not None and isinstance(self.open, Relation):
+            if self.member.nodes:
+                self.elements.ways.setdefault(self.open.members[-1][0], self.member)
+            self.member = None
         if self.depth == 1 and self.open is not None:
             self.elements.add(self.number, self.open)
             self.open = None
 
     def _element(self, tag: str, attributes: dict[str, str], line: int) -> None:
         if tag == "node":
-            position = (self._degrees(attributes, "lon", 180, line),
-                        self._degrees(attributes, "lat", 90, line))
-            self.elements.positions[self._integer(attributes, "id", line)] = position
+            self.elements.positions[self._integer(attributes, "id", line)] = self._place(
+                attributes, line)
             if len(self.elements.positions) > self.most:
                 VERTICES.check(len(self.elements.positions), self.path)
         elif tag in ("way", "relation"):
@@ -341,11 +357,19 @@ class _Reader:
         if tag == "tag":
             self.open.tags[attributes.get("k", "")] = attributes.get("v", "")
         elif tag == "nd" and isinstance(self.open, Way):
-            self.open.nodes.append(self._integer(attributes, "ref", line))
+            node = self._integer(attributes, "ref", line)
+            if "lat" in attributes:  # of `out geom;`
+                self.elements.node_at(self._place(attributes, line), node)
+            self.open.nodes.append(node)
         elif (tag == "member" and isinstance(self.open, Relation)
               and attributes.get("type") == "way"):
             way = self._integer(attributes, "ref", line)
             self.open.members.append((way, attributes.get("role", "")))
+            self.member = Way([])
+
+    def _place(self, attributes: dict[str, str], line: int) -> tuple[float, float]:
+        return (self._degrees(attributes, "lon", 180, line),
+                self._degrees(attributes, "lat", 90, line))
 
     def _integer(self, attributes: dict[str, str], name: str, line: int) -> int:
         try:
@@ -375,7 +399,6 @@ def osm_of_json(path: Path, document: Mapping) -> OsmElements:
         BadInput: an impossible value, with the element.
     """
     elements = OsmElements()
-    ids: dict[tuple[float, float], int] = {}  # of nodes, by their place
     by_kind: dict[str, list[tuple[str, Mapping]]] = {"node": [], "way": [], "relation": []}
     for number, element in enumerate(document["elements"], start=1):
         if not isinstance(element, dict):
@@ -399,21 +422,15 @@ def osm_of_json(path: Path, document: Mapping) -> OsmElements:
         found = [_whole(subject, node) for node in nodes]
         for row, point in enumerate(points):
             if isinstance(point, dict):  # of a part outside of a box, null
-                at = place(subject, point)
-                if row < len(found):
-                    ids.setdefault(at, found[row])
-                else:
-                    found.append(ids.setdefault(at, _MADE_UP - len(ids)))
-                elements.positions[found[row]] = at
+                number = found[row] if row < len(found) else None
+                found[row:row + 1] = [elements.node_at(place(subject, point), number)]
             elif row >= len(found):
                 found.append(0)  # a node without a place
         VERTICES.check(len(elements.positions), path)
         return Way(found, _tags(element))
 
     for subject, element in by_kind["node"]:
-        known = _whole(subject, element.get("id"))
-        elements.positions[known] = place(subject, element)
-        ids[elements.positions[known]] = known
+        elements.node_at(place(subject, element), _whole(subject, element.get("id")))
     for subject, element in by_kind["way"]:
         elements.add(_whole(subject, element.get("id")), way(subject, element))
     for subject, element in by_kind["relation"]:

@@ -158,6 +158,21 @@ def test_answers_of_overpass_in_json(tmp_path, geometry):
     assert found["way/4"].area.area == pytest.approx(40) and len(found) == 2
 
 
+def test_places_in_xml_as_overpass_answers(tmp_path):
+    """As of `[out:xml]` with `out geom;`: no nodes, but places in ways and in members."""
+    def places(way):
+        return "".join(f'<nd ref="{ref}" lat="{at["lat"]}" lon="{at["lon"]}"/>'
+                       for ref, at in zip(way.get("nodes", range(99)), way["geometry"]))
+    relation, shed = overpass(True)
+    members = "".join(f'<member type="way" ref="{one["ref"]}" role="{one["role"]}">' + places(one).replace("ref", "x")
+                      + "</member>" for one in relation["members"])
+    (tmp_path / "a.osm").write_text(
+        f'<osm><way id="4">{places(shed)}<tag k="building" v="shed"/></way><relation id="7"><bounds/>{members}'
+        '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/></relation></osm>')
+    found = {one.name: one.area.area for one in assemble(read_osm_xml(tmp_path / "a.osm")).features}
+    assert found == {"relation/7": pytest.approx(81 - 9), "way/4": pytest.approx(40)}
+
+
 @pytest.mark.parametrize(("elements", "message"), [
     ([{"type": "way", "id": 1, "tags": {"building": "yes"}, "center": {"lat": 1, "lon": 2}}], "out geom"),
     ([{"type": "way", "id": 1, "tags": {"building": "yes"}, "geometry": [{"lat": 91, "lon": 2}]}], "lat=91; allowed"),
