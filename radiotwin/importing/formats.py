@@ -231,34 +231,46 @@ DRIVE_TEST = (
 )
 
 
-def _things_stack(prefix: str) -> tuple[Format, Format]:
-    """Return the formats of uplink messages, for nodes with and without a position."""
-    message, gateway = f"{prefix}uplink_message.", f"{prefix}uplink_message.rx_metadata."
-    node = f"{prefix}end_device_ids.device_id"
-    decoded = message + "decoded_payload."
-    common: dict[str, str | tuple[str, ...]] = {
-        "level": gateway + "rssi", "snr": gateway + "snr",
-        "time": (message + "received_at", prefix + "received_at")}
-    name = "things-stack" + "-storage" * bool(prefix)
-    title = "The Things Stack, uplink messages" + ", storage integration" * bool(prefix)
+def _lora(name: str, title: str, source: str, payload: str, place: str,
+          settings: Mapping[str, Any] = _UNITS, **columns: str | tuple[str, ...]
+          ) -> tuple[Format, Format]:
+    """Return the formats of uplinks of a network, for nodes with and without a position.
+
+    Args:
+        name: of the format for nodes without one.
+        title: of the network.
+        source: of the description.
+        payload: before the names of what a node sends.
+        place: before the names of a gateway's position.
+        settings: others than `columns`.
+        columns: entries of `level`, `snr`, `time`, `node` and `gateway`.
+    """
+    node, gateway = str(columns.pop("node")), str(columns.pop("gateway"))
+    places = {each: f"{place}{each}" for each in ("latitude", "longitude", "altitude")}
+    if not place.endswith("."):  # as Helium has it
+        places = {"latitude": f"{place}.lat", "longitude": f"{place}.long"}
+    signature = (str(columns["level"]), gateway, node)
     return (
-        Format(
-            f"{name}-mapper", f"{title}, of a node that sends its position (JSON lines)",
-            {**common, "device": gateway + "gateway_ids.gateway_id", "receiver": node,
-             **_place_in(decoded),
-             "device_latitude": gateway + "location.latitude",
-             "device_longitude": gateway + "location.longitude",
-             "device_altitude": gateway + "location.altitude"},
-            (gateway + "rssi", gateway + "gateway_ids.gateway_id", node),
-            _LEVEL, _STACK, _GATEWAYS, caution=_MAPPER, needs=("latitude", "longitude")),
-        Format(
-            name, f"{title} (JSON lines)",
-            {**common, "device": node, "receiver": gateway + "gateway_ids.gateway_id",
-             "latitude": gateway + "location.latitude",
-             "longitude": gateway + "location.longitude",
-             "altitude": gateway + "location.altitude"},
-            (gateway + "rssi", gateway + "gateway_ids.gateway_id", node),
-            _LEVEL, _STACK, _UNITS, caution=_CAUTION))
+        Format(f"{name}-mapper", f"{title}, of a node that sends its position (JSON lines)",
+               {**columns, "device": gateway, "receiver": node, **_place_in(payload),
+                **{f"device_{each}": entry for each, entry in places.items()}},
+               signature, _LEVEL, source, {**settings, "read_at": "device"}, caution=_MAPPER,
+               needs=("latitude", "longitude")),
+        Format(name, f"{title} (JSON lines)",
+               {**columns, "device": node, "receiver": gateway, **places},
+               signature, _LEVEL, source, settings, caution=_CAUTION))
+
+
+def _things_stack(prefix: str) -> tuple[Format, Format]:
+    """Return the formats of uplink messages, whose fields may have a prefix."""
+    message, gateway = f"{prefix}uplink_message.", f"{prefix}uplink_message.rx_metadata."
+    return _lora(
+        "things-stack" + "-storage" * bool(prefix),
+        "The Things Stack, uplink messages" + ", storage integration" * bool(prefix), _STACK,
+        payload=message + "decoded_payload.", place=gateway + "location.",
+        level=gateway + "rssi", snr=gateway + "snr",
+        time=(message + "received_at", prefix + "received_at"),
+        node=f"{prefix}end_device_ids.device_id", gateway=gateway + "gateway_ids.gateway_id")
 
 
 LORA = (
@@ -275,24 +287,19 @@ LORA = (
         zone_caution="times are taken for UTC"),
     *_things_stack(""),
     *_things_stack("result."),
-    Format(
-        "chirpstack-mapper", "ChirpStack 4, uplink events of a node that sends its position "
-                             "(JSON lines)",
-        {"level": "rxInfo.rssi", "snr": "rxInfo.snr", "time": "time",
-         "device": "rxInfo.gatewayId", "receiver": "deviceInfo.devEui",
-         **_place_in("object."), "device_latitude": "rxInfo.location.latitude",
-         "device_longitude": "rxInfo.location.longitude",
-         "device_altitude": "rxInfo.location.altitude"},
-        ("rxInfo.rssi", "rxInfo.gatewayId", "deviceInfo.devEui"),
-        _LEVEL, _CHIRPSTACK, _GATEWAYS, caution=_MAPPER, needs=("latitude", "longitude")),
-    Format(
-        "chirpstack", "ChirpStack 4, uplink events (JSON lines)",
-        {"level": "rxInfo.rssi", "snr": "rxInfo.snr", "time": "time",
-         "device": "deviceInfo.devEui", "receiver": "rxInfo.gatewayId",
-         "latitude": "rxInfo.location.latitude", "longitude": "rxInfo.location.longitude",
-         "altitude": "rxInfo.location.altitude"},
-        ("rxInfo.rssi", "rxInfo.gatewayId", "deviceInfo.devEui"),
-        _LEVEL, _CHIRPSTACK, _UNITS, caution=_CAUTION),
+    *_lora("chirpstack", "ChirpStack 4, uplink events", _CHIRPSTACK, payload="object.",
+           place="rxInfo.location.", level="rxInfo.rssi", snr="rxInfo.snr", time="time",
+           node="deviceInfo.devEui", gateway="rxInfo.gatewayId"),
+    *_lora("chirpstack-3", "ChirpStack 3, uplink events",
+           _CHIRPSTACK.replace("api (", "api/3.8.1 ("), payload="object.",
+           place="rxInfo.location.", level="rxInfo.rssi",
+           snr="rxInfo.loRaSNR", time=("publishedAt", "rxInfo.time"), node="devEUI",
+           gateway="rxInfo.gatewayID"),
+    *_lora("helium", "Helium Console, uplinks",
+           "https://docs.helium.com/console/integrations/json-schema",
+           payload="decoded.payload.", place="hotspots",
+           settings={**_UNITS, "time_format": "epoch ms"}, level="hotspots.rssi",
+           snr="hotspots.snr", time="reported_at", node="dev_eui", gateway="hotspots.name"),
     Format(
         "semtech-udp", "Semtech UDP packet forwarder, rxpk (JSON lines)",
         {"level": "rxpk.rssi", "snr": "rxpk.lsnr", "time": "rxpk.time"},

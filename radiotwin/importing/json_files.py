@@ -7,6 +7,7 @@ their names. Tables of pandas, a list or an object for each column, are read, to
 
 import io
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
@@ -24,6 +25,8 @@ from radiotwin.io.inputs import parse_json
 
 _MAX_NUMBERED = 16  # values of a list that are columns, such as coordinates
 _PLACE = ("longitude", "latitude", "altitude")
+BEFORE = "before"
+"""Column of the text before the object of a line, such as a topic of MQTT."""
 _HEAD_BYTES = 2**16  # in which lines are looked for
 _SEPARATOR = "\x1e"  # before each record of RFC 8142
 
@@ -132,6 +135,19 @@ class _Table:
         self.unread[name] += len(items)
 
 
+def starts_json(line: str) -> bool:
+    """Return whether a first line is JSON, or a word or two and an object, as of an MQTT client."""
+    if re.match("\x1e?{|\\[ *({|$)", line):
+        return True
+    before, brace, _ = line.partition("{")
+    if not brace or not line.endswith("}") or not before.endswith(" ") or "," in before:
+        return False
+    try:
+        return isinstance(json.loads(brace + line.partition("{")[2]), dict)
+    except (ValueError, RecursionError):
+        return False
+
+
 def read_json_log(file: LogFile, declared: Collection[str], may_be: Collection[str],
                   chosen: str | None, crs: str | None, bad_rows: BadRows | None) -> Source:
     """Read the records of a JSON document, or of JSON lines.
@@ -168,11 +184,11 @@ def _read(file: LogFile, used: Collection[str], chosen: str | None, crs: str | N
         if _has_lines(file):
             left_out = _add_lines(file, table, bad_rows)
             return table.source(lambda number: f"line {number}", left_out)
-        is_map = _add_document(file, table)
+        is_map, left_out = _add_document(file, table, bad_rows)
     except UnicodeDecodeError:
         raise BadInput(f"{file} is not text in UTF-8; save it as UTF-8") from None
     noun = "feature" if is_map else "record"
-    return table.source(lambda number: f"{noun} {number}", [])
+    return table.source(lambda number: f"{noun} {number}", left_out)
 
 
 def _has_lines(file: LogFile) -> bool:
@@ -181,6 +197,8 @@ def _has_lines(file: LogFile) -> bool:
         head = content.read(_HEAD_BYTES).decode("utf-8-sig", "replace")
     lines = [line for line in (each.strip().lstrip(_SEPARATOR) for each in head.splitlines())
              if line]
+    if lines and not lines[0].startswith(("{", "[")) and starts_json(lines[0]):
+        return True
     return (len(lines) > 1 and lines[0].startswith("{") and lines[0].endswith("}")
             and "FeatureCollection" not in lines[0])
 
@@ -198,8 +216,12 @@ def _add_lines(file: LogFile, table: _Table,
             if not line:
                 continue
             where = f"{file}: line {lines.number}"
+            before, brace, _ = line.partition("{")
+            before = before.strip() if brace and not before.startswith("[") else ""
             try:
-                record = parse_json(line, where)
+                record = parse_json(line[len(before):], where)
+                if before and isinstance(record, dict):
+                    record = {BEFORE: before} | record
                 if not isinstance(record, dict):
                     raise BadInput(f"{where} is no JSON object; allowed is one object a line")
             except BadInput as error:
@@ -217,9 +239,15 @@ def _add_lines(file: LogFile, table: _Table,
     return [*cut, *([("bad row", len(bad), f"line {bad[0]}")] if bad else [])]
 
 
-def _add_document(file: LogFile, table: _Table) -> bool:
-    """Add the records of a document, or of several in a row; return whether they are features."""
+def _add_document(file: LogFile, table: _Table,
+                  bad_rows: BadRows | None) -> tuple[bool, list[tuple[str, int, str]]]:
+    """Add the records of a document, or of several in a row.
+
+    Returns:
+        whether they are features; and why, how many and which others are left out.
+    """
     is_map = False
+    bad: list[tuple[str, int, str]] = []
     number = 0
     for value in _documents(file):
         if isinstance(value, dict) and value.get("type") == "FeatureCollection":
@@ -238,11 +266,22 @@ def _add_document(file: LogFile, table: _Table) -> bool:
         ROWS.check(len(value), file)
         for record in value:
             number += 1
-            where = f"{file}: {'feature' if is_map else 'record'} {number}"
-            if not isinstance(record, dict):
-                raise BadInput(f"{where} is {shown(record)}; allowed are objects")
-            table.add(_point(record, where) if is_map else record, number, where)
-    return is_map
+            noun = "feature" if is_map else "record"
+            where = f"{file}: {noun} {number}"
+            try:
+                if not isinstance(record, dict):
+                    raise BadInput(f"{where} is {shown(record)}; allowed are objects")
+                own = _point(record, where) if is_map else record
+            except BadInput as error:
+                if bad_rows is None:
+                    raise
+                if not bad_rows.add(f"{bad_rows.prefix}{noun} {number}", "", record,
+                                    "is no point" if is_map else "is no object"):
+                    raise BadInput(f"{error}{bad_rows.hint(1)}") from None
+                bad.append(("bad row", 1, f"{noun} {number}"))
+                continue
+            table.add(own, number, where)
+    return is_map, bad
 
 
 def _documents(file: LogFile) -> Iterator[Any]:

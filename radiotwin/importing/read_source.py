@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput, optional_package
-from radiotwin.importing.json_files import read_json_log
+from radiotwin.importing.json_files import read_json_log, starts_json
 from radiotwin.importing.log_files import (
     BINARIES,
     JSON,
@@ -237,7 +237,7 @@ def _read_text(file: LogFile, settings: Settings, expected: Expected,
     first = _first_line(file)
     kind = next((each for each in expected.without_header
                  if re.fullmatch(each.first_line, first)), None)
-    if file.suffix in JSON or re.match("\x1e?{|\\[ *({|$)", first):
+    if file.suffix in JSON or starts_json(first):
         declared, *may_be = expected.columns or (frozenset(),)
         return read_json_log(file, declared, frozenset().union(*may_be), settings.list_name,
                              settings.crs, bad_rows)

@@ -116,3 +116,38 @@ def test_lines_that_are_no_json_can_be_skipped(bring_in):
         bring_in(content, "log.jsonl", columns=COLUMNS)
     report = bring_in(content, "log.jsonl", columns=COLUMNS, skip_bad_rows=1).report
     assert report["kept"] == 4 and report["bad_rows"][0]["row"] == "line 3"
+
+
+def test_lines_of_an_mqtt_client(bring_in):
+    content = "".join(f"2024-05-01T10:00:0{i}Z gateway/{i} {json.dumps(each)}\n" for i, each in enumerate(RECORDS))
+    for name in ("log.txt", "log.jsonl", "log.log"):
+        result = bring_in(content, name, columns=COLUMNS | {"receiver": "before"})
+        assert list(result.table["rssi_dbm"]) == [-80, -81, -82, -83] and result.table["receiver"][1] == "2024-05-01T10:00:01Z gateway/1"
+
+
+def test_features_that_are_no_points_can_be_skipped(bring_in):
+    features = [{"type": "Feature", "properties": {"cell": "A", "rssi": -80 - i},
+                 "geometry": {"type": "Point", "coordinates": [11.5, 48.1]}} for i in range(3)]
+    features.insert(1, {"type": "Feature", "properties": {}, "geometry": {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}})
+    content = json.dumps({"type": "FeatureCollection", "features": features})
+    columns = COLUMNS | {"latitude": "latitude", "longitude": "longitude"}
+    with pytest.raises(BadInput, match="feature 2 is LineString.*--skip-bad-rows 1"):
+        bring_in(content, "log.geojson", columns=columns)
+    report = bring_in(content, "log.geojson", columns=columns, skip_bad_rows=1).report
+    assert report["kept"] == 3 and report["bad_rows"][0]["row"] == "feature 2"
+
+
+@pytest.mark.parametrize(("payload", "name", "device"), [
+    ({"latitude": 48.1, "longitude": 11.5}, "mapper", "g"), ({"temperature": 3}, "", "n")])
+def test_networks(bring_in, payload, name, device):
+    place = {"latitude": 48.2, "longitude": 11.5, "altitude": 500}
+    events = {
+        "chirpstack-3": {"devEUI": "n", "publishedAt": "2024-05-01T10:00:00Z", "object": payload,
+                         "rxInfo": [{"gatewayID": "g", "rssi": -80, "loRaSNR": -9, "location": place}]},
+        "helium": {"dev_eui": "n", "reported_at": 1714557600000, "decoded": {"payload": payload}, "metadata": {"labels": [{"id": "x"}]},
+                   "hotspots": [{"name": "g", "lat": 48.2, "long": 11.5, "rssi": -80, "snr": -9}]}}
+    for network, event in events.items():
+        result = bring_in(json.dumps(event), "log.json")
+        assert result.report["files"][0]["format"] == network + f"-{name}" * bool(name)
+        assert list(result.table["rssi_dbm"]) == [-89] and list(result.devices["device"]) == [device]
+        assert list(result.table["time_s"]) == [1714557600]
