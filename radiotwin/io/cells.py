@@ -359,39 +359,49 @@ def _read_parquet(path: Path, required: Collection[str], optional: Collection[st
             ROWS.check(rows + len(batch), path)
             TABLE_BYTES.check(size, path)
             batches.append(pyarrow.record_batch(
-                [column if name in binary else _decoded(path, name, column, rows)
-                 for name, column in zip(names, batch.columns)], names=names))
+                [column.dictionary.take(column.indices)
+                 if pyarrow.types.is_dictionary(column.type) else column
+                 for column in batch.columns], names=names))
             rows += len(batch)
     if not batches:
         return schema.empty_table().select(names).to_pandas(ignore_metadata=True)
     whole = pyarrow.Table.from_batches(batches)
     del batches, batch
+    for index, name in enumerate(names):
+        if name not in binary and _is_text(whole.schema.field(name).type):
+            whole = whole.set_column(index, name, _text_of(path, name, whole[name]))
     return whole.to_pandas(ignore_metadata=True, split_blocks=True, self_destruct=True)
 
 
-def _decoded(path: Path, name: str, column: Any, first_row: int) -> Any:
-    """Return a column of a batch without a dictionary, and of bytes their text.
+def _text_of(path: Path, name: str, column: Any) -> Any:
+    """Return a column of texts, or of bytes, as texts, which a file may call what is none.
+
+    Where none of the bytes is a text, as of UUIDs and geometries, it is their hexadecimal digits.
 
     Raises:
-        BadInput: bytes that are not UTF-8, which a file may call a text, too.
+        BadInput: a text is not UTF-8; names the row.
     """
     import pyarrow
     from pyarrow import types
 
-    is_dictionary = types.is_dictionary(column.type)
-    values = column.dictionary if is_dictionary else column
-    if _is_text(values.type):
-        data = values.cast(pyarrow.large_binary())
+    data = column.cast(pyarrow.large_binary())
+    try:
+        return data.cast(pyarrow.large_string())
+    except pyarrow.ArrowInvalid:
+        cells = data.to_pylist()
+    texts = [cell.decode(errors="replace") for cell in cells if cell]
+    if not any(text.isprintable() and "\ufffd" not in text for text in texts) and not (
+            types.is_string(column.type) or types.is_large_string(column.type)
+            or types.is_string_view(column.type)):
+        return pyarrow.array([cell if cell is None else cell.hex() for cell in cells],
+                             pyarrow.large_string())
+    for row, cell in enumerate(cells, start=2):
         try:
-            values = data.cast(pyarrow.large_string())
-        except pyarrow.ArrowInvalid:
-            cells = data.take(column.indices) if is_dictionary else data
-            for row, cell in enumerate(cells.to_pylist(), start=first_row + 2):
-                if cell is not None and "\ufffd" in cell.decode(errors="replace"):
-                    raise BadInput(f"{path}: row {row}, column {name}: {cell[:60]!r} is not text "
-                                   "in UTF-8; write the table again") from None
-            raise
-    return values.take(column.indices) if is_dictionary else values
+            (cell or b"").decode()
+        except UnicodeDecodeError:
+            raise BadInput(f"{path}: row {row}, column {name}: {cell[:60]!r} is not text in UTF-8; "
+                           "write the table again") from None
+    raise AssertionError(name)
 
 
 def _is_text(kind: Any) -> bool:
