@@ -36,10 +36,10 @@ def helsinki(folder, tmp_path_factory):
 def test_every_building_has_its_height_and_where_it_is_from(helsinki):
     scene, report = helsinki
     facts = dict(report.facts)
-    assert facts["buildings"].startswith("548 in ")
-    assert facts["heights from"] == "building:levels × 3 m: 225, height tag: 31, default: 292 (10 m)"
+    assert facts["buildings"].startswith("549 in ")
+    assert facts["heights from"] == "building:levels × 3 m: 226, height tag: 31, default: 292 (10 m)"
     table = pd.read_csv(scene.folder / "buildings.csv")
-    assert table["building"].nunique() == 548
+    assert table["building"].nunique() == 549
     assert scene.config.lattice.altitudes_m == [1.5] and scene.config.lattice.step_m == 5.0
 
 
