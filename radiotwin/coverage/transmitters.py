@@ -10,11 +10,11 @@ import pandas as pd
 from radiotwin.display import some
 from radiotwin.errors import BadInput
 from radiotwin.geo import read_frame
-from radiotwin.importing.read_source import read_source
+from radiotwin.importing.read_source import Expected, read_source
 from radiotwin.links.declared import Radio, radios_of
 from radiotwin.links.implausible import far_notes, high_notes
 from radiotwin.links.measurements import RADIO, read_antenna_files
-from radiotwin.links.site_table import SiteTable, read_site_table
+from radiotwin.links.site_table import SiteTable, is_site_table, read_site_table
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna, parse_pattern
 
@@ -80,7 +80,7 @@ def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
         BadInput: names file, row and column of the first value that cannot be used.
     """
     path = Path(path)
-    source = read_source(path)
+    source = read_source(path, expected=Expected(is_wanted=is_site_table))
     sites = read_site_table(path, source.table, source.where, "device", (*_OPTIONAL, "antenna"))
     names, values = sites.names, sites.values
     sites.refuse("device", names.duplicated(), "occurs twice; every name must be unique")

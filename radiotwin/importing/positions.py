@@ -14,7 +14,7 @@ import pandas as pd
 from radiotwin.display import count, some
 from radiotwin.errors import BadInput
 from radiotwin.geo import ALLOWED, reference_system
-from radiotwin.importing.read_source import read_source
+from radiotwin.importing.read_source import Expected, read_source
 from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings
 from radiotwin.importing.source import Source, Tally
 from radiotwin.importing.units import ISO, seconds
@@ -23,7 +23,7 @@ from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.cell_limits import READS
 from radiotwin.links.implausible import FAR_M, distances_m, far_notes, unmatched_notes
 from radiotwin.links.measurements import DEVICE_OPTIONAL
-from radiotwin.links.site_table import SiteTable, local_positions, read_site_table
+from radiotwin.links.site_table import SiteTable, is_site_table, local_positions, read_site_table
 
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
 ORIGIN_DECIMALS = 7  # of a computed origin [degrees]: 1 cm
@@ -204,7 +204,7 @@ def _read_sites(path: str, key: str, settings: Settings, names: Collection[str])
         its values are latitude and longitude where x and y are projected; their index holds the
         names.
     """
-    source = read_source(path)
+    source = read_source(path, expected=Expected(is_wanted=is_site_table))
     uses = [*DEVICE_OPTIONAL, "antenna", "since", "until"] if key == "device" else []
     sites = read_site_table(source.path, source.table, source.where, key, uses,
                             settings.length_unit or "", settings.crs is not None, True, names)

@@ -63,10 +63,12 @@ class Expected:
     Attributes:
         columns: sets of columns, of which a header is likely to have one, in lower case.
         without_header: formats of texts without a header.
+        is_wanted: whether a sheet with these columns is the one to read; None: by `columns`.
     """
 
     columns: tuple[frozenset[str], ...] = ()
     without_header: tuple[WithoutHeader, ...] = ()
+    is_wanted: Callable[[list[str]], bool] | None = None
 
 
 def _read_sheets(file: LogFile, declared: str | None) -> Iterator[tuple[str, Sheet]]:
@@ -123,11 +125,15 @@ def _read_workbook(file: LogFile, settings: Settings, expected: Expected,
     declared = expected.columns[0] if expected.columns else frozenset()
     columns = {name: {str(column).lower() for column in source.table}
                for name, source in sources.items()}
-    chosen = [name for name in sources if declared and declared <= columns[name]] \
-        or [name for name in sources if columns[name] == next(iter(columns.values()))]
+    if expected.is_wanted is not None:
+        wanted = (name for name in sources if expected.is_wanted(list(sources[name].table)))
+        chosen = [next(wanted, next(iter(sources)))]
+    else:
+        chosen = [name for name in sources if declared and declared <= columns[name]] \
+            or [name for name in sources if columns[name] == next(iter(columns.values()))]
     others = [*(name for name in sources if name not in chosen), *failed]
-    notes = (f"{file.name}: sheets with other columns are not read: {listed(others)}; name one "
-             "with --sheet",) if others else ()
+    notes = (f"{file.name}: sheets with other columns are not read: {listed(others)}"
+             + "; name one with --sheet" * (expected.is_wanted is None),) if others else ()
     if len(chosen) == 1:
         only = sources[chosen[0]]
         return replace(only, notes=(*only.notes, *notes))

@@ -141,6 +141,7 @@ class Measurements(Summarised):
         origin: of the local frame of both; None where it is not known.
         antenna_files: content of the devices' antenna files, by their names in `devices`.
         notes: on columns of the files that are not used, and values that are probably not meant.
+        files: names of both tables, for messages.
     """
 
     table: pd.DataFrame
@@ -148,6 +149,7 @@ class Measurements(Summarised):
     origin: Origin | None = None
     antenna_files: Mapping[str, bytes] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    files: tuple[str, str] = ("measurements", "devices")
 
     @property
     def level_column(self) -> str:
@@ -220,8 +222,8 @@ class Measurements(Summarised):
             return self
         table, devices = (above_datum(rows, name, position, ground_height_m)
                           for rows, name, position in (
-                              (self.table, "measurements", _RECEIVER_POSITION),
-                              (self.devices, "devices", _DEVICE_POSITION)))
+                              (self.table, self.files[0], _RECEIVER_POSITION),
+                              (self.devices, self.files[1], _DEVICE_POSITION)))
         return replace(self, table=table, devices=devices)
 
     def in_frame(self, origin: Origin) -> "Measurements":
@@ -423,7 +425,8 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
     _check_spread(path, table, devices_path, devices)
     unused = unused_columns(path, column_names(path), table.columns, REQUIRED + OPTIONAL + LEVELS)
     return Measurements(table, devices, origin, read_antenna_files(
-        devices_path, devices.get("antenna", ())), (*unused, *notes))
+        devices_path, devices.get("antenna", ())), (*unused, *notes),
+        (str(path), str(devices_path)))
 
 
 def read_devices(path: Path | str) -> pd.DataFrame:

@@ -60,9 +60,11 @@ _SHARES = {"": _SAME, "percent": _times(1e-2), "pct": _times(1e-2)}
 _NO_UNIT = {"": _SAME}
 
 _QUANTITIES: dict[str, tuple[Mapping[str, Convert], str]] = {
-    "latitude": (_ANGLES, "latitude, lat, latitud, latitude wgs84, wgs84 latitude, lat wgs84, "
-                          "lat dd, gps latitude, gps lat, decimal latitude, latitude decimal"),
-    "longitude": (_ANGLES, "longitude, lon, long, lng, longitud, longitude wgs84, wgs84 longitude, "
+    "latitude": (_ANGLES, "latitude, lat, latitud, latitude dms, lat dms, latitude wgs84, "
+                          "wgs84 latitude, lat wgs84, lat dd, gps latitude, gps lat, "
+                          "decimal latitude, latitude decimal"),
+    "longitude": (_ANGLES, "longitude, lon, long, lng, longitud, longitude dms, lon dms, long dms, "
+                           "longitude wgs84, wgs84 longitude, "
                            "lon wgs84, long wgs84, lon dd, long dd, gps longitude, gps lon, "
                            "gps long, gps lng, decimal longitude, longitude decimal"),
     "x": (_LENGTHS, "x"), "y": (_LENGTHS, "y"), "z": (_LENGTHS, "z"),
@@ -121,6 +123,10 @@ _NAMES = {
               f"base station, bs, enb, gnb, beacon, bssid, {_ANY_NAME}",
     "receiver": f"receiver, receiver id, receiver name, rx, sensor, sensor id, probe, {_ANY_NAME}"}
 _IN_PARTS = re.compile(r"(lat|lon|long|latitude|longitude)(min|minute|minutes|sec|second|seconds)")
+_DMS = re.compile(
+    r"""([NSEW]?)\s*([-+]?\d+(?:\.\d+)?)(?:[°º:\sD]\s*(?:(\d+(?:\.\d+)?)['′’:\sM]?\s*"""
+    r"""(?:(\d+(?:\.\d+)?)(?:["″”S]|'')?\s*)?)?)?([NSEW]?)""")
+_DMS_CHARACTERS = 40
 _PROJECTED = {"x": "easting, utm x, utm easting, utm e",
               "y": "northing, utm y, utm northing, utm n"}
 
@@ -331,6 +337,13 @@ def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int]
     return replace(table, notes=(*_unused_note(path, unused), *_implausible(table)))
 
 
+def is_site_table(header: Iterable[str]) -> bool:
+    """Return whether a table with these columns has places."""
+    known = _known_names(True)
+    given = {known[_plain(str(name))].quantity for name in header if _plain(str(name)) in known}
+    return {"latitude", "longitude"} <= given or {"x", "y"} <= given
+
+
 def unused_columns(path: Path | str, header: Iterable[str], used: Collection[str],
                    known: Collection[str]) -> list[str]:
     """Return a note on the columns of a table of fixed names that are not used.
@@ -353,7 +366,8 @@ def _unused_note(path: Path | str, unused: Mapping[str, str]) -> list[str]:
         return []
     reasons = {name: why or next((why for word, why in _UNUSED.items() if re.fullmatch(
         f"{word}(deg|dbi?|dbd|m|ft)?", _plain(name))), "") for name, why in unused.items()}
-    columns = listed(f"{name} ({why})" if why else name for name, why in reasons.items())
+    columns = listed(f"{name or 'one without a name'}" + f" ({why})" * bool(why)
+                     for name, why in reasons.items())
     return [f"{Path(path).name}: column{'s' * (len(unused) > 1)} not used: {columns}"]
 
 
@@ -416,6 +430,9 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
     name = table.columns[quantity]
     text = as_text(table.cells[name])
     numbers = as_numbers(text)
+    if quantity in LIMITS_DEG:
+        for i in np.flatnonzero(np.isnan(numbers) & (text != "")):
+            numbers[i] = _degrees(text.iloc[i], quantity)
     _refuse(table, name, np.isnan(numbers) & (text != ""), "is not a number")
     _refuse(table, name, np.isinf(numbers), "is not finite")
     if convert is None:
@@ -443,6 +460,21 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
     refuse_limits(partial(_refuse, table, name),
                   f"{quantity.removesuffix('_m')}_m" if is_length else quantity, numbers)
     return numbers
+
+
+def _degrees(text: str, quantity: str) -> float:
+    """Return an angle in degrees, minutes and seconds, such as `48°06'12.5"N`; NaN of none."""
+    found = _DMS.fullmatch(text.upper()) if len(text) <= _DMS_CHARACTERS else None
+    if found is None:
+        return np.nan
+    before, *parts, after = found.groups()
+    degrees, minutes, seconds = (float(part or 0) for part in parts)
+    end = before or after or ""
+    ends = "NS" if quantity == "latitude" else "EW"
+    if minutes >= 60 or seconds >= 60 or (before and after) or end not in ("", *ends):
+        return np.nan
+    sign = -1.0 if end == ends[1] or parts[0].startswith("-") else 1.0
+    return sign * (abs(degrees) + minutes / 60 + seconds / 3600)
 
 
 def _check_positions(table: SiteTable) -> None:

@@ -129,10 +129,11 @@ def _check_heights(measurements: Measurements) -> None:
     """Raise BadInput, with the row, where a height is empty: a 3D map needs it."""
     empty = np.flatnonzero(measurements.table["receiver_z_m"].isna())
     if len(empty):
-        raise BadInput(f"measurements, row {empty[0] + 2}, column receiver_z_m: the receiver's "
-                       f"height is empty; {HEIGHT_NEEDED}, or import the file again with one for "
-                       "all rows, radiotwin import --columns \"…,height=always 1.5\"")
+        raise BadInput(f"{measurements.files[0]}, row {empty[0] + 2}, column receiver_z_m: the "
+                       f"receiver's height is empty; {HEIGHT_NEEDED}, or import the file again "
+                       "with one for all rows, radiotwin import --columns \"…,height=always 1.5\"")
     measured = np.unique(measurements.device_index)
     for index in measured[np.isnan(measurements.device_m[measured, 2])]:
-        raise BadInput(f"devices, row {index + 2}, column z_m: the height of device "
-                       f"{measurements.devices['device'][index]!r} is empty; {HEIGHT_NEEDED}")
+        raise BadInput(f"{measurements.files[1]}, row {index + 2}, column z_m: the height "
+                       f"of device {measurements.devices['device'][index]!r} is empty; "
+                       f"{HEIGHT_NEEDED}")

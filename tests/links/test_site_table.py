@@ -13,8 +13,8 @@ ALL = ("above_ground_m", "tx_power_dbm", "eirp_dbm", "cable_loss_db", "frequency
 
 
 def read(text, end="device", uses=ALL, **given):
-    rows = [line.split(",") for line in text.split()]
-    cells = pd.DataFrame(rows[1:], columns=[name.replace("~", " ") for name in rows[0]], dtype=str)
+    rows = [line.replace("~", " ").split(",") for line in text.split()]
+    cells = pd.DataFrame(rows[1:], columns=rows[0], dtype=str)
     return read_site_table("sites.csv", cells, lambda row: f"row {row + 2}", end, uses, **given)
 
 
@@ -45,6 +45,19 @@ def test_places_and_names_by_any_spelling(names, name):
     table = read(f"{name},{names},z_m\nb7,48.1,11.5,3\n")
     assert table.values[["latitude", "longitude", "z"]].values.tolist() == [[48.1, 11.5, 3]]
     assert table.names.tolist() == ["b7"] and not table.notes
+
+
+@pytest.mark.parametrize(("lat", "lon"), [("48°06'00\"N", "11°30'00\"W"), ("48~06~00~N", "11:30:00W"), ("N48°6'", "-11°30′"),
+                                          ("48.1N", "W~11.5"), ("48.1°", "11.5°W"), ("48°06′00.0″", "-11°30'00''")])
+def test_degrees_minutes_and_seconds(lat, lon):
+    table = read(f"device,lat,lon\na,{lat},{lon}\n")
+    np.testing.assert_allclose(table.values[["latitude", "longitude"]], [[48.1, -11.5]])
+
+
+@pytest.mark.parametrize("lat", ["48°66'N", "48°6'E", "N48S", "48°N6", "north"])
+def test_degrees_that_are_none(lat):
+    with pytest.raises(BadInput, match="column lat: .* is not a number"):
+        read(f"device,lat,lon\na,{lat},11.5\n")
 
 
 def test_of_several_columns_that_with_the_names_of_the_log_is_taken():
