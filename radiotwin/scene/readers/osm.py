@@ -19,7 +19,7 @@ import urllib.parse
 import urllib.request
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -145,8 +145,8 @@ def assemble(elements: OsmElements) -> MapFile:
     for number, way in elements.ways.items():
         if number in used or not is_building(way.tags):
             continue
-        if below := hidden(f"way/{number}", way.tags, _place(way, elements)):
-            left_out.append(below)
+        if below := hidden(f"way/{number}", way.tags, None):
+            left_out.append(replace(below, place=_place(way, elements)))
         elif not way.nodes or any(node not in elements.positions for node in way.nodes):
             left_out.append(LeftOut(f"way/{number}", INCOMPLETE, _place(way, elements)))
         elif len(way.nodes) < MIN_RING_NODES or way.nodes[0] != way.nodes[-1]:
