@@ -195,8 +195,8 @@ def _has_lines(file: LogFile) -> bool:
     """Return whether the first of several lines is an object."""
     with file.open() as content:
         head = content.read(_HEAD_BYTES).decode("utf-8-sig", "replace")
-    lines = [line for line in (each.strip().lstrip(_SEPARATOR) for each in head.splitlines())
-             if line]
+    lines = [line for line in (each.strip().lstrip(_SEPARATOR).rstrip(",")
+                               for each in head.splitlines()) if line]
     if lines and not lines[0].startswith(("{", "[")) and starts_json(lines[0]):
         return True
     return (len(lines) > 1 and lines[0].startswith("{") and lines[0].endswith("}")
@@ -212,14 +212,14 @@ def _add_lines(file: LogFile, table: _Table,
         lines = Lines(text, file)
         for line in lines:
             is_whole = line.endswith("\n")
-            line = line.strip().lstrip(_SEPARATOR)
+            line = line.strip().lstrip(_SEPARATOR).rstrip(",")
             if not line:
                 continue
             where = f"{file}: line {lines.number}"
             before, brace, _ = line.partition("{")
             before = before.strip() if brace and not before.startswith("[") else ""
             try:
-                record = parse_json(line[len(before):], where)
+                record = parse_json(line[len(before):], where, allow_nan=True)
                 if before and isinstance(record, dict):
                     record = {BEFORE: before} | record
                 if not isinstance(record, dict):
@@ -286,11 +286,8 @@ def _add_document(file: LogFile, table: _Table,
 
 def _documents(file: LogFile) -> Iterator[Any]:
     """Yield the documents that a text holds one after the other, as loggers append them."""
-    def refuse(constant: str) -> None:
-        raise ValueError(f"{constant} is no JSON number")
-
     text = file.read_text(DOCUMENT_BYTES)
-    decoder = json.JSONDecoder(parse_constant=refuse)
+    decoder = json.JSONDecoder()
     at = 0
     while at < len(text):
         if text[at].isspace() or text[at] in ("," + _SEPARATOR):

@@ -16,7 +16,7 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import ALLOWED, reference_system
 from radiotwin.importing.read_source import Expected, read_source
 from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings
-from radiotwin.importing.source import Source, Tally
+from radiotwin.importing.source import Source, Tally, are_few
 from radiotwin.importing.units import ISO, seconds
 from radiotwin.io.cells import shown
 from radiotwin.io.forms import MAX_POSITION_M, Origin
@@ -34,6 +34,9 @@ _MAX_PLACES = 1000  # of one device; one that moves all the time has no places
 SAME_BAND = 1.05  # ratio of carriers between which a device hops: 0.4 dB by 20 lg f
 MIN_SPREAD_DEG = 0.5  # of positions of which some are 100 km from others
 MIN_PLACES, MIN_REPEATS = 4, 3  # of a receiver that moves, and of readings at a place of none
+APART_M = 100_000.0  # from all other readings: more than the campaigns of one log lie apart
+FAST_M_S, NEAR_M = 340.0, 1000.0  # sound in air; jumps below it are errors of a fix, not glitches
+MIN_READINGS = 10  # of which one may be told from the others
 MOVING_M = 1.0  # a device whose positions differ by more than this is not at rest
 
 
@@ -291,6 +294,10 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     del receivers, devices  # as much memory as the links themselves
     if settings.place_m:
         links = links.assign(device=_place_names(source, links, device_m, settings.place_m))
+    keep = ~_are_glitches(links, receiver_m)
+    links = tally.drop(links, ~keep, f"position {APART_M / 1000:.0f} km from all others, or one "
+                                     f"that takes {FAST_M_S:.0f} m/s to and fro", "", source.where)
+    receiver_m, device_m = receiver_m[keep], device_m[keep]
     _check_near(source, links, receiver_m, "receiver")
     _check_near(source, links, device_m, "device")
     links = links.assign(**{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})
@@ -387,13 +394,52 @@ def _by_carrier(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list
         "carrier is a device of its own, with its frequency in its name"]
 
 
+def _are_glitches(links: pd.DataFrame, receiver_m: np.ndarray) -> np.ndarray:
+    """Return which links (n,) have a position of the receiver that it cannot have been at.
+
+    They are the few that lie far from all others of the receiver, or to which and from which it
+    would have had to fly faster than sound. Many are no glitches, but something else is wrong.
+    """
+    known = np.flatnonzero(np.isfinite(receiver_m[:, :2]).all(axis=1))
+    glitch = np.zeros(len(links), dtype=bool)
+    receiver = pd.factorize(links["receiver"].to_numpy()[known])[0]
+    ends = np.flatnonzero(np.diff(np.sort(receiver), append=-1)) + 1
+    for rows in np.split(known[np.argsort(receiver, kind="stable")], ends[:-1]):
+        place_m = receiver_m[rows, :2]
+        if len(rows) < MIN_READINGS or (np.ptp(place_m, axis=0) < APART_M / 2).all():
+            continue
+        distance_m = np.linalg.norm(place_m - np.median(place_m, axis=0), axis=1)
+        order_m = np.sort(distance_m)
+        gaps = np.flatnonzero(np.diff(order_m) > APART_M)
+        if len(gaps) and are_few(len(rows) - 1 - gaps[0], len(rows)):
+            glitch[rows[distance_m > order_m[gaps[0]]]] = True
+    if "time_s" in links:
+        timed = ~glitch[known] & np.isfinite(links["time_s"].to_numpy()[known])
+        known, receiver = known[timed], receiver[timed]
+        time_s = links["time_s"].to_numpy()[known]
+        order = np.lexsort((time_s, receiver))
+        known, time_s, receiver = known[order], time_s[order], receiver[order]
+
+        def is_fast(rows: int) -> np.ndarray:
+            """Return whether each place is too far from that so many rows before."""
+            step_m = np.linalg.norm(receiver_m[known[rows:], :2] - receiver_m[known[:-rows], :2],
+                                    axis=1)
+            same = receiver[rows:] == receiver[:-rows]
+            return same & (step_m > NEAR_M + FAST_M_S * (time_s[rows:] - time_s[:-rows]))
+
+        spike = is_fast(1)[:-1] & is_fast(1)[1:] & ~is_fast(2)
+        if are_few(spike.sum(), len(known)):
+            glitch[known[1:-1][spike]] = True
+    return glitch
+
+
 def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end: str) -> None:
     far = (np.abs(position_m) > MAX_POSITION_M).any(axis=1)
     if far.any():
         row = int(np.argmax(far))
         raise BadInput(f"{source.path}: {source.where(links.index[row])}: the {end} lies "
                        f"{np.nanmax(np.abs(position_m[row])) / 1000:.10g} km from the origin "
-                       f"({far.sum()} such rows); are position, unit and origin right?")
+                       f"({far.sum()} such rows); are position, unit and --origin right?")
 
 
 def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,

@@ -29,7 +29,7 @@ _NO_DATE = "it has no date: put the date before it ({file date}: that of the fil
            "the time and its format, as in --columns 'time=2024-05-01 {Time}' --time-format " \
            "'%Y-%m-%d %H:%M:%S'"
 _DATES = re.compile("%[YymbBdjDFcxsGUVWuw]")
-HALF_DAY_S, DAY_S = 43_200.0, 86_400.0
+BACK_S, HALF_DAY_S, DAY_S = 3600.0, 43_200.0, 86_400.0
 MAX_STEPS_BACK = 5  # more are no midnights, but rows in another order
 YEARS = (1900, 2200)  # of plausible times; milliseconds that are read as seconds lie outside
 _ROWS_AT_ONCE = 1_000_000  # of which texts are made
@@ -114,7 +114,7 @@ def past_midnights(source: Source, spec: str, time_s: np.ndarray,
     """
     known = np.flatnonzero(np.isfinite(time_s))
     step_s = np.diff(time_s[known])
-    falls = step_s < -HALF_DAY_S
+    falls = step_s < -BACK_S
     if falls.any():
         falls &= np.diff(ends()[known]) == 0
     back = known[1:][falls]
@@ -125,9 +125,9 @@ def past_midnights(source: Source, spec: str, time_s: np.ndarray,
     place = source.where(int(source.table.index[first]))
     is_fixed = spec not in source.table and any(
         re.search(r"\d", constant) for constant in constants_of(spec))
-    if not is_fixed:
+    if not is_fixed or by_s < HALF_DAY_S:
         return time_s, (f"{place}: the clock goes back by {_clock(by_s)} ({len(back)} times in the "
-                        "file); is the date of the later rows right?")
+                        "file); are the date, the hour and %p of the later rows right?")
     days = np.zeros(len(time_s))
     days[back] = 1
     return time_s + DAY_S * np.cumsum(days), (

@@ -151,3 +151,12 @@ def test_networks(bring_in, payload, name, device):
         assert result.report["files"][0]["format"] == network + f"-{name}" * bool(name)
         assert list(result.table["rssi_dbm"]) == [-89] and list(result.devices["device"]) == [device]
         assert list(result.table["time_s"]) == [1714557600]
+
+
+def test_numbers_that_are_none(bring_in):
+    """Python writes NaN, which is no JSON; of a level its meaning is asked for."""
+    content = lines(RECORDS).replace("-81", "NaN")
+    for text in (content, "[" + content.strip().replace("\n", ",") + "]", content.replace("}\n", "},\n")):
+        with pytest.raises(BadInput, match="'nan' is not a number.*not_detected"):
+            bring_in(text, "log.json", columns=COLUMNS)
+        assert bring_in(text, "log.json", columns=COLUMNS, not_measured=["nan"]).report["kept"] == 3

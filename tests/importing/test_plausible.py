@@ -102,3 +102,31 @@ def test_the_note_on_time_zones_is_of_undeclared_ones(bring_in):
             "AltitudeMeters,AccuracyMeters,Type\n02:00,net,[W],2020-01-31 11:44:00,6,-60,48.1,11.5,520.5,4.0,WIFI\n")
     assert any("are read as UTC" in note for note in bring_in(text).report["warnings"])
     assert not any("are read as UTC" in note for note in bring_in(text, time_zone="Europe/Berlin").report["warnings"])
+
+
+@pytest.mark.parametrize(("latitude", "longitude", "left_out"), [
+    (-48.1, 11.5, 1), (4.81, 11.5, 1), (48.1, -150, 1), (49.3, 11.5, 1), (48.2, 11.5, 1), (48.104, 11.5, 0), (-677.7, 11.5, 1)])
+def test_one_fix_that_is_none(bring_in, latitude, longitude, left_out):
+    """The others go north by 11 m in a second; one lies 11 km off, or farther."""
+    places = [(48.1 + i * 1e-4, 11.5) for i in range(40)]
+    places[20] = (latitude, longitude)
+    text = "t,lat,lon,l,d\n" + "".join(f"2024-05-01T10:00:{i:02}Z,{lat},{lon},{-80 - i % 9},a\n" for i, (lat, lon) in enumerate(places))
+    columns = {"time": "t", "latitude": "lat", "longitude": "lon", "level": "l", "device": "d"}
+    report = bring_in(text, columns=columns, time_format="ISO 8601").report
+    assert report["kept"] == 40 - left_out and [each["first"] for each in report["left_out"]] == ["row 22"] * left_out
+
+
+def test_two_campaigns_are_no_glitches(bring_in):
+    text = "x,l,d\n" + "".join(f"{i + 300_000 * (i > 20)},{-80 - i % 9},a\n" for i in range(40))
+    assert bring_in(text, columns={"x": "x", "y": "always 0", "level": "l", "device": "d"}, length_unit="m").report["kept"] == 40
+
+
+def test_clocks_of_twelve_hours_are_told(bring_in):
+    notes = bring_in(rows(["12:59:58", "12:59:59", "01:00:00"]), **MAPPING).report["warnings"]
+    assert any("row 4: the clock goes back by 11:59:59" in note for note in notes)
+
+
+def test_a_far_gateway_is_no_glitch(bring_in):
+    text = "x,l,d,g\n" + "".join(f"{150_000 * (i == 7)},{-80 - i % 9},a,{'far' if i == 7 else 'near'}\n" for i in range(40))
+    columns = {"x": "x", "y": "always 0", "level": "l", "device": "d", "receiver": "g"}
+    assert "far" in set(bring_in(text, columns=columns, length_unit="m").table["receiver"])
