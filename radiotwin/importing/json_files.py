@@ -260,6 +260,9 @@ def _add_document(file: LogFile, table: _Table,
             is_map, value = True, features
         elif isinstance(value, dict):
             value = _of_columns(value) or [value]
+        elif (isinstance(value, list) and value and all(isinstance(row, list) for row in value)
+              and all(isinstance(name, str) for name in value[0])):  # a header and rows
+            value = [dict(zip(value[0], row)) for row in value[1:]]
         if not isinstance(value, list):
             raise BadInput(f"{file} is neither an object nor an array of objects; allowed are "
                            "records {\"rssi\": -80, …}, an array of them, and GeoJSON of points")

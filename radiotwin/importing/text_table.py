@@ -417,10 +417,11 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
             has_units = False
             continue
         if len(row) != width and not fits(row, width):
-            if bad_rows is None or len(row) > width:
+            # Where blanks separate, any cell may be the one that is missing.
+            if bad_rows is None or len(row) > width or dialect.delimiter in BLANKS:
                 if bad_rows is not None and bad_rows.add(
                         f"{bad_rows.prefix}line {number}", "", f"{len(row)} fields",
-                        f"is more than the {width} of the header"):
+                        f"is not the {width} of the header"):
                     bad.append(number)
                     continue
                 hint = "" if bad_rows is None else bad_rows.hint(1)

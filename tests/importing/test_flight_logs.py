@@ -196,3 +196,12 @@ def test_tlog(fly):
 def test_formats_of_tracks_are_named(fly):
     with pytest.raises(BadInput, match=r"unknown format of a track; allowed are .gpx, .kml, .nmea.*\.ulg.*\.bag"):
         fly("", "track.xyz")
+
+
+def test_nmea_of_any_name_and_heights_above_the_start(fly):
+    sentences = [f"GPRMC,10000{i}.00,A,480{6 + i * 0.006:.4f},N,01130.0000,E,10,90,010524,,,A" for i in SECONDS]
+    lines = "".join(f"${each}\r\n" for each in sentences)
+    assert len(fly(lines, "gps.log").table) == 4
+    text = rows("datetime(utc),latitude,longitude,height_above_takeoff(feet)", lambda i: f"2024-05-01 10:00:0{i}.5,48.1,11.5,{i}")
+    notes = fly(text.replace(":00.5", ":00.0")).report["warnings"]
+    assert any("no altitude above the sea is known (height_above_takeoff(feet)" in note for note in notes)

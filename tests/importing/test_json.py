@@ -160,3 +160,8 @@ def test_numbers_that_are_none(bring_in):
         with pytest.raises(BadInput, match="'nan' is not a number.*not_detected"):
             bring_in(text, "log.json", columns=COLUMNS)
         assert bring_in(text, "log.json", columns=COLUMNS, not_measured=["nan"]).report["kept"] == 3
+
+
+def test_arrays_of_arrays_have_a_header(bring_in):
+    content = json.dumps([list(RECORDS[0]), *(list(each.values()) for each in RECORDS)])
+    assert list(bring_in(content, "log.json", columns=COLUMNS).table["rssi_dbm"]) == [-80, -81, -82, -83]

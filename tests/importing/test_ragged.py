@@ -97,3 +97,11 @@ def test_blanks_within_cells_need_names_of_their_parts(bring_in):
     result = bring_in(content, "log.txt", columns=columns, time_format="ISO 8601", header=["day", "hour", *HEAD[1:]],
                       lines_before_header=1)
     assert len(result.table) == 12
+
+
+def test_where_blanks_separate_any_cell_may_be_missing(bring_in):
+    head, rows = [*HEAD, "sats"], [[*row, "9"] for row in ROWS]
+    rows[5] = [*rows[5][:1], *rows[5][2:]]
+    with pytest.raises(BadInput, match="line 7 has 5 fields.*--skip-bad-rows 1"):
+        bring_in(text(rows, head, " "), "log.txt", **MAPPING)
+    assert len(bring_in(text(rows, head, " "), "log.txt", **MAPPING, skip_bad_rows=1).table) == 11

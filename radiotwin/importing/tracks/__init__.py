@@ -1,5 +1,6 @@
 """Positions of receivers from tracks of their own, at the times of a log's readings."""
 
+import re
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 
@@ -10,7 +11,7 @@ from radiotwin.errors import BadInput
 from radiotwin.importing.log_files import BINARIES, TEXTS
 from radiotwin.importing.settings import HEIGHTS, Settings, TrackFile
 from radiotwin.importing.source import Source, Tally
-from radiotwin.importing.tracks.autopilots import is_dataflash_text, read_dataflash, read_tlog
+from radiotwin.importing.tracks.autopilots import read_dataflash, read_tlog
 from radiotwin.importing.tracks.fixes import COLUMNS, Fixes
 from radiotwin.importing.tracks.gnss import read_gpx, read_nmea
 from radiotwin.importing.tracks.maps import read_geojson, read_kml
@@ -18,6 +19,7 @@ from radiotwin.importing.tracks.rosbag import is_rosbag, read_rosbag
 from radiotwin.importing.tracks.tables import read_track_table
 from radiotwin.importing.tracks.ulog import read_ulog
 from radiotwin.io.cells import listed
+from radiotwin.io.inputs import open_input
 
 _READERS = {".gpx": read_gpx, ".kml": read_kml, ".nmea": read_nmea, ".nma": read_nmea,
             ".ulg": read_ulog, ".bin": read_dataflash, ".tlog": read_tlog}
@@ -81,8 +83,13 @@ def _read(track: TrackFile, zone: str | None) -> Fixes:
         return _READERS[path.suffix.lower()](path)
     if path.suffix.lower() in (".geojson", ".json") and (fixes := read_geojson(path)):
         return fixes
-    if path.suffix.lower() in (".log", ".txt") and is_dataflash_text(path):
-        return read_dataflash(path)
+    if path.suffix.lower() in (".log", ".txt"):
+        with open_input(path, "track") as file:
+            begin = file.read(4)
+        if begin == b"FMT,":
+            return read_dataflash(path)
+        if re.match(rb"\$[A-Z]{2,3}", begin):
+            return read_nmea(path)
     kind = PurePath(path.name.lower().removesuffix(".gz")).suffix
     if kind not in (*TEXTS, *BINARIES):
         raise BadInput(f"{path}: unknown format of a track; allowed are "

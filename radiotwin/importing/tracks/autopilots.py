@@ -42,12 +42,6 @@ def _content(path: Path) -> bytes:
         return file.read()
 
 
-def is_dataflash_text(path: Path) -> bool:
-    """Return whether a text is a DataFlash log."""
-    with open_input(path, "flight log") as file:
-        return file.read(4) == b"FMT,"
-
-
 def read_dataflash(path: Path) -> Fixes:
     """Read the positions and the attitude of a DataFlash log, binary or a text.
 

@@ -21,12 +21,13 @@ from radiotwin.io.cells import as_numbers, as_text, listed
 from radiotwin.links.site_table import METRES
 
 _NAMES = {
-    "time": "timestamp, datetime, time, date time, utc, utc time, time utc, gps time, utc datetime",
+    "time": "timestamp, datetime, time, date time, utc, utc time, time utc, gps time, "
+            "utc datetime, gps date time stamp, tst",
     "latitude": "latitude, lat, osd latitude, gps latitude, gps lat, aircraft latitude",
     "longitude": "longitude, lon, lng, long, osd longitude, gps longitude, gps lon, gps long, "
                  "aircraft longitude",
     "altitude": "altitude above sea level, altitude amsl, altitude msl, alt msl, amsl, asl, "
-                "osd altitude, gps altitude, altitude, alt, elevation, ele",
+                "osd altitude, gps altitude, gps height msl, altitude, alt, elevation, ele",
     "heading": "heading, compass heading, osd yaw, yaw, course heading",
     "pitch": "pitch, osd pitch", "roll": "roll, osd roll",
     "day": "custom date, date, gps date, utc date", "hour": "custom update time, time, gps time"}
@@ -99,6 +100,11 @@ def read_track_table(path: Path, track: TrackFile, zone: str | None) -> Fixes:
     time_s, what = _times(source, header, track, zone)
     note = f"{path.name}: time is {what}; " + ", ".join(
         f"{name} {spec}" for name, spec in columns.items())
+    if "altitude" not in columns:
+        others = [name for name in header if re.search("(?i)height|ascent|alt", name)]
+        note += "; no altitude above the sea is known" + (
+            f" ({listed(others)} may be above the start: declare one by --track-columns "
+            "altitude=… if it is not)" if others else "")
     return make_fixes(path, time_s, values, (note,))
 
 
