@@ -361,33 +361,32 @@ def _beside(path: Path) -> Path:
 def _swap(new: Path, path: Path, names: Collection[str] | None) -> None:
     """Replace the folder `path`, or the `names` in it, by what is in `new`; all or nothing."""
     inside = _beside(path) != path
-    if not inside:
-        try:
-            os.replace(new, path)  # nothing is there, or an empty folder
-            return
-        except OSError:
-            if not path.exists():
+    with deferred(), _locked(path if inside else path.parent):  # another process may, too
+        if not inside:
+            try:
+                os.replace(new, path)  # nothing is there, or an empty folder
+                return
+            except OSError:
+                if not path.exists():
+                    raise
+        held, fresh = os.listdir(path), os.listdir(new)
+        others = [] if names is None else [
+            name for name in held if name not in fresh and not _is_one_of(name, names)]
+        whole = not (inside or others)
+        with _temporary_folder(path if whole else path / "inside", "-aside") as aside:
+            pairs = [(path, aside / path.name), (new, path)] if whole else [
+                *((path / name, aside / name) for name in held
+                  if name not in others and not _TEMPORARY.fullmatch(name)),
+                *((new / name, path / name) for name in fresh)]
+            done = 0
+            try:
+                for source, target in pairs:
+                    os.replace(source, target)
+                    done += 1
+            except OSError:
+                for source, target in reversed(pairs[:done]):
+                    os.replace(target, source)
                 raise
-    base = path / "inside" if inside or names is not None else path
-    with (_temporary_folder(base, "-aside") as aside, deferred(),
-          _locked(base.parent)):  # another process may replace it, too
-        if base == path:
-            pairs = [(path, aside / path.name), (new, path)]
-        else:
-            fresh = os.listdir(new)
-            pairs = [(path / name, aside / name) for name in os.listdir(path)
-                     if not _TEMPORARY.fullmatch(name)
-                     and (name in fresh or names is None or _is_one_of(name, names))]
-            pairs += [(new / name, path / name) for name in fresh]
-        done = 0
-        try:
-            for source, target in pairs:
-                os.replace(source, target)
-                done += 1
-        except OSError:
-            for source, target in reversed(pairs[:done]):
-                os.replace(target, source)
-            raise
 
 
 @contextmanager

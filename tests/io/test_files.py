@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -367,3 +368,25 @@ def test_a_folder_that_was_only_tried_is_removed_and_a_written_one_stays(tmp_pat
     path.unlink()
     require_writable(path)
     assert path.parent.is_dir()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="temporaries are locked and swept on POSIX only")
+def test_a_folder_that_is_replaced_again_and_again_is_whole_whenever_its_process_is_killed(tmp_path):
+    program = ("import sys; from itertools import count; from radiotwin.io.files import *\n"
+               "for number in count():\n"
+               "    with atomic_folder(sys.argv[1], ('*.txt',)) as folder:\n"
+               "        for name in 'abcdef':\n"
+               "            (folder / f'{name}.txt').write_text(str(number))\n"
+               "    print(number, flush=True)")
+    for moment in range(20):
+        child = subprocess.Popen([sys.executable, "-S", "-c", program, tmp_path / "out"], stdout=subprocess.PIPE,
+                                 env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)})
+        for _ in range(1 + moment % 4):
+            child.stdout.readline()
+        time.sleep(moment * 2e-4)
+        child.kill()
+        child.wait()
+        child.stdout.close()
+        files._sweep.cache_clear()
+        require_writable(tmp_path / "other")
+        assert len(content(tmp_path)) == 6 and len(set(content(tmp_path).values())) == 1
