@@ -105,3 +105,14 @@ def test_where_blanks_separate_any_cell_may_be_missing(bring_in):
     with pytest.raises(BadInput, match="line 7 has 5 fields.*--skip-bad-rows 1"):
         bring_in(text(rows, head, " "), "log.txt", **MAPPING)
     assert len(bring_in(text(rows, head, " "), "log.txt", **MAPPING, skip_bad_rows=1).table) == 11
+
+
+@pytest.mark.parametrize(("lat", "lon", "expected"), [
+    ("48°06'36.0\"\"N", "11°30'00\"\"E", (48.11, 11.5)), ("48.11 N", "11.5 W", (48.11, -11.5)), ("48° 6.6' S", "11.5°", (-48.11, 11.5)),
+    ("-48.11°", "11° 30′ E", (-48.11, 11.5))])
+def test_degrees_with_their_marks(bring_in, lat, lon, expected):
+    content = text([[row[0], f'"{lat}"', f'"{lon}"', *row[3:]] for row in ROWS])
+    report = bring_in(content, **MAPPING).report
+    assert (report["ranges"]["latitude"]["median"], report["ranges"]["longitude"]["median"]) == pytest.approx(expected)
+    with pytest.raises(BadInput, match="'somewhere' is not a number"):
+        bring_in(text(changed(5, [ROWS[5][0], "somewhere", *ROWS[5][2:]])), **MAPPING)
