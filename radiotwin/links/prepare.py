@@ -24,6 +24,7 @@ from radiotwin.links.checks import (
 )
 from radiotwin.links.correlation import devices_move
 from radiotwin.links.declared import Declared, Radio, antenna_of_uavs, complete, radios_of
+from radiotwin.links.implausible import high_notes
 from radiotwin.links.limits import estimate_limits
 from radiotwin.links.links import RESTART_NOTE, Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements
@@ -103,6 +104,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
         low = np.flatnonzero(np.isnan(declared_z_m))
         device_m[low, 2] += _ground_m(scene, device_m[low], receiver_m)
     notes += check_names(measurements)
+    notes += [note for note in high_notes(_clearance_m(declared_z_m, device_m, receiver_m, scene))
+              if not any(told.endswith(note) for told in notes)]
     notes += check_positions(receiver_m, device_m, scene)
     from_middle_m = np.abs(receiver_m[:, :2] - np.median(receiver_m[:, :2], axis=0)).max(axis=1)
     leave_out(from_middle_m > MAX_EXTENT_M,
@@ -150,6 +153,19 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
                   device_m[placed], device, np.flatnonzero(placed), notes)
     links = links if to_locate or devices_move(links) else links.with_notes(*end_notes(links))
     return links.with_notes(RESTART_NOTE) if links.time_restarts else links
+
+
+def _clearance_m(declared_z_m: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray,
+                 scene: Scene | None) -> np.ndarray:
+    """Return the heights (k,) of devices above the ground [m], or above the lowest receiver.
+
+    NaN where a height or, over a 3D map, a place is not declared.
+    """
+    if scene is not None:
+        return declared_z_m - _ground_m(scene, device_m, receiver_m)
+    known_m = receiver_m[np.isfinite(receiver_m[:, 2]), 2]
+    return declared_z_m - max(float(known_m.min(initial=np.inf)), 0.0) if len(known_m) \
+        else np.full(len(device_m), np.nan)
 
 
 def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:

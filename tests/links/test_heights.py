@@ -56,3 +56,14 @@ def test_a_device_whose_height_is_not_given_is_held_above_the_ground():
     links = prepare_links(Measurements(table, devices), world)
     assert dict(zip(links.device_names, links.device_m[:, 2])) == pytest.approx({"anchor": 161.5, "phone": 101.5})
     assert any("taken for 1.5 m above the ground" in note for note in links.notes)
+
+
+@pytest.mark.parametrize(("z_m", "receiver_z_m", "told"), [(530.0, 1.5, True), (530.0, 501.5, False), (30.0, 1.5, False)])
+def test_sites_at_altitudes_above_the_sea_are_told(z_m, receiver_z_m, told):
+    rng = np.random.default_rng(2)
+    table = pd.DataFrame({"flight": "f", "receiver": "u", "receiver_x_m": rng.uniform(-300, 300, 100),
+                          "receiver_y_m": rng.uniform(-300, 300, 100), "receiver_z_m": receiver_z_m, "device": ["a", "b"] * 50,
+                          "rssi_dbm": rng.uniform(-100, -60, 100)})
+    devices = pd.DataFrame({"device": ["a", "b"], "x_m": [0.0, 50.0], "y_m": 0.0, "z_m": z_m, "role": "anchor"})
+    notes = prepare_links(Measurements(table, devices), None).notes
+    assert any("the lowest of 2 sites is" in note for note in notes) == told
