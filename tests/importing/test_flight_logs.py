@@ -8,6 +8,10 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
+from radiotwin.importing.settings import TrackFile
+from radiotwin.importing.tracks.autopilots import read_dataflash, read_tlog
+from radiotwin.importing.tracks.maps import read_kml
+from radiotwin.importing.tracks.tables import read_track_table
 
 START = pd.Timestamp("2024-05-01 10:00:00Z").timestamp()
 LOG = "t,id,rssi\n" + "".join(f"{START + i},b,{-80 - i}\n" for i in range(4))
@@ -178,12 +182,17 @@ def packet(i, number, body, extra, system=1):
             + struct.pack("<H", crc(head + body + bytes([extra]))))
 
 
-def test_tlog(fly):
+def telemetry():
     log = b""
     for i in SECONDS:
         log += packet(i, 0, bytes(9), 50)
         log += packet(i, 30, struct.pack("<Iffffff", i, 0.0, 0.0, np.radians(10 * i), 0, 0, 0), 39)
         log += packet(i, 33, struct.pack("<IiiiihhhH", i, 481_000_000 + 1000 * i, 115_000_000, 550_000 + 1000 * i, 0, 0, 0, 0, 0), 104)
+    return log
+
+
+def test_tlog(fly):
+    log = telemetry()
     check(fly(log, "flight.tlog"), [0, 10, 20, 30])
     spoilt = bytearray(log)
     spoilt[-20] ^= 1
@@ -205,3 +214,33 @@ def test_nmea_of_any_name_and_heights_above_the_start(fly):
     text = rows("datetime(utc),latitude,longitude,height_above_takeoff(feet)", lambda i: f"2024-05-01 10:00:0{i}.5,48.1,11.5,{i}")
     notes = fly(text.replace(":00.5", ":00.0")).report["warnings"]
     assert any("no altitude above the sea is known (height_above_takeoff(feet)" in note for note in notes)
+
+
+KML = ("<kml><gx:Track>" + "".join(f"<when>2024-05-01T10:00:0{i}Z</when>" for i in SECONDS)
+       + "".join(f"<gx:coord>11.5 {48.1 + i * 1e-4:.6f} {550 + i}</gx:coord>" for i in SECONDS) + "</gx:Track></kml>").encode()
+TABLE = rows("datetime(utc),latitude,longitude,altitude(feet)", lambda i: f"2024-05-01 10:00:0{i},{48.1 + i * 1e-4:.6f},11.5,1800").encode()
+
+
+@pytest.mark.parametrize(("name", "content"), [("a.bin", dataflash()), ("a.tlog", telemetry()), ("a.kml", KML), ("a.csv", TABLE)])
+def test_damaged_tracks_end_in_a_message(tmp_path, name, content):
+    """Bytes are changed, left out and written twice, 150 times."""
+    rng = np.random.default_rng(5)
+    path = tmp_path / name
+    readers = {".bin": read_dataflash, ".tlog": read_tlog, ".kml": read_kml,
+               ".csv": lambda path: read_track_table(path, TrackFile(file=str(path)), "UTC")}
+    read = 0
+    for _ in range(150):
+        damaged = bytearray(content)
+        for _ in range(rng.integers(1, 4)):
+            at, end = np.sort(rng.integers(0, len(damaged), size=2))
+            end = min(end, at + 20)
+            damaged[at:end] = (bytes(rng.integers(0, 256, size=end - at, dtype=np.uint8)), b"", bytes(damaged[at:end]) * 2,
+                               b"nan", b"1e999", b"-")[rng.integers(6)]
+        path.write_bytes(bytes(damaged))
+        try:
+            fixes = readers[path.suffix](path)
+            assert (np.diff(fixes.time_s) > 0).all() and np.isfinite(fixes.values["latitude"]).all()
+            read += 1
+        except BadInput as error:
+            assert str(path) in str(error)
+    assert read
