@@ -403,7 +403,7 @@ def _columns(path: Path | str, header: Sequence[str],
         near = misspelt(plain, known)
         if plain not in known and plain not in keys and near \
                 and known[near].quantity not in found:
-            raise BadInput(f"{path}: column {shown(name)} is nearly one of a "
+            raise BadInput(f"{path}: column {shown(name)} is nearly a name of "
                            f"{known[near].quantity}; correct its name, or leave the column out. "
                            f"The table has {listed(header)}")
     return found, unused

@@ -85,7 +85,7 @@ def test_every_column_that_is_not_used_is_reported():
 @pytest.mark.parametrize("column", ["azimut_degg", "lattitude", "tx_powr_dbm", "antena_height_m", "frequncy_mhz",
                                     "above_grond_ft", "eirp_dmb", "longtitude", "Azimuht"])
 def test_a_column_that_is_nearly_a_known_one_is_refused(column):
-    with pytest.raises(BadInput, match=f"column '{column}' is nearly one of a"):
+    with pytest.raises(BadInput, match=f"column '{column}' is nearly a name of"):
         read(f"device,x_m,y_m,{column}\na,1,2,3\n")
 
 

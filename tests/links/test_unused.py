@@ -82,7 +82,7 @@ def test_every_reader_says_which_columns_it_does_not_use(reader, scene, tmp_path
 @pytest.mark.parametrize("reader", READERS)
 def test_every_reader_refuses_a_column_that_is_nearly_known(reader, scene, tmp_path):
     end, first, read = READERS[reader]
-    with pytest.raises(BadInput, match="sites.csv: column 'azimutth_deg' is nearly one of a azimuth_deg"):
+    with pytest.raises(BadInput, match="sites.csv: column 'azimutth_deg' is nearly a name of azimuth_deg"):
         read(written(tmp_path / "sites.csv", end, first, "azimutth_deg"), scene)
 
 
