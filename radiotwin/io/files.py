@@ -350,11 +350,15 @@ def _beside(path: Path) -> Path:
     what lies in a folder without rights.
     """
     with _reported(path):
-        if path.exists() and not path.is_dir():
-            raise BadInput(f"{path} is a file; give the name of a folder")
-        stays = path.is_dir() and (
-            path.is_symlink() or path.is_mount() or path.samefile(os.curdir)
-            or not os.access(path.parent, os.W_OK))
+        try:
+            found = path.stat()  # once: another process may be replacing it
+            if not stat.S_ISDIR(found.st_mode):
+                raise BadInput(f"{path} is a file; give the name of a folder")
+            stays = (path.is_symlink() or path.is_mount()
+                     or os.path.samestat(found, os.stat(os.curdir))
+                     or not os.access(path.parent, os.W_OK))
+        except (FileNotFoundError, NotADirectoryError):
+            stays = False
     return path / "inside" if stays else path
 
 
