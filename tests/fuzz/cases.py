@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.fuzz.mutations import Mutation, apply, names
 from tests.fuzz.sandbox import Outcome, prepare_case, run_watched
-from tests.fuzz.targets import TARGETS, Target
+from tests.fuzz.targets import TARGETS, Target, suffix_of
 
 CORPUS = Path(__file__).with_name("corpus.jsonl")
 # Instead of the file: links, pipes and folders where a file should be.
@@ -78,7 +78,7 @@ def run_case(case: Case, honest: Path, folder: Path, listener: socket.socket) ->
     else:
         data = path.read_bytes()
         for mutation in case.mutations:
-            data = apply(mutation, data, "." + path.name.rpartition(".")[2], listener.getsockname()[1])
+            data = apply(mutation, data, suffix_of(path.name), listener.getsockname()[1])
         path.write_bytes(data)
     return run_watched(case.command, folder, listener)
 

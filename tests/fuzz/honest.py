@@ -141,6 +141,12 @@ def _write_maps(folder: Path) -> None:
                       ["height"], geometry_type="Polygon", crs="EPSG:4326", driver="GPKG")
     pyogrio.raw.write(folder / "town.shp", np.array([shapely.to_wkb(shapely.Polygon(SQUARE))]), [np.array([12.5])],
                       ["HOEHE"], geometry_type="Polygon", crs="EPSG:4326", driver="ESRI Shapefile")
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    known = {"version": "1.1.0", "primary_column": "geom", "columns": {"geom": {"encoding": "WKB", "geometry_types": []}}}
+    table = pa.table({"geom": [shapely.to_wkb(shapely.Polygon(SQUARE))], "height": [12.5], "class": ["yes"]})
+    parquet.write_table(table.replace_schema_metadata({"geo": json.dumps(known)}), folder / "town.parquet")
     with zipfile.ZipFile(folder / "town.zip", "w") as archive:
         for suffix in (".shp", ".dbf", ".prj"):
             archive.write(folder / f"town{suffix}", f"town{suffix}")

@@ -174,6 +174,46 @@ def _json_deep(data: bytes, where: float, what: int) -> bytes:
     return (text[:index] + "[" * depth + "]" * depth + text[index:].lstrip("0123456789.-e")).encode()
 
 
+def _surface(data: bytes, where: float, what: int) -> bytes:
+    """Change a surface of a city model: leave it out, repeat it, turn it, give it another corner, or put all in one place."""
+    model = json.loads(data)
+    geometry = [each for known in model["CityObjects"].values() for each in known["geometry"]][-1]
+    geometry.pop("semantics", None)
+    shell = geometry["boundaries"][0]
+    index, count = _at(where, len(shell)), len(model["vertices"])
+    ring = shell[index][0]
+    if what % 8 == 0:
+        del shell[index]
+    elif what % 8 == 1:
+        shell += [shell[index]] * (1, 10, 3000)[what // 8 % 3]
+    elif what % 8 == 2:
+        ring.reverse()
+    elif what % 8 == 3:
+        ring[what // 8 % len(ring)] = what // 64 % count
+    elif what % 8 == 4:
+        ring.insert(what // 8 % len(ring), what // 64 % count)
+    elif what % 8 == 5:
+        shell[index].append([number * what % count for number in range(3 + what // 8 % 5)])
+    elif what % 8 == 6:
+        model["vertices"][what // 8 % count] = model["vertices"][what // 64 % count]
+    else:
+        name, known = list(model["CityObjects"].items())[-1]
+        model["CityObjects"] |= {f"{name}-{number}": known for number in range((10, 200, 5000)[what // 8 % 3])}
+    return json.dumps(model).encode()
+
+
+def _geometry(what: int) -> bytes:
+    """Return well-known binary that libraries do not expect: without end, cut off, not finite, curved."""
+    ring = np.array([[8, 47], [8.0002, 47], [8.0002, 47.0002], [8, 47]])
+    head = [b"\1" + kind.to_bytes(4, "little") for kind in (1, 3, 6, 7, 8, 10, 12, 15, 17, 99, 1007, 2**31 + 7)]
+    one = b"\1\0\0\0"
+    polygon = head[1] + one + len(ring).to_bytes(4, "little") + ring.tobytes()
+    kind = head[what // 7 % len(head)]
+    return ((kind + one) * (50, 200, 50_000)[what // 97 % 3] + polygon, kind + one + polygon, polygon[:what % len(polygon)],
+            kind + b"\xff" * 4 + polygon, polygon.replace(ring[1].tobytes(), np.array([np.nan, np.inf]).tobytes()),
+            kind + bytes(4), kind + one + head[4] + one + polygon)[what % 7]
+
+
 # Of a command line, with NUL between its arguments -------------------------------------------------------------------
 
 def _value_of_option(data: bytes, where: float, what: int) -> bytes:
@@ -286,7 +326,12 @@ def _sqlite(data: bytes, where: float, what: int) -> bytes:
             table = tables[_at(where, len(tables))]
             columns = [row[1] for row in database.execute(f"PRAGMA table_info({table})")]
             column = columns[what % len(columns)]
+            database.create_function("geometry", 0, lambda: b"GP\0\1" + (4326).to_bytes(4, "little") + _geometry(what))
+            for trigger in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
+                database.execute(f"DROP TRIGGER {trigger[0]}")
             statements = (
+                f"UPDATE {table} SET geom = geometry()" if "geom" in columns else f"DELETE FROM {table}",
+                f"UPDATE sqlite_master SET sql = CAST(replace(CAST(sql AS BLOB), '{column}', x'ff' || '{column}') AS TEXT)",
                 f"UPDATE {table} SET {column} = NULL", f"UPDATE {table} SET {column} = '{_number(what)}'",
                 f"UPDATE {table} SET {column} = zeroblob({10 ** (what % 7)})", f"DROP TABLE {table}",
                 f"DELETE FROM {table}", f"ALTER TABLE {table} RENAME TO other",
@@ -309,10 +354,13 @@ def _parquet(data: bytes, where: float, what: int) -> bytes:
     columns = (
         pa.nulls(count), pa.array([_text(what).encode("utf-8", "replace")] * count), pa.array([float(10 ** (what % 300))] * count),
         pa.array([[1.0]] * count), pa.array([{"a": 1}] * count), pa.array([True] * count), pa.array([10**18] * count),
-        pa.array(["a"] * count).dictionary_encode(), pa.array([0] * count, pa.timestamp("us")))
+        pa.array(["a"] * count).dictionary_encode(), pa.array([0] * count, pa.timestamp("us")),
+        pa.array([None, *["a"] * (count - 1)]), pa.array([b"\xff", *[b"a"] * (count - 1)]),
+        pa.array([_geometry(what)] * count),
+        pa.StringArray.from_buffers(count, *pa.array([b"\xff"] * count).buffers()[1:]))
     name = table.column_names[index] if what % 3 else _text(what)
     out = io.BytesIO()
-    table = table.set_column(index, name, columns[what % len(columns)])
+    table = table.set_column(index, name, columns[what % len(columns)]).replace_schema_metadata(table.schema.metadata)
     if what % 5 == 0:
         table = pa.concat_tables([table] * 50)
     parquet.write_table(table, out)
@@ -322,6 +370,7 @@ def _parquet(data: bytes, where: float, what: int) -> bytes:
 def _of(suffix: str) -> dict[str, Callable[[bytes, float, int], bytes]]:
     return {
         ".json": TEXT | {"node": _json_node, "deep": _json_deep}, ".geojson": TEXT | {"node": _json_node, "deep": _json_deep},
+        ".city.json": TEXT | {"node": _json_node, "deep": _json_deep, "surface": _surface, "surface again": _surface},
         ".gltf": TEXT | {"node": _json_node, "deep": _json_deep},
         ".gz": {"inside": _inside, "bomb": _bomb}, ".safetensors": {"header": _header},
         ".nc": {"object": _hdf5}, ".args": {"value": _value_of_option}, ".gpkg": {"statement": _sqlite}, ".parquet": {"column": _parquet},

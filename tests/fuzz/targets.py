@@ -5,6 +5,11 @@ from dataclasses import dataclass
 from tests.fuzz.honest import LINES
 
 
+def suffix_of(file: str) -> str:
+    """Return the ending of a file's name; that of a city model in JSON has two parts."""
+    return ".city.json" if file.endswith(".city.json") else "." + file.rpartition(".")[2]
+
+
 @dataclass(frozen=True)
 class Target:
     """A file of the honest folder and a command that reads it.
@@ -20,7 +25,7 @@ class Target:
     @property
     def suffix(self) -> str:
         """Ending of the file, which decides how it is damaged."""
-        return "." + self.file.rpartition(".")[2]
+        return suffix_of(self.file)
 
 
 _SURVEY = "open/measurements.csv"
@@ -45,6 +50,7 @@ TARGETS = (
     Target("GeoJSON map", "town.geojson", "radiotwin build-scene town.geojson -o out"),
     Target("Overpass", "town.json", "radiotwin build-scene town.json -o out"),
     Target("GeoPackage", "town.gpkg", "radiotwin build-scene town.gpkg -o out"),
+    Target("GeoParquet", "town.parquet", "radiotwin build-scene town.parquet -o out"),
     *(Target("Shapefile", f"town.{suffix}", "radiotwin build-scene town.shp -o out") for suffix in ("shp", "dbf", "prj")),
     Target("Shapefile", "town.zip", "radiotwin build-scene town.zip -o out"),
     Target("city model", "town.city.json", "radiotwin build-scene town.city.json -o out"),

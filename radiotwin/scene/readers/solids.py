@@ -400,7 +400,7 @@ def _triangulate(shell: Shell, points_m: np.ndarray) -> tuple[np.ndarray, np.nda
     same = same.reshape(-1)
     whole: dict[int, list[np.ndarray]] = {}  # outlines without holes, by their corners
     faces, seen = [np.zeros((0, 3), dtype=np.int64)], set()
-    for polygon in shell.polygons:
+    for polygon in filter(None, shell.polygons):
         rings = [same[ring] for ring in polygon]
         if (key := tuple(ring.tobytes() for ring in rings)) in seen:  # it is in the file twice
             continue

@@ -93,13 +93,14 @@ def test_broken_shells_end_in_a_message_or_a_scene(tmp_path, seed):
 
 @pytest.mark.parametrize("shell", [[], [[]], [[[]]], [[[0]]], [[[0, 1]]], [[[0, 0, 0]]], [[[0, 1, 2]]], [[[0, 1, 2]], [[0, 2, 1]]],
                                    [[[0, 1, 2, 3]]] * 5000, [[list(range(10)) * 50]], [[[0, 3, 2, 1], [0, 3, 2, 1]]]])
-def test_empty_flat_and_repeated_shells(tmp_path, shell):
+@pytest.mark.parametrize("more", [False, True])
+def test_empty_flat_and_repeated_shells(tmp_path, shell, more):
     model = without_semantics()
-    model["CityObjects"]["B0-0"]["geometry"][0]["boundaries"][0] = shell
+    model["CityObjects"]["B0-0"]["geometry"][0]["boundaries"][0] = shell + more * surfaces(model)
     try:
         city(tmp_path, model)
     except BadInput:
-        pass
+        assert not more or len(shell) > 100
 
 
 def test_surfaces_that_are_in_the_file_many_times_count_once(tmp_path):
