@@ -71,7 +71,7 @@ def test_what_pages_say_of_it(effect):
         {"name": effect.name, "probability": 0.6}]}], "verdict": "undecided", "candidates": [],
         "effects": [], "remaining": {"drivers": []}, "error": {"before": {"rmse_db": 3.0}}}
     assert "To settle it: repeat the flight in dry weather" in closeloop_summary(undecided)
-    values = features((20.0, 20.0, 20.0), 0.1, 1.0, False)
+    values = features((20.0, 20.0, 20.0), 1.0, False)
     assert probability_of(effect.name, values) == probability_of("episode", values)
 
 

@@ -177,6 +177,9 @@ def require_folder(path: Path | str, names: Collection[str], mark: str | None = 
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         raise BadInput(f"cannot write {path}: {getattr(error, 'strerror', None) or error}; "
                        "choose another output folder") from None
+    if mark is not None and (path / mark).is_dir():
+        raise BadInput(f"{path / mark} is a folder, where a file is to be; move it away or choose "
+                       "another output folder")
     is_earlier = mark is None or mark in held
     lost = [name for name in held if (not keep_others if not _is_one_of(name, names)
                                       else not is_earlier)]

@@ -249,7 +249,7 @@ def test_wrong_data_is_one_message(close_loop, tmp_path, edit, parts):
     ("devices.csv", b"", ["devices.csv is empty", "names of the columns"]),
     ("devices.csv", None, ["devices.csv does not exist", "--devices names another file"]),
     ("measurements.csv", b"\x89PNG\r\n\x1a\n\x00\xff", ["measurements.csv", "not text"]),
-    ("result", b"a file", ["cannot write result", "choose another output path"]),
+    ("result", b"a file", ["result is a file", "give the name of a folder"]),
     ("result/closeloop.json/x", b"", ["result/closeloop.json is a folder"]),
 ])
 def test_files_that_cannot_be_are_one_message(close_loop, tmp_path, name, content, parts):

@@ -91,7 +91,7 @@ def test_gains_at_points(run, folder):
 
 
 BAD = {
-    "export-scene scene -o city.stl": "unknown format '.stl'", "export-scene scene -o scene": "holds preview.png",
+    "export-scene scene -o city.stl": "unknown format '.stl'", "export-scene scene -o scene": "scene holds city.xml, meshes, preview.png, scene.toml",
     "export-scene none -o out": "none is not a folder", "map map.nc --scene scene": "give the file to write with --out",
     "map map.nc --scene scene -o a.xls": "unknown format '.xls'",
     "map map.nc --scene scene -o a.tif --devices d9": "device 'd9' is not in the map",

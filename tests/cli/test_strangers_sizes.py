@@ -109,7 +109,7 @@ def a_star_of_6_000_points(folder):
     write_town(folder / "town.geojson", [*points, points[0]])
 
 
-@stranger("build-scene town.geojson --check", "RADIOTWIN_MAX_TOUCHING_CORNERS")
+@stranger("build-scene town.geojson --check", "RADIOTWIN_MAX_PART_PAIRS")
 def equal_buildings(folder):
     write_town(folder / "town.geojson", *[SQUARE] * 1500)
 
@@ -138,7 +138,7 @@ def test_a_full_disk(run, strangers_folder, tmp_path, suffix):
         pytest.skip("no file system can be mounted here")
     try:
         (disk / f"o{suffix}").write_text("an older result")
-        found, said = forked(run, f"map twin --scene scene -o {disk}/o{suffix}", folder)
+        found, said = forked(run, f"map twin --scene scene -o {disk}/o{suffix} --force", folder)
         assert found == 1 and "Traceback" not in said and "No space left" in " ".join(said.split()), (found, said)
         assert [path.name for path in disk.iterdir()] == [f"o{suffix}"]
         assert (disk / f"o{suffix}").read_text() == "an older result"

@@ -271,7 +271,7 @@ def test_folders_that_cannot_be_written_are_refused_before_the_work(small_scene,
     out = tmp_path / "out"
     for folder, scene, message in (
             (tmp_path / "new", None, "give it with --scene"), (tmp_path / "mine", small_scene, "holds thesis.txt"),
-            (tmp_path / "file", small_scene, "cannot write"), (out, small_scene, "the report"),
+            (tmp_path / "file", small_scene, "is a file"), (out, small_scene, "the report"),
             (small_scene.folder, small_scene, "the declared scene"),
             (small_scene.folder.parent, small_scene, "the declared scene")):
         with pytest.raises(BadInput, match=message):
