@@ -1,5 +1,6 @@
 """Maps: gains over the outlines of buildings, and residuals, levels and effects of a close-loop."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from textwrap import fill
 
@@ -299,8 +300,15 @@ def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:
                 ha="left" if right else "right", zorder=7, path_effects=HALO)
 
 
-def residual_map_figure(data: LoopData, background: MapBackground) -> Figure:
-    """Draw the mean held-out residual over the positions of the moving end, before and after."""
+def residual_map_figure(data: LoopData, background: MapBackground,
+                        anomalies: Sequence[dict] = ()) -> Figure:
+    """Draw the mean held-out residual over the positions of the moving end, before and after.
+
+    Args:
+        data: of the loop.
+        background: map.
+        anomalies: of `closeloop.json`; places among them are framed in the panel of the base.
+    """
     panels = [(f"before: {name_label(data.base)}", data.before_db)]
     if data.changed:
         names = [name_label(name) for name in data.kept]
@@ -316,12 +324,25 @@ def residual_map_figure(data: LoopData, background: MapBackground) -> Figure:
         image = _draw_cells(ax, grid, RESIDUAL_COLOURS, -range_db, range_db)
         for effect in data.effects:
             mark(ax, effect)
+        if number == 0:
+            _frame_places(ax, anomalies)
         ax.set_title(f"{title}\nRMSE {rmse_db(residual_db):.2f} dB", fontsize=11)
     figure.colorbar(image, ax=figure.axes, shrink=0.85, extend="both", label=RESIDUAL_LABEL)
     end = "receiver" if background.receivers_move else "device"
     draw_legend_below(
         figure, f"mean over all links with the {end} in a cell of {background.cell_m:g} m")
     return figure
+
+
+def _frame_places(ax: Axes, anomalies: Sequence[dict]) -> None:
+    label: str | None = "links at or through it stand out"
+    for each in anomalies:
+        if each["family"] == "place":
+            (west_m, east_m), (south_m, north_m) = each["ranges"]["x_m"], each["ranges"]["y_m"]
+            ax.plot([west_m, east_m, east_m, west_m, west_m],
+                    [south_m, south_m, north_m, north_m, south_m], color="black", linestyle="--",
+                    linewidth=1.5, zorder=6, label=label)
+            label = None
 
 
 def level_map_figure(data: LoopData, background: MapBackground) -> Figure | None:
