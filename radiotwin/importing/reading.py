@@ -46,8 +46,8 @@ from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, shown
 from radiotwin.io.forms import name_fault
 from radiotwin.links.cell_limits import READS, refuse_limits
-from radiotwin.links.implausible import LIMITS_DEG
-from radiotwin.links.site_table import METRES
+from radiotwin.links.implausible import LIMITS_DEG, no_height
+from radiotwin.links.site_table import HEIGHTS, METRES
 
 ANGLES = ("heading", "pitch", "roll")
 NAMES = ("device", "receiver", "flight")
@@ -218,6 +218,11 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
             reason = f"{prefix}latitude, longitude 0, 0 (no fix)".replace("_", " ")
             links = tally.drop(links, no_fix, reason, _spec(settings, level, prefix + "latitude"),
                                source.where)
+        for name in HEIGHTS:
+            column = prefix + name.removesuffix("_m")
+            if column in links:
+                links = tally.drop(links, no_height(links[column].to_numpy()), "impossible height",
+                                   _spec(settings, level, column), source.where)
     return links
 
 

@@ -229,6 +229,8 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
     if positioned.links.empty:
         reasons = "; ".join(f"{number} {reason}" for (reason, _), number in tally.left_out.items())
         hint = f". {_IMPOSSIBLE}" if "impossible level" in reasons else ""
+        if "impossible height" in reasons:
+            hint += ". Where the file has no heights, leave their column out of the mapping"
         raise BadInput(f"{logs.source.path}: nothing is left of {logs.readings} readings: "
                        f"{reasons}{hint}")
     kept = len(positioned.links)

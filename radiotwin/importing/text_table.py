@@ -47,6 +47,7 @@ class Dialect:
         decimal: `.` or `,`.
         before: lines before the header.
         after: lines after the last row, blank ones not counted.
+        trailer: the first of them, where it was found and not declared.
         repeated: a name of a column that occurs more than once, or `""`.
         names: of the columns where there is no header.
         units: line below the header that has no digit, as one of units, or `""`.
@@ -60,6 +61,7 @@ class Dialect:
     decimal: str = "."
     before: int = 0
     after: int = 0
+    trailer: str = ""
     repeated: str = ""
     names: tuple[str, ...] = ()
     units: str = ""
@@ -73,7 +75,8 @@ class Dialect:
                  "decimal commas" * (self.decimal == ","),
                  f"encoding {self.encoding}" * (not self.encoding.startswith("utf-8")),
                  "no header" * bool(self.names), _lines(self.before, "before the header"),
-                 _lines(self.after, "after the table"),
+                 _lines(self.after, "after the table")
+                 + f" ({shown(self.trailer)})" * bool(self.trailer),
                  f"a row of units ({self.units})" * bool(self.units)]
         if self.repeated:
             parts.append(f"column {shown(self.repeated)} occurs more than once: the others are "
@@ -108,12 +111,15 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
         first = before + 1
     rows = [_fields(line, delimiter) for line in lines[first:]]
     decimal = settings.decimal or _decimal(file, delimiter, rows, isinstance(file, Sheet))
-    after = settings.lines_after_table
+    after, trailer = settings.lines_after_table, ""
     if after is None:
         last = _split(tail.decode(encoding, "replace"))
         lengths = Counter(map(len, rows))
-        after = _trailer(every[first:] if whole else last[1:], delimiter, header,
+        last = every[first:] if whole else last[1:]
+        after = _trailer(last, delimiter, header,
                          {each for each, number in lengths.items() if each > 1 and number > 1})
+        if after:
+            trailer = [line.strip() for line in last if line.strip(f"{delimiter} \r\n\t")][-after]
     stripped = [name.strip() for name in header]
     repeated = next((name for i, name in enumerate(stripped) if name and name in stripped[:i]), "")
     columns = len(header_names(header))
@@ -124,8 +130,8 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
         or (not names and bool(header) and _COMMENT.match(header[0]) is not None)
     is_mark = bool(has_comments and header and filled and _COMMENT.fullmatch(header[0].strip())
                    and fits(filled[0], columns - 1))
-    return Dialect(encoding, delimiter, decimal, before, after, repeated, tuple(names), units,
-                   has_comments, is_mark, settings.quotes)
+    return Dialect(encoding, delimiter, decimal, before, after, trailer, repeated, tuple(names),
+                   units, has_comments, is_mark, settings.quotes)
 
 
 def fits(row: Sequence[str], columns: int) -> bool:

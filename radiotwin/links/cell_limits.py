@@ -14,6 +14,7 @@ FREQUENCIES_HZ = (1e6, 450e9)  # as of a scene; materials of ITU-R P.2040 end at
 MAX_TIME_S = 1e11  # the year 5138; milliseconds since 1970 lie beyond
 MAX_SPAN_S = 3.2e9  # a century, the longest campaign
 MAX_TILT_DEG = 90.0
+MAX_AZIMUTH_DEG = 720.0  # of an antenna that stands; 999 and 65535 are placeholders
 MAX_ANGLE_DEG = 1e6  # thousands of turns in one direction, which some compasses count
 MAX_POWER_DBM = 300.0  # as of a level
 MAX_CABLE_LOSS_DB = 100.0
@@ -55,6 +56,10 @@ def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
     if name == "tilt_deg":
         refuse(np.abs(numbers) > MAX_TILT_DEG,
                f"is no tilt; allowed are -{MAX_TILT_DEG:g} (down) to {MAX_TILT_DEG:g} (up)")
+    if name == "azimuth_deg":
+        refuse(np.abs(numbers) > MAX_AZIMUTH_DEG,
+               "is no azimuth; allowed are 0 (north) to 360, clockwise; leave the cell empty where "
+               "it is not known")
     if name == READS:
         refuse(~np.isin(numbers, (0, 1)) & ~np.isnan(numbers),
                "is neither 0 (levels are read at the receiver) nor 1 (at the device)")

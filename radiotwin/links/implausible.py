@@ -11,9 +11,15 @@ from radiotwin.errors import BadInput
 
 LIMITS_DEG = {"latitude": 90.0, "longitude": 360.0}
 FAR_M, MAX_APART_M = 100_000.0, 1e6  # from what is measured or mapped: odd, longer than any link
+HEIGHTS_M = (-3_000.0, 60_000.0)  # about the deepest mine (Kidd), the highest balloon (JAXA 2013)
 HIGH_M = 200.0  # above the ground: an altitude above the sea is suspected; masts are lower
 _EARTH_M = 6_371_008.8  # mean radius (Moritz 2000, GRS80)
 _NAMED = 5  # names in a message
+
+
+def no_height(height_m: np.ndarray) -> np.ndarray:
+    """Return which heights (k,) are placeholders, such as -9999 and 99999 [m]."""
+    return (height_m < HEIGHTS_M[0]) | (height_m > HEIGHTS_M[1])
 
 
 def tilt_notes(tilt_deg: np.ndarray) -> list[str]:
@@ -71,6 +77,8 @@ def _slip(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> str:
     """
     if "latitude" not in axes and np.linalg.norm(middle) <= FAR_M:
         return ""
+    if "latitude" in axes and not place.any():
+        return "0, 0 is a placeholder; leave both empty where they are not known"
     tries = [(place[::-1], f"are {axes[0]} and {axes[1]} swapped?")]
     for sign in ([-1, 1], [1, -1], [-1, -1]):
         turned = place * sign

@@ -44,6 +44,7 @@ from radiotwin.io.cells import (
     read_cells,
     refuse,
     require_pyarrow,
+    shown,
     write_csv,
 )
 from radiotwin.io.files import atomic_path
@@ -483,6 +484,10 @@ def read_antenna_files(path: Path, names: Iterable[str], are_rows: bool = True
         if name and name not in files:
             where = f"row {row + 2}" if are_rows else "column antenna"
             file = require_within(path.parent, path.parent / name, f"{path}, {where}")
+            if not file.exists():
+                raise BadInput(f"{path}, {where}: antenna {shown(name)} is no file of a pattern in "
+                               "the table's folder; put it there, or call the column "
+                               "antenna_model if it names a product")
             files[name] = read_bytes(file, "pattern of an antenna", DOCUMENT_BYTES)
             parse_pattern(file, files[name])
     return files

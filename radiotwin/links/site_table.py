@@ -22,7 +22,13 @@ from radiotwin.io.budgets import DEVICES, ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, refuse, shown
 from radiotwin.io.forms import Origin, name_fault
 from radiotwin.links.cell_limits import refuse_limits
-from radiotwin.links.implausible import LIMITS_DEG, high_notes, tilt_notes
+from radiotwin.links.implausible import (
+    HEIGHTS_M,
+    LIMITS_DEG,
+    high_notes,
+    no_height,
+    tilt_notes,
+)
 
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
 HEIGHTS = ("altitude", "height", "z", "above_ground_m")
@@ -127,6 +133,8 @@ _DMS = re.compile(
     r"""([NSEW]?)\s*([-+]?\d+(?:\.\d+)?)(?:[°º:\sD]\s*(?:(\d+(?:\.\d+)?)['′’:\sM]?\s*"""
     r"""(?:(\d+(?:\.\d+)?)(?:["″”S]|'')?\s*)?)?)?([NSEW]?)""")
 _DMS_CHARACTERS = 40
+_WITH_UNIT = re.compile(r"([-+]?\d+(?:\.\d+)?)\s*([A-Za-z]+|['′°%])\.?")
+_UNIT_SIGNS = {"'": "ft", "′": "ft", "°": "deg", "%": "percent"}
 _PROJECTED = {"x": "easting, utm x, utm easting, utm e",
               "y": "northing, utm y, utm northing, utm n"}
 
@@ -310,6 +318,7 @@ def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int]
     if end is not None:
         key, others = _key(path, cells, end, names, set(columns.values()))
         unused = {name: why for name, why in unused.items() if name != key} | others
+        cells = _without_blank_rows(cells, key)
     used = {*POSITION, "above_ground_m", *uses}
     unused |= {name: "not used here" for quantity, name in columns.items() if quantity not in used}
     columns = {quantity: name for quantity, name in columns.items() if quantity in used}
@@ -433,8 +442,14 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
     if quantity in LIMITS_DEG:
         for i in np.flatnonzero(np.isnan(numbers) & (text != "")):
             numbers[i] = _degrees(text.iloc[i], quantity)
-    _refuse(table, name, np.isnan(numbers) & (text != ""), "is not a number")
+    with_unit = np.isnan(numbers) & (text != "").to_numpy()
+    by_cell = np.full(len(numbers), np.nan)
+    for i in np.flatnonzero(with_unit):
+        by_cell[i], numbers[i] = _number_with_unit(text.iloc[i], name, quantity, crs)
+    _refuse(table, name, np.isnan(numbers) & np.isnan(by_cell) & (text != ""), "is not a number")
     _refuse(table, name, np.isinf(numbers), "is not finite")
+    if convert is None and np.isnan(numbers).all() and with_unit.any():
+        convert = _SAME  # each cell has its unit
     if convert is None:
         units = _QUANTITIES[quantity][0]
         if units is _LENGTHS and crs and quantity in "xy":
@@ -452,14 +467,46 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
                            f"not known; end its name in it: {endings}"
                            + (", or give length_unit" if units is _LENGTHS
                               and length_unit is not None else ""))
-    numbers = convert(numbers)
+    numbers = np.where(np.isnan(by_cell), convert(numbers), by_cell)
     _refuse(table, name, np.isinf(numbers) | (np.isnan(numbers) & (text != "")),
             "is no power above zero")
     is_projected = crs and quantity in "xy"
     is_length = _QUANTITIES[quantity][0] is _LENGTHS and not is_projected
     refuse_limits(partial(_refuse, table, name),
                   f"{quantity.removesuffix('_m')}_m" if is_length else quantity, numbers)
+    if quantity in HEIGHTS:
+        _refuse(table, name, no_height(numbers), "is no height; allowed are "
+                f"{HEIGHTS_M[0]:,.0f} to {HEIGHTS_M[1]:,.0f} m; leave the cell empty where it is "
+                "not known")
     return numbers
+
+
+def _number_with_unit(text: str, name: str, quantity: str, crs: bool) -> tuple[float, float]:
+    """Return the number of a cell such as `30 m`, `100'`, `20 W` in the quantity's unit; or NaN.
+
+    A column whose name has a unit may repeat it in its cells: then the number is the second one, in
+    that unit. Another unit contradicts it.
+    """
+    found = _WITH_UNIT.fullmatch(text) if len(text) <= _DMS_CHARACTERS else None
+    nothing = (np.nan, np.nan)
+    if found is None or quantity in LIMITS_DEG or found[2] == "MW":  # mW, or megawatts?
+        return nothing
+    number, unit = float(found[1]), _UNIT_SIGNS.get(found[2], found[2].casefold())
+    known, plain = _known_names(crs), _plain(name)
+    own = max((end for end in _QUANTITIES[quantity][0] if end and plain.endswith(end)
+               and plain.removesuffix(end) in known), key=len, default="")
+    if own:
+        return (np.nan, number) if own == unit else nothing
+    convert = known[plain + unit].convert if plain + unit in known else None
+    return nothing if convert is None else (float(convert(np.array([number]))[0]), np.nan)
+
+
+def _without_blank_rows(cells: pd.DataFrame, key: str) -> pd.DataFrame:
+    """Return the rows of a table without those that are empty in all columns, as a sheet's end."""
+    nameless = cells[(as_text(cells[key]) == "").to_numpy()]
+    if nameless.empty:
+        return cells
+    return cells.drop(index=nameless.index[(nameless.apply(as_text) == "").all(axis=1)])
 
 
 def _degrees(text: str, quantity: str) -> float:

@@ -44,7 +44,7 @@ def test_tables_are_the_same_however_they_are_written(read, delimiter, decimal, 
 def test_what_was_found_is_told(read):
     source, _ = read(text_of(";", ",", "Messfahrt Süd\n\n", "Ende\n").encode("cp1252"))
     assert source.notes == ("data.csv: separated by semicolons, decimal commas, encoding cp1252, 2 lines before the header, "
-                            "1 line after the table",)
+                            "1 line after the table ('Ende')",)
 
 
 def test_a_preamble_of_pairs_is_no_table(read):

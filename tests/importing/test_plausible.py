@@ -130,3 +130,13 @@ def test_a_far_gateway_is_no_glitch(bring_in):
     text = "x,l,d,g\n" + "".join(f"{150_000 * (i == 7)},{-80 - i % 9},a,{'far' if i == 7 else 'near'}\n" for i in range(40))
     columns = {"x": "x", "y": "always 0", "level": "l", "device": "d", "receiver": "g"}
     assert "far" in set(bring_in(text, columns=columns, length_unit="m").table["receiver"])
+
+
+@pytest.mark.parametrize("height_m", [-9999, -32768, 99999, 65535])
+def test_placeholders_of_heights_are_left_out(bring_in, height_m):
+    text = "x,z,l,d\n" + "".join(f"{i},{height_m if i in given else 60},{-80 - i % 9},a\n" for given in [(3, 4)] for i in range(40))
+    columns = {"x": "x", "y": "always 0", "z": "z", "level": "l", "device": "d"}
+    report = bring_in(text, columns=columns, length_unit="m").report
+    assert report["kept"] == 38 and report["left_out"][0]["reason"] == "impossible height" and report["left_out"][0]["first"] == "row 5"
+    with pytest.raises(BadInput, match="nothing is left of 40 readings: 40 impossible height.*no heights, leave their column out"):
+        bring_in(text.replace(",60,", f",{height_m},"), columns=columns, length_unit="m")

@@ -126,6 +126,18 @@ def test_gpx_that_cannot_be_used(track, content, message):
         read_gpx(track("a.gpx", content))
 
 
+def test_few_places_and_heights_of_a_track_that_are_none_are_left_out():
+    time_s, lat = np.arange(40.0), np.full(40, 48.1)
+    lat[3], altitude = 677.7, np.full(40, 500.0)
+    altitude[[7, 8]] = -9999, 99999
+    fixes = make_fixes("a.csv", time_s, {"latitude": lat, "longitude": lat * 0 + 11, "altitude": altitude})
+    assert fixes.time_s.tolist() == [*range(3), *range(4, 40)]
+    assert np.flatnonzero(np.isnan(fixes.values["altitude"])).tolist() == [6, 7]
+    assert fixes.notes == ("a.csv: 1 positions left out: 677.7 is no latitude", "a.csv: 2 altitudes left out, such as -9999 m")
+    with pytest.raises(BadInput, match="1 positions with a time; at least two are needed; 3 damaged"):
+        make_fixes("a.csv", time_s[:1], {"latitude": lat[:1], "longitude": lat[:1]}, ("3 damaged",))
+
+
 def test_nmea_has_its_date_from_rmc_and_its_height_from_gga(track):
     text = nmea(gga("100000.00", 48.1, 11.5, 500.0), rmc("100000.00", 48.1, 11.5, "010324"),
                 rmc("100001.50", 48.2, 11.5, "010324"), gga("100001.50", 48.2, 11.5, 510.5), "GPGSV,1,1,00",

@@ -99,7 +99,12 @@ def test_another_column_is_none_that_is_misspelt(column):
     ("device,x_m,y_m,power\na,1,2,43\n", "'power': the unit .*power_dbm or power_w"),
     ("device,x,y\na,1,2\n", "'x': the unit .*x_m or x_ft"),
     ("device,x_m,y_m,tx_power_w\na,1,2,0\n", "column tx_power_w: '0' is no power above zero"),
-    ("device,x_m,y_m,z_m\na,1,2,30m\n", "row 2, column z_m: '30m' is not a number"),
+    ("device,x_m,y_m,z_m\na,1,2,30ft\n", "row 2, column z_m: '30ft' is not a number"),
+    ("device,x_m,y_m,power\na,1,2,1MW\n", "column power: '1MW' is not a number"),
+    ("device,x_m,y_m,height\na,1,2,30m\nb,1,2,30\n", "'height': the unit of its numbers from 30 to 30 is not known"),
+    ("device,x_m,y_m,z_m\na,1,2,-9999\n", "column z_m: '-9999' is no height; .*leave the cell empty"),
+    ("device,x_m,y_m,agl_ft\na,1,2,999999\n", "column agl_ft: '999999' is no height"),
+    ("device,x_m,y_m,azimuth\na,1,2,65535\n", "column azimuth: '65535' is no azimuth; .*leave the cell empty"),
     ("device,lat_deg,lat_min,lon_deg,lon_min\na,48,6,11,30\n", "'lat_min' is a part of an angle.*decimal degrees"),
     ("device,x_m,y_m,altitude_m,above_ground_m\na,1,2,500,30\n", "row 2: 'a' has several heights, altitude_m and above"),
     ("device,lat,lon\na,111.5,48.1\n", "column lat: '111.5' is no latitude.*swapped"),
@@ -108,6 +113,29 @@ def test_another_column_is_none_that_is_misspelt(column):
 def test_what_cannot_be_used_is_named(text, message):
     with pytest.raises(BadInput, match=message):
         read(text)
+
+
+@pytest.mark.parametrize(("column", "cell", "quantity", "value"), [
+    ("height", "30m", "height", 30), ("Antenna~Height", "100'", "above_ground_m", 30.48), ("z_m", "30~m", "z", 30),
+    ("height_ft", "10~ft", "height", 3.048), ("power", "20~W", "tx_power_dbm", 43.0103), ("erp", "50~dBm", "eirp_dbm", 52.15),
+    ("power_dbm", "43~dBm", "tx_power_dbm", 43), ("downtilt", "6°", "tilt_deg", -6), ("frequency", "1.8~GHz", "frequency_hz", 1.8e9),
+    ("height_mm", "30000~mm", "height", 30), ("load", "50%", "load", 0.5)])
+def test_cells_may_have_their_units(column, cell, quantity, value):
+    cells = pd.DataFrame([["a", "1", "2", cell.replace("~", " ")], ["b", "1", "2", ""]],
+                         columns=["device", "x_m", "y_m", column.replace("~", " ")], dtype=str)
+    table = read_site_table("sites.csv", cells, lambda row: f"row {row + 2}", "device", ALL)
+    np.testing.assert_allclose(table.values[quantity], [value, np.nan], rtol=1e-6)
+
+
+def test_rows_that_are_all_empty_are_none():
+    assert read("device,x_m,y_m,note\na,1,2,\n,,,\nb,3,4,\n,,,\n").names.tolist() == ["a", "b"]
+    with pytest.raises(BadInput, match="row 3, column device: '' is empty"):
+        read("device,x_m,y_m,note\na,1,2,\n,,,roof\n")
+
+
+def test_a_place_at_zero_is_a_placeholder():
+    with pytest.raises(BadInput, match="0, 0 is a placeholder; leave both empty"):
+        far_notes(np.zeros((1, 2)), np.array([52.5, 13.4]), ("latitude", "longitude"), lambda row: "s.csv: 'a'", "it")
 
 
 def test_what_is_probably_not_meant_is_said():

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from radiotwin.errors import BadInput
+from radiotwin.importing.source import are_few
+from radiotwin.links.implausible import LIMITS_DEG, no_height
 
 ANGLES = ("heading_deg", "pitch_deg", "roll_deg")
 COLUMNS = ("latitude", "longitude", "altitude", *ANGLES)
@@ -56,20 +58,28 @@ def make_fixes(source: object, time_s: np.ndarray, values: dict[str, np.ndarray]
     """Sort positions by time (n,) [s since 1970 UTC]; of several at one time the last one counts.
 
     Raises:
-        BadInput: fewer than two have a time and a position, or one is off the Earth.
+        BadInput: fewer than two have a time and a position, or more than a few are off the Earth.
     """
     known = np.isfinite(time_s) & np.isfinite(values["latitude"]) & np.isfinite(values["longitude"])
     known &= (values["latitude"] != 0) | (values["longitude"] != 0)
-    for name, limit in (("latitude", 90.0), ("longitude", 360.0)):
-        wrong = np.abs(values[name][known]) > limit
+    for name, limit in LIMITS_DEG.items():
+        wrong = known & (np.abs(values[name]) > limit)
         if wrong.any():
-            raise BadInput(f"{source}: {values[name][known][wrong][0]:g} is no {name}; allowed are "
-                           f"-{limit:g} to {limit:g} degrees")
+            text = f"{values[name][wrong][0]:g} is no {name}"
+            if not are_few(int(wrong.sum()), int(known.sum())):
+                raise BadInput(f"{source}: {text}; allowed are -{limit:g} to {limit:g} degrees "
+                               f"({wrong.sum()} such positions)")
+            notes = (*notes, f"{source}: {wrong.sum()} positions left out: {text}")
+            known &= ~wrong
+    if "altitude" in values and (wrong := known & no_height(values["altitude"])).any():
+        notes = (*notes, f"{source}: {wrong.sum()} altitudes left out, such as "
+                         f"{values['altitude'][wrong][0]:g} m")
+        values = {**values, "altitude": np.where(wrong, np.nan, values["altitude"])}
     time_s = time_s[known]
     last_first = np.arange(len(time_s))[::-1]
     unique_s, first = np.unique(time_s[last_first], return_index=True)
     if len(unique_s) < 2:
-        raise BadInput(f"{source} has {len(unique_s)} positions with a time; at least two are "
-                       "needed")
+        raise BadInput("; ".join((f"{source} has {len(unique_s)} positions with a time; at least "
+                                  "two are needed", *notes)))
     order = last_first[first]
     return Fixes(unique_s, {name: column[known][order] for name, column in values.items()}, notes)
