@@ -12,6 +12,7 @@ Severity = Literal["error", "warning", "fixed"]
 # No city has a median above it (San Francisco's centre 11 m, Munich's 16 m), but 60 feet are six
 # storeys. Low-rise cities in feet stay below and are not noticed.
 MAX_MEDIAN_M = 60.0  # of heights
+HIGH_M = 10.0  # above z = 0: the lowest point of a city that is not raised on purpose is lower
 _TO_Z_UP = {  # rotation that makes the axis point up
     "x": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=float),
     "y": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=float),
@@ -111,8 +112,11 @@ def check_units(surfaces: Surfaces) -> list[Problem]:
                         "if that is kilometres, convert with --scale 1000, if it is right say "
                         "--scale 1")]
     if median > MAX_MEDIAN_M and len(heights) > 1:
-        return [warning(f"half of the buildings are taller than {median:.0f} m; if that is feet, "
-                        "convert with --scale 0.3048, if it is right say --scale 1")]
+        unit, metres = next((unit, metres) for unit, metres, least_m in (
+            ("millimetres", 0.001, 3000), ("centimetres", 0.01, 500), ("feet", 0.3048, 0))
+            if median > least_m)
+        return [warning(f"half of the buildings are taller than {median:.0f} m; if that is {unit}, "
+                        f"convert with --scale {metres}, if it is right say --scale 1")]
     return []
 
 
@@ -121,9 +125,11 @@ def check_ground(ground: np.ndarray, surfaces: Surfaces) -> list[Problem]:
     if ground.any():
         return []
     lowest_m = surfaces.vertices[:, 2].min()
+    high = (", so that buildings hang in the air: if heights are elevations, subtract the ground's"
+            if lowest_m > HIGH_M else "")
     return [warning("there is no ground: no ground reflections will be traced, and z = 0 is taken "
-                    f"as the ground datum (the lowest point is at {lowest_m:.2f} m); add a plane "
-                    "to the file")]
+                    f"as the ground datum (the lowest point is at {lowest_m:.2f} m{high}); add a "
+                    "plane to the file")]
 
 
 def check_closed(surfaces: Surfaces, ground: np.ndarray, names: Sequence[str]) -> list[Problem]:

@@ -226,6 +226,14 @@ def test_no_ground(town):
     del town.shapes[0]
     report = check(town.write())
     assert "there is no ground" in found(report, "warning") and not report.tracing_would_fail
+    assert "hang in the air" not in found(report, "warning")
+
+
+def test_a_model_without_ground_at_its_elevation(town):
+    del town.shapes[0]
+    town.add("house", town.box((0, 5), (0, 5), (520, 530)))
+    town.shapes = town.shapes[-1:]
+    assert "hang in the air" in found(check(town.write()), "warning")
 
 
 def test_uneven_ground(empty_city):

@@ -228,7 +228,7 @@ def build_scene_from_map(
         raise BadInput("\n".join([
             f"{path} holds no buildings (closed ways or multipolygons with the tag building or "
             "building:part; of a table polygons); export an area or a layer that has some",
-            *(problem.message for problem in left_out)]))
+            *(problem.message for problem in [*found.problems, *left_out])]))
     features = _within(found.features, map_options.bbox_deg, path)
     SHAPES.check(len(features), path)
     check_crowding(shapely.bounds([feature.area for feature in features]), path)

@@ -90,13 +90,15 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
     chosen: list[tuple[CityObject, str, list[Geometry]]] = []
     unusable: list[CityObject] = []
     solid_roots = {_root(one, by_name) for one in built if _choose(one, 1)}
+    with_surfaces = solid_roots | {_root(one, by_name) for one in built if _choose(one, 0)}
     for one in built:
         root = _root(one, by_name)
         # An outline of a building whose parts have surfaces says nothing more
         geometries = _choose(one, 1) or ([] if root in solid_roots else _choose(one, 0))
         if geometries:
             chosen.append((one, root, geometries))
-        elif one.geometries and root not in solid_roots:
+        elif root not in with_surfaces and one.name == root or (
+                one.geometries and root not in solid_roots):
             unusable.append(one)
     SHAPES.check(sum(len(geometries) for _, _, geometries in chosen), path)
     problems = _others(objects)
@@ -119,9 +121,13 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
 
 
 def _root(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
-    """Return the name of the building that an object belongs to."""
+    """Return the name of the building that an object belongs to.
+
+    A group of buildings (CityObjectGroup) has them as children, and is none itself.
+    """
     seen = [one.name]
-    while one.parent in by_name and len(seen) < _MAX_PARENTS:
+    while (one.parent in by_name and by_name[one.parent].kind in BUILT
+           and len(seen) < _MAX_PARENTS):
         one = by_name[one.parent]
         if one.name in seen:  # in a file, an object may be a part of itself
             return min(seen)

@@ -77,16 +77,18 @@ def _objects(path: Path, document: Any, scale: np.ndarray,
                        "numbers; export the model again") from None
     VERTICES.check(len(vertices), path)
     corners = vertices * scale + offset
+    groups = {name for name, known in objects.items()
+              if isinstance(known, dict) and known.get("type") == "CityObjectGroup"}
     parents = {child: name for name, known in objects.items() if isinstance(known, dict)
-               for child in _names(known.get("children"))}
+               and name not in groups for child in _names(known.get("children"))}
     for name, known in objects.items():
         try:
             geometries = [one for geometry in known.get("geometry") or []
                           for one in _geometries(geometry, corners)]
+            named = [one for one in _names(known.get("parents")) if one not in groups]
             yield CityObject(name[:200], str(known["type"]).lstrip("+"),
                              _attributes(known.get("attributes")),
-                             (_names(known.get("parents")) or [parents.get(name, "")])[0][:200],
-                             geometries)
+                             (named or [parents.get(name, "")])[0][:200], geometries)
         except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
             raise BadInput(f"{path}: the object {name[:60]!r} is not as CityJSON has it (a type, "
                            "and geometries whose boundaries are indices of vertices); export the "

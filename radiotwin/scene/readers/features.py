@@ -29,14 +29,18 @@ from radiotwin.scene.vegetation import count_meetings
 BUILDING_KEYS = ("building", "building:part")  # tags of OpenStreetMap
 UNDERGROUND = "building(s) lie below the ground: left out"
 INDOORS = "room(s) are inside of buildings: left out"
+NOT_THERE = "building(s) do not stand, or not yet: left out"
+_LIFECYCLE = ("proposed", "planned", "demolished", "removed", "razed", "destroyed", "collapsed")
+_CAR_PARKS = ("parking", "garage", "garages")
 _BELOW = {  # tag or column -> its values of what lies below the ground
-    "location": ("underground",), "is_underground": ("true", "yes", "1"),
-    "tunnel": ("yes", "true", "1"), "relativetoterrain": ("entirelybelowterrain",),
+    "is_underground": ("true", "yes", "1"),
+    "tunnel": ("yes", "true", "1"),
+    "relativetoterrain": ("entirelybelowterrain",),
     "ofl": ("1200",), "lagezurerdoberflaeche": ("1200",)}
 # At the ground: 0
 _LEVELS = ("layer", "level", "max_level", "relatievehoogteligging", "relatieve_hoogteligging")
-READ_TAGS = frozenset((*BUILDING_KEYS, *_BELOW, *_LEVELS, "indoor", "has_parts", "building_id",
-                       "building:levels:underground", "other_tags"))
+READ_TAGS = frozenset((*BUILDING_KEYS, *_BELOW, *_LEVELS, "location", "parking", "indoor",
+                       "has_parts", "building_id", "building:levels:underground", "other_tags"))
 _LEVEL_RANGE = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*(?:-\s*(-?\d+(?:\.\d+)?)\s*)?")
 _CHUNK = 256  # segments: bounds the pairs that are found at once
 
@@ -149,7 +153,10 @@ def is_building(tags: Mapping[str, str]) -> bool:
 
 
 def hidden(name: str, tags: Mapping[str, str], place: BaseGeometry | None) -> LeftOut | None:
-    """Return a building that is below the ground or inside of another; None: it is neither."""
+    """Return a building that is below the ground, inside of another or not there; None: none."""
+    for key in BUILDING_KEYS:
+        if tags.get(key, "").strip().lower() in _LIFECYCLE:
+            return LeftOut(f"{name}: {key}={tags[key]}", NOT_THERE, place)
     why = _below_ground(tags)
     if why:
         return LeftOut(f"{name}: {why}", UNDERGROUND, place)
@@ -163,6 +170,9 @@ def _below_ground(tags: Mapping[str, str]) -> str:
     for key, values in _BELOW.items():
         if tags.get(key, "").strip().lower() in values:
             return f"{key}={tags[key]}"
+    places = {text.strip().lower() for text in tags.get("location", "").split(";")}
+    if "underground" in places <= {"underground", "indoor"}:
+        return f"location={tags['location']}"
     storeys, below = (number(tags.get(key, "")) for key in (
         "building:levels", "building:levels:underground"))
     top_m, roof_m = (parse_length_m(tags.get(key, "")) for key in ("height", "roof:height"))
@@ -172,6 +182,9 @@ def _below_ground(tags: Mapping[str, str]) -> str:
         if is_below_zero(tags, key) and not stands.get(key):
             return f"{key}={tags[key]}"
     rises = top_m > 0 or roof_m > 0 or number(tags.get("roof:levels", "")) > 0
+    if (tags.get("parking", "").strip().lower() == "underground" and not (rises or storeys > 0)
+            and (tags.get("building") in _CAR_PARKS or tags.get("amenity") == "parking")):
+        return f"parking={tags['parking']}"
     if below > 0 and storeys == 0 and not rises:
         return f"building:levels=0, building:levels:underground={below:g}"
     if top_m <= 0 and parse_length_m(tags.get("min_height", "")) < 0:

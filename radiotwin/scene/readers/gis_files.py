@@ -53,6 +53,7 @@ _AREAS = ("Polygon", "MultiPolygon", "GeometryCollection")
 NO_AREA = "building(s) are points or lines, without an area: left out"
 _KINDS = ("POLYGON", "MULTIPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE", "MULTISURFACE",
           "CURVEPOLYGON")
+ELEVATIONS = "z of the coordinates"  # as a report of what is not used names it
 UNREAD = ("building(s) have no geometry, or one that is not read (not finite, a curve, a surface "
           "in space): left out; `ogr2ogr -nlt CONVERT_TO_LINEAR` makes polygons of curves")
 _ENVELOPE_DOUBLES = (0, 4, 6, 6, 8)  # of a geometry's header, by its code
@@ -98,7 +99,10 @@ def geojson_map(path: Path, data: Any, crs: str | None = None) -> MapFile:
 
 
 def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None:
-    """Return the polygons of a GeoJSON geometry, or the points of another type; None: none."""
+    """Return the polygons of a GeoJSON geometry, or the points of another type; None: none.
+
+    Polygons whose points have elevations other than 0 have some z.
+    """
     kind = geometry.get("type")
     coordinates: Any = geometry.get("coordinates")  # unchecked: no list raises TypeError below
     members = geometry.get("geometries")
@@ -116,8 +120,12 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
                    for polygon in polygons for ring in polygon):
             raise ValueError
         # RFC 7946 wants at least four points a ring; shorter ones have no area anyway
-        return shapely.MultiPolygon([(polygon[0], [ring for ring in polygon[1:] if len(ring) > 3])
+        area = shapely.MultiPolygon([(polygon[0], [ring for ring in polygon[1:] if len(ring) > 3])
                                      for polygon in polygons if polygon and len(polygon[0]) > 3])
+        elevated = any(len(point) > 2 and point[2] for polygon in (
+            [coordinates] if kind == "Polygon" else coordinates) for ring in polygon
+            for point in ring)
+        return shapely.force_3d(area, 1.0) if elevated else area
     except (TypeError, ValueError, LookupError, OverflowError):
         raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite "
                        "numbers; export the map again") from None
@@ -164,6 +172,10 @@ def map_file(
     columns: set[str] = set()
     for name, properties, area in rows:
         columns.update(properties)
+        if area is not None and area.has_z:
+            if np.nan_to_num(shapely.get_coordinates(area, include_z=True)[:, 2]).any():
+                columns.add(ELEVATIONS)
+            area = shapely.force_2d(area)
         tagged.append((name, _part_or_whole(properties, _tags(properties)), area))
     marked = any(key in tags for _, tags, _ in tagged for key in BUILDING_KEYS)
     features, left_out = [], []
@@ -346,7 +358,8 @@ def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
                    area_of_wkb(data, f"{path}: row {number}") if isinstance(data, bytes) else None)
 
     try:
-        return replace(map_file(path, rows(), system), columns={*names, *nested} - {geometry})
+        found = map_file(path, rows(), system)
+        return replace(found, columns=found.columns | {*names, *nested} - {geometry})
     except shapely.errors.GEOSException as error:
         raise BadInput(f"{path}: a geometry is damaged ({str(error)[:100]}); export it again"
                        ) from None

@@ -31,6 +31,7 @@ from radiotwin.errors import BadInput, RunFailed, optional_package
 from radiotwin.io.budgets import FEATURES, FILE_BYTES, OUTLINE_CORNERS, VERTICES
 from radiotwin.io.files import atomic_file
 from radiotwin.io.inputs import check_input, parse_elements
+from radiotwin.scene.checks import warning
 from radiotwin.scene.readers.features import (
     BUILDING_KEYS,
     Feature,
@@ -50,6 +51,8 @@ _MADE_UP = -(2**60)  # ids of nodes that have none
 _PLACE_NODES = 1000  # that say where something lies: many relations may name one long way
 MIN_RING_NODES = 4  # a triangle, with the first node again at the end
 _IDS_PER_BLOCK = 100  # elements: 40 kB of the filter for each that is looked for
+REMARKED = ("Overpass added a remark to its answer, as where it ran out of time or memory: "
+            "buildings may be missing; ask for a smaller area, or more time ([timeout:600])")
 SERVER = "https://overpass-api.de/api/interpreter"
 TIMEOUT_S = 180  # [s], the default of Overpass itself
 MAX_DOWNLOAD_S = 1800.0  # [s], chosen: some 100 MB on a slow line
@@ -91,12 +94,14 @@ class OsmElements:
         ways: at least the buildings, and the ways of relations that are buildings.
         relations: at least those of type multipolygon.
         nodes_at: place -> node, of places that stand in ways and relations.
+        remarked: whether Overpass remarks something, as where it ran out of time.
     """
 
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
     ways: dict[int, Way] = field(default_factory=dict)
     relations: dict[int, Relation] = field(default_factory=dict)
     nodes_at: dict[tuple[float, float], int] = field(default_factory=dict)
+    remarked: bool = False
 
     def node_at(self, place: tuple[float, float], number: int | None = None) -> int:
         """Return the node at a place, with that number, or one that is made up."""
@@ -156,7 +161,8 @@ def assemble(elements: OsmElements) -> MapFile:
             ways.append(Feature(f"way/{number}", way.tags, _polygon(way.nodes, elements)))
     left_out.sort(key=lambda one: one.reason != INCOMPLETE)
     vegetation, unusable = _vegetation(elements)
-    return MapFile(ways + relations, left_out + unusable, vegetation=vegetation)
+    return MapFile(ways + relations, left_out + unusable, vegetation=vegetation,
+                   problems=[warning(REMARKED)] if elements.remarked else [])
 
 
 def _place(element: Way | Relation, elements: OsmElements) -> BaseGeometry:
@@ -351,6 +357,8 @@ class _Reader:
         elif tag in ("way", "relation"):
             self.open = Way([]) if tag == "way" else Relation()
             self.number = self._integer(attributes, "id", line)
+        elif tag == "remark":
+            self.elements.remarked = True
 
     def _content(self, tag: str, attributes: dict[str, str], line: int) -> None:
         assert self.open is not None
@@ -398,7 +406,7 @@ def osm_of_json(path: Path, document: Mapping) -> OsmElements:
     Raises:
         BadInput: an impossible value, with the element.
     """
-    elements = OsmElements()
+    elements = OsmElements(remarked="remark" in document)
     by_kind: dict[str, list[tuple[str, Mapping]]] = {"node": [], "way": [], "relation": []}
     for number, element in enumerate(document["elements"], start=1):
         if not isinstance(element, dict):

@@ -293,8 +293,9 @@ def _area(shape: Any) -> BaseGeometry | None:
         if len(inside):
             smallest = min(inside.tolist(), key=lambda index: abs(outlines[index].area))
             held[smallest].append(ring)
-    return _with_courtyards(shapely.MultiPolygon([(outline.exterior.coords, rings)
+    area = _with_courtyards(shapely.MultiPolygon([(outline.exterior.coords, rings)
                                                   for outline, rings in zip(outlines, held)]))
+    return shapely.force_3d(area, 1.0) if any(getattr(shape, "z", ())) else area
 
 
 def _with_courtyards(area: shapely.MultiPolygon) -> BaseGeometry:

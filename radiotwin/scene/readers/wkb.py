@@ -21,7 +21,7 @@ _PLANE = (1, 2, 3, 4, 5, 6, 7)  # that GEOS has as we need them: without arcs an
 
 
 def area_of_wkb(data: bytes, source: object) -> BaseGeometry | None:
-    """Return a geometry in well-known binary, in the plane.
+    """Return a geometry in well-known binary, with its z.
 
     Args:
         data: one geometry.
@@ -39,7 +39,7 @@ def area_of_wkb(data: bytes, source: object) -> BaseGeometry | None:
     area = shapely.from_wkb(data)
     while any(part.geom_type == "GeometryCollection" for part in shapely.get_parts(area)):
         area = shapely.GeometryCollection(list(shapely.get_parts(shapely.get_parts(area))))
-    return shapely.force_2d(area) if np.isfinite(shapely.get_coordinates(area)).all() else None
+    return area if np.isfinite(shapely.get_coordinates(area)).all() else None
 
 
 def _kinds(data: bytes, source: object) -> set[int]:

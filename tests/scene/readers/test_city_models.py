@@ -154,6 +154,28 @@ def test_what_is_inside_of_a_building_and_placed_copies_are_left_out(tmp_path):
     assert len(one.shell.polygons) == len(made.FACES)
 
 
+def test_each_building_of_a_group_stands_on_its_own_ground(tmp_path):
+    model = made.cityjson([(0, 0, 1.0), (40, 0, 31.0)])
+    for name in ("B0", "B1"):
+        model["CityObjects"][name]["parents"] = ["street"]
+    model["CityObjects"]["street"] = {"type": "CityObjectGroup", "children": ["B0", "B1"], "geometry": []}
+    report = build_scene_from_map(write(tmp_path, model), tmp_path / "scene")
+    rows = pd.read_csv(report.folder / "buildings.csv")
+    assert rows["building"].tolist() == ["B0", "B1"]
+    assert (rows["bottom_m"] == 0).all() and rows["top_m"].tolist() == pytest.approx([9, 9], abs=0.01)
+
+
+@pytest.mark.parametrize("geometry", [[], [{"type": "GeometryInstance", "template": 0, "boundaries": [0],
+                                            "transformationMatrix": [1] * 16}]])
+def test_a_building_without_surfaces_is_told(tmp_path, geometry):
+    model = made.cityjson(HOUSES)
+    del model["CityObjects"]["B0-0"]
+    model["CityObjects"]["B0"] = {"type": "Building", "geometry": geometry}
+    report = build_scene_from_map(write(tmp_path, model), tmp_path / "scene")
+    assert len(pd.read_csv(report.folder / "buildings.csv")) == 2
+    assert any("1 object(s) have no surfaces" in one.message and "'B0'" in one.message for one in report.problems)
+
+
 def test_other_objects_are_counted(tmp_path):
     model = made.cityjson(HOUSES)
     model["CityObjects"]["T"] = {"type": "TINRelief", "geometry": [

@@ -34,7 +34,8 @@ def write_lines(path, columns):
 def write_table(path, columns):
     values = [np.array([9.0]), *(np.array([value], dtype=object if isinstance(value, str) else None)
                                  for value in columns.values())]
-    pyogrio.raw.write(path, shapely.to_wkb([SQUARE]), values, ["height", *columns], geometry_type="Polygon",
+    pyogrio.raw.write(path, shapely.to_wkb([SQUARE]), values, ["height", *columns],
+                      geometry_type="Polygon Z" if SQUARE.has_z else "Polygon",
                       crs="EPSG:4326", driver="GPKG" if path.suffix == ".gpkg" else "ESRI Shapefile")
 
 
@@ -84,3 +85,18 @@ def test_nested_and_empty_columns_are_told(tmp_path, name, write):
     write(tmp_path / name, {"names": {"primary": "x"}, "sources": [{"dataset": "OSM"}], "nothing": None})
     told = dict(build_scene(tmp_path / name, tmp_path / "out", check_only=True).facts)["not used"]
     assert told == "tags or columns 'names', 'nothing', 'sources'"
+
+
+@pytest.mark.parametrize("z_m", [0.0, 512.5])
+@pytest.mark.parametrize("ending", ["geojson", "gpkg", "shp", "parquet"])
+def test_elevations_in_the_coordinates_are_told(tmp_path, monkeypatch, ending, z_m):
+    raised = shapely.force_3d(SQUARE, z_m)
+    monkeypatch.setitem(globals(), "SQUARE", raised)
+    path = tmp_path / f"a.{ending}"
+    if ending == "geojson":
+        feature = {"type": "Feature", "properties": {"height": 9}, "geometry": shapely.geometry.mapping(raised)}
+        path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    else:
+        (write_parquet if ending == "parquet" else write_table)(path, {})
+    report = build_scene(path, tmp_path / "scene")
+    assert ("z of the coordinates" in dict(report.facts).get("not used", "")) == (z_m > 0)

@@ -207,3 +207,18 @@ def test_ways_that_overpass_gives_twice_keep_their_tags(tmp_path):
     elements.append({key: value for key, value in elements[-2].items() if key != "tags"})  # the shed
     (tmp_path / "a.json").write_text(json.dumps({"elements": elements}))
     assert {one.name for one in read_json_map(tmp_path / "a.json").features} == {"relation/7", "way/4"}
+
+
+@pytest.mark.parametrize("remark", [True, False])
+@pytest.mark.parametrize("name", ["a.osm", "a.json"])
+def test_an_answer_of_overpass_that_is_not_whole_is_told(tmp_path, name, remark):
+    """Overpass ends an answer that ran out of time with a remark, after what it had found."""
+    text = "runtime error: Query timed out in &quot;query&quot; at line 3 after 26 seconds."
+    if name == "a.osm":
+        content = f"<osm>{f'<remark> {text} </remark>' if remark else ''}</osm>"
+    else:
+        content = json.dumps({"elements": []} | ({"remark": text} if remark else {}))
+    (tmp_path / name).write_text(content)
+    with pytest.raises(BadInput, match="holds no buildings") as told:
+        build_scene(tmp_path / name, tmp_path / "scene")
+    assert ("[timeout:600]" in str(told.value)) == remark

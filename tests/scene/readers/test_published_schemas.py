@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.scene.readers import build_scene
-from radiotwin.scene.readers.features import INDOORS, UNDERGROUND, hidden
+from radiotwin.scene.readers.features import INDOORS, NOT_THERE, UNDERGROUND, hidden
 from tests.scene.readers import city_models
 from tests.scene.readers.test_height_columns import box
 
@@ -26,7 +26,8 @@ def geojson(tmp_path, rows):
 
 
 @pytest.mark.parametrize("tags", [
-    {"location": "underground", "height": "8"}, {"layer": "-1", "building:levels": "1"}, {"level": "-2;-1"},
+    {"location": "underground", "height": "8"}, {"location": "indoor; Underground"},
+    {"building": "parking", "parking": "underground"}, {"layer": "-1", "building:levels": "1"}, {"level": "-2;-1"},
     {"level": "-3--1"}, {"tunnel": "yes"}, {"building:levels": "0", "building:levels:underground": "3"},
     {"min_height": "-6", "height": "0"}, {"min_height": "-9", "height": "-3"}, {"is_underground": "True"},
     {"max_level": "-1", "min_level": "-3"}, {"relativetoterrain": "entirelyBelowTerrain"}, {"ofl": "1200"}, {"relatievehoogteligging": "-1"}])
@@ -36,7 +37,9 @@ def test_what_lies_below_the_ground(tags):
 
 
 @pytest.mark.parametrize("tags", [
-    {}, {"location": "roof"}, {"layer": "1"}, {"layer": "roofs"}, {"layer": "-1", "height": "8"}, {"level": "-1", "amenity": "restaurant", "building:levels": "4"}, {"level": "-1;0"}, {"level": "-1-2"}, {"level": "0-3"},
+    {}, {"location": "roof"}, {"location": "overground;underground"},
+    {"building": "apartments", "parking": "underground"},
+    {"building": "parking", "parking": "underground", "building:levels": "1"}, {"layer": "1"}, {"layer": "roofs"}, {"layer": "-1", "height": "8"}, {"level": "-1", "amenity": "restaurant", "building:levels": "4"}, {"level": "-1;0"}, {"level": "-1-2"}, {"level": "0-3"},
     {"tunnel": "building_passage"}, {"tunnel": "no"}, {"building:levels": "0"},
     {"building:levels": "0", "building:levels:underground": "2", "roof:levels": "1"},
     {"building:levels": "0", "building:levels:underground": "2", "height": "4"},
@@ -44,6 +47,13 @@ def test_what_lies_below_the_ground(tags):
     {"is_underground": "False"}, {"relativetoterrain": "substantiallyBelowTerrain"}, {"height": "-3"}])
 def test_what_stands_above_the_ground(tags):
     assert hidden("way/1", {"building": "yes"} | tags, None) is None
+
+
+@pytest.mark.parametrize("tags", [{"building": "proposed"}, {"building:part": "Demolished"}])
+def test_what_does_not_stand(tags):
+    found = hidden("way/1", tags | {"height": "9"}, None)
+    assert found is not None and found.reason == NOT_THERE
+    assert hidden("way/1", {"building": "construction"}, None) is None
 
 
 def test_rooms_are_inside_of_buildings():
