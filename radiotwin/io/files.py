@@ -297,7 +297,7 @@ def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
     finally:
         with deferred():
             if name is not None:
-                shutil.rmtree(name, ignore_errors=True)
+                _remove(name)
             if handle is not None:
                 os.close(handle)
 
@@ -337,9 +337,23 @@ def _remove_stale(path: Path, aside: bool) -> None:
         for old in path.iterdir() if aside else ():  # killed in `_swap`
             if not (path.parent / old.name).exists():
                 os.replace(old, path.parent / old.name)
-        shutil.rmtree(path)
+        _remove(path)
     finally:
         os.close(handle)
+
+
+def _remove(folder: str | Path) -> None:
+    """Remove a folder, also with folders in it that nothing may be removed from.
+
+    One that stayed would be put back where an earlier run's was, see `_remove_stale`.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    for at, names, _ in os.walk(folder):  # gone, as a rule
+        for path in (os.path.join(at, name) for name in names):
+            with suppress(OSError):
+                if not os.path.islink(path):
+                    os.chmod(path, stat.S_IRWXU)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _is_one_of(name: str, patterns: Collection[str]) -> bool:

@@ -390,3 +390,16 @@ def test_a_folder_that_is_replaced_again_and_again_is_whole_whenever_its_process
         files._sweep.cache_clear()
         require_writable(tmp_path / "other")
         assert len(content(tmp_path)) == 6 and len(set(content(tmp_path).values())) == 1
+
+
+@pytest.mark.parametrize("names", [None, ("maps",)])
+def test_an_older_folder_that_nothing_may_be_removed_from_leaves_nothing(tmp_path, names):
+    """What stayed would come back where the older run was, once the newer one is removed."""
+    (tmp_path / "out" / "maps").mkdir(parents=True)
+    (tmp_path / "out" / "maps" / "a.nc").write_text("old")
+    (tmp_path / "out" / "maps").chmod(0o555)
+    if os.access(tmp_path / "out" / "maps", os.W_OK):
+        pytest.skip("this user may write everywhere")
+    with atomic_folder(tmp_path / "out", names) as temporary:
+        (temporary / "b.nc").write_text("new")
+    assert os.listdir(tmp_path) == ["out"] and os.listdir(tmp_path / "out") == ["b.nc"]
