@@ -88,7 +88,8 @@ def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
     columns = {name: values[name].to_numpy() for name in _OPTIONAL if name in values}
     load = columns.pop("load", np.full(len(names), np.nan))
     if "load" in values:
-        sites.refuse("load", (load < 0) | (load > 1), "is no load; allowed are 0 to 1")
+        sites.refuse("load", (load < 0) | (load > 1), "is no load; allowed are 0 to 1; "
+                     "call a column of percents load_percent")
     if "antenna" not in values and any(np.nan_to_num(columns.get(name, 0.0)).any()
                                        for name in ("azimuth_deg", "tilt_deg")):
         notes.append(f"{path}: azimuth and tilt are not used, as no column antenna names the file "

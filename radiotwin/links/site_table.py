@@ -75,8 +75,10 @@ _QUANTITIES: dict[str, tuple[Mapping[str, Convert], str]] = {
                            "gps long, gps lng, decimal longitude, longitude decimal"),
     "x": (_LENGTHS, "x"), "y": (_LENGTHS, "y"), "z": (_LENGTHS, "z"),
     "height": (_LENGTHS, "height"),
-    "altitude": (_LENGTHS, "altitude, alt, altitude amsl, height amsl, amsl, height asl, asl, "
-                           "height above sea level, height above mean sea level, above sea level, "
+    "altitude": (_LENGTHS, "altitude, alt, altitude amsl, alt amsl, altitude msl, alt msl, "
+                           "altitude asl, alt asl, height amsl, height msl, amsl, msl, height asl, "
+                           "asl, height above sea level, height above mean sea level, "
+                           "above sea level, "
                            "antenna amsl, antenna altitude"),
     "above_ground_m": (_LENGTHS, "above ground, height above ground, height above ground level, "
                                  "agl, height agl, agl height, antenna agl, antenna height agl, "
@@ -133,6 +135,8 @@ _DMS = re.compile(
     r"""([NSEW]?)\s*([-+]?\d+(?:\.\d+)?)(?:[°º:\sD]\s*(?:(\d+(?:\.\d+)?)['′’:\sM]?\s*"""
     r"""(?:(\d+(?:\.\d+)?)(?:["″”S]|'')?\s*)?)?)?([NSEW]?)""")
 _DMS_CHARACTERS = 40
+_UNIT_AND_ZERO = re.compile(r"[\s_([]+(m|ft|feet|met(?:re|er)s?)[\s_]+"
+                            r"(a\.?g\.?l|a?m?\.?s\.?l)\.?[)\]]?$")  # `Height (ft AGL)`
 _WITH_UNIT = re.compile(r"([-+]?\d+(?:\.\d+)?)\s*([A-Za-z]+|['′°%])\.?")
 _UNIT_SIGNS = {"'": "ft", "′": "ft", "°": "deg", "%": "percent"}
 _PROJECTED = {"x": "easting, utm x, utm easting, utm e",
@@ -140,8 +144,9 @@ _PROJECTED = {"x": "easting, utm x, utm easting, utm e",
 
 
 def _plain(name: str) -> str:
-    """Return a name in lower case without what separates its words."""
-    return re.sub(r"[\W_]+", "", name.casefold())
+    """Return a name in lower case without what separates its words, its unit at the end."""
+    name = _UNIT_AND_ZERO.sub(r" \2\1", name.casefold())
+    return re.sub(r"[\W_]+", "", name)
 
 
 def _words(names: str) -> list[str]:
@@ -427,7 +432,7 @@ def _key(path: Path | str, cells: pd.DataFrame, end: str, names: Collection[str]
                    key=lambda name: words.index(_plain(name)))
     if not found:
         raise BadInput(f"{path}: column {end!r} is missing: which one has the names of the {end}s? "
-                       f"It has {listed(cells)}")
+                       f"It has {listed(cells)}; a table without a header needs one")
     if len(found) > 1 and names and found[0] != end:
         found.sort(key=lambda name: -as_text(cells[name]).isin(set(names)).sum())
     return found[0], {name: f"{found[0]} has the names" for name in found[1:]}

@@ -23,6 +23,8 @@ def read(text, end="device", uses=ALL, **given):
     ("antennaHeightFt", "100", "above_ground_m", 30.48), ("AGL[m]", "30", "above_ground_m", 30),
     ("rad_center_ft", "10", "above_ground_m", 3.048), ("altitude_m", "519", "altitude", 519),
     ("amsl_ft", "1000", "altitude", 304.8), ("z_m", "7", "z", 7), ("height_km", "0.1", "height", 100),
+    ("Antenna~Height~(ft~AGL)", "100", "above_ground_m", 30.48), ("height~(m~a.g.l.)", "30", "above_ground_m", 30),
+    ("alt~(ft~MSL)", "1000", "altitude", 304.8), ("Altitude~[m~ASL]", "519", "altitude", 519), ("agl_m", "3", "above_ground_m", 3),
     ("azimuth", "120", "azimuth_deg", 120), ("Azimuth~(deg)", "120", "azimuth_deg", 120), ("azi", "9", "azimuth_deg", 9),
     ("azimuth_rad", "3.141592653589793", "azimuth_deg", 180), ("tilt", "-6", "tilt_deg", -6),
     ("downtilt", "6", "tilt_deg", -6), ("Mechanical~Tilt", "4", "tilt_deg", -4),
@@ -97,6 +99,7 @@ def test_another_column_is_none_that_is_misspelt(column):
 @pytest.mark.parametrize(("text", "message"), [
     ("device,x_m,y_m,frequency\na,1,2,1800\n", "'frequency': the unit of its numbers from 1800 to 1800 is not known; .*mhz"),
     ("device,x_m,y_m,power\na,1,2,43\n", "'power': the unit .*power_dbm or power_w"),
+    ("a,1,2\nb,3,4\n", "a table without a header needs one"),
     ("device,x,y\na,1,2\n", "'x': the unit .*x_m or x_ft"),
     ("device,x_m,y_m,tx_power_w\na,1,2,0\n", "column tx_power_w: '0' is no power above zero"),
     ("device,x_m,y_m,z_m\na,1,2,30ft\n", "row 2, column z_m: '30ft' is not a number"),
