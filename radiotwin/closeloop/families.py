@@ -227,17 +227,21 @@ def _windows(readings: Readings, units: Units) -> Iterator[Family]:
     if len(np.unique(track)) > len(np.unique(readings.flight)):
         scopes.append(("receiver", track))
     for scope, label in scopes:
-        begin, end = _extremes(readings.time_s, label)
-        lasts = np.maximum(end - begin, 1e-9)
+        share = _share_of_time(readings, label)
         for number in WINDOWS:
             for shift in (0.0, 0.5):
-                share = (readings.time_s - begin[label]) / lasts[label]
-                window = np.floor(np.clip(np.where(timed, share, 0.0), 0, 1 - 1e-9) * number
-                                  + shift).astype(np.int64)
+                window = np.floor(share * number + shift).astype(np.int64)
                 code = _packed(label * (number + 1) + window, timed)
                 yield Family("time", Groups.of_labels(code, units),
                              _time_words(readings, scope, code), ends, ("level", "blanks"),
                              is_crossing=True)
+
+
+def _share_of_time(readings: Readings, label: np.ndarray) -> np.ndarray:
+    """Return the share (n,) of its label's time that has passed, below 1; 0 where unknown."""
+    begin, end = _extremes(readings.time_s, label)
+    share = (readings.time_s - begin[label]) / np.maximum(end - begin, 1e-9)[label]
+    return np.clip(np.nan_to_num(share), 0, 1 - 1e-9)
 
 
 def _extremes(values: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -296,8 +300,7 @@ def _bands(readings: Readings, units: Units) -> Iterator[Family]:
                               ("altitude", readings.moving_m[:, 2], "height_m"),
                               ("level", readings.predicted_db, "predicted_db")):
         known = np.isfinite(values)
-        edges = np.unique(np.quantile(values[known], np.linspace(0, 1, BANDS + 1)[1:-1])) \
-            if known.any() else np.zeros(0)
+        edges = _quantiles(values, BANDS)
         if len(edges) < 2:
             continue
         code = _packed(np.searchsorted(edges, values), known)
@@ -324,7 +327,7 @@ def _curves(readings: Readings, units: Units) -> Iterator[Family]:
                               for label in (track, readings.flight))
     few = _windows_of(readings, readings.flight, READINGS_A_BIN * len(np.unique(device)))
     sector = np.floor(np.nan_to_num(body_deg) / CURVE_SECTOR_DEG).astype(np.int64)
-    level = _quantile_band(predicted_db, LEVEL_BANDS)
+    level = np.searchsorted(_quantiles(predicted_db, LEVEL_BANDS), predicted_db)
     for end, along, bins, known, off in (
             ("receiver", "time_s", (track, by_receiver), timed, ends),
             ("receiver", "flight", (readings.flight,), None, (device, receiver)),
@@ -347,18 +350,15 @@ def _curves(readings: Readings, units: Units) -> Iterator[Family]:
 
 def _windows_of(readings: Readings, label: np.ndarray, count: int) -> np.ndarray:
     """Return the window (n,) of time within its label (n,), of about `count` readings each."""
-    begin, end = _extremes(readings.time_s, label)
-    number = np.clip(np.bincount(label, minlength=len(begin)) // count, 2, MAX_WINDOWS)
-    share = (readings.time_s - begin[label]) / np.maximum(end - begin, 1e-9)[label]
-    return np.floor(np.clip(np.nan_to_num(share), 0, 1 - 1e-9) * number[label]).astype(np.int64)
+    number = np.clip(np.bincount(label) // count, 2, MAX_WINDOWS)
+    return np.floor(_share_of_time(readings, label) * number[label]).astype(np.int64)
 
 
-def _quantile_band(values: np.ndarray, count: int) -> np.ndarray:
+def _quantiles(values: np.ndarray, count: int) -> np.ndarray:
+    """Return the different edges between `count` bands with as many known values each."""
     known = np.isfinite(values)
-    if not known.any():
-        return np.zeros(len(values), dtype=np.int64)
-    edges = np.unique(np.quantile(values[known], np.linspace(0, 1, count + 1)[1:-1]))
-    return np.searchsorted(edges, values)
+    return np.unique(np.quantile(values[known], np.linspace(0, 1, count + 1)[1:-1])) \
+        if known.any() else np.zeros(0)
 
 
 def _places(readings: Readings, units: Units) -> Iterator[Family]:
