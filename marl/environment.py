@@ -201,17 +201,17 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
 def _sense(mission: Mission, frame: Frame, flying: np.ndarray, lasting: np.ndarray,
            rng: np.random.Generator) -> None:
     """Draw this slot's SNRs and assign devices, in the flights that are still flying."""
-    uavs, devices = mission.snr_db.shape[:2]
+    uavs, devices = len(mission.start), len(mission.data_units)
     of_slot = np.sqrt(1.0 - mission.shadowing_share)
     strength = np.empty((uavs, devices))
     for e in range(len(flying)):
         if not flying[e]:
             continue
         for u in range(uavs):
-            row, column = frame.cell[e, u, 0], frame.cell[e, u, 1]
+            level, row, column = mission.level[u], frame.cell[e, u, 0], frame.cell[e, u, 1]
             for k in range(devices):
-                snr_db = mission.snr_db[u, k, row, column]
-                sigma_db = mission.sigma_db[u, k, row, column]
+                snr_db = mission.snr_db[level, k, row, column]
+                sigma_db = mission.sigma_db[level, k, row, column]
                 if sigma_db > 0:
                     shadowing = of_slot * rng.standard_normal()
                     if mission.shadowing_share > 0:

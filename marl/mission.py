@@ -26,16 +26,17 @@ MAX_UNITS, MAX_SLOT_S = 1e9, 1e6
 
 
 class Mission(NamedTuple):
-    """All that a flight depends on; U UAVs, K devices, a lattice of ny x nx cells at each altitude.
+    """All that a flight depends on; U UAVs, K devices, a lattice of ny x nx cells at L levels.
 
     A tuple of arrays, because compiled functions take it as it is.
 
     Attributes:
-        snr_db: (U, K, ny, nx) float32 mean SNR [dB]; -inf where nothing is ever received.
-        sigma_db: (U, K, ny, nx) float32 standard deviation of the shadowing [dB].
+        snr_db: (L, K, ny, nx) float32 mean SNR [dB]; -inf where nothing is ever received.
+        sigma_db: (L, K, ny, nx) float32 standard deviation of the shadowing [dB].
         steps_home: (U, ny, nx) int64 moves to the UAV's terminal.
         start: (U, 2) int64 cell (row, column) where each UAV starts.
         battery: (U,) int64 at take-off, in hovers (half battery units).
+        level: (U,) int64 the level of the maps at which each UAV flies.
         altitude_m: (U,) [m]
         data_units: (K,) float64 waiting at each device.
         known_m: (K, 2) float64 horizontal positions of the devices as the UAVs know them, relative
@@ -59,6 +60,7 @@ class Mission(NamedTuple):
     steps_home: np.ndarray
     start: np.ndarray
     battery: np.ndarray
+    level: np.ndarray
     altitude_m: np.ndarray
     data_units: np.ndarray
     known_m: np.ndarray
@@ -135,30 +137,32 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
     _check(scene, radio_map, assignment)
     config, lattice = scene.config, scene.lattice
     levels = [int(np.abs(lattice.z_m - uav.altitude_m).argmin()) for uav in config.uavs]
+    used, level = np.unique(levels, return_inverse=True)
     to_snr_db = config.radio.tx_power_dbm - config.radio.noise_dbm
     powers_dbm = radio_map.tx_power_dbm
-    shape = (len(config.uavs), len(config.devices), *lattice.shape[1:])
+    shape = (len(used), len(config.devices), *lattice.shape[1:])
     MAP_VALUES.check(math.prod(shape), f"{scene.folder / 'scene.toml'}: the mission's map")
     snr_db, sigma_db = np.full(shape, -np.inf, np.float32), np.zeros(shape, np.float32)
     for k, device in enumerate(config.devices):
         if device.device not in radio_map.devices:
             continue
         row = radio_map.devices.index(device.device)
-        gain_db = radio_map.gain_db[row, levels]
+        gain_db = radio_map.gain_db[row, used]
         _check_values(device.device, "gain_db", gain_db, -MAX_GAIN_DB, MAX_GAIN_DB)
         power_dbm = powers_dbm.get(device.device, config.radio.tx_power_dbm)
         snr_db[:, k] = np.where(np.isnan(gain_db), -np.inf,
                                 gain_db + (power_dbm - config.radio.noise_dbm))
         if "sigma_db" in radio_map.dataset:
-            own_db = radio_map.dataset["sigma_db"].values[row, levels]
+            own_db = radio_map.dataset["sigma_db"].values[row, used]
             _check_values(device.device, "sigma_db", own_db, 0.0, MAX_SIGMA_DB)
             sigma_db[:, k] = np.nan_to_num(own_db)
-    starts, homes = zip(*(_ends(scene, uav, level) for uav, level in zip(config.uavs, levels)))
+    starts, homes = zip(*(_ends(scene, uav, at) for uav, at in zip(config.uavs, levels)))
     origin_m = np.array([lattice.x_m[0], lattice.y_m[0]])
     known_m = np.array([known.position_m.get(d.device, (np.nan, np.nan)) for d in config.devices])
     return Mission(
         snr_db, sigma_db, steps_home=np.array(homes), start=np.array(starts),
         battery=np.array([int(uav.battery / HOVER_COST + 1e-9) for uav in config.uavs]),
+        level=level.astype(np.int64),
         altitude_m=np.array([uav.altitude_m for uav in config.uavs], dtype=float),
         data_units=np.full(len(config.devices), float(config.mission.data_units)),
         known_m=known_m - origin_m, step_m=lattice.step_m,

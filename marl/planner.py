@@ -138,7 +138,7 @@ def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.nda
         on_progress: called with the number of plans tried since the last call.
     """
     strongest = value.reshape(*value.shape[:2], -1).argmax(axis=2)
-    peaks = np.stack(np.unravel_index(strongest, value.shape[2:]), axis=-1)
+    peaks = np.stack(np.unravel_index(strongest, value.shape[2:]), axis=-1)[mission.level]
     tour, count = tour.copy(), count.copy()
     best_tour, best_count = tour.copy(), count.copy()
     actions = np.full((mission.longest, mission.uavs), NO_OP, dtype=np.int8)
@@ -154,7 +154,7 @@ def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.nda
 
 
 def expected_data(mission: Mission) -> np.ndarray:
-    """Return the data units (U, K, ny, nx) that one slot on each link is expected to bring.
+    """Return the data units (L, K, ny, nx) that one slot on each link is expected to bring.
 
     The probability that the SNR reaches the threshold times the rate at the mean SNR of the cases
     in which it does.
@@ -235,18 +235,19 @@ def fly_on(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndar
            flight: TourFlight, actions: np.ndarray) -> None:
     """Fly as many slots along the tours as `actions` (T, U) has rows, with the expected data."""
     cell, battery, left, reached, hovered, strength, assigned, mask = flight
-    uavs, devices = value.shape[:2]
+    uavs, devices = strength.shape
     for slot in range(len(actions)):
         for u in range(uavs):
             for k in range(devices):
-                worth = value[u, k, cell[u, 0], cell[u, 1]]
+                worth = value[mission.level[u], k, cell[u, 0], cell[u, 1]]
                 usable = battery[u] > 0 and left[k] > 0 and worth > 0
                 strength[u, k] = worth if usable else -np.inf
         assign(strength, mission.max_rate, assigned)
         for u in range(uavs):
             k = assigned[u]
             if k >= 0:
-                left[k] = max(left[k] - value[u, k, cell[u, 0], cell[u, 1]], 0.0)
+                worth = value[mission.level[u], k, cell[u, 0], cell[u, 1]]
+                left[k] = max(left[k] - worth, 0.0)
             action, reached[u], hovered[u] = next_action(
                 mission, u, cell[u, 0], cell[u, 1], battery[u], tour[u], count[u], reached[u],
                 hovered[u], mask)

@@ -153,7 +153,7 @@ def _expected_flight(mission: Mission, value: np.ndarray, tour: np.ndarray, coun
     Cells (T, U, 2), batteries (T, U), data left (T, K), waypoints passed and hovers flown at the
     next one (T, U).
     """
-    slots, (uavs, devices) = mission.battery.max() + 1, value.shape[:2]
+    slots, uavs, devices = mission.battery.max() + 1, len(tour), value.shape[1]
     cells = np.empty((slots, uavs, 2), np.int64)
     batteries = np.empty((slots, uavs), np.int64)
     left = np.empty((slots, devices))

@@ -58,7 +58,7 @@ def initial_weights(shared: Shared) -> Weights:
     links = np.zeros((shared.uavs, shared.devices, 1, 1), np.float32)
     each = np.zeros(shared.uavs, np.int64)
     sizes = Mission(links, links, np.zeros((shared.uavs, 1, 1), np.int64),
-                    np.zeros((shared.uavs, 2), np.int64), each, each.astype(float),
+                    np.zeros((shared.uavs, 2), np.int64), each, each, each.astype(float),
                     np.zeros(shared.devices), np.zeros((shared.devices, 2)), 1.0, 1.0, 0.0, 0.0,
                     np.zeros(2), False)
     return QNetworks(shared.learner, sizes, shared.run.seed).weights()

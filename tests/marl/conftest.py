@@ -58,7 +58,7 @@ def build(rng, rows=5, columns=5, uavs=2, devices=3, battery=(12, 15, 9), start=
     return Mission(
         np.broadcast_to(snr_db, shape).astype(np.float32), np.broadcast_to(sigma_db, shape).astype(np.float32),
         np.array([moves_home(blocked, end) for end in terminal]), np.array(start, dtype=np.int64),
-        np.array(battery[:uavs], dtype=np.int64), 50.0 + 5.0 * np.arange(uavs), np.array(data_units, dtype=float),
+        np.array(battery[:uavs], dtype=np.int64), np.arange(uavs), 50.0 + 5.0 * np.arange(uavs), np.array(data_units, dtype=float),
         np.array(known_m, dtype=float), float(step_m), float(rate_scale), float(threshold_db),
         float(detection_db), np.array([72.0, -25.0]), bool(max_rate))
 

@@ -24,8 +24,9 @@ def test_the_snr_is_power_plus_gain_minus_noise_at_the_uavs_altitude(small_scene
         at_altitude = truth.dataset.sel(z=uav.altitude_m)
         for k, device in enumerate(small_scene.config.devices):
             expected = at_altitude["gain_db"].sel(device=device.device).values + radio.tx_power_dbm - radio.noise_dbm
-            np.testing.assert_allclose(city_mission.snr_db[u, k], expected, rtol=1e-5)
-            np.testing.assert_allclose(city_mission.sigma_db[u, k],
+            level = city_mission.level[u]
+            np.testing.assert_allclose(city_mission.snr_db[level, k], expected, rtol=1e-5)
+            np.testing.assert_allclose(city_mission.sigma_db[level, k],
                                        at_altitude["sigma_db"].sel(device=device.device).values)
 
 

@@ -262,6 +262,6 @@ def test_three_replicas_of_five_thousand_flights_of_the_papers_missions_take_at_
     mission = Mission(
         np.zeros((uavs, devices, 2, 2), np.float32), np.zeros((uavs, devices, 2, 2), np.float32),
         np.zeros((uavs, 2, 2), np.int64), np.zeros((uavs, 2), np.int64), np.full(uavs, int(2 * battery)),
-        np.zeros(uavs), np.ones(devices), np.zeros((devices, 2)), 20.0, 100.0, 10.0, -np.inf, np.zeros(2), False)
+        np.arange(uavs), np.zeros(uavs), np.ones(devices), np.zeros((devices, 2)), 20.0, 100.0, 10.0, -np.inf, np.zeros(2), False)
     # Zeros are not yet taken from the system, so this needs no memory.
     assert 3 * Replay(5000, mission).bytes < 0.7 * GIB
