@@ -1,14 +1,25 @@
 """Algorithm 1 of the paper: fly, learn the twin from the measurements, train in it, and repeat."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from marl.checkpoint import NAME, keep_twin, restored, save_checkpoint
+from marl.checkpoint import (
+    NAME,
+    Damaged,
+    keep_twin,
+    load_checkpoint,
+    refusing,
+    require,
+    require_log,
+    require_tables,
+    save_checkpoint,
+    stored_twin,
+)
 from marl.environment import Environment
 from marl.flights import Flights, Policy, evaluate, fly
 from marl.heuristics import HeuristicPolicy, waypoint_actions
@@ -26,6 +37,11 @@ from radiotwin.twin.shadowing import with_shadowing
 TWINS = {"nn": "segmented_nn", "log-distance": "log_distance", "kriging": "regression_kriging",
          "raytrace": "raytrace", "path-kriging": "path_kriging"}
 """Name of a twin on the command line -> model of `fit_twin`."""
+COUNTS = ("round", "real_episodes", "simulated_episodes", "located", "evaluation_flights")
+NUMBERS = ("truth_ratio", "truth_ratio_std", "twin_ratio", "location_error_median_m",
+           "location_error_worst_m", "learn_twin_s", "round_s")
+"""Columns of the log, of which `Campaign.log` writes rows."""
+MAX_NUMBER = 1e30  # in it
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,68 +90,198 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
     Raises:
         BadInput: a damaged checkpoint, or input that `fit_twin` or `make_mission` refuses.
     """
-    # The shadowing of a truth includes the receivers' noise.
-    noise_db = 0.0 if "sigma_db" in truth.dataset else run.noise_db
-    reality = Reality(scene, truth, run.assignment, noise_db, run.seed)
-    true_positions = run.twin == "truth" or run.privileged
-    known = Known.truth(scene) if true_positions else Known.anchors(scene)
-    learner = make_learner(run, learner_settings, reality.mission(known), run.real_episodes,
-                           device)
+    campaign = Campaign(run, scene, truth)
+    learner = make_learner(run, learner_settings, campaign.in_truth(), run.real_episodes, device)
+    rows, blocks = campaign.rows, list[dict]()
     checkpoint = folder / NAME if folder else None
-    rows: list[dict] = []
-    blocks: list[dict] = []
-    twin: Twin | None = None
     try:
         # A run that was stopped before its first checkpoint starts again.
-        if resume and folder and (folder / NAME).exists():
-            rows, blocks, reality.tables, twin = restored(folder / NAME, run, scene, learner)
-            if twin is not None:
-                twin.save(folder / "twin")
-                known = known if true_positions else Known.of(twin.devices)
+        if resume and folder and checkpoint and checkpoint.exists():
+            blocks += resumed(campaign, learner, checkpoint)
+            if campaign.twin is not None:
+                campaign.twin.save(folder / "twin")
             on_progress(run.episodes * len(rows), _summary(rows[-1], run))
             # The run may have been stopped between the checkpoint and the log.
             on_round(rows, blocks)
         for number in range(len(rows), run.real_episodes):
             started = time.perf_counter()
             rng = stream(run.seed, "decisions", number)
-            if run.twin == "truth":
-                mission = reality.mission(known)
-            else:
-                reality.fly(measuring_policy(run, reality, twin, known, learner, rng), known)
-                measured = reality.measurements()
-                twin = fit_twin(measured, scene, model=TWINS[run.twin], seed=run.seed, start=twin)
-                known = known if true_positions else Known.of(twin.devices)
-                mission = twin_mission(scene, run, twin, known, measured)
-            learned_s = time.perf_counter() - started
+            campaign.learn(learner, rng)
+            mission = campaign.mission()
             blocks += [{"round": number + 1} | block
                        for block in learner.prepare(mission, on_progress)]
-            in_twin = np.full(1, np.nan)
-            if twin is not None:
-                flights = evaluate(mission, learner.policy(rng), run.flights,
-                                   stream(run.seed, "twin evaluation"))
-                in_twin = flights.ratio(mission)
-            real = reality.mission(known)
-            flights = evaluate(real, learner.policy(rng), run.flights,
-                               stream(run.seed, "truth evaluation"))
-            found = known if twin is None else Known.of(twin.devices)
-            rows.append(round_row(run, learner, number + 1, in_twin, flights.ratio(real),
-                                  location_errors_m(scene, found))
-                        | {"evaluation_flights": (number + 1) * run.flights,
-                           "learn_twin_s": learned_s, "round_s": time.perf_counter() - started})
+            campaign.log(learner, mission, rng, (number + 1) * run.episodes * learner.replicas)
+            rows[-1]["round_s"] = time.perf_counter() - started
             on_progress(0, _summary(rows[-1], run))
             if folder and checkpoint:
-                state = {"rows": rows, "blocks": blocks, "tables": reality.tables,
-                         "strategy": learner.state(last=number + 1 == run.real_episodes)}
-                if twin is not None:
-                    state["twin"] = keep_twin(twin, folder)
-                save_checkpoint(state, checkpoint)
+                last = number + 1 == run.real_episodes
+                save_checkpoint(campaign.state(folder) | {"blocks": blocks,
+                                                          "strategy": learner.state(last)},
+                                checkpoint)
             on_round(rows, blocks)
-        real = reality.mission(known)
         policy = learner.policy(stream(run.seed, "decisions", run.real_episodes - 1))
-        flights = evaluate(real, policy, run.flights, stream(run.seed, "truth evaluation"))
-        return Outcome(rows, blocks, flights, known, twin)
+        flights = evaluate(campaign.in_truth(), policy, run.flights,
+                           stream(run.seed, "truth evaluation"))
+        return Outcome(rows, blocks, flights, campaign.known, campaign.twin)
     finally:
         learner.close()
+
+
+def resumed(campaign: "Campaign", learner: Learner, path: Path) -> list[dict]:
+    """Have a campaign and its learner go on from a checkpoint, and return the log's blocks.
+
+    Raises:
+        BadInput: it is damaged, or not of this run.
+    """
+    state = load_checkpoint(path)
+    with refusing(path):
+        campaign.load_state(state, path, ("blocks", "strategy"))
+        if not campaign.rows:
+            raise Damaged("no round has finished")
+        learner.load_state(state["strategy"])
+        return require_log(state["blocks"], ("round", "episodes"))
+
+
+class Campaign:
+    """Real flights of one owner, the twin that is learned from them, and the log of the rounds.
+
+    Args:
+        run: settings of the run.
+        scene: the true positions of its unknown devices are not used unless `run` says so.
+        truth: map of the real world; None: there is none, and flights were flown.
+        measured: on flights that were flown; None: they are simulated in the truth.
+
+    Attributes:
+        known: positions that the UAVs know.
+        twin: the present one; None where none was needed so far.
+        rows: of the log, one for every round; `docs/marl.md` explains the columns.
+        learn_s: time that learning the present twin took [s].
+    """
+
+    def __init__(self, run: RunSettings, scene: Scene, truth: RadioMap | None,
+                 measured: Measurements | None = None) -> None:
+        self.run, self.scene, self.measured = run, scene, measured
+        self.rows: list[dict] = []
+        self.twin: Twin | None = None
+        self.reality: Reality | None = None
+        if truth is not None:
+            # The shadowing of a truth includes the receivers' noise.
+            noise_db = 0.0 if "sigma_db" in truth.dataset else run.noise_db
+            self.reality = Reality(scene, truth, run.assignment, noise_db, run.seed)
+        self._true_positions = run.twin == "truth" or run.privileged
+        self.known = (Known.truth if self._true_positions else Known.anchors)(scene)
+        self.learn_s = 0.0
+
+    @property
+    def flown(self) -> int:
+        """Number of real flights that were simulated."""
+        return len(self.reality.tables) if self.reality is not None else 0
+
+    def in_truth(self) -> Mission:
+        """Return the mission in the truth, which there must be."""
+        assert self.reality is not None
+        return self.reality.mission(self.known)
+
+    def mission(self) -> Mission:
+        """Return the mission to train in: in the twin, or in the truth where there is no twin."""
+        if self.twin is None:
+            return self.in_truth()
+        return twin_mission(self.scene, self.run, self.twin, self.known, self._measurements())
+
+    def learn(self, learner: Learner | None, rng: np.random.Generator) -> None:
+        """Fly a real episode, and learn the twin anew from all measurements.
+
+        Flights that were flown are learned from once. With a perfect twin there is nothing to
+        learn.
+
+        Args:
+            learner: may fly; None: flights were flown.
+            rng: of the decisions.
+        """
+        run, started = self.run, time.perf_counter()
+        if run.twin == "truth" or (self.measured is not None and self.twin is not None):
+            return
+        if self.measured is None:
+            assert self.reality is not None and learner is not None
+            self.reality.fly(measuring_policy(run, self.reality, self.twin, self.known, learner,
+                                              rng), self.known)
+        self._see(fit_twin(self._measurements(), self.scene, model=TWINS[run.twin], seed=run.seed,
+                           start=self.twin))
+        self.learn_s = time.perf_counter() - started
+
+    def log(self, learner: Learner, mission: Mission, rng: np.random.Generator,
+            simulated: int) -> None:
+        """Evaluate the policy in the twin and in the truth, as far as they are there.
+
+        Args:
+            learner: that has been prepared.
+            mission: that it was prepared in.
+            rng: of its policy.
+            simulated: episodes so far, of all replicas.
+        """
+        run, found, in_twin, real = self.run, self.known, np.full(1, np.nan), np.full(1, np.nan)
+        if self.twin is not None:
+            flown = evaluate(mission, learner.policy(rng), run.flights,
+                             stream(run.seed, "twin evaluation"))
+            in_twin, found = flown.ratio(mission), Known.of(self.twin.devices)
+        if self.reality is not None:
+            mission = self.in_truth()
+            real = evaluate(mission, learner.policy(rng), run.flights,
+                            stream(run.seed, "truth evaluation")).ratio(mission)
+        number = len(self.rows) + 1
+        real_episodes = number if self.measured is None else len(self.measured.flights)
+        if run.twin == "truth":  # flights that choose between policies are real, too
+            real_episodes = simulated + learner.selection_flights
+        errors_m = location_errors_m(self.scene, found)
+        located = errors_m[np.isfinite(errors_m)]
+        self.rows.append({
+            "round": number, "real_episodes": real_episodes, "simulated_episodes": simulated,
+            "truth_ratio": float(real.mean()), "truth_ratio_std": float(real.std()),
+            "twin_ratio": float(in_twin.mean()), "located": len(located),
+            "location_error_median_m": float(np.median(located)) if len(located) else np.nan,
+            "location_error_worst_m": float(located.max()) if len(located) else np.nan,
+            "evaluation_flights": number * run.flights, "learn_twin_s": self.learn_s,
+            "round_s": 0.0})
+
+    def state(self, folder: Path) -> dict:
+        """Return what a checkpoint has of it, and write the twin into the run's folder."""
+        tables = [] if self.reality is None else self.reality.tables
+        return {"rows": self.rows, "tables": tables,
+                "twin": None if self.twin is None else keep_twin(self.twin, folder)}
+
+    def load_state(self, state: dict, path: Path, others: Collection[str]) -> None:
+        """Go on from a checkpoint, a stranger's; raise Damaged if it is not of this campaign.
+
+        Args:
+            state: see there, with parts that the caller checks.
+            path: of the checkpoint.
+            others: names of those parts.
+        """
+        require(state, dict.fromkeys(("rows", "tables", "twin", *others), ...))
+        run, tables = self.run, state["tables"]
+        self.rows += require_log(state["rows"], COUNTS, NUMBERS, MAX_NUMBER)
+        if len(self.rows) > run.real_episodes or any(
+                row["round"] != number for number, row in enumerate(self.rows, 1)):
+            raise Damaged("rounds are too many, or not in order")
+        flown = self.measured is None and run.twin != "truth"
+        if (state["twin"] is None) != (run.twin == "truth") or bool(tables) != flown \
+                or len(tables) > run.real_episodes:
+            raise Damaged("the twin or its measurements are missing, or not of this run")
+        if self.reality is not None:
+            self.reality.tables += require_tables(tables, self.scene)
+        if state["twin"] is not None:
+            self._see(stored_twin(state["twin"], path, self.scene))
+
+    def _measurements(self) -> Measurements:
+        if self.measured is not None:
+            return self.measured
+        assert self.reality is not None
+        return self.reality.measurements()
+
+    def _see(self, twin: Twin) -> None:
+        self.twin = twin
+        if not self._true_positions:
+            self.known = Known.of(twin.devices)
 
 
 @dataclass
@@ -233,33 +379,6 @@ def measuring_policy(run: RunSettings, reality: Reality, twin: Twin | None, know
     if how == "waypoints":
         return PlanPolicy(waypoint_actions(reality.scene, reality.mission(known), rng))
     return HeuristicPolicy("random", rng) if twin is None else learner.policy(rng)
-
-
-def round_row(run: RunSettings, learner: Learner, number: int, in_twin: np.ndarray,
-              real: np.ndarray, errors_m: np.ndarray) -> dict:
-    """Return the row of a round (from 1) in the log.
-
-    Args:
-        run: settings of the run.
-        learner: that has been prepared in so many rounds.
-        number: of the round.
-        in_twin: (E,) shares collected in the twin.
-        real: (E,) shares collected in the truth.
-        errors_m: see `location_errors_m`.
-    """
-    simulated = number * run.episodes * learner.replicas
-    located = errors_m[np.isfinite(errors_m)]
-    return {
-        "round": number,
-        # In the truth, flights that choose between policies are real, too.
-        "real_episodes": simulated + learner.selection_flights if run.twin == "truth" else number,
-        "simulated_episodes": simulated,
-        "truth_ratio": float(real.mean()), "truth_ratio_std": float(real.std()),
-        "twin_ratio": float(in_twin.mean()),
-        "located": len(located),
-        "location_error_median_m": float(np.median(located)) if len(located) else np.nan,
-        "location_error_worst_m": float(located.max()) if len(located) else np.nan,
-    }
 
 
 def _summary(row: dict, run: RunSettings) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import norm
 from typing_extensions import override
 
-from marl.checkpoint import require_fields, require_plan
+from marl.checkpoint import require, require_plan
 from marl.environment import ACTION_COUNT, Frame, assign, feasible
 from marl.flights import Policy
 from marl.learner import Learner, Setup
@@ -106,7 +106,7 @@ class Planner(Learner):
 
     @override
     def load_state(self, state: dict) -> None:
-        require_fields(state, ("actions",))
+        require(state, {"actions": ...})
         self._actions = require_plan(state["actions"], self.setup.mission)
 
 

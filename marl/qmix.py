@@ -28,7 +28,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from marl.checkpoint import Damaged, require_count, require_fields, require_plan, require_tensors
+from marl.checkpoint import COUNT, require, require_plan
 from marl.environment import (
     ACTION_COUNT,
     Frame,
@@ -328,7 +328,7 @@ class QNetworks:
             target = td_lambda_targets(reward, best, valid, settings.discount, settings.td_lambda)
         count = valid.sum() * chosen[0, 0].numel()
         loss = ((chosen - target) * valid).square().sum() / count
-        gradients = torch.autograd.grad(loss + self.penalty(), self.parameters())
+        gradients = torch.autograd.grad(loss, self.parameters())
         norm = torch.stack([gradient.norm() for gradient in gradients]).norm()
         scale = (MAX_GRADIENT_NORM / norm).clamp(max=1.0)
         self.optimiser.step([gradient * scale for gradient in gradients], learning_rate)
@@ -342,10 +342,6 @@ class QNetworks:
     def mix(self, values: Tensor, state: Tensor, modules: dict[str, nn.Module]) -> Tensor:
         """Return the values that are learned: (T, E) Q_tot of (T, E, U) values of actions."""
         return modules["mixer"](values, state)
-
-    def penalty(self) -> Tensor | float:
-        """Return what a subclass adds to the loss."""
-        return 0.0
 
     def copy_to_targets(self) -> None:
         """Copy the online networks to the target networks."""
@@ -398,19 +394,13 @@ class QNetworks:
 
     def load_state(self, state: dict) -> None:
         """Go on from a checkpoint."""
-        targets = {f"target_{name}": module for name, module in self.targets.items()}
-        modules = self.modules | targets
-        require_fields(state, ("updates", "optimiser", *modules))
-        self.updates = require_count(state["updates"])
-        moments = require_fields(state["optimiser"], ("count", "mean", "square"))
-        require_count(moments["count"])
-        for name in ("mean", "square"):
-            like = getattr(self.optimiser, name)
-            given = {str(number): tensor for number, tensor in enumerate(moments[name])}
-            require_tensors(given, {str(number): tensor for number, tensor in enumerate(like)})
-        self.optimiser.load_state_dict(moments)
-        for name, module in modules.items():
-            module.load_state_dict(require_tensors(state[name], module.state_dict()))
+        like = self.state()
+        require(state, like | {"updates": COUNT, "optimiser": like["optimiser"] | {"count": COUNT}})
+        self.updates = state["updates"]
+        self.optimiser.load_state_dict(state["optimiser"])
+        for name, module in self.modules.items():
+            module.load_state_dict(state[name])
+            self.targets[name].load_state_dict(state[f"target_{name}"])
 
 
 def td_lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: float,
@@ -534,21 +524,22 @@ class QMIX(Learner):
     def state(self, last: bool) -> dict:
         # The replicas' memories are most of a checkpoint.
         return {"episodes": self.episodes, "best": self._best.state_dict(),
-                "actions": self._actions, "selection_flights": self.selection_flights,
+                "actions": self._actions, "highest": float(self._highest),
+                "selection_flights": self.selection_flights,
                 "replicas": None if last else self._trainers.call("state")}
 
     @override
     def load_state(self, state: dict) -> None:
-        require_fields(state, ("episodes", "best", "actions", "selection_flights", "replicas"))
-        self.episodes = require_count(state["episodes"])
-        self.selection_flights = require_count(state["selection_flights"])
-        self._best.load_state_dict(require_tensors(state["best"], self._best.state_dict()))
+        replicas = state["replicas"]
+        require(state, {"episodes": COUNT, "best": self._best.state_dict(), "actions": ...,
+                        "selection_flights": COUNT, "highest": ...,
+                        "replicas": None if replicas is None else [...] * self.replicas})
+        self.episodes, self._highest = state["episodes"], float(state["highest"])
+        self.selection_flights = state["selection_flights"]
+        self._best.load_state_dict(state["best"])
         if state["actions"] is not None:
             self._actions = require_plan(state["actions"], self.setup.mission)
-        replicas = state["replicas"]
         if replicas is not None:
-            if not isinstance(replicas, list) or len(replicas) != self.replicas:
-                raise Damaged(f"{self.replicas} replicas are needed")
             self._trainers.call("load_state", each=replicas)
 
     @override

@@ -111,10 +111,7 @@ class Session:
                         "that it was started with, or give another --out")
             require_plain(self.out)
             return
-        if self.out.exists() and (not self.out.is_dir() or any(
-                not is_temporary(each) for each in self.out.iterdir())):
-            raise BadInput(f"{self.out} exists and is not an empty folder; --resume goes on with "
-                           "the run in it, --out names another folder")
+        require_free(self.out, "--resume goes on with the run in it, --out names another folder")
         with atomic_file(path) as file:
             file.write(json.dumps(config, indent=1).encode())
 
@@ -164,6 +161,13 @@ class Session:
         row = {"real_episodes": 0 if free else real_episodes, "truth_ratio": float(ratio.mean()),
                "truth_ratio_std": float(ratio.std())}
         return _entry(name, run.twin, row)
+
+
+def require_free(folder: Path, advice: str) -> None:
+    """Refuse a folder that has something in it, BadInput."""
+    if folder.exists() and (not folder.is_dir() or any(
+            not is_temporary(each) for each in folder.iterdir())):
+        raise BadInput(f"{folder} exists and is not an empty folder; {advice}")
 
 
 def _entry(method: str, twin: str, row: dict) -> dict:

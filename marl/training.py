@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from marl.checkpoint import require_array, require_count, require_fields, require_generator
+from marl.checkpoint import COUNT, GENERATOR, Within, require
 from marl.environment import ACTION_COUNT, Environment, Frame, empty_frame, observe
 from marl.flights import Flights, fly
 from marl.mission import MAX_SNR_DB, Mission
@@ -140,10 +140,10 @@ class Trainer:
 
     def load_state(self, state: dict) -> None:
         """Go on from a checkpoint."""
-        require_fields(state, ("episodes", "slots", "rng", "learner", "replay"))
-        self.episodes = require_count(state["episodes"])
-        self.slots = require_count(state["slots"])
-        self._rng.bit_generator.state = require_generator(state["rng"])
+        require(state, {"episodes": COUNT, "slots": COUNT, "rng": GENERATOR, "learner": ...,
+                        "replay": ...})
+        self.episodes, self.slots = state["episodes"], state["slots"]
+        self._rng.bit_generator.state = state["rng"]
         self.networks.load_state(state["learner"])
         self.replay.load_state(state["replay"])
 
@@ -292,12 +292,13 @@ class Replay:
 
     def load_state(self, state: dict) -> None:
         """Go on from a checkpoint."""
-        arrays = _arrays(self._flights)
-        require_fields(state, ("next", "size", *arrays))
-        size = require_count(state["size"], self.capacity)
+        size = require(state["size"], range(self.capacity + 1), "size")
+        arrays = {name: array[:size] for name, array in _arrays(self._flights).items()}
+        require(state, {"next": range(self.capacity), "size": ...} | {
+            name: Within(array, *self._ranges[name]) for name, array in arrays.items()})
         for name, array in arrays.items():
-            array[:size] = require_array(state[name], array[:size], *self._ranges[name])
-        self._next, self.size = require_count(state["next"], self.capacity - 1), size
+            array[:] = state[name]
+        self._next, self.size = state["next"], size
 
 
 def _arrays(flights: Flights) -> dict[str, np.ndarray]:

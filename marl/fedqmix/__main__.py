@@ -10,14 +10,14 @@ from typing import Annotated
 
 import typer
 
-from marl.fedqmix.settings import EngineSettings, FederationSettings
+from marl.fedqmix.settings import FederationSettings
 from marl.settings import LearnerSettings, RunSettings, checked, settings_of, with_settings
 from radiotwin.errors import BadInput
 from radiotwin.runtime.command import exit_status, with_output_options
 from radiotwin.runtime.console import say, show_warnings_plainly
 
 
-@with_settings(RunSettings, LearnerSettings, EngineSettings, FederationSettings)
+@with_settings(RunSettings, LearnerSettings, FederationSettings)
 def fedqmix(
     given: dict[str, str],
     out: Annotated[Path | None, typer.Option(
@@ -32,15 +32,10 @@ def fedqmix(
     """
     show_warnings_plainly()
     run, learner = settings_of(given)
-    engine = checked(given, EngineSettings())
     federation = checked(given, FederationSettings())
     name = f"{run.scene.name}-{run.truth}-{run.twin}-{run.algorithm}-{run.seed}"
     folder = out or Path("runs") / name
-    of_federation = "federation" in given or engine != EngineSettings()
-    if not of_federation:  # one owner of all
-        if federation != FederationSettings():
-            raise BadInput("--strategy and what goes with it are of a federation; give "
-                           "--federation or --party-scenes, too")
+    if not given.keys() & FederationSettings.model_fields.keys():  # one owner of all
         from marl.session import Session  # torch and all: not for --help
 
         Session(run, learner, folder, resume).execute()
@@ -51,7 +46,7 @@ def fedqmix(
                            "--party-measurements, or that")
         from marl.fedqmix.session import FederatedSession
 
-        FederatedSession(run, learner, federation, engine, folder).execute()
+        FederatedSession(run, learner, federation, folder).execute()
     say(f"wrote {folder}")
 
 

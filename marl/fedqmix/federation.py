@@ -9,6 +9,7 @@ from marl.fedqmix.settings import Shared
 from marl.learner import Setup
 from marl.mission import Mission
 from marl.qmix import QMIX, QNetworks
+from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 
 Weights = dict[str, np.ndarray]
@@ -64,6 +65,17 @@ def initial_weights(shared: Shared) -> Weights:
     return QNetworks(shared.learner, sizes, shared.run.seed).weights()
 
 
+def rounds_of(run: RunSettings, settings: LearnerSettings) -> list[tuple[int, int]]:
+    """Return (real episode from 0, training episodes) of each round of a federation.
+
+    They are the blocks of `FedQMIX`: a mean after every `federate_every` episodes, and after the
+    last one before the next real episode.
+    """
+    blocks = [min(settings.federate_every, run.episodes - start)
+              for start in range(0, run.episodes, settings.federate_every)]
+    return [(number, block) for number in range(run.real_episodes) for block in blocks]
+
+
 class FedQMIX(QMIX):
     """`--algorithm fedqmix`: as `QMIX`, with a replica for each UAV.
 
@@ -82,3 +94,27 @@ class FedQMIX(QMIX):
         self._trainers.call("set_weights", mean)
         return {name: float(np.mean([record[name] for record in records]))
                 for name in records[0]}, mean
+
+
+class Replica(QMIX):
+    """One of the replicas of `FedQMIX`, alone: the mean is made elsewhere."""
+
+    def __init__(self, setup: Setup, number: int) -> None:
+        super().__init__(setup, [number])
+
+    def train(self, mean: Weights, episodes: int) -> Weights:
+        """Train for some episodes from a mean, and return the weights."""
+        self._trainers.call("set_weights", mean)
+        _, weights = self._train(episodes)
+        self.episodes += episodes
+        return weights
+
+    def weights(self) -> Weights:
+        """Return the present weights."""
+        return self._trainers.call("weights")[0]
+
+    def go_on(self, mission: Mission, state: dict) -> None:
+        """Go on from a checkpoint, in the map of that time."""
+        self.load_state(state)
+        self.mission = mission
+        self._trainers.call("enter", mission, self._actions)

@@ -2,25 +2,17 @@
 
 import re
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 
 import marl.replicas
 from marl.algorithm1 import run_algorithm
-from marl.fedqmix import federation
-from marl.fedqmix.client import Client, Party, ProximalNetworks, rounds_of
-from marl.fedqmix.federation import average, initial_weights, require_weights
+from marl.fedqmix.client import Client, Party
+from marl.fedqmix.federation import FedQMIX, average, initial_weights, require_weights, rounds_of
 from marl.fedqmix.session import FederatedSession, federate
-from marl.fedqmix.settings import (
-    EngineSettings,
-    FederationSettings,
-    Shared,
-    check_federation,
-)
+from marl.fedqmix.settings import FederationSettings, Shared
 from marl.settings import PRESETS, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.maps.survey import fly_survey, segmented_truth
@@ -40,7 +32,7 @@ def one_process(monkeypatch):
 @pytest.fixture
 def shared(small_scene):
     config = small_scene.config
-    return Shared(RUN, LEARNER, FederationSettings(), 2, len(config.uavs), len(config.devices))
+    return Shared(run=RUN, learner=LEARNER, clients=2, uavs=len(config.uavs), devices=len(config.devices))
 
 
 @pytest.fixture
@@ -50,7 +42,7 @@ def parties(small_scene, tmp_path):
 
 
 def in_truth(shared):
-    return replace(shared, run=shared.run.model_copy(update={"twin": "truth"}))
+    return shared.model_copy(update={"run": shared.run.model_copy(update={"twin": "truth"})})
 
 
 def play(shared, party, means, rounds, keep):
@@ -69,14 +61,14 @@ def test_rounds_are_the_blocks_between_real_episodes():
 
 def test_means_and_policy_are_those_of_fedqmix(small_scene, shared, parties, monkeypatch):
     # The learner of one owner, and parties that know nothing of each other: the same bits after every round.
-    means, train = [], federation.FedQMIX._train
+    means, train = [], FedQMIX._train
 
     def seen(self, episodes):
         record, mean = train(self, episodes)
         means.append(mean)
         return record, mean
 
-    monkeypatch.setattr(federation.FedQMIX, "_train", seen)
+    monkeypatch.setattr(FedQMIX, "_train", seen)
     run = shared.run.model_copy(update={"scene": small_scene.folder})
     outcome = run_algorithm(run, LEARNER, small_scene, segmented_truth(small_scene), None, False,
                             lambda rows, blocks: None, lambda *given: None)
@@ -111,13 +103,14 @@ def test_a_party_goes_on_from_its_checkpoint_to_the_bit(shared, parties, tmp_pat
 
 def test_the_session_makes_the_same_means_in_one_process(shared, parties):
     shared = in_truth(shared)
-    first, *means = federate(shared, parties, lambda count: None)
+    others = [Party(party.scene, party.folder / "other", party.number, "segmented") for party in parties]
+    first, *means = federate(shared, [Client(shared.run, LEARNER, party) for party in others])
     clients = [Client(shared.run, LEARNER, party) for party in parties]
     for number, mean in enumerate(means, 1):
         first = average([client.train(number, first)[0] for client in clients])
         for name in mean:
             np.testing.assert_array_equal(mean[name], first[name])
-    assert all((party.folder / "run-in-process" / "metrics.csv").exists() for party in parties)
+    assert all((party.folder / "metrics.csv").exists() for party in others)
 
 
 def test_a_party_that_missed_rounds_goes_on(shared, parties):
@@ -174,41 +167,35 @@ def test_weights_of_others_are_checked(shared, change, message):
 
 
 def test_settings_survive_the_way_through_an_app(shared):
-    flat = {f"{group}.{name}": value for group, values in shared.config().items() if isinstance(values, dict)
-            for name, value in values.items()}
-    flat |= {name: getattr(shared, name) for name in ("clients", "uavs", "devices")}
-    assert Shared.of(flat) == Shared(shared.run.model_copy(update={"truth": "traced", "device": "auto"}),
-                                     shared.learner, shared.federation, 2, shared.uavs, shared.devices)
+    flat = {}
+    for group, values in shared.config().items():
+        flat |= {f"{group}.{name}": value for name, value in values.items()} if isinstance(values, dict) else {
+            group: values}
+    own = shared.run.model_copy(update={"truth": "traced", "device": "auto"})
+    assert Shared.of(flat) == shared.model_copy(update={"run": own})
     for name, value, message in (("run.scene", "/etc", "not for the coordinator"), ("uavs", "3", "uavs = 3"),
                                  ("learner.hidden", 10**9, "learner.hidden"), ("run.other", 1, "run.other"),
-                                 ("federation.strategy", "fedavgm", "federate-all")):
+                                 ("min_clients", 3, "there are 2 parties"), ("other.name", 1, "other"), ("other", 1, "other"),
+                                 ("learner.replay", 2, "replay")):
         with pytest.raises(BadInput, match=message):
             Shared.of(flat | {name: value})
-
-
-def test_more_parties_than_there_are_cannot_be_needed():
-    with pytest.raises(BadInput, match="--min-clients 3: there are 2"):
-        check_federation(FederationSettings(min_clients=3), LEARNER, 2)
+    with pytest.raises(BadInput, match="devices"):
+        Shared.of({name: value for name, value in flat.items() if name != "devices"})
 
 
 @pytest.mark.parametrize("options, status, message", [
-    (["--federation", "flower", "--algorithm", "qmix"], 2, "--algorithm fedqmix"),
-    (["--federation", "flower", "--resume"], 2, "without --resume"),
-    (["--strategy", "fedavgm"], 2, "of a federation"),
+    (["--federation", "flower-app", "--algorithm", "qmix"], 2, "--algorithm fedqmix"),
+    (["--federation", "flower-app", "--resume"], 2, "without --resume"),
     (["--federation", "in-process", "--min-clients", "4"], 2, "there are 2 parties"),
-    (["--party-scenes", "a,b", "--strategy", "fedavgm", "--federate-all", "false"], 2, "it is Flower's"),
-    (["--federation", "flower-app", "--strategy", "fedavgm"], 2, "--federate-all false"),
     (["--federation", "flower-app", "--min-clients", "4"], 2, "there are 2 parties"),
+    (["--federation", "flower"], 2, "in-process|flower-app"),
     (["--federation", "flower-app", "--party-measurements", "a,b,c", "--party-scenes", "x,y"], 2, "3 files for 2"),
-    (["--federation", "flower"], 1, "extra flower"),
     (["--federation", "flower-app"], 0, "app"),
 ])
 def test_options_that_do_not_go_together_end_with_one_message(options, status, message, small_scene, tmp_path,
                                                               monkeypatch, capsys):
-    from marl.fedqmix import session
     from marl.fedqmix.__main__ import app
 
-    monkeypatch.setattr(session, "find_spec", lambda name: None)
     out = tmp_path / "out"
     given = ["--scene", str(small_scene.folder), "--truth", "segmented", "--out", str(out), *options]
     monkeypatch.setattr("sys.argv", ["fedqmix", *given])
@@ -225,10 +212,10 @@ def test_scenes_of_other_sizes_are_refused(small_scene, tmp_path):
     first = text.index("[[uavs]]")
     second = text.index("[[", first + 1)
     (other / "scene.toml").write_text(text[:first] + text[second:])
-    engine = EngineSettings(party_scenes=f"{small_scene.folder},{other}")
+    federation = FederationSettings(party_scenes=f"{small_scene.folder},{other}")
     run = RUN.model_copy(update={"scene": small_scene.folder})
     with pytest.raises(BadInput, match="equal"):
-        FederatedSession(run, LEARNER, FederationSettings(), engine, tmp_path / "out").execute()
+        FederatedSession(run, LEARNER, federation, tmp_path / "out").execute()
     assert not (tmp_path / "out").exists()
 
 
@@ -240,45 +227,19 @@ def test_what_cannot_be_trained_is_refused_before_anything_is_written(small_scen
     shutil.copytree(small_scene.folder, scene)
     text = re.sub(r"battery = [\d.]+", f"battery = {battery}", (scene / "scene.toml").read_text())
     (scene / "scene.toml").write_text(re.sub(r"start_x_m = [\d.]+", "start_x_m = 200.0", text))
-    engine = EngineSettings(party_scenes=f"{scene},{scene}")
+    federation = FederationSettings(party_scenes=f"{scene},{scene}")
     learner = LEARNER.model_copy(update=settings)
     with pytest.raises(BadInput, match=message):
-        FederatedSession(RUN.model_copy(update={"scene": scene}), learner, FederationSettings(), engine,
+        FederatedSession(RUN.model_copy(update={"scene": scene}), learner, federation,
                          tmp_path / "out").execute()
     assert not (tmp_path / "out").exists()
 
 
 def test_a_session_in_one_process_writes_what_each_party_collects(small_scene, tmp_path, capsys):
-    engine = EngineSettings(party_scenes=f"{small_scene.folder},{small_scene.folder}")
+    federation = FederationSettings(party_scenes=f"{small_scene.folder},{small_scene.folder}")
     run = RUN.model_copy(update={"scene": small_scene.folder, "twin": "truth", "real_episodes": 1, "episodes": 8})
-    FederatedSession(run, LEARNER, FederationSettings(), engine, tmp_path / "out").execute()
+    FederatedSession(run, LEARNER, federation, tmp_path / "out").execute()
     assert "in its truth" in " ".join(capsys.readouterr().out.split())
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["app", "config.json", "curve.png", "parties"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["config.json", "curve.png", "parties"]
     with pytest.raises(BadInput, match="not an empty folder"):
-        FederatedSession(run, LEARNER, FederationSettings(), engine, tmp_path / "out").execute()
-
-
-def test_the_proximal_term_is_that_of_the_paper(shared, city_mission):
-    networks = ProximalNetworks(LEARNER, city_mission, 0, "cpu", mu=0.3)
-    mean = {name: array + np.float32(0.25) for name, array in networks.weights().items()}
-    networks.set_weights(mean)
-    assert float(networks.penalty().detach()) == 0
-    with torch.no_grad():
-        for weight in networks.parameters():
-            weight += 0.5
-    count = sum(weight.numel() for weight in networks.parameters())
-    assert float(networks.penalty().detach()) == pytest.approx(0.3 / 2 * 0.25 * count, rel=1e-5)
-    gradients = torch.autograd.grad(networks.penalty(), networks.parameters())
-    for gradient in gradients:
-        torch.testing.assert_close(gradient, torch.full_like(gradient, 0.3 * 0.5), rtol=1e-5, atol=1e-6)
-
-
-def test_a_large_proximal_term_holds_weights_near_the_mean(shared, parties, tmp_path):
-    shared = in_truth(shared)
-    mean, moved = initial_weights(shared), []
-    for mu in (0.0, 1e3):
-        party = Party(parties[0].scene, tmp_path / f"mu{mu}", 0, "segmented")
-        weights, _ = Client(shared.run, shared.learner, party, mu).train(1, mean)
-        moved.append(np.sqrt(sum(((weights[name] - mean[name]) ** 2).sum() for name in mean
-                                 if name.startswith(("agent.", "mixer.")))))
-    assert 0 < moved[1] < 0.7 * moved[0]
+        FederatedSession(run, LEARNER, federation, tmp_path / "out").execute()

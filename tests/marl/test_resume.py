@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 import torch
 
-from marl.algorithm1 import run_algorithm
-from marl.checkpoint import Damaged, _blocks, load_checkpoint, restored, save_checkpoint
+from marl.algorithm1 import Campaign, resumed, run_algorithm
+from marl.checkpoint import Damaged, load_checkpoint, require_log, save_checkpoint
 from marl.learner import make_learner
 from marl.mission import Known, make_mission
 from marl.settings import LearnerSettings, RunSettings
@@ -85,7 +85,8 @@ def wrong(value):
 def test_every_part_that_is_wrong_is_one_message(small_scene, stopped, tmp_path, monkeypatch):
     """Whatever is accepted must be what this run may have written."""
     state, known = load_checkpoint(stopped / NAME), 0
-    mission = make_mission(small_scene, segmented_truth(small_scene), Known.anchors(small_scene))
+    truth = segmented_truth(small_scene)
+    mission = make_mission(small_scene, truth, Known.anchors(small_scene))
     learner = make_learner(RUN, LEARNER, mission, RUN.real_episodes)
     allowed = {("strategy", "actions"), ("strategy", "replicas"), ("blocks",), ("tables", 0, "gain_db")}
     for path in leaves(state):
@@ -94,10 +95,10 @@ def test_every_part_that_is_wrong_is_one_message(small_scene, stopped, tmp_path,
                 content = changed(state, path, new)
             except ValueError:
                 continue  # a table of columns of different lengths
-            monkeypatch.setattr("marl.checkpoint.load_checkpoint", lambda path, content=content: content)
+            monkeypatch.setattr("marl.algorithm1.load_checkpoint", lambda path, content=content: content)
             number = isinstance(at(state, path), int | float) and isinstance(new, int | float)
             try:
-                restored(tmp_path / NAME, RUN, small_scene, learner)
+                resumed(Campaign(RUN, small_scene, truth), learner, tmp_path / NAME)
             except BadInput as error:
                 assert "checkpoint" in str(error) and len(str(error)) < 1000
                 known += 1
@@ -141,7 +142,7 @@ def test_what_was_written_is_accepted(small_scene, stopped, tmp_path):
 def test_a_learner_of_ones_own_logs_what_it_likes(name, value, is_one):
     block = {"round": 1, "episodes": 4, name: value}
     if is_one:
-        assert _blocks([block]) == [block]
+        assert require_log([block], ("round", "episodes")) == [block]
     else:
         with pytest.raises(Damaged):
-            _blocks([block])
+            require_log([block], ("round", "episodes"))
