@@ -176,25 +176,27 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
         max_rate: see `Mission`.
         out: (U,) device or -1, overwritten.
     """
-    uavs, devices = strength.shape
     out[:] = -1
-    if max_rate:
-        for u in range(uavs):
-            own = np.argmax(strength[u])
-            for k in range(devices):
-                if k != own:
-                    strength[u, k] = -np.inf
-    for _ in range(min(uavs, devices)):
-        best_u, best_k, best = -1, -1, -np.inf
-        for u in range(uavs):
-            for k in range(devices):
-                if strength[u, k] > best:
-                    best_u, best_k, best = u, k, strength[u, k]
-        if best_u < 0:
-            return
-        out[best_u] = best_k
-        strength[best_u, :] = -np.inf
-        strength[:, best_k] = -np.inf
+    for first in range(len(strength)):
+        # Deferred acceptance: who loses a device takes the next one. As both sides prefer the
+        # stronger link, this is the matching by the strongest remaining pair.
+        u = first
+        while u >= 0:
+            k = np.argmax(strength[u])
+            if strength[u, k] == -np.inf:
+                break
+            loser = -1
+            for v in range(len(out)):
+                if out[v] == k:
+                    stronger = strength[u, k] > strength[v, k]
+                    loser = v if stronger or (strength[u, k] == strength[v, k] and u < v) else u
+            if loser != u:
+                out[u] = k
+            if loser >= 0:
+                strength[loser, k] = -np.inf
+                if loser != u:
+                    out[loser] = -1
+            u = -1 if max_rate else loser
 
 
 @njit(cache=True, nogil=True)

@@ -5,10 +5,11 @@ Shadowing enters by its expectation: each slot counts with its mean data.
 """
 
 from collections.abc import Callable
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import log_ndtr, ndtr
 from typing_extensions import override
 
 from marl.checkpoint import require, require_plan
@@ -22,6 +23,9 @@ from radiotwin.runtime.console import progress
 
 MAX_WAYPOINTS = 8  # of a UAV
 START_TEMPERATURE, END_TEMPERATURE = 0.02, 0.0003  # of the annealing, in collected share
+STARTS, REHEATS = 3, 10  # of a search: it begins anew, and then improves the best
+STARTS_SHARE = 1 / 3  # of the tried plans
+REHEAT_TEMPERATURE = 0.003
 CHUNK = 5000  # iterations between updates of the progress bar
 
 
@@ -61,6 +65,62 @@ class TourFlight(NamedTuple):
     strength: np.ndarray
     assigned: np.ndarray
     mask: np.ndarray
+
+
+class Candidates(NamedTuple):
+    """Devices in reach of each cell, the strongest link first; a cell is listed when it is needed.
+
+    Attributes:
+        value: (L, K, ny, nx) float32, of `expected_data`.
+        peak: (L, K, 2) int64 cell (row, column) where each device is heard best.
+        listed: (L, cells) bool.
+        device: (L, cells, K) int32
+        worth: (L, cells, K) float32 data units of a slot; 0 after the last device in reach.
+    """
+
+    value: np.ndarray
+    peak: np.ndarray
+    listed: np.ndarray
+    device: np.ndarray
+    worth: np.ndarray
+
+    @classmethod
+    def of(cls, value: np.ndarray) -> "Candidates":
+        """Return lists that searches in one map can share, all still to be filled."""
+        levels, devices, rows, columns = value.shape
+        strongest = value.reshape(levels, devices, -1).argmax(axis=2)
+        shape = (levels, rows * columns, devices)
+        return cls(value, np.stack(np.unravel_index(strongest, (rows, columns)), axis=-1),
+                   np.zeros(shape[:2], np.bool_), np.empty(shape, np.int32),
+                   np.empty(shape, np.float32))
+
+
+class Course(NamedTuple):
+    """A flight along tours slot by slot, from which one along a changed tour can branch off.
+
+    Attributes:
+        cell: (U, T) int32 row * nx + column at the beginning of each slot; -1 after landing.
+        battery: (U, T) int32 [hovers]
+        since: (U, W + 1) int32 slot from which on the UAV has passed so many waypoints.
+        device: (T, U) int32 that is expected to serve the UAV; -1 for none.
+        before: (T, U) data units left at that device before the slot.
+        left: (K,) data units left at the end.
+    """
+
+    cell: np.ndarray
+    battery: np.ndarray
+    since: np.ndarray
+    device: np.ndarray
+    before: np.ndarray
+    left: np.ndarray
+
+    @classmethod
+    def of(cls, mission: Mission, waypoints: int) -> "Course":
+        """Return a course of UAVs that have not taken off, with tours of so many waypoints."""
+        slots, uavs = mission.longest, mission.uavs
+        return cls(np.full((uavs, slots), -1, np.int32), np.zeros((uavs, slots), np.int32),
+                   np.zeros((uavs, waypoints + 1), np.int32), np.full((slots, uavs), -1, np.int32),
+                   np.zeros((slots, uavs)), mission.data_units.copy())
 
 
 class PlanPolicy:
@@ -111,19 +171,36 @@ class Planner(Learner):
 
 
 def plan(mission: Mission, iterations: int, seed: int) -> Plan:
-    """Search a plan in the map that is known; the annealing is spread over so many tried plans."""
-    rng = stream(seed, "planning")
-    value = expected_data(mission)
-    tour = np.zeros((mission.uavs, MAX_WAYPOINTS, 3), dtype=np.int64)
-    count = np.zeros(mission.uavs, dtype=np.int64)
+    """Search a plan in the map that is known: a few times from nothing, then from the best again.
+
+    Args:
+        mission: with the map.
+        iterations: plans that are tried in all.
+        seed: of the search.
+    """
+    rng, candidates = stream(seed, "planning"), Candidates.of(expected_data(mission))
+    nothing = (np.zeros((mission.uavs, MAX_WAYPOINTS, 3), dtype=np.int64),
+               np.zeros(mission.uavs, dtype=np.int64))
+    shares = [STARTS_SHARE / STARTS] * STARTS + [(1 - STARTS_SHARE) / REHEATS] * REHEATS
+    tries = np.diff(np.round(iterations * np.cumsum([0.0, *shares])).astype(int))
     with progress("planning", total=iterations) as advance:
-        return improve(mission, value, tour, count, iterations, rng, on_progress=advance)
+        def search(tries: int, tour: np.ndarray, count: np.ndarray, temperature: float) -> Plan:
+            return improve(mission, candidates.value, tour, count, tries, rng,
+                           temperature=temperature, on_progress=advance, candidates=candidates)
+
+        best = max((search(each, *nothing, START_TEMPERATURE) for each in tries[:STARTS]),
+                   key=attrgetter("ratio"))
+        for each in tries[STARTS:]:
+            again = search(each, best.tour, best.visits, REHEAT_TEMPERATURE)
+            best = max(best, again, key=attrgetter("ratio"))
+    return best
 
 
 def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
             iterations: int, rng: np.random.Generator, *, only: int = -1,
             temperature: float = START_TEMPERATURE,
-            on_progress: Callable[[int], None] = lambda _: None) -> Plan:
+            on_progress: Callable[[int], None] = lambda _: None,
+            candidates: Candidates | None = None) -> Plan:
     """Continue the search from a tour.
 
     Args:
@@ -136,40 +213,49 @@ def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.nda
         only: UAV whose tour is changed while the others keep theirs; -1 for all.
         temperature: at the start, in collected share.
         on_progress: called with the number of plans tried since the last call.
+        candidates: of the same value, from an earlier search; None: made here.
     """
-    strongest = value.reshape(*value.shape[:2], -1).argmax(axis=2)
-    peaks = np.stack(np.unravel_index(strongest, value.shape[2:]), axis=-1)[mission.level]
     tour, count = tour.copy(), count.copy()
     best_tour, best_count = tour.copy(), count.copy()
-    actions = np.full((mission.longest, mission.uavs), NO_OP, dtype=np.int8)
-    score = best = _fly_tour(mission, value, tour, count, actions)
+    candidates = Candidates.of(value) if candidates is None else candidates
+    course = Course.of(mission, tour.shape[1])
+    score = best = _fly_tours(mission, candidates, tour, count, course)
+    trial = Course(*(array.copy() for array in course))
     for start in range(0, iterations, CHUNK):
+        if best == 1.0:
+            break
         stop = min(start + CHUNK, iterations)
-        score, best = _anneal(mission, value, peaks, tour, count, only, temperature, score,
+        score, best = _anneal(mission, candidates, tour, count, only, temperature, score,
                               best_tour, best_count, best, np.arange(start, stop) / iterations,
-                              actions, rng)
+                              course, trial, rng)
         on_progress(stop - start)
-    best = _fly_tour(mission, value, best_tour, best_count, actions)
-    return Plan(actions, float(best), best_tour, best_count)
+    actions = np.full((mission.longest, mission.uavs), NO_OP, dtype=np.int8)
+    flight = take_off(mission, mission.devices)
+    fly_on(mission, value, best_tour, best_count, flight, actions)
+    ratio = 1.0 - flight.left.sum() / mission.data_units.sum()
+    return Plan(actions, float(ratio), best_tour, best_count)
 
 
 def expected_data(mission: Mission) -> np.ndarray:
-    """Return the data units (L, K, ny, nx) that one slot on each link is expected to bring.
+    """Return the data units (L, K, ny, nx) float32 that one slot on each link is expected to bring.
 
     The probability that the SNR reaches the threshold times the rate at the mean SNR of the cases
     in which it does.
     """
-    mean_db = mission.snr_db.astype(float)
-    sigma_db = np.maximum(mission.sigma_db.astype(float), 1e-6)
+    value = np.empty(mission.snr_db.shape, np.float32)
     least_db = max(mission.threshold_db, mission.detection_db)
-    short = np.clip((least_db - mean_db) / sigma_db, -40.0, 40.0)
-    chance = np.where(mission.sigma_db > 0, norm.sf(short), mean_db >= least_db)
-    # Mean of a normal distribution above a threshold; density and tail in logarithms, because
-    # both may vanish.
-    hazard = np.exp(norm.logpdf(short) - norm.logsf(short))
-    usable_db = np.where(np.isfinite(mean_db), mean_db, 0) + sigma_db * hazard
-    data = mission.rate_scale * np.log2(1 + 10 ** (np.minimum(usable_db, 300.0) / 10))
-    return np.where(np.isfinite(mean_db) & (chance > 1e-3), chance * data, 0.0)
+    for links in np.ndindex(value.shape[:2]):  # one after the other takes less memory
+        mean_db = mission.snr_db[links].astype(float)
+        sigma_db = np.maximum(mission.sigma_db[links].astype(float), 1e-6)
+        short = np.clip((least_db - mean_db) / sigma_db, -40.0, 40.0)
+        chance = np.where(mission.sigma_db[links] > 0, ndtr(-short), mean_db >= least_db)
+        # Mean of a normal distribution above a threshold; density and tail in logarithms, because
+        # both may vanish.
+        hazard = np.exp(-short**2 / 2 - np.log(2 * np.pi) / 2 - log_ndtr(-short))
+        usable_db = np.where(np.isfinite(mean_db), mean_db, 0) + sigma_db * hazard
+        data = mission.rate_scale * np.log2(1 + 10 ** (np.minimum(usable_db, 300.0) / 10))
+        value[links] = np.where(np.isfinite(mean_db) & (chance > 1e-3), chance * data, 0.0)
+    return value
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -258,54 +344,188 @@ def fly_on(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndar
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fly_tour(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
-              actions: np.ndarray) -> float:
-    """Return the share of the data that a tour should collect; write its actions to `actions`."""
-    flight = take_off(mission, value.shape[1])
-    fly_on(mission, value, tour, count, flight, actions)
-    return 1.0 - flight.left.sum() / mission.data_units.sum()
+def _list(candidates: Candidates, level: int, cell: int) -> None:
+    """List the devices that are heard in a cell."""
+    value, _, listed, device, worth = candidates
+    columns = value.shape[3]
+    heard = value[level, :, cell // columns, cell % columns]
+    order = np.argsort(-heard, kind="mergesort")  # of equal links the first device comes first
+    for i in range(len(order)):
+        device[level, cell, i], worth[level, cell, i] = order[i], heard[order[i]]
+        if heard[order[i]] <= 0:
+            break
+    listed[level, cell] = True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _anneal(mission: Mission, value: np.ndarray, peaks: np.ndarray, tour: np.ndarray,
-            count: np.ndarray, only: int, hot: float, score: float, best_tour: np.ndarray,
-            best_count: np.ndarray, best: float, progress: np.ndarray, actions: np.ndarray,
+def _walk(mission: Mission, candidates: Candidates, uav: int, tour: np.ndarray, count: int,
+          changed: int, course: Course, mask: np.ndarray) -> None:
+    """Fly one UAV's tour (W, 3) from where it sets out to the waypoint that has changed."""
+    level, columns = mission.level[uav], mission.steps_home.shape[2]
+    cells, batteries, since = course.cell[uav], course.battery[uav], course.since[uav]
+    slot, reached, hovered = since[changed], changed, 0
+    if slot >= len(cells) or cells[slot] < 0:
+        return
+    row, column, battery = cells[slot] // columns, cells[slot] % columns, batteries[slot]
+    while battery > 0:
+        cell = row * columns + column
+        if not candidates.listed[level, cell]:
+            _list(candidates, level, cell)
+        cells[slot], batteries[slot] = cell, battery
+        before = reached
+        action, reached, hovered = next_action(mission, uav, row, column, battery, tour, count,
+                                               reached, hovered, mask)
+        since[before + 1:reached + 1] = slot
+        row, column = row + MOVES[action, 0], column + MOVES[action, 1]
+        battery -= COSTS[action]
+        slot += 1
+    cells[slot:] = -1
+    since[reached + 1:] = slot
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _collect(mission: Mission, candidates: Candidates, course: Course, start: int,
+             holder: np.ndarray, rank: np.ndarray) -> None:
+    """Serve the UAVs from a slot on, as `assign` does; `left` is of the beginning of that slot.
+
+    `holder` (K,) is -1, `rank` (U,) scratch.
+    """
+    cells, left, level = course.cell, course.left, mission.level
+    listed, worths = candidates.device, candidates.worth
+    (uavs, slots), devices = cells.shape, len(left)
+    for slot in range(start, slots):
+        device, before = course.device[slot], course.before[slot]
+        device[:] = -1
+        for first in range(uavs):
+            u, i = first, 0
+            while u >= 0 and cells[u, slot] >= 0:
+                links, worth = listed[level[u], cells[u, slot]], worths[level[u], cells[u, slot]]
+                while i < devices and worth[i] > 0 and left[links[i]] <= 0:
+                    i += 1
+                if i == devices or worth[i] <= 0:
+                    break
+                k = links[i]
+                rank[u], device[u], v, loser = i, k, holder[k], -1
+                if v >= 0:
+                    other = worths[level[v], cells[v, slot], rank[v]]
+                    loser = v if worth[i] > other or (worth[i] == other and u < v) else u
+                if loser != u:
+                    holder[k] = u
+                if loser < 0:
+                    break
+                device[loser] = -1
+                if mission.max_rate:
+                    break
+                u, i = loser, rank[loser] + 1
+        for u in range(uavs):
+            k = device[u]
+            if k >= 0:
+                holder[k] = -1
+                before[u] = left[k]
+                left[k] = max(left[k] - worths[level[u], cells[u, slot], rank[u]], 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fly_tours(mission: Mission, candidates: Candidates, tour: np.ndarray, count: np.ndarray,
+               course: Course) -> float:
+    """Fly the tours from take-off; return the share collected, and write an empty `course`."""
+    mask = np.empty(ACTION_COUNT, np.bool_)
+    for u in range(len(tour)):
+        if mission.battery[u] > 0:
+            row, column = mission.start[u]
+            course.cell[u, 0] = row * mission.steps_home.shape[2] + column
+            course.battery[u, 0] = mission.battery[u]
+            _walk(mission, candidates, u, tour[u], count[u], 0, course, mask)
+    holder, rank = np.full(len(course.left), -1), np.zeros(len(tour), np.int64)
+    _collect(mission, candidates, course, 0, holder, rank)
+    return 1.0 - course.left.sum() / mission.data_units.sum()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: np.ndarray,
+            only: int, hot: float, score: float, best_tour: np.ndarray, best_count: np.ndarray,
+            best: float, progress: np.ndarray, course: Course, trial: Course,
             rng: np.random.Generator) -> tuple[float, float]:
     """Try a change at every step of `progress` (0 to 1) and keep it by the Metropolis rule.
 
     `only` is the UAV whose tour is changed, -1 for any; `hot` the temperature at the start.
+    `course` is that of the tours, and `trial` a copy; both follow what is kept.
     """
-    old_tour, old_count = tour.copy(), count.copy()
+    uavs, slots = course.cell.shape
+    mask, rank = np.empty(ACTION_COUNT, np.bool_), np.zeros(uavs, np.int64)
+    holder = np.full(len(course.left), -1)
+    total = mission.data_units.sum()
+    new_tour, new_count = tour.copy(), count.copy()
+    changed, at = np.zeros(2, np.int64), np.zeros(2, np.int64)
+    rows, columns = mission.steps_home.shape[1:]
     for done in progress:
         temperature = hot * (END_TEMPERATURE / hot) ** done
-        old_tour[:], old_count[:] = tour, count
-        _change(tour, count, only, peaks, value.shape[2], value.shape[3], rng)
-        new = _fly_tour(mission, value, tour, count, actions)
-        if new >= score or rng.random() < np.exp((new - score) / temperature):
+        n = _change(new_tour, new_count, only, mission.level, candidates.peak, rows, columns, rng,
+                    changed, at)
+        first = slots
+        for i in range(n):
+            u = changed[i]
+            slot = course.since[u, at[i]]
+            _walk(mission, candidates, u, new_tour[u], new_count[u], at[i], trial, mask)
+            while slot < first and trial.cell[u, slot] == course.cell[u, slot]:
+                slot += 1
+            first = min(first, slot)
+        new = score
+        if first < slots:
+            trial.left[:] = course.left
+            for slot in range(slots - 1, first - 1, -1):  # back to that slot, bit by bit the same
+                for u in range(uavs):
+                    k = course.device[slot, u]
+                    if k >= 0:
+                        trial.left[k] = course.before[slot, u]
+            _collect(mission, candidates, trial, first, holder, rank)
+            new = 1.0 - trial.left.sum() / total
+        kept = new >= score or rng.random() < np.exp((new - score) / temperature)
+        source, target = (trial, course) if kept else (course, trial)
+        for i in range(n):
+            u = changed[i]
+            target.cell[u] = source.cell[u]
+            target.battery[u] = source.battery[u]
+            target.since[u] = source.since[u]
+            if kept:
+                tour[u], count[u] = new_tour[u], new_count[u]
+            else:
+                new_tour[u], new_count[u] = tour[u], count[u]
+        if kept and first < slots:
+            course.left[:] = trial.left
+            course.device[first:] = trial.device[first:]
+            course.before[first:] = trial.before[first:]
             score = new
             if score > best:
                 best = score
                 best_tour[:], best_count[:] = tour, count
-        else:
-            tour[:], count[:] = old_tour, old_count
     return score, best
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _change(tour: np.ndarray, count: np.ndarray, only: int, peaks: np.ndarray, rows: int,
-            columns: int, rng: np.random.Generator) -> None:
-    """Make one random change of one tour, or of two."""
+def _change(tour: np.ndarray, count: np.ndarray, only: int, level: np.ndarray, peaks: np.ndarray,
+            rows: int, columns: int, rng: np.random.Generator, changed: np.ndarray,
+            first: np.ndarray) -> int:
+    """Make one random change of one tour, or of two.
+
+    Returns:
+        Number of tours that have changed; `changed` gets the UAVs, `first` their first waypoint
+        that is another one.
+    """
     u = only if only >= 0 else rng.integers(0, len(count))
     n = count[u]
     kind = rng.random()
-    if n < MAX_WAYPOINTS and (n == 0 or kind < 0.12):  # insert one
+    changed[0] = u
+    if n < tour.shape[1] and (n == 0 or kind < 0.12):  # insert one
         at = rng.integers(0, n + 1)
         for i in range(n, at, -1):
             tour[u, i] = tour[u, i - 1]
-        _draw_waypoint(tour[u, at], peaks[u], rows, columns, rng)
+        _draw_waypoint(tour[u, at], peaks[level[u]], rows, columns, rng)
         count[u] = n + 1
-        return
+        first[0] = at
+        return 1
     at = rng.integers(0, n)
+    first[0] = at
     if kind < 0.24:  # delete one
         for i in range(at, n - 1):
             tour[u, i] = tour[u, i + 1]
@@ -316,9 +536,10 @@ def _change(tour: np.ndarray, count: np.ndarray, only: int, peaks: np.ndarray, r
     elif kind < 0.74:  # hover longer or shorter
         tour[u, at, 2] = max(tour[u, at, 2] + rng.integers(-4, 5), 0)
     elif kind < 0.82:  # move it anywhere
-        _draw_waypoint(tour[u, at], peaks[u], rows, columns, rng)
+        _draw_waypoint(tour[u, at], peaks[level[u]], rows, columns, rng)
     elif kind < 0.91:  # change the order
         other = rng.integers(0, n)
+        first[0] = min(at, other)
         for i in range(3):
             tour[u, at, i], tour[u, other, i] = tour[u, other, i], tour[u, at, i]
     else:  # exchange with another UAV
@@ -327,6 +548,12 @@ def _change(tour: np.ndarray, count: np.ndarray, only: int, peaks: np.ndarray, r
             other = rng.integers(0, count[v])
             for i in range(3):
                 tour[u, at, i], tour[v, other, i] = tour[v, other, i], tour[u, at, i]
+            if u == v:
+                first[0] = min(at, other)
+            else:
+                changed[1], first[1] = v, other
+                return 2
+    return 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

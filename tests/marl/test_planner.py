@@ -11,7 +11,17 @@ from hypothesis import strategies as st
 
 from marl.environment import Environment
 from marl.flights import fly
-from marl.planner import PlanPolicy, expected_data, plan
+from marl.planner import (
+    Candidates,
+    Course,
+    PlanPolicy,
+    _anneal,
+    _fly_tours,
+    expected_data,
+    fly_on,
+    plan,
+    take_off,
+)
 
 
 def flown(mission, actions, flights=1, seed=0):
@@ -107,3 +117,26 @@ def test_the_same_seed_gives_the_same_plan_and_more_search_none_worse(city_missi
     first, again, longer = (plan(mission, iterations, 7) for iterations in (300, 300, 6000))
     np.testing.assert_array_equal(first.actions, again.actions)
     assert first.ratio == again.ratio < longer.ratio
+
+
+@given(st.data())
+@settings(max_examples=60, deadline=None)
+def test_a_search_that_goes_on_from_the_slot_that_changes_counts_as_a_flight_from_the_beginning(missions, data):
+    mission = data.draw(missions)
+    rng, value = np.random.default_rng(data.draw(st.integers(0, 99))), expected_data(mission)
+    candidates, tour, count = Candidates.of(value), np.zeros((mission.uavs, 4, 3), np.int64), np.zeros(mission.uavs, np.int64)
+    course = Course.of(mission, 4)
+    score = _fly_tours(mission, candidates, tour, count, course)
+    trial = Course(*(array.copy() for array in course))
+    for _ in range(5):
+        score, _ = _anneal(mission, candidates, tour, count, -1, 1.0, score, tour.copy(), count.copy(), score, np.zeros(8),
+                           course, trial, rng)
+        flight = take_off(mission, mission.devices)
+        fly_on(mission, value, tour, count, flight, np.empty((mission.longest, mission.uavs), np.int8))
+        assert score == pytest.approx(1 - flight.left.sum() / mission.data_units.sum(), abs=1e-12)
+        again = Course.of(mission, 4)
+        _fly_tours(mission, candidates, tour, count, again)
+        flown = again.device >= 0
+        np.testing.assert_array_equal(course.before[flown], again.before[flown])
+        for name in ("cell", "since", "device", "left"):
+            np.testing.assert_array_equal(getattr(course, name), getattr(again, name))
