@@ -66,7 +66,8 @@ class Outcome:
 def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Scene,
                   truth: RadioMap, folder: Path | None, resume: bool,
                   on_round: Callable[[list[dict], list[dict]], None],
-                  on_progress: Callable[..., None], device: str = "cpu") -> Outcome:
+                  on_progress: Callable[..., None], device: str = "cpu",
+                  on_learned: Callable[["Campaign", Mission], None] | None = None) -> Outcome:
     """Alternate real flights and training in the twin.
 
     With a perfect twin (`run.twin == "truth"`) nothing needs to be measured: every training
@@ -83,6 +84,7 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
         on_progress: called with the number of episodes simulated since the last call, and with a
             text about the last round.
         device: torch device.
+        on_learned: called in every round with the campaign and the mission to train in.
 
     Returns:
         The same to the bit, whether it was interrupted or not (on the CPU).
@@ -108,6 +110,8 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             rng = stream(run.seed, "decisions", number)
             campaign.learn(learner, rng)
             mission = campaign.mission()
+            if on_learned is not None:
+                on_learned(campaign, mission)
             blocks += [{"round": number + 1} | block
                        for block in learner.prepare(mission, on_progress)]
             campaign.log(learner, mission, rng, (number + 1) * run.episodes * learner.replicas)

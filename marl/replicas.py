@@ -119,26 +119,38 @@ class Replicas:
         if self._here:
             return [getattr(trainer, method)(*arguments, *mine)
                     for trainer, mine in zip(self._here, own)]
-        from loky.process_executor import TerminatedWorkerError
-
-        try:
-            for begun in self._begun:
-                begun.result()
-            calls = [pool.submit(_call, method, (*arguments, *mine))
-                     for pool, mine in zip(self._pools, own)]
-            return [call.result() for call in calls]
-        except TerminatedWorkerError as error:
-            if "SIGTERM" in str(error):  # sent to all, and to this one as well
-                raise SystemExit(143) from None
-            raise RunFailed("a process that trains a replica has ended, perhaps for lack of "
-                            "memory; start the same command with --resume to go on from the last "
-                            "checkpoint") from None
+        for begun in self._begun:
+            result_of(begun)
+        return [result_of(call) for call in [pool.submit(_call, method, (*arguments, *mine))
+                                             for pool, mine in zip(self._pools, own)]]
 
     def close(self) -> None:
         """End the processes, whatever they do."""
-        with deferred():
-            for pool in self._pools:
-                pool.shutdown(wait=True, kill_workers=True)
+        for pool in self._pools:
+            shut(pool)
+
+
+def shut(pool: Any) -> None:
+    """End a pool's process, whatever it does."""
+    with deferred():
+        pool.shutdown(wait=True, kill_workers=True)
+
+
+def result_of(call: "Future[Any]") -> Any:
+    """Return what a process that trains gives back.
+
+    Raises:
+        RunFailed: it has ended.
+    """
+    from loky.process_executor import TerminatedWorkerError
+
+    try:
+        return call.result()
+    except TerminatedWorkerError as error:
+        if "SIGTERM" in str(error):  # sent to all, and to this one as well
+            raise SystemExit(143) from None
+        raise RunFailed("a process that trains has ended, perhaps for lack of memory; start the "
+                        "same command with --resume to go on from the last checkpoint") from None
 
 
 _trainer: Trainer  # of a process that is nothing but a replica's

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+from concurrent.futures import Future
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from marl.algorithm1 import Outcome, run_algorithm
+from marl.algorithm1 import Campaign, Outcome, run_algorithm
 from marl.checkpoint import NAME
 from marl.figures import choose_flight, draw_curve, save, trajectories_figure
 from marl.flights import evaluate, track_table
 from marl.learner import make_learner
 from marl.mission import Known, Mission, make_mission
-from marl.replicas import check_sizes, keep_memory, limit_threads
+from marl.replicas import check_sizes, keep_memory, limit_threads, result_of, shut
 from marl.settings import LearnerSettings, RunSettings, learner_class, stream
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import write_csv
@@ -24,8 +26,9 @@ from radiotwin.io.files import atomic_file, atomic_path, is_temporary
 from radiotwin.io.inputs import read_bytes, read_json, require_plain
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import read_truth
-from radiotwin.runtime.console import print_rows, progress
+from radiotwin.runtime.console import print_rows, progress, say
 from radiotwin.runtime.cuda import torch_device
+from radiotwin.runtime.execution.local import start_process
 from radiotwin.scene import Scene
 
 if TYPE_CHECKING:
@@ -35,6 +38,14 @@ TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "
               "raytrace": "ray-traced twin", "path-kriging": "twin of a map that may be wrong",
               "truth": "the truth"}
 BASELINES = ("planner", "greedy", "random")  # in every table
+RECORDED = {
+    truth: {"method": "qmix", "trained_in": "the truth (recorded with 0.1.0)",
+            "real_episodes": 13_696, "truth_ratio": ratio, "truth_ratio_std": ratio_sd}
+    for truth, ratio, ratio_sd in (
+        ("1e44db1d67e1a86564b1ebba6ff3f1b0e974324272941efbf615a7f78a4a9622", 0.912, 0.018),  # RBM
+        ("4e3ce2205330c13ac95f4f8ff317806c8b4a4ebaf27a5386c81856eaf44af7a5", 0.873, 0.017))}  # RDM
+"""Hash of a published traced truth -> QMIX after training in it, mean and deviation of three seeds
+(`python -m studies curve`, of versions 0.1.0 1041c7b77ada and 27311fa1f1e1)."""
 
 
 @dataclass(frozen=True)
@@ -62,21 +73,56 @@ class Session:
         mission = make_mission(scene, truth, Known.truth(scene), self.run.assignment)
         check_sizes(self.run, self.learner, mission)
         device = torch_device(self.run.device)
-        self._claim_folder(_world(scene, truth))
-        runs: dict[str, RunSettings] = {self.run.twin: self.run}
-        if self.run.compare and learner_class(self.run.algorithm).learns:
-            runs |= {twin: self.run.model_copy(update={"twin": twin})
-                     for twin in ("nn", "log-distance", "truth") if twin != self.run.twin}
-        outcomes = {}
-        episodes = len(runs) * self.run.real_episodes * self.run.episodes
-        with progress("first real episode", total=episodes) as advance:
-            for twin, run in runs.items():
-                def on_progress(count: int, text: str | None = None, twin: str = twin) -> None:
-                    advance(count, text and f"{TRAINED_IN[twin]}: {text}")
-                folder = self.out if run is self.run else self.out / "compare" / twin
-                outcomes[twin] = run_algorithm(run, self.learner, scene, truth, folder,
-                                               self.resume, _Log(folder), on_progress, device)
-        self._write(scene, truth, outcomes)
+        world = _world(scene, truth)
+        self._claim_folder(world)
+        with ExitStack() as stack:
+            beside = self._begin_beside(stack)
+            advance = stack.enter_context(progress(
+                "first real episode", total=self.run.real_episodes * self.run.episodes, lines=True))
+
+            def on_learned(campaign: Campaign, mission: Mission) -> None:
+                if not campaign.rows and learner_class(self.run.algorithm).learns:
+                    for name in ("greedy", "planner"):
+                        _say_row(self._baseline(name, mission, campaign.in_truth(), 1))
+
+            def on_progress(count: int, text: str | None = None) -> None:
+                advance(count, text and f"{TRAINED_IN[self.run.twin]}: {text}")
+
+            main = run_algorithm(self.run, self.learner, scene, truth, self.out, self.resume,
+                                 _Log(self.out), on_progress, device, on_learned)
+            curves = {f"{self.run.algorithm} in {TRAINED_IN[self.run.twin]}": main.rows}
+            entries = [_entry(self.run.algorithm, self.run.twin, main.rows[-1])]
+            for run, call in beside:
+                _say_row(entries[-1])
+                advance(0, f"{TRAINED_IN[run.twin]}: the comparison is trained")
+                rows = result_of(call)
+                curves[f"{run.algorithm} in {TRAINED_IN[run.twin]}"] = rows
+                entries.append(_entry(run.algorithm, run.twin, rows[-1]))
+        recorded = RECORDED.get(world["truth"])
+        if recorded and self.run.truth == "traced" and self.run.compare == "twins" and beside:
+            entries.append(recorded)
+        self._write(scene, truth, main, curves, entries)
+
+    def _begin_beside(self, stack: ExitStack) -> "list[tuple[RunSettings, Future[list[dict]]]]":
+        """Begin the runs of the comparison, one after the other in a process of their own.
+
+        A single replica of QMIX stands there for FedQMIX: it takes a third of the work.
+
+        Returns:
+            Their settings, and the rows of their logs to come.
+        """
+        own = self.run
+        twins = {"none": (), "twins": ("nn", "log-distance"),
+                 "truth": ("nn", "log-distance", "truth")}[own.compare]
+        algorithm = "qmix" if own.algorithm == "fedqmix" else own.algorithm
+        runs = [own.model_copy(update={"twin": twin, "algorithm": algorithm})
+                for twin in twins if twin != own.twin and learner_class(own.algorithm).learns]
+        if not runs:
+            return []
+        pool, _ = start_process({})
+        stack.callback(shut, pool)
+        return [(run, pool.submit(_compared, run, self.learner, self.out / "compare" / run.twin,
+                                  self.resume)) for run in runs]
 
     def _claim_folder(self, world: dict[str, str]) -> None:
         """Make the folder of a new run, or check that it holds the run that is to be resumed."""
@@ -115,11 +161,9 @@ class Session:
         with atomic_file(path) as file:
             file.write(json.dumps(config, indent=1).encode())
 
-    def _write(self, scene: Scene, truth: RadioMap, outcomes: dict[str, Outcome]) -> None:
-        main = outcomes[self.run.twin]
+    def _write(self, scene: Scene, truth: RadioMap, main: Outcome, curves: dict[str, list[dict]],
+               entries: list[dict]) -> None:
         real = make_mission(scene, truth, main.known, self.run.assignment)
-        entries = [_entry(self.run.algorithm, twin, outcome.rows[-1])
-                   for twin, outcome in outcomes.items()]
         trained_in = real
         if main.twin is not None:
             trained_in = make_mission(scene, main.twin.radio_map(scene), main.known,
@@ -132,8 +176,6 @@ class Session:
             write_csv(table, temporary)
         levels = {entry["method"]: entry["truth_ratio"] for entry in entries
                   if entry["method"] in baselines}
-        curves = {f"{self.run.algorithm} in {TRAINED_IN[twin]}": outcome.rows
-                  for twin, outcome in outcomes.items()}
         draw_curve(curves, levels, self.out / "curve.png")
         flights, typical = main.flights, choose_flight(main.flights, real)
         with atomic_path(self.out / "flights.csv") as temporary:
@@ -174,6 +216,23 @@ def _entry(method: str, twin: str, row: dict) -> dict:
     trained_in = TRAINED_IN[twin] if learner_class(method).uses_map else ""
     return {"method": method, "trained_in": trained_in,
             **{name: row[name] for name in ("real_episodes", "truth_ratio", "truth_ratio_std")}}
+
+
+def _compared(run: RunSettings, learner: LearnerSettings, folder: Path,
+              resume: bool) -> list[dict]:
+    """Run Algorithm 1 in a process of its own, and return the rows of its log."""
+    limit_threads(1)
+    keep_memory()
+    scene = Scene.load(run.scene)
+    return run_algorithm(run, learner, scene, read_truth(scene, run.truth), folder, resume,
+                         _Log(folder), lambda *_: None, torch_device(run.device)).rows
+
+
+def _say_row(row: dict) -> None:
+    """Print a row of the table before the others are there."""
+    where = f" in the {row['trained_in'].removeprefix('the ')}" if row["trained_in"] else ""
+    say(f"{row['method']}{where}, real episodes {row['real_episodes']:,}: "
+        f"{row['truth_ratio']:.3f} ± {row['truth_ratio_std']:.3f} collected in the truth")
 
 
 def _world(scene: Scene, truth: RadioMap) -> dict[str, str]:

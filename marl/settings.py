@@ -154,9 +154,9 @@ class RunSettings(BaseModel):
         "each UAV's best device")
     privileged: bool = Field(
         False, description="agents see the true positions of the unknown devices")
-    compare: bool = Field(
-        True, description="afterwards train in the other twins and in the truth, too, for the "
-        "table")
+    compare: Literal["none", "twins", "truth"] = Field(
+        "twins", description="train in other maps beside it, too, for the table: in the nn and "
+        "log-distance twins; truth: also in the truth")
     planner_iterations: int = Field(
         60_000, ge=1, le=10**9, description="plans that the planner tries")
     noise_db: float = Field(

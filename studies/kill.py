@@ -46,7 +46,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "map": (*RADIOTWIN, "map", "twin", *SCENE, "-o", "out/twin.nc"),
     "marl": ("-m", "marl.fedqmix", *SCENE, "--truth", "segmented", "--twin", "log-distance",
              "--algorithm", "fedqmix", "--real-episodes", "3", "--episodes", "16", "--batch", "8",
-             "--replay", "40", "--flights", "2", "--planner-iterations", "50", "--compare", "false",
+             "--replay", "40", "--flights", "2", "--planner-iterations", "50", "--compare", "none",
              "--out", "out"),
     "demo": (*RADIOTWIN, "demo", "-o", "out"),
 }

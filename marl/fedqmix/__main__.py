@@ -27,7 +27,7 @@ def fedqmix(
 ) -> None:
     """Train UAVs to harvest data inside a twin learned from few real flights; judge in the truth.
 
-    With no option: scenes/rbm, within ten minutes on two cores. In brackets: the default, which
+    With no option: scenes/rbm, about five minutes on two cores. In brackets: the default, which
     is that of the preset fast.
     """
     show_warnings_plainly()

@@ -112,7 +112,7 @@ def federate(shared: Shared, clients: list[Client]) -> list[Weights]:
     """
     means = [initial_weights(shared)]
     rounds = len(rounds_of(shared.run, shared.learner))
-    with progress("rounds", total=rounds) as advance:
+    with progress("rounds", total=rounds, lines=True) as advance:
         for number in range(1, rounds + 1):
             means.append(average([client.train(number, means[-1])[0] for client in clients]))
             advance()

@@ -5,6 +5,7 @@ Names come from strangers' files: what a terminal would obey is shown as an esca
 
 import logging
 import re
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -30,6 +31,7 @@ from rich.table import Table
 _OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"
                      "\ud800-\udfff]")
 MAX_LINE = 10_000  # characters of a table that is not on a terminal
+LINE_S = 10.0  # between lines of progress that is not on a terminal
 silent = False  # True hides every bar
 _displays: list[Progress] = []  # at most one: a terminal has room for one display
 
@@ -156,7 +158,8 @@ def _text(cell: Any) -> str:
 
 
 @contextmanager
-def progress(description: str, total: float | None) -> Iterator[Callable[..., None]]:
+def progress(description: str, total: float | None, lines: bool = False,
+             ) -> Iterator[Callable[..., None]]:
     """Show a progress bar on standard error; show nothing where that is no terminal.
 
     A bar inside another one gets a line below it in the same display.
@@ -164,6 +167,7 @@ def progress(description: str, total: float | None) -> Iterator[Callable[..., No
     Args:
         description: text before the bar.
         total: number of steps; None if unknown.
+        lines: where that is no terminal, print a line every ten seconds.
 
     Yields:
         `advance(n=1, description=None)`, which adds `n` steps and may change the text.
@@ -177,6 +181,9 @@ def progress(description: str, total: float | None) -> Iterator[Callable[..., No
             _displays[0].remove_task(task)
         return
     console = PrintableConsole(stderr=True)
+    if lines and not silent and not console.is_terminal:
+        yield _Lines(description, total)
+        return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
                TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True,
@@ -188,3 +195,19 @@ def progress(description: str, total: float | None) -> Iterator[Callable[..., No
                 task, advance=n, description=description)
         finally:
             _displays.remove(display)
+
+
+class _Lines:
+    """Progress in a file: a line every ten seconds."""
+
+    def __init__(self, description: str, total: float | None) -> None:
+        self._text, self._total, self._done = description, total, 0.0
+        self._started = self._printed = time.monotonic()
+
+    def __call__(self, n: float = 1, description: str | None = None) -> None:
+        self._text, self._done = description or self._text, self._done + n
+        now = time.monotonic()
+        if now - self._printed >= LINE_S:
+            self._printed = now
+            of = "" if self._total is None else f" of {self._total:,.0f}"
+            notice(f"{self._text} ({self._done:,.0f}{of}, {now - self._started:.0f} s)")

@@ -26,7 +26,7 @@ from tests.cli.strangers import (
     write_town,
 )
 
-PLANNING = "--scene scene --truth segmented --algorithm random --twin log-distance --real-episodes 1 --compare false --out run"
+PLANNING = "--scene scene --truth segmented --algorithm random --twin log-distance --real-episodes 1 --compare none --out run"
 pytestmark = pytest.mark.usefixtures("drawn_preview")
 stranger = Strangers()
 

@@ -24,7 +24,7 @@ import pandas as pd
 from tests.scene.readers import city_models
 
 SQUARE = [[8.001, 50.001], [8.002, 50.001], [8.002, 50.002], [8.001, 50.002], [8.001, 50.001]]
-RUN = "scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false --planner-iterations 50 --hidden 8"
+RUN = "scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare none --planner-iterations 50 --hidden 8"
 COMMANDS = (
     "radiotwin build-scene preset:small -o scene",
     "radiotwin survey scene --truth segmented --flights 2 -o survey/measurements.csv",
@@ -62,7 +62,7 @@ LINES = {
     "marl": "python -m marl.fedqmix --out out --scene scene --truth segmented --twin log-distance --algorithm random "
             "--real-episodes 1 --noise-db 1 --seed 1 --flights 2 --planner-iterations 50",
     "learn": "python -m marl.fedqmix --out out --scene scene --algorithm iql --truth segmented --episodes 4 --planner-iterations 50 "
-             "--real-episodes 1 --flights 2 --compare false --hidden 8 --parallel 2 --replay 8 --batch 2 --discount 0.9",
+             "--real-episodes 1 --flights 2 --compare none --hidden 8 --parallel 2 --replay 8 --batch 2 --discount 0.9",
 }
 
 

@@ -30,7 +30,7 @@ class Target:
 
 _SURVEY = "open/measurements.csv"
 _FIT = "radiotwin fit survey/{} --scene scene --model log_distance -o out"
-_RUN = ("marl.fedqmix --scene scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false "
+_RUN = ("marl.fedqmix --scene scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare none "
         "--planner-iterations 50 --hidden 8 --out run --resume")
 _IMPORT = "radiotwin import {} --columns {} -o out"
 _MESH = "scene/meshes/building_000.ply"

@@ -10,12 +10,14 @@ import marl.session
 from marl.fedqmix.__main__ import app
 from marl.learner import make_learner
 from marl.mission import Known, make_mission
-from marl.session import Session, _world
+from marl.session import RECORDED, Session, _world
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.maps.radiomap import RadioMap
-from radiotwin.maps.survey import segmented_truth
+from radiotwin.maps.survey import read_truth, segmented_truth
 from radiotwin.runtime.command import exit_status
+from radiotwin.scene import Scene
+from radiotwin.scene.folder import published_scene
 from radiotwin.twin import Twin
 
 WORLD = {"city": "a", "scene.toml": "b", "truth": "c", "truth besides gain_db": "e"}
@@ -77,6 +79,12 @@ def test_a_truth_is_the_same_from_its_file(small_scene, tmp_path):
     truth = segmented_truth(small_scene)
     truth.save(tmp_path / "truth.nc")
     assert _world(small_scene, truth) == _world(small_scene, RadioMap.load(tmp_path / "truth.nc"))
+
+
+@pytest.mark.parametrize("name", ["rbm", "rdm"])
+def test_recorded_figures_are_of_the_published_truths(name):
+    scene = Scene.load(published_scene(name))
+    assert _world(scene, read_truth(scene, "traced"))["truth"] in RECORDED
 
 
 def test_a_folder_that_a_killed_run_only_began_is_empty(session, tmp_path):

@@ -90,3 +90,13 @@ def test_a_progress_bar_reads_no_markup(monkeypatch):
     with progress_module.progress("[/] \x1b]0;x", 2) as advance, progress_module.progress("[/b]\x9b", 1):
         advance(1, "[/c]\u202e")
     assert "[/] \\x1b" in text.getvalue() and "\x1b]" not in text.getvalue() and "\x9b" not in text.getvalue()
+
+
+def test_progress_in_a_file_is_a_line_now_and_then(out, monkeypatch):
+    monkeypatch.setattr(progress_module, "PrintableConsole", lambda stderr: PrintableConsole(file=io.StringIO()))
+    clock = iter([0.0, 4.0, 10.0, 12.0, 25.0])
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
+    with progress_module.progress("first", 1000, lines=True) as advance:
+        for text in (None, "second", None, "third"):
+            advance(200, text)
+    assert out.getvalue().splitlines() == ["radiotwin: second (400 of 1,000, 10 s)", "radiotwin: third (800 of 1,000, 25 s)"]
