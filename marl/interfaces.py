@@ -12,6 +12,7 @@ from typing_extensions import override
 from marl.environment import (
     ACTION_COUNT,
     Environment,
+    Frame,
     global_state,
     observation_size,
     observe,
@@ -37,7 +38,7 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
     """One flight of all UAVs; the numbers are those of `marl.environment.Environment`.
 
     Observation: `observation`, float32 as in `marl.environment.observe`, and `action_mask`, (6,)
-    int8, which is also in `infos`. Actions: hover, north, west, south, east, no-op; one that is not
+    int8. Actions: hover, north, west, south, east, no-op; one that is not
     feasible is replaced (`safe_actions`), and `infos[agent]["replaced"]` says so. Reward: data
     units that the UAV itself collected in the slot; the sum over UAVs is the team's reward. A UAV
     terminates with an empty battery, which is at its terminal.
@@ -114,8 +115,7 @@ class HarvestEnv(ParallelEnv[str, Arrays, int]):
             if agent in agents:
                 observations[agent] = {"observation": observation[0, u],
                                        "action_mask": mask[0, u].astype(np.int8)}
-                infos[agent] = {"action_mask": mask[0, u].astype(np.int8),
-                                "replaced": bool(replaced[u])}
+                infos[agent] = {"replaced": bool(replaced[u])}
         return observations, infos
 
 
@@ -179,8 +179,13 @@ class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
         infos["replaced"] = action != wanted
         return seen, reward, self._over.copy(), np.zeros(self.num_envs, dtype=bool), infos
 
+    @property
+    def frame(self) -> Frame:
+        """Present state of all flights."""
+        return self._environment.frame
+
     def _seen(self) -> tuple[Arrays, dict[str, Any]]:
-        frame = self._environment.frame
+        frame = self.frame
         observation, mask = observe(self.mission, frame)
         mask = mask.astype(np.int8)
         return {"state": global_state(self.mission, frame), "observation": observation,
@@ -209,6 +214,11 @@ class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
     def step(self, action: np.ndarray) -> tuple[Arrays, float, bool, bool, dict[str, Any]]:
         seen, reward, terminated, _, infos = self._flights.step(np.asarray(action)[None])
         return _first(seen), float(reward[0]), bool(terminated[0]), False, _first(infos)
+
+
+    def action_masks(self) -> np.ndarray:
+        """Return the (U * 6,) actions that are feasible, as SB3-contrib's `MaskablePPO` asks."""
+        return observe(self._flights.mission, self._flights.frame)[1][0].ravel()
 
 
 def _first(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -80,13 +80,15 @@ class Session:
             advance = stack.enter_context(progress(
                 "first real episode", total=self.run.real_episodes * self.run.episodes, lines=True))
 
-            def on_learned(campaign: Campaign, mission: Mission) -> None:
-                if not campaign.rows and learner_class(self.run.algorithm).learns:
-                    for name in ("greedy", "planner"):
-                        _say_row(self._baseline(name, mission, campaign.in_truth(), 1))
-
             def on_progress(count: int, text: str | None = None) -> None:
                 advance(count, text and f"{TRAINED_IN[self.run.twin]}: {text}")
+
+            def on_learned(campaign: Campaign, mission: Mission) -> None:
+                number, rounds = len(campaign.rows) + 1, self.run.real_episodes
+                on_progress(0, f"round {number}/{rounds}")
+                if number == 1 and learner_class(self.run.algorithm).learns:
+                    for name in ("greedy", "planner"):
+                        _say_row(self._baseline(name, mission, campaign.in_truth(), 1))
 
             main = run_algorithm(self.run, self.learner, scene, truth, self.out, self.resume,
                                  _Log(self.out), on_progress, device, on_learned)

@@ -44,7 +44,6 @@ def test_each_agent_sees_and_collects_what_the_batched_environment_says(city_mis
             if agent in env.agents:
                 np.testing.assert_array_equal(observations[agent]["observation"], seen[0, u])
                 np.testing.assert_array_equal(observations[agent]["action_mask"], mask[0, u])
-                np.testing.assert_array_equal(infos[agent]["action_mask"], mask[0, u])
         np.testing.assert_array_equal(env.state(), global_state(city_mission, batched.frame)[0])
         action = np.where(mask, rng.random(mask.shape), -1).argmax(axis=-1)
         flying = env.agents
@@ -120,3 +119,19 @@ def test_without_the_extra_it_says_what_to_install(package):
     code = f"import sys; sys.modules[{package!r}] = None; import marl.interfaces"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 1 and "pip install 'radiotwin[rl]'" in result.stderr
+
+
+def test_torchrl_wraps_the_environment_of_agents(tiny):
+    """Its masks are in the observation alone: twice, and the wrapper fails."""
+    pettingzoo = pytest.importorskip("torchrl.envs", reason="TorchRL is not installed")
+    env = pettingzoo.PettingZooWrapper(HarvestEnv(tiny()), use_mask=True)
+    flown = env.rollout(100)
+    assert flown["uav0", "action_mask"].shape[-1] == 6 and flown["uav1", "observation", "observation"].isfinite().all()
+
+
+def test_maskable_ppo_trains_in_the_central_environment(tiny):
+    env = CentralEnv(tiny())
+    seen, _ = env.reset(seed=0)
+    np.testing.assert_array_equal(env.action_masks(), seen["action_mask"].ravel())
+    contrib = pytest.importorskip("sb3_contrib", reason="SB3-contrib is not installed")
+    contrib.MaskablePPO("MultiInputPolicy", env, n_steps=32, batch_size=16, n_epochs=1).learn(64)
