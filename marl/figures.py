@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogFormatter
+from PIL import Image
 
 from marl.flights import Flights
 from marl.mission import Known, Mission
@@ -23,6 +24,7 @@ IDLE_COLOUR = "#555555"
 COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9",  # Okabe and Ito
            "#6a3d9a", "#f0e442"]
 MARKERS = "os^DvPX*"
+MAX_IMAGES = 60  # of an animation
 LEVEL_STYLES = ("--", ":", "-.")
 
 
@@ -104,6 +106,73 @@ def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Fig
     axes.grid(alpha=0.3, which="both")
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
     return figure
+
+
+class FlightPicture:
+    """The UAVs of a flight over the city, from above, slot by slot.
+
+    Args:
+        scene: the city, and the true positions of its devices.
+        mission: that is flown.
+    """
+
+    def __init__(self, scene: Scene, mission: Mission) -> None:
+        x_min, x_max, y_min, y_max = scene.config.extent.bounds
+        figure = Figure(figsize=(6.0, 6.0 * (y_max - y_min) / (x_max - x_min)), dpi=80)
+        self._canvas, self._scene, self._mission = FigureCanvasAgg(figure), scene, mission
+        self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        height_m, bounds = height_grid(scene, 300)
+        self._axes.imshow(np.ma.masked_less(height_m, 0.5), origin="lower", extent=bounds,
+                          cmap="Greys", vmin=0, vmax=2.2 * max(float(height_m.max()), 1.0))
+        self._axes.set(xlim=(x_min, x_max), ylim=(y_min, y_max), xticks=[], yticks=[])
+        self._colours = _device_colours(mission.devices)
+        self._devices = [self._axes.plot(device.x_m, device.y_m, "o", color=colour, alpha=0.8,
+                                         markeredgecolor="black")[0]
+                         for device, colour in zip(scene.config.devices, self._colours)]
+        self._trails = [self._axes.plot([], [], color=COLOURS[u % len(COLOURS)], linewidth=1.5)[0]
+                        for u in range(mission.uavs)]
+        self._uavs = [self._axes.plot([], [], "^", markersize=11, markeredgecolor="black")[0]
+                      for _ in range(mission.uavs)]
+        self._text = self._axes.text(0.01, 0.99, "", transform=self._axes.transAxes, va="top")
+
+    def image(self, cells: np.ndarray, assigned: np.ndarray, data_units: np.ndarray) -> np.ndarray:
+        """Draw a slot: devices as large as their data, UAVs in the colour of what serves them.
+
+        Args:
+            cells: (T, U, 2) of the slots so far, row and column.
+            assigned: (U,) device that serves each UAV, -1 for none.
+            data_units: (K,) left.
+
+        Returns:
+            (height, width, 3) uint8
+        """
+        lattice, step_m = self._scene.lattice, self._mission.step_m
+        for u, (trail, uav) in enumerate(zip(self._trails, self._uavs)):
+            x_m = lattice.x_m[0] + cells[:, u, 1] * step_m
+            y_m = lattice.y_m[0] + cells[:, u, 0] * step_m
+            trail.set_data(x_m, y_m)
+            uav.set_data(x_m[-1:], y_m[-1:])
+            uav.set_color(IDLE_COLOUR if assigned[u] < 0 else self._colours[assigned[u]])
+        share = data_units / self._mission.data_units
+        for device, left in zip(self._devices, share):
+            device.set_markersize(3 + 15 * np.sqrt(left))
+        collected = 1 - data_units.sum() / self._mission.data_units.sum()
+        self._text.set_text(f"slot {len(cells) - 1}: {collected:.0%} collected")
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+
+def save_animation(scene: Scene, mission: Mission, flights: Flights, flight: int,
+                   path: Path) -> None:
+    """Write one flight of a record as an animated GIF of at most `MAX_IMAGES` images."""
+    picture, frames, length = FlightPicture(scene, mission), flights.frames, flights.length[flight]
+    slots = range(0, length, -(-length // MAX_IMAGES))
+    first, *others = [Image.fromarray(picture.image(
+        frames.cell[flight, :slot + 1].astype(int), frames.assigned[flight, slot],
+        frames.data_units[flight, slot])).quantize(64) for slot in slots]
+    with atomic_path(path) as temporary:
+        first.save(temporary, format="GIF", save_all=True, append_images=others, duration=120,
+                   loop=0)
 
 
 def _device_colours(count: int) -> list:

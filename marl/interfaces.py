@@ -4,6 +4,7 @@
 for all UAVs.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,10 @@ from marl.environment import (
     safe_actions,
     state_size,
 )
-from marl.mission import NO_OP, Mission
+from marl.figures import FlightPicture
+from marl.mission import NO_OP, Known, Mission, make_mission
+from radiotwin.maps.survey import read_truth
+from radiotwin.scene import Scene
 
 try:
     import gymnasium
@@ -193,11 +197,24 @@ class CentralVectorEnv(VectorEnv[Arrays, np.ndarray, np.ndarray]):
 
 
 class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
-    """One flight; as `CentralVectorEnv`, but a flight that is over waits for `reset`."""
+    """One flight; as `CentralVectorEnv`, but a flight that is over waits for `reset`.
 
-    metadata = {"render_modes": []}
+    Args:
+        mission: of `make_mission`.
+        scene: of the mission, for `render`.
+        render_mode: `rgb_array`, or None.
+    """
 
-    def __init__(self, mission: Mission) -> None:
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 8}
+
+    def __init__(self, mission: Mission, scene: Scene | None = None,
+                 render_mode: str | None = None) -> None:
+        if render_mode not in (None, "rgb_array") or (render_mode and scene is None):
+            raise ValueError(f"render_mode = {render_mode}: None is allowed, and with a scene "
+                             "rgb_array")
+        self.render_mode, self._scene = render_mode, scene
+        self._picture: FlightPicture | None = None
+        self._cells: list[np.ndarray] = []  # of the slots so far
         self._flights = CentralVectorEnv(mission)
         self.observation_space, self.action_space = spaces(mission)  # type: ignore[assignment]
 
@@ -208,13 +225,24 @@ class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
         # The generator that Gymnasium seeds is the one that is drawn from.
         self._flights._np_random = self.np_random
         seen, infos = self._flights.reset()
+        self._cells = [self._flights.frame.cell[0].astype(int)]
         return _first(seen), _first(infos)
 
     @override
     def step(self, action: np.ndarray) -> tuple[Arrays, float, bool, bool, dict[str, Any]]:
         seen, reward, terminated, _, infos = self._flights.step(np.asarray(action)[None])
+        self._cells.append(self._flights.frame.cell[0].astype(int))
         return _first(seen), float(reward[0]), bool(terminated[0]), False, _first(infos)
 
+
+    @override
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        if self.render_mode is None or self._scene is None:
+            return None
+        if self._picture is None:
+            self._picture = FlightPicture(self._scene, self._flights.mission)
+        frame = self._flights.frame
+        return self._picture.image(np.array(self._cells), frame.assigned[0], frame.data_units[0])
 
     def action_masks(self) -> np.ndarray:
         """Return the (U * 6,) actions that are feasible, as SB3-contrib's `MaskablePPO` asks."""
@@ -223,3 +251,21 @@ class CentralEnv(gymnasium.Env[Arrays, np.ndarray]):
 
 def _first(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: value[0] for name, value in values.items()}
+
+
+def central_env(scene: Path | str, truth: str = "traced", assignment: str = "matching",
+                render_mode: str | None = None) -> CentralEnv:
+    """Return the environment that `gymnasium.make("radiotwin/Harvest-v0", scene=…)` makes.
+
+    Args:
+        scene: folder.
+        truth: map that is flown in, `traced` or `segmented`; all positions are known.
+        assignment: see `make_mission`.
+        render_mode: see `CentralEnv`.
+    """
+    loaded = Scene.load(scene)
+    mission = make_mission(loaded, read_truth(loaded, truth), Known.truth(loaded), assignment)
+    return CentralEnv(mission, loaded, render_mode)
+
+
+gymnasium.register("radiotwin/Harvest-v0", entry_point="marl.interfaces:central_env")

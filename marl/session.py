@@ -13,7 +13,7 @@ import pandas as pd
 
 from marl.algorithm1 import Campaign, Outcome, run_algorithm
 from marl.checkpoint import NAME
-from marl.figures import choose_flight, draw_curve, save, trajectories_figure
+from marl.figures import choose_flight, draw_curve, save, save_animation, trajectories_figure
 from marl.flights import evaluate, track_table
 from marl.learner import make_learner
 from marl.mission import Known, Mission, make_mission
@@ -184,6 +184,7 @@ class Session:
             write_csv(track_table(scene, real, flights, typical), temporary)
         save(trajectories_figure(scene, real, flights, typical, main.known),
              self.out / "trajectories.png")
+        save_animation(scene, real, flights, typical, self.out / "flight.gif")
         print_rows(f"Collected in the truth ({self.run.truth}), of all data; mean and standard "
                    f"deviation of {self.run.flights} flights",
                    {"method": "left", "trained in": "left", "real episodes": "right",

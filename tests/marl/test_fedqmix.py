@@ -64,7 +64,7 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(unbroken):
     # Trained in the truth, every episode is a real one, and so are three looks at the policy.
     assert lines[2].split()[3] == str(80 + 3 * 64)
     for name in ("config.json", "metrics.csv", "checkpoint.safetensors", "comparison.csv", "curve.png", "trajectories.png",
-                 "flights.csv", "twin/twin.json", "compare/truth/metrics.csv"):
+                 "flight.gif", "flights.csv", "twin/twin.json", "compare/truth/metrics.csv"):
         assert (folder / name).is_file(), name
     assert list((folder / "tensorboard").iterdir())
     config = json.loads((folder / "config.json").read_text())

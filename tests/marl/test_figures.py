@@ -3,9 +3,18 @@
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
+from PIL import Image
 
 from marl.environment import Environment
-from marl.figures import choose_flight, curve_figure, draw_curve, save, trajectories_figure
+from marl.figures import (
+    MAX_IMAGES,
+    choose_flight,
+    curve_figure,
+    draw_curve,
+    save,
+    save_animation,
+    trajectories_figure,
+)
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy
 from marl.mission import Known
@@ -65,3 +74,11 @@ def test_the_curve_has_a_logarithmic_axis_and_every_curve_and_level(tmp_path):
 def test_the_curve_of_a_run_without_real_episodes_is_drawn(tmp_path):
     draw_curve({"a": ROWS[:1]}, {"planner": 0.9}, tmp_path / "curve.png")
     assert is_png(tmp_path / "curve.png")
+
+
+def test_an_animation_has_an_image_every_few_slots(small_scene, city_mission, tmp_path):
+    flights = flown(city_mission)
+    save_animation(small_scene, city_mission, flights, 1, tmp_path / "flight.gif")
+    with Image.open(tmp_path / "flight.gif") as film:
+        length = flights.length[1]
+        assert film.is_animated and film.n_frames == -(-length // -(-length // MAX_IMAGES))

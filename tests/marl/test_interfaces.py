@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("pettingzoo", reason="the extra rl is not installed")
 
+import gymnasium  # noqa: E402
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from pettingzoo.test import parallel_api_test, parallel_seed_test  # noqa: E402
 
@@ -135,3 +136,17 @@ def test_maskable_ppo_trains_in_the_central_environment(tiny):
     np.testing.assert_array_equal(env.action_masks(), seen["action_mask"].ravel())
     contrib = pytest.importorskip("sb3_contrib", reason="SB3-contrib is not installed")
     contrib.MaskablePPO("MultiInputPolicy", env, n_steps=32, batch_size=16, n_epochs=1).learn(64)
+
+
+def test_gymnasium_makes_and_renders_a_flight(small_scene):
+    env = gymnasium.make("radiotwin/Harvest-v0", scene=small_scene.folder, truth="segmented", render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    later = env.render()
+    assert first.shape == later.shape and first.shape[2] == 3 and first.dtype == np.uint8
+    assert (first != later).any() and (first == later).mean() > 0.8
+    assert CentralEnv(env.unwrapped._flights.mission).render() is None
+    with pytest.raises(ValueError, match="rgb_array"):
+        CentralEnv(env.unwrapped._flights.mission, render_mode="rgb_array")
