@@ -1,7 +1,7 @@
 """The interface of a learner: prepare in a map, then give a policy that flies.
 
-To add a learner, subclass `Learner` in one file and add one line to `marl.settings.LEARNERS`
-(example in `docs/marl.md`).
+To add a learner, subclass `Learner` in one file and add one line to `marl.settings.LEARNERS`, or
+an entry point to a package of one's own (example in `docs/marl.md`).
 """
 
 from abc import ABC, abstractmethod

@@ -339,6 +339,10 @@ class QNetworks:
         return {"loss": float(loss.detach()), "gradient_norm": float(norm),
                 "mean_value": float(mean)}
 
+    def reward(self, flights: Flights) -> np.ndarray:
+        """Return the (E, T) float32 rewards that are learned from; a subclass may shape them."""
+        return flights.collected.sum(axis=2) / np.float32(self.settings.reward_scale)
+
     def mix(self, values: Tensor, state: Tensor, modules: dict[str, nn.Module]) -> Tensor:
         """Return the values that are learned: (T, E) Q_tot of (T, E, U) values of actions."""
         return modules["mixer"](values, state)
@@ -358,7 +362,7 @@ class QNetworks:
             torch.from_numpy(array).to(self.device).unflatten(0, (slots, count))
             for array in (*observe(mission, flat), state))
         action = torch.from_numpy(flights.action.swapaxes(0, 1).astype(np.int64))
-        reward = flights.collected.sum(axis=2).T / np.float32(self.settings.reward_scale)
+        reward = self.reward(flights).T
         valid = (np.arange(slots)[:, None] < flights.length[None]).astype(np.float32)
         return (observation, mask, state, action.to(self.device),
                 *(torch.from_numpy(array).to(self.device) for array in (reward, valid)))

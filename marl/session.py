@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -18,7 +18,7 @@ from marl.flights import evaluate, track_table
 from marl.learner import make_learner
 from marl.mission import Known, Mission, make_mission
 from marl.replicas import check_sizes, keep_memory, limit_threads, result_of, shut
-from marl.settings import LearnerSettings, RunSettings, learner_class, stream
+from marl.settings import LEARNERS, LearnerSettings, RunSettings, learner_class, stream
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import write_csv
 from radiotwin.io.content_hash import content_hash
@@ -123,8 +123,8 @@ class Session:
             return []
         pool, _ = start_process({})
         stack.callback(shut, pool)
-        return [(run, pool.submit(_compared, run, self.learner, self.out / "compare" / run.twin,
-                                  self.resume)) for run in runs]
+        return [(run, pool.submit(_compared, run, learner_class(algorithm), self.learner,
+                                  self.out / "compare" / run.twin, self.resume)) for run in runs]
 
     def _claim_folder(self, world: dict[str, str]) -> None:
         """Make the folder of a new run, or check that it holds the run that is to be resumed."""
@@ -221,11 +221,15 @@ def _entry(method: str, twin: str, row: dict) -> dict:
             **{name: row[name] for name in ("real_episodes", "truth_ratio", "truth_ratio_std")}}
 
 
-def _compared(run: RunSettings, learner: LearnerSettings, folder: Path,
+def _compared(run: RunSettings, made: Any, learner: LearnerSettings, folder: Path,
               resume: bool) -> list[dict]:
-    """Run Algorithm 1 in a process of its own, and return the rows of its log."""
+    """Run Algorithm 1 in a process of its own, and return the rows of its log.
+
+    The class of the learner comes with it, for it may be registered by a script.
+    """
     limit_threads(1)
     keep_memory()
+    LEARNERS[run.algorithm] = made
     scene = Scene.load(run.scene)
     return run_algorithm(run, learner, scene, read_truth(scene, run.truth), folder, resume,
                          _Log(folder), lambda *_: None, torch_device(run.device)).rows

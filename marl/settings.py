@@ -20,6 +20,7 @@ from pydantic_core import PydanticCustomError
 
 from radiotwin.errors import BadInput
 from radiotwin.runtime.command import with_options
+from radiotwin.runtime.plugins import entry_points
 from radiotwin.scene.folder import published_scene
 
 LEARNERS: dict[str, Any] = {
@@ -30,15 +31,24 @@ LEARNERS: dict[str, Any] = {
     "planner": "marl.planner:Planner",
     "random": "marl.heuristics:Random",
 }
-"""Name -> `module:class`, or the class itself; each is a `marl.learner.Learner`."""
+"""Name -> `module:class`, or the class itself; each is a `marl.learner.Learner`.
+
+Installed packages add theirs by entry points of the group `radiotwin.learners`.
+"""
 PURPOSES = ("learning", "real flight", "decisions", "choice", "twin evaluation",
             "truth evaluation", "planning")
 Settings = TypeVar("Settings", bound=BaseModel)
 
 
+def learners() -> dict[str, Any]:
+    """Return `LEARNERS`, and those of installed packages."""
+    others = {point.name: point.value for point in entry_points("radiotwin.learners")}
+    return LEARNERS | {name: value for name, value in others.items() if name not in LEARNERS}
+
+
 def learner_class(name: str) -> Any:
-    """Return the class of a learner, by its name in `LEARNERS`."""
-    found = LEARNERS[name]
+    """Return the class of a learner by its name."""
+    found = learners()[name]
     if isinstance(found, str):
         module, _, attribute = found.partition(":")
         found = getattr(importlib.import_module(module), attribute)
@@ -110,8 +120,8 @@ class Choices:
 
 
 def _registered(name: str) -> str:
-    if name not in LEARNERS:
-        *others, last = (repr(each) for each in LEARNERS)
+    if name not in learners():
+        *others, last = (repr(each) for each in learners())
         raise PydanticCustomError("literal_error", f"Input should be {', '.join(others)} or {last}")
     return name
 
@@ -132,7 +142,7 @@ class RunSettings(BaseModel):
     twin_shadowing: Literal["fitted", "slot"] = Field(
         "fitted", description="how long the twin's error lasts in a simulated flight: fitted to "
         "its residuals, or one slot; preset paper: slot")
-    algorithm: Annotated[str, Choices(lambda: list(LEARNERS)), AfterValidator(_registered)] = Field(
+    algorithm: Annotated[str, Choices(lambda: [*learners()]), AfterValidator(_registered)] = Field(
         "fedqmix", description="learner, planner or heuristic that flies")
     preset: Literal["fast", "paper"] = Field("fast", description="settings of learning")
     real_episodes: int = Field(
@@ -180,7 +190,7 @@ def check_together(run: RunSettings, learner: LearnerSettings) -> None:
             f"replay {learner.replay}: it must hold a batch ({learner.batch} flights) and what is "
             f"flown side by side ({learner.parallel}); raise it, or lower batch or parallel")
     if run.guide != "none" and not learner_class(run.algorithm).learns:
-        able = ", ".join(name for name in LEARNERS if learner_class(name).learns)
+        able = ", ".join(name for name in learners() if learner_class(name).learns)
         raise BadInput(f"guide {run.guide}: {run.algorithm} does not learn, so nothing can be "
                        f"guided; it is for algorithm {able} only")
 

@@ -2,13 +2,17 @@
 
 import csv
 import json
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from marl.algorithm1 import run_algorithm
+from marl.flights import evaluate
+from marl.heuristics import HeuristicPolicy
 from marl.learner import Learner, make_learner
+from marl.qmix import IQL, QNetworks
 from marl.session import Session
 from marl.settings import (
     LEARNERS,
@@ -16,10 +20,12 @@ from marl.settings import (
     RunSettings,
     check_together,
     learner_class,
+    learners,
     settings_of,
 )
 from radiotwin.errors import BadInput
 from radiotwin.maps.survey import segmented_truth
+from radiotwin.runtime.plugins import entry_points
 
 DOCS = Path(__file__).parents[2] / "docs" / "marl.md"
 
@@ -41,10 +47,33 @@ def test_every_registered_learner_is_one():
     assert [name for name in LEARNERS if not learner_class(name).uses_map] == ["greedy", "random"]
 
 
+def test_an_installed_package_adds_a_learner(monkeypatch):
+    point = EntryPoint("theirs", "marl.qmix:IQL", "radiotwin.learners")
+    monkeypatch.setattr("radiotwin.runtime.plugins.metadata.entry_points", lambda group: [point] * (group == "radiotwin.learners"))
+    entry_points.cache_clear()
+    try:
+        assert settings_of({"algorithm": "theirs"})[0].algorithm == "theirs" and learner_class("theirs") is IQL
+        assert list(learners())[-1] == "theirs"
+    finally:
+        entry_points.cache_clear()
+
+
+def test_a_learner_may_shape_its_reward(city_mission):
+    class Half(QNetworks):
+        def reward(self, flights):
+            return super().reward(flights) / 2
+
+    flights = evaluate(city_mission, HeuristicPolicy("random", np.random.default_rng(0)), 3, np.random.default_rng(1))
+    settings = LearnerSettings(hidden=4, mixing_width=4)
+    usual, half = (made(settings, city_mission, 0)._tensors(flights, city_mission)[4] for made in (QNetworks, Half))
+    assert usual.sum() * settings.reward_scale == pytest.approx(flights.collected.sum(), rel=1e-4)
+    np.testing.assert_allclose(half, usual / 2)
+
+
 def test_a_new_learner_runs_like_the_others(small_scene, tmp_path, best_of_many, capsys):
     given = {"scene": str(small_scene.folder), "truth": "segmented", "twin": "log-distance",
              "algorithm": "best-of-many", "real_episodes": "2", "episodes": "30", "flights": "4",
-             "planner_iterations": "50"}
+             "planner_iterations": "50", "compare": "truth"}
     run, settings = settings_of(given)
     Session(run, settings, tmp_path / "out", resume=False).execute()
     with (tmp_path / "out" / "comparison.csv").open() as file:
