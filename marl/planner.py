@@ -18,14 +18,16 @@ from marl.flights import Policy
 from marl.learner import Learner, Setup
 from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
 from marl.settings import stream
+from marl.tours import change
 from radiotwin.runtime.compiled import njit
 from radiotwin.runtime.console import progress
 
-MAX_WAYPOINTS = 8  # of a UAV
-START_TEMPERATURE, END_TEMPERATURE = 0.02, 0.0003  # of the annealing, in collected share
-STARTS, REHEATS = 3, 10  # of a search: it begins anew, and then improves the best
-STARTS_SHARE = 1 / 3  # of the tried plans
-REHEAT_TEMPERATURE = 0.003
+LEAST_WAYPOINTS, HOVERS_PER_WAYPOINT = 8, 12  # so many waypoints a tour has at most
+# Temperatures of the annealing, in collected share times devices
+START_TEMPERATURE, REHEAT_TEMPERATURE, END_TEMPERATURE = 0.2, 0.03, 0.003
+STARTS, REHEATS = 5, 10  # of a search: at most so often it begins anew, then improves the best
+TRIES_OF_A_START = 5000  # at least, for each UAV
+STARTS_SHARE = 1 / 2  # of the tried plans
 CHUNK = 5000  # iterations between updates of the progress bar
 
 
@@ -35,7 +37,7 @@ class Plan(NamedTuple):
     Attributes:
         actions: (T, U) int8; feasible from take-off until all batteries are empty.
         ratio: expected share of the data that it collects in the map that it was planned in.
-        tour: (U, MAX_WAYPOINTS, 3) int64 waypoints (row, column, hovers) that the actions follow.
+        tour: (U, W, 3) int64 waypoints (row, column, hovers) that the actions follow.
         visits: (U,) int64 number of waypoints of each UAV.
     """
 
@@ -73,9 +75,9 @@ class Candidates(NamedTuple):
     Attributes:
         value: (L, K, ny, nx) float32, of `expected_data`.
         peak: (L, K, 2) int64 cell (row, column) where each device is heard best.
-        listed: (L, cells) bool.
-        device: (L, cells, K) int32
-        worth: (L, cells, K) float32 data units of a slot; 0 after the last device in reach.
+        listed: (P,) bool; a place is a cell at a level, number (level * ny + row) * nx + column.
+        device: (P, K) int32
+        worth: (P, K) float32 data units of a slot; 0 after the last device in reach.
     """
 
     value: np.ndarray
@@ -89,9 +91,9 @@ class Candidates(NamedTuple):
         """Return lists that searches in one map can share, all still to be filled."""
         levels, devices, rows, columns = value.shape
         strongest = value.reshape(levels, devices, -1).argmax(axis=2)
-        shape = (levels, rows * columns, devices)
+        shape = (levels * rows * columns, devices)
         return cls(value, np.stack(np.unravel_index(strongest, (rows, columns)), axis=-1),
-                   np.zeros(shape[:2], np.bool_), np.empty(shape, np.int32),
+                   np.zeros(shape[0], np.bool_), np.empty(shape, np.int32),
                    np.empty(shape, np.float32))
 
 
@@ -99,7 +101,7 @@ class Course(NamedTuple):
     """A flight along tours slot by slot, from which one along a changed tour can branch off.
 
     Attributes:
-        cell: (U, T) int32 row * nx + column at the beginning of each slot; -1 after landing.
+        place: (T, U) int32 of `Candidates` at the beginning of each slot; -1 after landing.
         battery: (U, T) int32 [hovers]
         since: (U, W + 1) int32 slot from which on the UAV has passed so many waypoints.
         device: (T, U) int32 that is expected to serve the UAV; -1 for none.
@@ -107,7 +109,7 @@ class Course(NamedTuple):
         left: (K,) data units left at the end.
     """
 
-    cell: np.ndarray
+    place: np.ndarray
     battery: np.ndarray
     since: np.ndarray
     device: np.ndarray
@@ -118,7 +120,7 @@ class Course(NamedTuple):
     def of(cls, mission: Mission, waypoints: int) -> "Course":
         """Return a course of UAVs that have not taken off, with tours of so many waypoints."""
         slots, uavs = mission.longest, mission.uavs
-        return cls(np.full((uavs, slots), -1, np.int32), np.zeros((uavs, slots), np.int32),
+        return cls(np.full((slots, uavs), -1, np.int32), np.zeros((uavs, slots), np.int32),
                    np.zeros((uavs, waypoints + 1), np.int32), np.full((slots, uavs), -1, np.int32),
                    np.zeros((slots, uavs)), mission.data_units.copy())
 
@@ -179,18 +181,22 @@ def plan(mission: Mission, iterations: int, seed: int) -> Plan:
         seed: of the search.
     """
     rng, candidates = stream(seed, "planning"), Candidates.of(expected_data(mission))
-    nothing = (np.zeros((mission.uavs, MAX_WAYPOINTS, 3), dtype=np.int64),
+    waypoints = max(LEAST_WAYPOINTS, mission.longest // HOVERS_PER_WAYPOINT)
+    nothing = (np.zeros((mission.uavs, waypoints, 3), dtype=np.int64),
                np.zeros(mission.uavs, dtype=np.int64))
-    shares = [STARTS_SHARE / STARTS] * STARTS + [(1 - STARTS_SHARE) / REHEATS] * REHEATS
+    starts = int(STARTS_SHARE * iterations / (TRIES_OF_A_START * mission.uavs))
+    starts = min(max(starts, 1), STARTS)
+    shares = [STARTS_SHARE / starts] * starts + [(1 - STARTS_SHARE) / REHEATS] * REHEATS
     tries = np.diff(np.round(iterations * np.cumsum([0.0, *shares])).astype(int))
     with progress("planning", total=iterations) as advance:
         def search(tries: int, tour: np.ndarray, count: np.ndarray, temperature: float) -> Plan:
             return improve(mission, candidates.value, tour, count, tries, rng,
-                           temperature=temperature, on_progress=advance, candidates=candidates)
+                           temperature=temperature / mission.devices, on_progress=advance,
+                           candidates=candidates)
 
-        best = max((search(each, *nothing, START_TEMPERATURE) for each in tries[:STARTS]),
+        best = max((search(each, *nothing, START_TEMPERATURE) for each in tries[:starts]),
                    key=attrgetter("ratio"))
-        for each in tries[STARTS:]:
+        for each in tries[starts:]:
             again = search(each, best.tour, best.visits, REHEAT_TEMPERATURE)
             best = max(best, again, key=attrgetter("ratio"))
     return best
@@ -198,7 +204,7 @@ def plan(mission: Mission, iterations: int, seed: int) -> Plan:
 
 def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
             iterations: int, rng: np.random.Generator, *, only: int = -1,
-            temperature: float = START_TEMPERATURE,
+            temperature: float = START_TEMPERATURE / 10,
             on_progress: Callable[[int], None] = lambda _: None,
             candidates: Candidates | None = None) -> Plan:
     """Continue the search from a tour.
@@ -278,7 +284,7 @@ def next_action(mission: Mission, uav: int, row: int, column: int, battery: int,
                 count: int, reached: int, hovered: int, mask: np.ndarray) -> tuple[int, int, int]:
     """Follow a tour; at its end, or for lack of battery, stay as long as possible, then go home.
 
-    The tour (MAX_WAYPOINTS, 3) has `count` waypoints; the UAV has passed `reached` of them, and has
+    The tour (W, 3) has `count` waypoints; the UAV has passed `reached` of them, and has
     hovered so long at the next one. `battery` is in hovers, `mask` (6,) is scratch.
 
     Returns:
@@ -286,9 +292,9 @@ def next_action(mission: Mission, uav: int, row: int, column: int, battery: int,
     """
     feasible(mission, uav, row, column, battery, mask)
     while reached < count:
-        to_row, to_column, hovers = tour[reached]
+        to_row, to_column = tour[reached, 0], tour[reached, 1]
         if row == to_row and column == to_column:
-            if hovered < hovers and mask[HOVER]:
+            if hovered < tour[reached, 2] and mask[HOVER]:
                 return HOVER, reached, hovered + 1
         else:
             action = _towards(row, column, to_row, to_column, mask)
@@ -344,34 +350,30 @@ def fly_on(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndar
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _list(candidates: Candidates, level: int, cell: int) -> None:
-    """List the devices that are heard in a cell."""
-    value, _, listed, device, worth = candidates
-    columns = value.shape[3]
-    heard = value[level, :, cell // columns, cell % columns]
+def _list(candidates: Candidates, level: int, row: int, column: int, place: int) -> None:
+    """List the devices that are heard at a place."""
+    heard = candidates.value[level, :, row, column]
     order = np.argsort(-heard, kind="mergesort")  # of equal links the first device comes first
-    for i in range(len(order)):
-        device[level, cell, i], worth[level, cell, i] = order[i], heard[order[i]]
-        if heard[order[i]] <= 0:
-            break
-    listed[level, cell] = True
+    candidates.device[place], candidates.worth[place] = order, heard[order]
+    candidates.listed[place] = True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _walk(mission: Mission, candidates: Candidates, uav: int, tour: np.ndarray, count: int,
           changed: int, course: Course, mask: np.ndarray) -> None:
     """Fly one UAV's tour (W, 3) from where it sets out to the waypoint that has changed."""
-    level, columns = mission.level[uav], mission.steps_home.shape[2]
-    cells, batteries, since = course.cell[uav], course.battery[uav], course.since[uav]
+    level, (rows, columns) = mission.level[uav], mission.steps_home.shape[1:]
+    places, batteries, since = course.place[:, uav], course.battery[uav], course.since[uav]
     slot, reached, hovered = since[changed], changed, 0
-    if slot >= len(cells) or cells[slot] < 0:
+    if slot >= len(places) or places[slot] < 0:
         return
-    row, column, battery = cells[slot] // columns, cells[slot] % columns, batteries[slot]
+    row, column = places[slot] // columns - level * rows, places[slot] % columns
+    battery = batteries[slot]
     while battery > 0:
-        cell = row * columns + column
-        if not candidates.listed[level, cell]:
-            _list(candidates, level, cell)
-        cells[slot], batteries[slot] = cell, battery
+        place = (level * rows + row) * columns + column
+        if not candidates.listed[place]:
+            _list(candidates, level, row, column, place)
+        places[slot], batteries[slot] = place, battery
         before = reached
         action, reached, hovered = next_action(mission, uav, row, column, battery, tour, count,
                                                reached, hovered, mask)
@@ -379,65 +381,66 @@ def _walk(mission: Mission, candidates: Candidates, uav: int, tour: np.ndarray, 
         row, column = row + MOVES[action, 0], column + MOVES[action, 1]
         battery -= COSTS[action]
         slot += 1
-    cells[slot:] = -1
+    places[slot:] = -1
     since[reached + 1:] = slot
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _collect(mission: Mission, candidates: Candidates, course: Course, start: int,
-             holder: np.ndarray, rank: np.ndarray) -> None:
+             holder: np.ndarray, rank: np.ndarray, empty: np.ndarray) -> None:
     """Serve the UAVs from a slot on, as `assign` does; `left` is of the beginning of that slot.
 
-    `holder` (K,) is -1, `rank` (U,) scratch.
+    `holder` (K,) is -1, `rank` and `empty` (U,) are scratch.
     """
-    cells, left, level = course.cell, course.left, mission.level
-    listed, worths = candidates.device, candidates.worth
-    (uavs, slots), devices = cells.shape, len(left)
+    left, listed, worth = course.left, candidates.device, candidates.worth
+    (slots, uavs), devices = course.place.shape, len(course.left)
     for slot in range(start, slots):
-        device, before = course.device[slot], course.before[slot]
-        device[:] = -1
+        place, device, before = course.place[slot], course.device[slot], course.before[slot]
         for first in range(uavs):
-            u, i = first, 0
-            while u >= 0 and cells[u, slot] >= 0:
-                links, worth = listed[level[u], cells[u, slot]], worths[level[u], cells[u, slot]]
-                while i < devices and worth[i] > 0 and left[links[i]] <= 0:
-                    i += 1
-                if i == devices or worth[i] <= 0:
-                    break
-                k = links[i]
-                rank[u], device[u], v, loser = i, k, holder[k], -1
-                if v >= 0:
-                    other = worths[level[v], cells[v, slot], rank[v]]
-                    loser = v if worth[i] > other or (worth[i] == other and u < v) else u
-                if loser != u:
-                    holder[k] = u
-                if loser < 0:
-                    break
-                device[loser] = -1
-                if mission.max_rate:
-                    break
-                u, i = loser, rank[loser] + 1
+            device[first], at = -1, place[first]
+            if at < 0:
+                continue
+            if slot == start or at != course.place[slot - 1, first]:
+                empty[first] = 0  # so many devices at the head of the list have no data
+            i = empty[first]
+            while i < devices and worth[at, i] > 0 and left[listed[at, i]] <= 0:
+                i += 1
+            empty[first], u = i, first
+            while i < devices and worth[at, i] > 0:
+                k = listed[at, i]
+                if left[k] > 0:
+                    v = holder[k]
+                    other = worth[place[v], rank[v]] if v >= 0 else -1.0
+                    if worth[at, i] > other or (worth[at, i] == other and u < v):
+                        holder[k], device[u], rank[u] = u, k, i
+                        if v < 0:
+                            break
+                        device[v] = -1
+                        u, at, i = v, place[v], rank[v]  # which looks for another device
+                    if mission.max_rate:
+                        break
+                i += 1
         for u in range(uavs):
             k = device[u]
             if k >= 0:
                 holder[k] = -1
                 before[u] = left[k]
-                left[k] = max(left[k] - worths[level[u], cells[u, slot], rank[u]], 0.0)
+                left[k] = max(left[k] - worth[place[u], rank[u]], 0.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fly_tours(mission: Mission, candidates: Candidates, tour: np.ndarray, count: np.ndarray,
                course: Course) -> float:
     """Fly the tours from take-off; return the share collected, and write an empty `course`."""
-    mask = np.empty(ACTION_COUNT, np.bool_)
+    mask, (rows, columns) = np.empty(ACTION_COUNT, np.bool_), mission.steps_home.shape[1:]
     for u in range(len(tour)):
         if mission.battery[u] > 0:
             row, column = mission.start[u]
-            course.cell[u, 0] = row * mission.steps_home.shape[2] + column
+            course.place[0, u] = (mission.level[u] * rows + row) * columns + column
             course.battery[u, 0] = mission.battery[u]
             _walk(mission, candidates, u, tour[u], count[u], 0, course, mask)
-    holder, rank = np.full(len(course.left), -1), np.zeros(len(tour), np.int64)
-    _collect(mission, candidates, course, 0, holder, rank)
+    holder, scratch = np.full(len(course.left), -1), np.zeros((2, len(tour)), np.int64)
+    _collect(mission, candidates, course, 0, holder, scratch[0], scratch[1])
     return 1.0 - course.left.sum() / mission.data_units.sum()
 
 
@@ -451,23 +454,23 @@ def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
     `only` is the UAV whose tour is changed, -1 for any; `hot` the temperature at the start.
     `course` is that of the tours, and `trial` a copy; both follow what is kept.
     """
-    uavs, slots = course.cell.shape
-    mask, rank = np.empty(ACTION_COUNT, np.bool_), np.zeros(uavs, np.int64)
+    (slots, uavs), cold = course.place.shape, END_TEMPERATURE / len(course.left)
+    mask, scratch = np.empty(ACTION_COUNT, np.bool_), np.zeros((2, uavs), np.int64)
     holder = np.full(len(course.left), -1)
     total = mission.data_units.sum()
     new_tour, new_count = tour.copy(), count.copy()
     changed, at = np.zeros(2, np.int64), np.zeros(2, np.int64)
     rows, columns = mission.steps_home.shape[1:]
     for done in progress:
-        temperature = hot * (END_TEMPERATURE / hot) ** done
-        n = _change(new_tour, new_count, only, mission.level, candidates.peak, rows, columns, rng,
-                    changed, at)
+        temperature = hot * (cold / hot) ** done
+        n = change(new_tour, new_count, only, mission.level, candidates.peak, course.left, rows,
+                   columns, rng, changed, at)
         first = slots
         for i in range(n):
             u = changed[i]
             slot = course.since[u, at[i]]
             _walk(mission, candidates, u, new_tour[u], new_count[u], at[i], trial, mask)
-            while slot < first and trial.cell[u, slot] == course.cell[u, slot]:
+            while slot < first and trial.place[slot, u] == course.place[slot, u]:
                 slot += 1
             first = min(first, slot)
         new = score
@@ -478,13 +481,13 @@ def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
                     k = course.device[slot, u]
                     if k >= 0:
                         trial.left[k] = course.before[slot, u]
-            _collect(mission, candidates, trial, first, holder, rank)
+            _collect(mission, candidates, trial, first, holder, scratch[0], scratch[1])
             new = 1.0 - trial.left.sum() / total
         kept = new >= score or rng.random() < np.exp((new - score) / temperature)
         source, target = (trial, course) if kept else (course, trial)
         for i in range(n):
             u = changed[i]
-            target.cell[u] = source.cell[u]
+            target.place[:, u] = source.place[:, u]
             target.battery[u] = source.battery[u]
             target.since[u] = source.since[u]
             if kept:
@@ -500,70 +503,3 @@ def _anneal(mission: Mission, candidates: Candidates, tour: np.ndarray, count: n
                 best = score
                 best_tour[:], best_count[:] = tour, count
     return score, best
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _change(tour: np.ndarray, count: np.ndarray, only: int, level: np.ndarray, peaks: np.ndarray,
-            rows: int, columns: int, rng: np.random.Generator, changed: np.ndarray,
-            first: np.ndarray) -> int:
-    """Make one random change of one tour, or of two.
-
-    Returns:
-        Number of tours that have changed; `changed` gets the UAVs, `first` their first waypoint
-        that is another one.
-    """
-    u = only if only >= 0 else rng.integers(0, len(count))
-    n = count[u]
-    kind = rng.random()
-    changed[0] = u
-    if n < tour.shape[1] and (n == 0 or kind < 0.12):  # insert one
-        at = rng.integers(0, n + 1)
-        for i in range(n, at, -1):
-            tour[u, i] = tour[u, i - 1]
-        _draw_waypoint(tour[u, at], peaks[level[u]], rows, columns, rng)
-        count[u] = n + 1
-        first[0] = at
-        return 1
-    at = rng.integers(0, n)
-    first[0] = at
-    if kind < 0.24:  # delete one
-        for i in range(at, n - 1):
-            tour[u, i] = tour[u, i + 1]
-        count[u] = n - 1
-    elif kind < 0.54:  # shift it
-        for axis, limit in ((0, rows), (1, columns)):
-            tour[u, at, axis] = min(max(tour[u, at, axis] + rng.integers(-2, 3), 0), limit - 1)
-    elif kind < 0.74:  # hover longer or shorter
-        tour[u, at, 2] = max(tour[u, at, 2] + rng.integers(-4, 5), 0)
-    elif kind < 0.82:  # move it anywhere
-        _draw_waypoint(tour[u, at], peaks[level[u]], rows, columns, rng)
-    elif kind < 0.91:  # change the order
-        other = rng.integers(0, n)
-        first[0] = min(at, other)
-        for i in range(3):
-            tour[u, at, i], tour[u, other, i] = tour[u, other, i], tour[u, at, i]
-    else:  # exchange with another UAV
-        v = only if only >= 0 else rng.integers(0, len(count))
-        if count[v] > 0:
-            other = rng.integers(0, count[v])
-            for i in range(3):
-                tour[u, at, i], tour[v, other, i] = tour[v, other, i], tour[u, at, i]
-            if u == v:
-                first[0] = min(at, other)
-            else:
-                changed[1], first[1] = v, other
-                return 2
-    return 1
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _draw_waypoint(waypoint: np.ndarray, peaks: np.ndarray, rows: int, columns: int,
-                   rng: np.random.Generator) -> None:
-    """Draw a waypoint near a cell where a device is heard best, or anywhere."""
-    if rng.random() < 0.7:
-        k = rng.integers(0, len(peaks))
-        for axis, limit in ((0, rows), (1, columns)):
-            waypoint[axis] = min(max(peaks[k, axis] + rng.integers(-2, 3), 0), limit - 1)
-    else:
-        waypoint[0], waypoint[1] = rng.integers(0, rows), rng.integers(0, columns)
-    waypoint[2] = rng.integers(0, 10)

@@ -168,7 +168,7 @@ class RunSettings(BaseModel):
         "twins", description="train in other maps beside it, too, for the table: in the nn and "
         "log-distance twins; truth: also in the truth")
     planner_iterations: int = Field(
-        60_000, ge=1, le=10**9, description="plans that the planner tries")
+        150_000, ge=1, le=10**9, description="plans that the planner tries")
     noise_db: float = Field(
         1.0, ge=0, le=50, description="standard deviation of the receivers' measurement error; "
         "not used in a truth with shadowing")
