@@ -79,8 +79,8 @@ def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Fig
     """Draw the collected share against real episodes.
 
     Args:
-        curves: name -> rows with `real_episodes`, `truth_ratio` and `truth_ratio_std`; rows
-            without any real episode are left out.
+        curves: name -> rows with `real_episodes`, `truth_ratio`, and `truth_ratio_std` or `low`
+            and `high`; rows without any real episode are left out.
         levels: name of a baseline -> its share.
     """
     figure = Figure(figsize=(8.5, 5.2), layout="constrained")
@@ -88,12 +88,14 @@ def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Fig
     axes = figure.add_subplot()
     for number, (name, rows) in enumerate(curves.items()):
         rows = [row for row in rows if row["real_episodes"] > 0]
-        x, ratio, ratio_sd = (np.array([row[key] for row in rows]) for key in
-                              ("real_episodes", "truth_ratio", "truth_ratio_std"))
+        x, ratio = (np.array([row[key] for row in rows]) for key in
+                    ("real_episodes", "truth_ratio"))
+        low, high = (np.array([row[edge] if edge in row else
+                               row["truth_ratio"] + sign * row["truth_ratio_std"] for row in rows])
+                     for edge, sign in (("low", -1), ("high", 1)))
         colour = COLOURS[number % len(COLOURS)]
         axes.plot(x, ratio, marker=MARKERS[number % len(MARKERS)], color=colour, label=name)
-        axes.fill_between(x, ratio - ratio_sd, ratio + ratio_sd, color=colour, alpha=0.18,
-                          linewidth=0)
+        axes.fill_between(x, low, high, color=colour, alpha=0.18, linewidth=0)
     for style, (name, level) in zip(LEVEL_STYLES, levels.items()):
         axes.axhline(level, color="black", linestyle=style, linewidth=1.1,
                      label=f"{name}: {level:.2f}")

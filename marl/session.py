@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 
 from marl.algorithm1 import Campaign, Outcome, run_algorithm
-from marl.checkpoint import NAME
 from marl.figures import choose_flight, draw_curve, save, save_animation, trajectories_figure
 from marl.flights import evaluate, track_table
 from marl.learner import make_learner
@@ -57,8 +56,11 @@ class Session:
     out: Path
     resume: bool
 
-    def execute(self) -> None:
+    def execute(self) -> tuple[pd.DataFrame, dict[str, list[dict]]]:
         """Run, write the folder, and print the table.
+
+        Returns:
+            The table, and the rounds of each run in it by name.
 
         Raises:
             BadInput: a scene or truth that cannot be used, a folder that is taken, or settings
@@ -103,7 +105,7 @@ class Session:
         recorded = RECORDED.get(world["truth"])
         if recorded and self.run.truth == "traced" and self.run.compare == "twins" and beside:
             entries.append(recorded)
-        self._write(scene, truth, main, curves, entries)
+        return self._write(scene, truth, main, curves, entries), curves
 
     def _begin_beside(self, stack: ExitStack) -> "list[tuple[RunSettings, Future[list[dict]]]]":
         """Begin the runs of the comparison, one after the other in a process of their own.
@@ -132,12 +134,6 @@ class Session:
         config = {"run": self.run.model_dump(mode="json"),
                   "learner": self.learner.model_dump(mode="json"), "world": world}
         if self.resume:
-            old = self.out / "checkpoint.pt"
-            if old.exists() and not (self.out / NAME).exists():
-                raise BadInput(f"{old} is of an earlier version of radiotwin, in a form that this "
-                               "one does not read, so the run in it cannot be resumed; finish it "
-                               "with that version, or start it anew without --resume and with "
-                               "another --out")
             try:
                 before = read_json(path)
                 if not isinstance(before, dict) or not all(
@@ -164,7 +160,7 @@ class Session:
             file.write(json.dumps(config, indent=1).encode())
 
     def _write(self, scene: Scene, truth: RadioMap, main: Outcome, curves: dict[str, list[dict]],
-               entries: list[dict]) -> None:
+               entries: list[dict]) -> pd.DataFrame:
         real = make_mission(scene, truth, main.known, self.run.assignment)
         trained_in = real
         if main.twin is not None:
@@ -192,6 +188,7 @@ class Session:
                    [[row.method, row.trained_in, f"{row.real_episodes:,}",
                      f"{row.truth_ratio:.3f}", f"{row.truth_ratio_std:.3f}"]
                     for row in table.itertuples()])
+        return table
 
     def _baseline(self, name: str, trained_in: Mission, real: Mission, real_episodes: int) -> dict:
         run = self.run.model_copy(update={"algorithm": name})

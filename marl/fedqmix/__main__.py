@@ -24,6 +24,9 @@ def fedqmix(
         help="Folder of the results [runs/SCENE-TRUTH-TWIN-ALGORITHM-SEED].")] = None,
     resume: Annotated[bool, typer.Option(
         "--resume", help="Go on with a run that was stopped; same options, same result.")] = False,
+    seeds: Annotated[int, typer.Option(
+        min=1, max=1000, help="Runs with as many seeds, from --seed on, and their interquartile "
+        "means with bands [1].", show_default=False)] = 1,
 ) -> None:
     """Train UAVs to harvest data inside a twin learned from few real flights; judge in the truth.
 
@@ -36,13 +39,18 @@ def fedqmix(
     name = f"{run.scene.name}-{run.truth}-{run.twin}-{run.algorithm}-{run.seed}"
     folder = out or Path("runs") / name
     if not given.keys() & FederationSettings.model_fields.keys():  # one owner of all
-        from marl.session import Session  # torch and all: not for --help
+        if seeds == 1:
+            from marl.session import Session  # torch and all: not for --help
 
-        Session(run, learner, folder, resume).execute()
+            Session(run, learner, folder, resume).execute()
+        else:
+            from marl.seeds import run_seeds
+
+            run_seeds(run, learner, folder, resume, seeds)
     else:
-        if run.algorithm != "fedqmix" or resume:
+        if run.algorithm != "fedqmix" or resume or seeds > 1:
             raise BadInput("parties of a federation train with --algorithm fedqmix and without "
-                           "--resume; leave out --federation, --party-scenes and "
+                           "--resume and --seeds; leave out --federation, --party-scenes and "
                            "--party-measurements, or that")
         from marl.fedqmix.session import FederatedSession
 

@@ -4,18 +4,18 @@ import json
 import os
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import marl.session
-from marl.fedqmix.__main__ import app
 from marl.learner import make_learner
 from marl.mission import Known, make_mission
+from marl.seeds import over_seeds, run_seeds
 from marl.session import RECORDED, Session, _world
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import read_truth, segmented_truth
-from radiotwin.runtime.command import exit_status
 from radiotwin.scene import Scene
 from radiotwin.scene.folder import published_scene
 from radiotwin.twin import Twin
@@ -42,26 +42,6 @@ def test_a_run_is_resumed_in_its_own_folder_only(begun, session):
         session(False)._claim_folder(WORLD)
     with pytest.raises(BadInput, match="truth has changed"):
         begun._claim_folder(WORLD | {"truth": "d"})
-
-
-def test_a_run_of_an_earlier_version_is_not_begun_anew_without_a_word(small_scene, tmp_path, monkeypatch, capsys):
-    """Its checkpoint is of a form that is not read."""
-    out = tmp_path / "run"
-    out.mkdir()
-    (out / "checkpoint.pt").write_bytes(b"of torch")
-    monkeypatch.setattr("sys.argv", ["fedqmix", "--scene", str(small_scene.folder), "--truth", "segmented", "--out", str(out),
-                                     "--resume"])
-    assert exit_status(app, "") == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert f"{out / 'checkpoint.pt'} is of an earlier version" in said and "cannot be resumed" in said
-    assert "without --resume and with another --out" in said
-    assert [path.name for path in out.iterdir()] == ["checkpoint.pt"]
-
-
-def test_an_old_checkpoint_beside_a_new_one_does_no_harm(begun, tmp_path):
-    for name in ("checkpoint.pt", "checkpoint.safetensors"):
-        (tmp_path / "run" / name).touch()
-    begun._claim_folder(WORLD)
 
 
 @pytest.mark.parametrize("change", [lambda truth: truth.assign(sigma_db=3 * truth["sigma_db"]), lambda truth: truth.assign(los=~truth["los"]),
@@ -148,3 +128,22 @@ def test_planners_beside_a_learner_plan_in_its_twin(small_scene, tmp_path, monke
     for _, mission in planned_in:
         np.testing.assert_allclose(mission.snr_db, in_twin, atol=1e-3)
         assert np.abs(mission.snr_db - in_truth).max() > 1
+
+
+def test_seeds_have_folders_of_their_own_and_a_band(small_scene, tmp_path, capsys):
+    run = RunSettings(scene=small_scene.folder, truth="segmented", twin="truth", algorithm="greedy", real_episodes=1, flights=2,
+                      planner_iterations=50, seed=4)
+    run_seeds(run, LearnerSettings(), tmp_path / "run", False, 3)
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["curve.png", "seed-4", "seed-5", "seed-6", "seeds.csv"]
+    table = pd.read_csv(tmp_path / "run" / "seeds.csv").set_index("method")
+    ratios = [pd.read_csv(tmp_path / "run" / f"seed-{seed}" / "comparison.csv").set_index("method")["truth_ratio"]["greedy"]
+              for seed in (4, 5, 6)]
+    row = table.loc["greedy"]
+    assert row["truth_ratio"] == pytest.approx(np.mean(ratios))  # of three, none is trimmed
+    assert min(ratios) - 1e-9 <= row["low"] < row["truth_ratio"] < row["high"] <= max(ratios) + 1e-9
+    assert "interquartile mean of 3 seeds" in " ".join(capsys.readouterr().out.split())
+    with pytest.raises(BadInput, match="not an empty folder"):
+        run_seeds(run, LearnerSettings(), tmp_path / "run", False, 3)
+    run_seeds(run, LearnerSettings(), tmp_path / "run", True, 3)
+    assert over_seeds(np.array([0.0, 0.5, 0.7, 1.0]))["truth_ratio"] == pytest.approx(0.6)  # the outer quarters do not count
+    assert np.isnan(over_seeds(np.array([0.5]))["low"])
