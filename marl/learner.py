@@ -7,13 +7,16 @@ an entry point to a package of one's own (example in `docs/marl.md`).
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from marl.flights import Policy
 from marl.mission import Mission
 from marl.settings import LearnerSettings, RunSettings, learner_class
+
+if TYPE_CHECKING:
+    from marl.belief import Prior
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,9 @@ class Learner(ABC):
         self.setup = setup
         self.replicas = 1 if self.learns else 0
         self.selection_flights = 0
+
+    def believe(self, prior: "Prior | None") -> None:  # noqa: B027  most take the map as it is
+        """Take what the twin says of its own errors, before `prepare`; None: it says nothing."""
 
     @abstractmethod
     def prepare(self, mission: Mission,

@@ -172,15 +172,17 @@ class Planner(Learner):
         self._actions = require_plan(state["actions"], self.setup.mission)
 
 
-def plan(mission: Mission, iterations: int, seed: int) -> Plan:
+def plan(mission: Mission, iterations: int, seed: int, value: np.ndarray | None = None) -> Plan:
     """Search a plan in the map that is known: a few times from nothing, then from the best again.
 
     Args:
         mission: with the map.
         iterations: plans that are tried in all.
         seed: of the search.
+        value: data expected of a slot, in place of `expected_data` of the map.
     """
-    rng, candidates = stream(seed, "planning"), Candidates.of(expected_data(mission))
+    rng = stream(seed, "planning")
+    candidates = Candidates.of(expected_data(mission) if value is None else value)
     waypoints = max(LEAST_WAYPOINTS, mission.longest // HOVERS_PER_WAYPOINT)
     nothing = (np.zeros((mission.uavs, waypoints, 3), dtype=np.int64),
                np.zeros(mission.uavs, dtype=np.int64))

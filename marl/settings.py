@@ -29,6 +29,7 @@ LEARNERS: dict[str, Any] = {
     "iql": "marl.qmix:IQL",
     "greedy": "marl.heuristics:Greedy",
     "planner": "marl.planner:Planner",
+    "belief": "marl.replanning:BeliefPlanner",
     "random": "marl.heuristics:Random",
 }
 """Name -> `module:class`, or the class itself; each is a `marl.learner.Learner`.

@@ -25,7 +25,7 @@ from radiotwin import Scene, segmented_truth
 from radiotwin.runtime.console import progress
 from studies import tables
 from studies.disturbed import Disturbance, DisturbedEnvironment
-from studies.replanning import ReplanPolicy
+from marl.replanning import ReplanPolicy
 from studies.runner import Study
 from studies.twins import LONG
 
@@ -86,7 +86,7 @@ def fly_disturbed(seed: int, settings: dict) -> dict:
     curve: dict[str, list] = {}
     policy: Policy
     if method == "replan":
-        policy = ReplanPolicy(world.believed, linked, settings["replan_every"],
+        policy = ReplanPolicy(world.believed, None, linked, settings["replan_every"],
                               settings["replan_iterations"], settings["planner_iterations"], seed,
                               stream(seed, "planning", 1))
     elif method == "greedy":

@@ -71,7 +71,8 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(unbroken):
     assert config["run"]["real_episodes"] == 2 and config["learner"]["batch"] == 8
     with (folder / "comparison.csv").open() as file:
         ratios = {(row["method"], row["trained_in"]): float(row["truth_ratio"]) for row in csv.DictReader(file)}
-    assert all(0 < ratio <= 1 for ratio in ratios.values()) and ratios["planner", "NN twin"] > ratios["random", ""]
+    assert all(0 < ratio <= 1 for ratio in ratios.values()), ratios
+        assert ratios["planner", "NN twin"] > ratios["random", ""]
 
 
 @pytest.mark.slow

@@ -7,11 +7,11 @@ from marl.environment import Environment
 from marl.flights import fly
 from marl.planner import PlanPolicy, plan
 from studies.disturbed import Disturbance, DisturbedEnvironment
-from studies.replanning import ReplanPolicy
+from marl.replanning import ReplanPolicy
 
 
 def policy(mission, linked, every=4, iterations=200):
-    return ReplanPolicy(mission, linked, every, iterations, 1000, 0, np.random.default_rng(0))
+    return ReplanPolicy(mission, None, linked, every, iterations, 1000, 0, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize("linked", [True, False])

@@ -1,0 +1,247 @@
+"""What UAVs believe of the devices, and how they learn from what they hear and do not hear.
+
+A device is believed to be at one of N candidate positions (particles), each with a map of its own.
+At each of them an error of its level, the same everywhere, and an error of the map, correlated
+along the flight of a UAV (Gudmundson 1991, Electronics Letters 27), are estimated by a Kalman
+filter; so a wrong map costs a candidate one error for every correlation length, not one for every
+slot, and readings in a row do not make the belief surer than they may. A reading below the limit
+of detection enters as censored: by the probability of it, and the moments of the truncated normal
+distribution. A device that does not transmit is one more candidate, which explains silence.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from marl.mission import Mission
+from marl.planner import expected_data
+from radiotwin.runtime.compiled import njit
+
+NOISE_DB = 1.0  # of a reading, besides the error of the map
+TAIL = 4.0  # degrees of freedom of the readings' distribution: a few are far off
+NEGLIGIBLE = 1e-3  # probability of a candidate that no plan depends on
+# Of the table of the data expected in a slot: mean SNR and its standard deviation [dB].
+_MEANS_DB, _SDS_DB = np.arange(-60.0, 120.5, 0.5), np.arange(0.0, 40.5, 0.5)
+
+
+class Prior(NamedTuple):
+    """Belief before take-off; U UAVs, K devices, N candidates of each, L altitudes.
+
+    Attributes:
+        snr_db: (K, N, L, ny, nx) float32 mean SNR of each candidate [dB]; -inf: never received.
+        sd_db: (K, N, L, ny, nx) float32 standard deviation of its error [dB].
+        weight: (K, N) probability of each candidate, of a device that transmits; sums to 1.
+        level: (U,) int64 altitude of each UAV, in L.
+        level_sd_db: (K,) standard deviation of the error of a device's level [dB].
+        silent: (K,) probability that a device does not transmit.
+        data_spread: of each device's data, evenly from (1 - this) to (1 + this) times the
+            mission's.
+        share, length_m: of the map's error that lasts; see `Mission.shadowing_share`.
+    """
+
+    snr_db: np.ndarray
+    sd_db: np.ndarray
+    weight: np.ndarray
+    level: np.ndarray
+    level_sd_db: np.ndarray
+    silent: np.ndarray
+    data_spread: float
+    share: float
+    length_m: float
+
+    @classmethod
+    def of_mission(cls, mission: Mission, level_sd_db: float = 0.0, silent: float = 0.0,
+                   data_spread: float = 0.0) -> "Prior":
+        """Return the belief of UAVs that have one map alone: one candidate for each device."""
+        devices = mission.devices
+        return cls(mission.snr_db.swapaxes(0, 1)[:, None], mission.sigma_db.swapaxes(0, 1)[:, None],
+                   np.ones((devices, 1)), np.arange(mission.uavs),
+                   np.full(devices, float(level_sd_db)), np.full(devices, float(silent)),
+                   float(data_spread), float(mission.shadowing_share),
+                   float(mission.shadowing_m))
+
+
+class _State(NamedTuple):
+    """Of the filter: (K, N) log weights, (K, N, 1 + U) means of the errors, and covariances.
+
+    The first error is that of the level [dB]; the others are those of the map where each UAV is, in
+    standard deviations.
+    """
+
+    log_weight: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+class Belief:
+    """Belief of one UAV, or of UAVs that share what they hear, in one flight.
+
+    Args:
+        prior: before take-off.
+        mission: of the flight, as it is believed.
+    """
+
+    def __init__(self, prior: Prior, mission: Mission) -> None:
+        self.prior, self._mission = prior, mission
+        devices, candidates = prior.weight.shape
+        errors = 1 + len(prior.level)
+        covariance = np.zeros((devices, candidates, errors, errors))
+        covariance[:, :, 0, 0] = prior.level_sd_db[:, None]**2
+        for u in range(1, errors):
+            covariance[:, :, u, u] = 1.0
+        with np.errstate(divide="ignore"):
+            self._state = _State(np.log(prior.weight), np.zeros((devices, candidates, errors)),
+                                 covariance)
+        self._heard = np.zeros(devices, dtype=bool)
+        self._cell = mission.start.copy()  # where each UAV listened last
+        self._table = _expected_table(mission)
+
+    def hear(self, uav: int, cell: np.ndarray, snr_db: np.ndarray) -> None:
+        """Learn from what a UAV hears of all devices in a slot.
+
+        Args:
+            uav: its number.
+            cell: (2,) row and column.
+            snr_db: (K,) [dB]; -inf where a device is not detected.
+        """
+        moved_m = self._mission.step_m * float(np.hypot(*(cell - self._cell[uav])))
+        kept = math.exp(-moved_m / self.prior.length_m)
+        _hear(self.prior, self._state, uav, int(cell[0]), int(cell[1]), kept,
+              snr_db.astype(float), float(self._mission.detection_db))
+        self._heard |= np.isfinite(snr_db)
+        self._cell[uav] = cell
+
+    @property
+    def silent(self) -> np.ndarray:
+        """(K,) probability that a device does not transmit."""
+        top = self._state.log_weight.max(axis=1)
+        evidence = np.exp(top) * np.exp(self._state.log_weight - top[:, None]).sum(axis=1)
+        prior = self.prior.silent
+        posterior = prior / np.maximum(prior + (1 - prior) * evidence, 1e-300)
+        return np.where(self._heard, 0.0, posterior)
+
+    @property
+    def weight(self) -> np.ndarray:
+        """(K, N) probabilities of the candidates, of devices that transmit."""
+        weight = np.exp(self._state.log_weight - self._state.log_weight.max(axis=1, keepdims=True))
+        return weight / weight.sum(axis=1, keepdims=True)
+
+    def expected_data(self) -> np.ndarray:
+        """Return the data units (U, K, ny, nx) that a slot on each link is expected to bring."""
+        prior = self.prior
+        value = np.zeros((len(prior.level), len(prior.weight), *prior.snr_db.shape[3:]))
+        _value(prior, self._state, self.weight, self._cell, float(self._mission.step_m),
+               self._table, value)
+        value *= (1.0 - self.silent)[None, :, None, None]
+        return value
+
+
+def _expected_table(mission: Mission) -> np.ndarray:
+    """Return `expected_data` of links with each mean and standard deviation of the grid."""
+    mean_db, sd_db = (grid.astype(np.float32)[None, None] for grid in np.meshgrid(
+        _MEANS_DB, _SDS_DB, indexing="ij"))
+    return expected_data(mission._replace(snr_db=mean_db, sigma_db=sd_db))[0, 0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hear(prior: Prior, state: _State, uav: int, row: int, column: int, kept: float,
+          snr_db: np.ndarray, limit_db: float) -> None:
+    """Update the state with a UAV's readings (K,); `kept`: correlation since its last ones."""
+    devices, candidates, errors = state.mean.shape
+    at, level, lasting = uav + 1, prior.level[uav], math.sqrt(prior.share)
+    gain = np.empty(errors)
+    for k in range(devices):
+        for i in range(candidates):
+            if state.log_weight[k, i] < -700.0:
+                continue
+            mean, covariance = state.mean[k, i], state.covariance[k, i]
+            mean[at] *= kept
+            for j in range(errors):
+                covariance[at, j] *= kept
+                covariance[j, at] *= kept
+            covariance[at, at] += 1.0 - kept * kept
+            expected_db = prior.snr_db[k, i, level, row, column]
+            if expected_db == -np.inf:  # a candidate that is not heard here
+                if snr_db[k] > -np.inf:
+                    state.log_weight[k, i] -= 20.0
+                continue
+            sd_db = prior.sd_db[k, i, level, row, column]
+            slope = sd_db * lasting
+            variance = sd_db * sd_db * (1.0 - prior.share) + NOISE_DB * NOISE_DB
+            for j in range(errors):
+                gain[j] = covariance[j, 0] + slope * covariance[j, at]
+            spread = gain[0] + slope * gain[at] + variance
+            expected_db += mean[0] + slope * mean[at]
+            if snr_db[k] == -np.inf:  # below the limit
+                depth = (limit_db - expected_db) / math.sqrt(spread)
+                log_tail, hazard = _below(depth)
+                state.log_weight[k, i] += log_tail
+                shift = -hazard / math.sqrt(spread)
+                shrink = hazard * (hazard + depth) / spread
+            else:
+                off_db = snr_db[k] - expected_db
+                square = off_db * off_db / spread
+                state.log_weight[k, i] -= 0.5 * (math.log(spread) + (TAIL + 1.0) * math.log1p(
+                    square / TAIL))
+                # A reading that is far off says less of the errors.
+                spread *= max((TAIL + square) / (TAIL + 1.0), 1.0)
+                shift, shrink = off_db / spread, 1.0 / spread
+            for j in range(errors):
+                mean[j] += gain[j] * shift
+            for j in range(errors):
+                for m in range(errors):
+                    covariance[j, m] -= gain[j] * gain[m] * shrink
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _below(depth: float) -> tuple[float, float]:
+    """Return the logarithm of a normal distribution below a depth, and density over it there."""
+    if depth < -8.0:  # the series of Mills's ratio
+        log_tail = -0.5 * depth * depth - math.log(-depth) - 0.9189385332046727
+        return log_tail, -depth - 1.0 / depth
+    tail = 0.5 * math.erfc(-depth / math.sqrt(2.0))
+    return math.log(tail), math.exp(-0.5 * depth * depth) * 0.3989422804014327 / tail
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _value(prior: Prior, state: _State, weight: np.ndarray, cell: np.ndarray, step_m: float,
+           table: np.ndarray, value: np.ndarray) -> None:
+    """Add the data (U, K, ny, nx) that a slot is expected to bring, over all candidates."""
+    uavs, devices, rows, columns = value.shape
+    lasting = math.sqrt(prior.share)
+    near = np.zeros((rows, columns))
+    for u in range(uavs):
+        level, at = prior.level[u], u + 1
+        for r in range(rows):
+            for c in range(columns):
+                away = math.hypot(r - cell[u, 0], c - cell[u, 1]) * step_m
+                near[r, c] = math.exp(-away / prior.length_m)
+        for k in range(devices):
+            for i in range(weight.shape[1]):
+                if weight[k, i] < NEGLIGIBLE:
+                    continue
+                mean, covariance = state.mean[k, i], state.covariance[k, i]
+                for r in range(rows):
+                    for c in range(columns):
+                        snr_db = prior.snr_db[k, i, level, r, c]
+                        if snr_db == -np.inf:
+                            continue
+                        sd_db = prior.sd_db[k, i, level, r, c]
+                        slope = sd_db * lasting * near[r, c]
+                        snr_db += mean[0] + slope * mean[at]
+                        variance = (sd_db * sd_db + covariance[0, 0] + 2 * slope * covariance[0, at]
+                                    + slope * slope * (covariance[at, at] - 1.0))
+                        value[u, k, r, c] += weight[k, i] * _looked_up(
+                            table, snr_db, math.sqrt(max(variance, 0.0)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _looked_up(table: np.ndarray, snr_db: float, sd_db: float) -> float:
+    """Return the data expected in a slot, between the entries of its table."""
+    x = min(max((snr_db + 60.0) * 2.0, 0.0), table.shape[0] - 1.000001)
+    y = min(max(sd_db * 2.0, 0.0), table.shape[1] - 1.000001)
+    a, b = int(x), int(y)
+    x, y = x - a, y - b
+    return ((1 - x) * ((1 - y) * table[a, b] + y * table[a, b + 1])
+            + x * ((1 - y) * table[a + 1, b] + y * table[a + 1, b + 1]))

@@ -1,0 +1,282 @@
+"""Planning again in flight, on a belief that what is heard, and what is not, changes.
+
+Every few slots a short search changes the rest of the tours, over the data that each slot is
+expected to bring. The map may stay as it was before take-off, or be that of a `marl.belief`. Data
+left at a device are known while its SNR reaches the threshold; before, they are those of the prior.
+With a link the UAVs share all that they hear, and one search changes all tours. Without, each has a
+belief of its own and believes that the others fly the plan made before take-off, until it meets
+one: in reach of each other they exchange what they have heard, and where they mean to fly.
+"""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from typing_extensions import override
+
+from marl.belief import Belief, Prior
+from marl.environment import ACTION_COUNT, Frame
+from marl.flights import Policy
+from marl.learner import Learner, Setup
+from marl.mission import Mission
+from marl.planner import Plan, expected_data, fly_on, improve, next_action, plan, take_off
+from marl.settings import stream
+from radiotwin.runtime.compiled import njit
+
+LOW_TEMPERATURE = 0.005  # keeps the present plan unless another one is better
+EVERY, ITERATIONS = 5, 1500  # slots between searches, and plans that each tries
+
+
+class ReplanPolicy:
+    """Fly a plan that is improved every few slots.
+
+    Args:
+        believed: the mission in the map that the UAVs have; its data are those of the prior.
+        prior: of the belief; None: the map is taken as it is, and nothing is learnt of it.
+        linked: whether the UAVs communicate wherever they are; otherwise where they are in reach.
+        every: slots between searches.
+        iterations: plans that a search tries.
+        first_iterations: plans that the search before take-off tries.
+        seed: of the first plan.
+        rng: of the searches in flight.
+    """
+
+    def __init__(self, believed: Mission, prior: Prior | None, linked: bool, every: int,
+                 iterations: int, first_iterations: int, seed: int,
+                 rng: np.random.Generator) -> None:
+        self._mission, self._prior, self._linked = believed, prior, linked
+        self._every, self._iterations, self._rng = every, iterations, rng
+        self._value = expected_data(believed) if prior is None \
+            else Belief(prior, believed).expected_data()
+        self._first = plan(believed, first_iterations, seed, self._value)
+        self._expected = _expected_flight(believed, self._value, self._first.tour,
+                                          self._first.visits)
+
+    def start(self, mission: Mission, flights: int) -> None:
+        """See `marl.flights.Policy`; of the mission that is flown, nothing is read."""
+        self._slot = 0
+        minds = 1 if self._linked else self._mission.uavs
+        self._flights = [[_Mind(self, range(self._mission.uavs) if self._linked else [u])
+                          for u in range(minds)] for _ in range(flights)]
+        first, uavs = self._first, self._mission.uavs
+        self._tour = np.tile(first.tour, (flights, 1, 1, 1))
+        self._count = np.tile(first.visits, (flights, 1))
+        self._reached, self._hovered = np.zeros((2, flights, uavs), dtype=np.int64)
+
+    def act(self, frame: Frame) -> np.ndarray:
+        """See `marl.flights.Policy`."""
+        for flight, minds in enumerate(self._flights):
+            if frame.battery[flight].any():
+                for mind in minds:
+                    mind.look(frame, flight, self._slot)
+                if len(minds) > 1:
+                    self._meet(frame, flight)
+                if self._slot and self._slot % self._every == 0:
+                    self._search(frame, flight)
+        action = _follow(self._mission, frame, self._tour, self._count, self._reached,
+                         self._hovered)
+        self._slot += 1
+        return action
+
+    def _meet(self, frame: Frame, flight: int) -> None:
+        """Exchange what UAVs know that are in reach of each other."""
+        mission, minds = self._mission, self._flights[flight]
+        cell = frame.cell[flight].astype(float) * mission.step_m
+        for u, mind in enumerate(minds):
+            for v in range(u):
+                if not (frame.battery[flight, u] and frame.battery[flight, v]):
+                    continue
+                away_m = np.hypot(np.hypot(*(cell[u] - cell[v])),
+                                  mission.altitude_m[u] - mission.altitude_m[v])
+                snr_db = mission.uav_link_db[0] + mission.uav_link_db[1] * np.log10(
+                    max(away_m, 1.0))
+                if snr_db >= mission.threshold_db:
+                    mind.learn_from(minds[v])
+                    minds[v].learn_from(mind)
+                    for one, other in ((mind, v), (minds[v], u)):
+                        one.others[other] = (
+                            self._slot, frame.cell[flight, other].astype(np.int64),
+                            int(frame.battery[flight, other]), self._rest(flight, other))
+
+    def _rest(self, flight: int, u: int) -> tuple[np.ndarray, int]:
+        return _rest(self._tour[flight, u], self._count[flight, u], self._reached[flight, u],
+                     self._hovered[flight, u])
+
+    def _search(self, frame: Frame, flight: int) -> None:
+        cell, battery = (array[flight].astype(np.int64) for array in (frame.cell, frame.battery))
+        tours = [self._rest(flight, u) for u in range(self._mission.uavs)]
+        for u, mind in enumerate(self._flights[flight]):
+            if self._linked:
+                # The data of a device that no UAV hears does not change.
+                found = self._improved(mind, cell, battery, mind.seen, tours, -1)
+                self._take(flight, range(len(tours)), found)
+            elif battery[u]:
+                cells, batteries, believed = self._believed_of_others(mind)
+                cells[u], batteries[u], believed[u] = cell[u], battery[u], tours[u]
+                found = self._improved(mind, cells, batteries, self._left(mind), believed, u)
+                self._take(flight, [u], found)
+
+    def _believed_of_others(self, mind: "_Mind",
+                            ) -> tuple[np.ndarray, np.ndarray, list[tuple[np.ndarray, int]]]:
+        """Return cells, batteries and rest of the tours of all UAVs, as one believes them."""
+        cells, batteries, _, *passed = (array[self._slot] for array in self._expected)
+        cells, batteries = cells.copy(), batteries.copy()
+        tours = [_rest(self._first.tour[v], self._first.visits[v], passed[0][v], passed[1][v])
+                 for v in range(self._mission.uavs)]
+        for v, (slot, cell, battery, tour) in mind.others.items():
+            # Flown on since they met.
+            start = self._mission._replace(start=cell[None], battery=np.array([battery]),
+                                           steps_home=self._mission.steps_home[v:v + 1])
+            course = _expected_flight(start, self._value[v:v + 1], tour[0][None],
+                                      np.array([tour[1]]))
+            now = min(self._slot - slot, len(course[0]) - 1)
+            cells[v], batteries[v] = course[0][now, 0], course[1][now, 0]
+            tours[v] = _rest(*tour, int(course[3][now, 0]), int(course[4][now, 0]))
+        return cells, batteries, tours
+
+    def _left(self, mind: "_Mind") -> np.ndarray:
+        """Return the (K,) data that a UAV without link believes left.
+
+        The data that it saw, less the share that the first plan has taken since.
+        """
+        planned, devices = self._expected[2], np.arange(self._mission.devices)
+        before = planned[mind.seen_in, devices]
+        kept = np.divide(planned[self._slot], before, out=np.zeros(len(before)), where=before > 0)
+        return mind.seen * kept
+
+    def _improved(self, mind: "_Mind", cell: np.ndarray, battery: np.ndarray, left: np.ndarray,
+                  tours: list[tuple[np.ndarray, int]], only: int) -> Plan | None:
+        mission = self._mission._replace(start=cell, battery=battery,
+                                         data_units=np.maximum(left, 0.0).astype(float))
+        if not mission.data_units.any():
+            return None
+        value = self._value if mind.belief is None else mind.belief.expected_data()
+        return improve(mission, value, np.array([tour for tour, _ in tours]),
+                       np.array([count for _, count in tours]), self._iterations, self._rng,
+                       only=only, temperature=LOW_TEMPERATURE)
+
+    def _take(self, flight: int, uavs: Iterable[int], found: Plan | None) -> None:
+        if found is not None:
+            for u in uavs:
+                self._tour[flight, u], self._count[flight, u] = found.tour[u], found.visits[u]
+                self._reached[flight, u] = self._hovered[flight, u] = 0
+
+
+class _Mind:
+    """What one UAV knows in a flight, or UAVs with a link.
+
+    Attributes:
+        belief: of the map; None where it is taken as it is.
+        seen: (K,) data left when they were seen last; before, as thought before take-off.
+        seen_in: (K,) slot of that; 0: never.
+        others: UAV -> slot, cell, battery and rest of its tour when it was met last.
+    """
+
+    def __init__(self, policy: ReplanPolicy, uavs: Iterable[int]) -> None:
+        mission, prior = policy._mission, policy._prior
+        self._mission, self._uavs = mission, list(uavs)
+        self.belief = None if prior is None else Belief(prior, mission)
+        self.seen = mission.data_units.copy()
+        self.seen_in = np.zeros(mission.devices, dtype=np.int64)
+        self.others: dict[int, tuple[int, np.ndarray, int, tuple[np.ndarray, int]]] = {}
+        # UAV -> what it heard: slot, cell, SNR; and how much of another's it has got
+        self._readings: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {
+            u: [] for u in range(mission.uavs)}
+
+    def look(self, frame: Frame, flight: int, slot: int) -> None:
+        """Learn from what its UAVs hear in a slot."""
+        for u in self._uavs:
+            if not frame.battery[flight, u]:
+                continue
+            snr_db = frame.snr_db[flight, u]
+            heard = snr_db >= self._mission.threshold_db
+            self.seen = np.where(heard, frame.data_units[flight], self.seen)
+            self.seen_in = np.where(heard, slot, self.seen_in)
+            self._hear(u, slot, frame.cell[flight, u].astype(np.int64), snr_db.copy())
+
+    def learn_from(self, other: "_Mind") -> None:
+        """Take over what another one has heard, and seen later."""
+        later = other.seen_in > self.seen_in
+        self.seen = np.where(later, other.seen, self.seen)
+        self.seen_in = np.where(later, other.seen_in, self.seen_in)
+        for u, theirs in other._readings.items():
+            for reading in theirs[len(self._readings[u]):]:
+                self._hear(u, *reading)
+
+    def _hear(self, u: int, slot: int, cell: np.ndarray, snr_db: np.ndarray) -> None:
+        self._readings[u].append((slot, cell, snr_db))
+        if self.belief is not None:
+            self.belief.hear(u, cell, snr_db)
+
+
+class BeliefPlanner(Learner):
+    """`--algorithm belief`: plan, and plan again in flight on what is heard."""
+
+    learns = False
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        self._mission = setup.mission
+        self._prior: Prior | None = None
+
+    @override
+    def believe(self, prior: Prior | None) -> None:
+        self._prior = prior
+
+    @override
+    def prepare(self, mission: Mission,
+                on_progress: Callable[[int], None]) -> list[dict[str, float]]:
+        self._mission = mission
+        return []
+
+    @override
+    def policy(self, rng: np.random.Generator) -> Policy:
+        run = self.setup.run
+        prior = Prior.of_mission(self._mission) if self._prior is None else self._prior
+        return ReplanPolicy(self._mission, prior, True, EVERY, ITERATIONS, run.planner_iterations,
+                            run.seed, stream(run.seed, "planning", 1))
+
+
+def _rest(tour: np.ndarray, count: int, reached: int, hovered: int) -> tuple[np.ndarray, int]:
+    """Return the rest of a UAV's tour, and its number of waypoints."""
+    rest = np.zeros_like(tour)
+    rest[:len(tour) - reached] = tour[reached:]
+    if reached < count:
+        rest[0, 2] = max(rest[0, 2] - hovered, 0)
+    return rest, max(count - reached, 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _follow(mission: Mission, frame: Frame, tour: np.ndarray, count: np.ndarray,
+            reached: np.ndarray, hovered: np.ndarray) -> np.ndarray:
+    """Return the (E, U) next action of every tour, and update `reached` and `hovered`."""
+    flights, uavs = frame.battery.shape
+    action = np.empty((flights, uavs), np.int64)
+    mask = np.empty(ACTION_COUNT, np.bool_)
+    for e in range(flights):
+        for u in range(uavs):
+            row, column = np.int64(frame.cell[e, u, 0]), np.int64(frame.cell[e, u, 1])
+            action[e, u], reached[e, u], hovered[e, u] = next_action(
+                mission, u, row, column, np.int64(frame.battery[e, u]),  # type: ignore[arg-type]
+                tour[e, u], count[e, u], reached[e, u], hovered[e, u], mask)
+    return action
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _expected_flight(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray,
+                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the expected course of a plan, at the beginning of every slot.
+
+    Cells (T, U, 2), batteries (T, U), data left (T, K), waypoints passed and hovers flown at the
+    next one (T, U).
+    """
+    slots, (uavs, devices) = mission.battery.max() + 1, value.shape[:2]
+    cells = np.empty((slots, uavs, 2), np.int64)
+    batteries = np.empty((slots, uavs), np.int64)
+    left = np.empty((slots, devices))
+    reached, hovered = np.empty((slots, uavs), np.int64), np.empty((slots, uavs), np.int64)
+    flight, actions = take_off(mission, devices), np.empty((1, uavs), np.int8)
+    for slot in range(slots):
+        cells[slot], batteries[slot], left[slot] = flight.cell, flight.battery, flight.left
+        reached[slot], hovered[slot] = flight.reached, flight.hovered
+        fly_on(mission, value, tour, count, flight, actions)
+    return cells, batteries, left, reached, hovered
