@@ -26,14 +26,15 @@ _MEANS_DB, _SDS_DB = np.arange(-60.0, 120.5, 0.5), np.arange(0.0, 40.5, 0.5)
 
 
 class Prior(NamedTuple):
-    """Belief before take-off; U UAVs, K devices, N candidates of each, L altitudes.
+    """Belief before take-off; K devices, N candidates of each, L levels
+    as those of the mission.
 
     Attributes:
         snr_db: (K, N, L, ny, nx) float32 mean SNR of each candidate [dB]; -inf: never received.
         sd_db: (K, N, L, ny, nx) float32 standard deviation of its error [dB].
         weight: (K, N) probability of each candidate, of a device that transmits; sums to 1.
-        level: (U,) int64 altitude of each UAV, in L.
-        level_sd_db: (K,) standard deviation of the error of a device's level [dB].
+        level_sd_db: (K,) standard deviation of the error of a device's own level [dB].
+        common_sd_db: of the error that is common to all devices [dB].
         silent: (K,) probability that a device does not transmit.
         data_spread: of each device's data, evenly from (1 - this) to (1 + this) times the
             mission's.
@@ -43,8 +44,8 @@ class Prior(NamedTuple):
     snr_db: np.ndarray
     sd_db: np.ndarray
     weight: np.ndarray
-    level: np.ndarray
     level_sd_db: np.ndarray
+    common_sd_db: float
     silent: np.ndarray
     data_spread: float
     share: float
@@ -56,8 +57,7 @@ class Prior(NamedTuple):
         """Return the belief of UAVs that have one map alone: one candidate for each device."""
         devices = mission.devices
         return cls(mission.snr_db.swapaxes(0, 1)[:, None], mission.sigma_db.swapaxes(0, 1)[:, None],
-                   np.ones((devices, 1)), np.arange(mission.uavs),
-                   np.full(devices, float(level_sd_db)), np.full(devices, float(silent)),
+                   np.ones((devices, 1)), np.full(devices, float(level_sd_db)), 0.0, np.full(devices, float(silent)),
                    float(data_spread), float(mission.shadowing_share),
                    float(mission.shadowing_m))
 
@@ -85,9 +85,9 @@ class Belief:
     def __init__(self, prior: Prior, mission: Mission) -> None:
         self.prior, self._mission = prior, mission
         devices, candidates = prior.weight.shape
-        errors = 1 + len(prior.level)
+        errors = 1 + mission.uavs
         covariance = np.zeros((devices, candidates, errors, errors))
-        covariance[:, :, 0, 0] = prior.level_sd_db[:, None]**2
+        covariance[:, :, 0, 0] = prior.level_sd_db[:, None]**2 + prior.common_sd_db**2
         for u in range(1, errors):
             covariance[:, :, u, u] = 1.0
         with np.errstate(divide="ignore"):
@@ -107,7 +107,7 @@ class Belief:
         """
         moved_m = self._mission.step_m * float(np.hypot(*(cell - self._cell[uav])))
         kept = math.exp(-moved_m / self.prior.length_m)
-        _hear(self.prior, self._state, uav, int(cell[0]), int(cell[1]), kept,
+        _hear(self.prior, self._state, uav, int(self._mission.level[uav]), int(cell[0]), int(cell[1]), kept,
               snr_db.astype(float), float(self._mission.detection_db))
         self._heard |= np.isfinite(snr_db)
         self._cell[uav] = cell
@@ -130,9 +130,10 @@ class Belief:
     def expected_data(self) -> np.ndarray:
         """Return the data units (U, K, ny, nx) that a slot on each link is expected to bring."""
         prior = self.prior
-        value = np.zeros((len(prior.level), len(prior.weight), *prior.snr_db.shape[3:]))
-        _value(prior, self._state, self.weight, self._cell, float(self._mission.step_m),
-               self._table, value)
+        mission = self._mission
+        value = np.zeros((mission.uavs, mission.devices, *prior.snr_db.shape[3:]))
+        _value(prior, self._state, self.weight, mission.level, self._cell,
+               float(mission.step_m), self._table, value)
         value *= (1.0 - self.silent)[None, :, None, None]
         return value
 
@@ -145,11 +146,11 @@ def _expected_table(mission: Mission) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _hear(prior: Prior, state: _State, uav: int, row: int, column: int, kept: float,
+def _hear(prior: Prior, state: _State, uav: int, level: int, row: int, column: int, kept: float,
           snr_db: np.ndarray, limit_db: float) -> None:
     """Update the state with a UAV's readings (K,); `kept`: correlation since its last ones."""
     devices, candidates, errors = state.mean.shape
-    at, level, lasting = uav + 1, prior.level[uav], math.sqrt(prior.share)
+    at, lasting = uav + 1, math.sqrt(prior.share)
     gain = np.empty(errors)
     for k in range(devices):
         for i in range(candidates):
@@ -205,14 +206,14 @@ def _below(depth: float) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _value(prior: Prior, state: _State, weight: np.ndarray, cell: np.ndarray, step_m: float,
-           table: np.ndarray, value: np.ndarray) -> None:
+def _value(prior: Prior, state: _State, weight: np.ndarray, levels: np.ndarray, cell: np.ndarray,
+           step_m: float, table: np.ndarray, value: np.ndarray) -> None:
     """Add the data (U, K, ny, nx) that a slot is expected to bring, over all candidates."""
     uavs, devices, rows, columns = value.shape
     lasting = math.sqrt(prior.share)
     near = np.zeros((rows, columns))
     for u in range(uavs):
-        level, at = prior.level[u], u + 1
+        level, at = levels[u], u + 1
         for r in range(rows):
             for c in range(columns):
                 away = math.hypot(r - cell[u, 0], c - cell[u, 1]) * step_m

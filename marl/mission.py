@@ -116,8 +116,24 @@ class Known:
         return cls.of(d for d in scene.config.devices if d.role == "anchor")
 
 
-def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
-                 assignment: str = "matching") -> Mission:
+def levels_of(scene: Scene) -> np.ndarray:
+    """Return the (U,) level of the lattice that each UAV of a scene flies on."""
+    return np.array([int(np.abs(scene.lattice.z_m - uav.altitude_m).argmin())
+                     for uav in scene.config.uavs])
+
+
+def snr_offset_db(scene: Scene, radio_map: RadioMap) -> np.ndarray:
+    """Return the (K,) SNR of each device of a scene less its gain in a map [dB].
+
+    Transmit powers that the map does not know are the scene's.
+    """
+    radio, powers_dbm = scene.config.radio, radio_map.tx_power_dbm
+    return np.array([powers_dbm.get(device.device, radio.tx_power_dbm)
+                     for device in scene.config.devices]) - radio.noise_dbm
+
+
+def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: str = "matching",
+                 keep_out: np.ndarray | None = None) -> Mission:
     """Return the mission of a scene in a radio map: the truth's, or a twin's.
 
     Args:
@@ -129,6 +145,7 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
             `radiotwin.twin.shadowing`) a part of it stays for a flight.
         known: positions that the agents see.
         assignment: `matching` or `max-rate`.
+        keep_out: (nz, ny, nx) bool, where no UAV may be; None: inside buildings alone.
 
     Raises:
         BadInput: no UAV, no device, a map of another lattice or with impossible attributes, or a
@@ -136,10 +153,10 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
     """
     _check(scene, radio_map, assignment)
     config, lattice = scene.config, scene.lattice
-    levels = [int(np.abs(lattice.z_m - uav.altitude_m).argmin()) for uav in config.uavs]
+    levels, offset_db = levels_of(scene), snr_offset_db(scene, radio_map)
     used, level = np.unique(levels, return_inverse=True)
     to_snr_db = config.radio.tx_power_dbm - config.radio.noise_dbm
-    powers_dbm = radio_map.tx_power_dbm
+    keep_out = scene.blocked if keep_out is None else keep_out | scene.blocked
     shape = (len(used), len(config.devices), *lattice.shape[1:])
     MAP_VALUES.check(math.prod(shape), f"{scene.folder / 'scene.toml'}: the mission's map")
     snr_db, sigma_db = np.full(shape, -np.inf, np.float32), np.zeros(shape, np.float32)
@@ -149,14 +166,13 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
         row = radio_map.devices.index(device.device)
         gain_db = radio_map.gain_db[row, used]
         _check_values(device.device, "gain_db", gain_db, -MAX_GAIN_DB, MAX_GAIN_DB)
-        power_dbm = powers_dbm.get(device.device, config.radio.tx_power_dbm)
-        snr_db[:, k] = np.where(np.isnan(gain_db), -np.inf,
-                                gain_db + (power_dbm - config.radio.noise_dbm))
+        snr_db[:, k] = np.where(np.isnan(gain_db), -np.inf, gain_db + offset_db[k])
         if "sigma_db" in radio_map.dataset:
             own_db = radio_map.dataset["sigma_db"].values[row, used]
             _check_values(device.device, "sigma_db", own_db, 0.0, MAX_SIGMA_DB)
             sigma_db[:, k] = np.nan_to_num(own_db)
-    starts, homes = zip(*(_ends(scene, uav, at) for uav, at in zip(config.uavs, levels)))
+    starts, homes = zip(*(_ends(scene, uav, ~keep_out[at])
+                          for uav, at in zip(config.uavs, levels)))
     origin_m = np.array([lattice.x_m[0], lattice.y_m[0]])
     known_m = np.array([known.position_m.get(d.device, (np.nan, np.nan)) for d in config.devices])
     return Mission(
@@ -164,7 +180,8 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
         battery=np.array([int(uav.battery / HOVER_COST + 1e-9) for uav in config.uavs]),
         level=level.astype(np.int64),
         altitude_m=np.array([uav.altitude_m for uav in config.uavs], dtype=float),
-        data_units=np.full(len(config.devices), float(config.mission.data_units)),
+        data_units=np.array([config.mission.data_units if device.data_units is None
+                             else device.data_units for device in config.devices], dtype=float),
         known_m=known_m - origin_m, step_m=lattice.step_m,
         rate_scale=float(config.mission.rate_scale),
         threshold_db=float(config.radio.snr_threshold_db),
@@ -187,21 +204,18 @@ def _check(scene: Scene, radio_map: RadioMap, assignment: str) -> None:
             not np.allclose(radio_map.lattice.positions_m, lattice.positions_m):
         raise BadInput(f"the radio map's lattice {radio_map.gain_db.shape[1:]} (z, y, x) is not "
                        f"that of {path} {lattice.shape}; make the map for this scene")
-    if lattice.ground_m is not None:
-        raise BadInput(f'{path}: [lattice] above = "ground" lets UAVs climb with the terrain, '
-                       'which a mission does not know; give above = "datum", and altitudes above '
-                       "all hills that they fly over")
     for uav in config.uavs:
         if not 1 <= uav.battery / HOVER_COST <= MAX_HOVERS:
             raise BadInput(f"{path}: uav {uav.uav!r}: battery = {uav.battery:g}; a mission allows "
                            f"{HOVER_COST:g} to {MAX_HOVERS * HOVER_COST:g}")
     mission = config.mission
-    for name, high in (("data_units", MAX_UNITS), ("rate_scale", MAX_UNITS),
-                       ("slot_s", MAX_SLOT_S)):
-        value = getattr(mission, name)
+    given = [(f"mission.{name}", getattr(mission, name), high) for name, high in (
+        ("data_units", MAX_UNITS), ("rate_scale", MAX_UNITS), ("slot_s", MAX_SLOT_S))]
+    given += [(f"device {each.device}: data_units", each.data_units, MAX_UNITS)
+              for each in config.devices if each.data_units is not None]
+    for name, value, high in given:
         if not 1e-6 <= value <= high:
-            raise BadInput(f"{path}: mission.{name} = {value:g}; a mission allows 1e-06 to "
-                           f"{high:g}")
+            raise BadInput(f"{path}: {name} = {value:g}; a mission allows 1e-06 to {high:g}")
     attributes = radio_map.dataset.attrs
     share, length_m = (attributes.get(name, 1.0)
                        for name in ("shadowing_share", "shadowing_length_m"))
@@ -223,14 +237,14 @@ def _number(value: object) -> bool:
     return isinstance(value, int | float | np.number)
 
 
-def _ends(scene: Scene, uav: UavConfig, level: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the start cell, and the (ny, nx) moves home."""
+def _ends(scene: Scene, uav: UavConfig, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the start cell, and the (ny, nx) moves home over the cells that are allowed."""
     lattice = scene.lattice
     start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m),
                         round((x_m - lattice.x_m[0]) / lattice.step_m))
                        for x_m, y_m in ((uav.start_x_m, uav.start_y_m),
                                         (uav.terminal_x_m, uav.terminal_y_m)))
-    home = FlightGrid(~scene.blocked[level], terminal).steps_to(terminal)
+    home = FlightGrid(allowed, terminal).steps_to(terminal)
     needed = home[start] * MOVE_COST
     if needed > uav.battery:
         moves = "there is no way" if home[start] == UNREACHABLE else f"{needed:g} are needed"

@@ -45,10 +45,12 @@ class ReplanPolicy:
                  rng: np.random.Generator) -> None:
         self._mission, self._prior, self._linked = believed, prior, linked
         self._every, self._iterations, self._rng = every, iterations, rng
-        self._value = expected_data(believed) if prior is None \
+        # Each UAV has a map of its own, by what it has heard.
+        self._value = expected_data(believed)[believed.level] if prior is None \
             else Belief(prior, believed).expected_data()
-        self._first = plan(believed, first_iterations, seed, self._value)
-        self._expected = _expected_flight(believed, self._value, self._first.tour,
+        self._planned = believed._replace(level=np.arange(believed.uavs))
+        self._first = plan(self._planned, first_iterations, seed, self._value)
+        self._expected = _expected_flight(self._planned, self._value, self._first.tour,
                                           self._first.visits)
 
     def start(self, mission: Mission, flights: int) -> None:
@@ -124,7 +126,8 @@ class ReplanPolicy:
                  for v in range(self._mission.uavs)]
         for v, (slot, cell, battery, tour) in mind.others.items():
             # Flown on since they met.
-            start = self._mission._replace(start=cell[None], battery=np.array([battery]),
+            start = self._planned._replace(start=cell[None], battery=np.array([battery]),
+                                           level=np.zeros(1, dtype=np.int64),
                                            steps_home=self._mission.steps_home[v:v + 1])
             course = _expected_flight(start, self._value[v:v + 1], tour[0][None],
                                       np.array([tour[1]]))
@@ -145,7 +148,7 @@ class ReplanPolicy:
 
     def _improved(self, mind: "_Mind", cell: np.ndarray, battery: np.ndarray, left: np.ndarray,
                   tours: list[tuple[np.ndarray, int]], only: int) -> Plan | None:
-        mission = self._mission._replace(start=cell, battery=battery,
+        mission = self._planned._replace(start=cell, battery=battery,
                                          data_units=np.maximum(left, 0.0).astype(float))
         if not mission.data_units.any():
             return None
@@ -269,7 +272,7 @@ def _expected_flight(mission: Mission, value: np.ndarray, tour: np.ndarray, coun
     Cells (T, U, 2), batteries (T, U), data left (T, K), waypoints passed and hovers flown at the
     next one (T, U).
     """
-    slots, (uavs, devices) = mission.battery.max() + 1, value.shape[:2]
+    slots, uavs, devices = mission.battery.max() + 1, len(tour), value.shape[1]
     cells = np.empty((slots, uavs, 2), np.int64)
     batteries = np.empty((slots, uavs), np.int64)
     left = np.empty((slots, devices))

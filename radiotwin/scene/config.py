@@ -130,6 +130,8 @@ class DeviceConfig(Table):
     azimuth_deg: Number | None = Field(None, ge=-360, le=360,
                                        description="clockwise from north [0]")
     tilt_deg: Number | None = Field(None, ge=-90, le=90, description="upwards is positive [0]")
+    data_units: Number | None = Field(None, gt=0, le=1e15, description="data waiting at it [that "
+                                                                       "of the mission]")
 
     @model_validator(mode="after")
     def _one_height(self) -> "DeviceConfig":
@@ -161,7 +163,8 @@ class UavConfig(Table):
 class MissionConfig(Table):
     """The data-harvesting mission of Chen et al. 2023."""
 
-    data_units: Number = Field(16_000.0, gt=0, le=1e15, description="data waiting at each device")
+    data_units: Number = Field(16_000.0, gt=0, le=1e15, description="data waiting at each device that "
+                                                            "declares none")
     rate_scale: Number = Field(100.0, gt=0, le=1e15, description="data units per slot and bit/s/Hz")
     slot_s: Number = Field(2.0, gt=0, le=86_400, description="duration of one move or hover")
 

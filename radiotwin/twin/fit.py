@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import asdict
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_links
 from radiotwin.twin.fit_paths import fit_along_paths, fit_over_wrong_map
 from radiotwin.twin.localize import LocalizeSettings
+from radiotwin.twin.shadowing import MAP_ERRORS, MapErrors
 from radiotwin.twin.twin import Twin
 
 # Of more links, so many are fitted: what a model can use. Of 310,000 simulated links, whose errors
@@ -90,6 +92,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         settings = LocalizeSettings(allow_indoor=allow_indoor)
         twin = fit_links(links, scene, channel, seed, start, settings)
     twin.provenance.update(flights=flights, seed=seed)
+    if not along_paths:  # which would be followed once more
+        twin.provenance[MAP_ERRORS] = asdict(MapErrors.of(twin, links, seed))
     return twin
 
 

@@ -1,4 +1,6 @@
-"""How long the errors of a twin's map last: nearby, and over a flight, they are much the same.
+"""The errors of a twin's map: how long they last, and how far devices' levels differ.
+
+Nearby, and over a flight, errors are much the same.
 
 `sigma_db` of a map is the size of its errors. Drawn anew in every slot of a simulated flight, it
 would pay to hover anywhere and wait for a lucky slot, which no real world rewards. So the share of
@@ -6,17 +8,23 @@ the variance that stays, and the distance over which it does, are estimated from
 the measurements and written into the map's attributes.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.distance import pdist, squareform
 
 from radiotwin.inference.gaussian import standardised
+from radiotwin.links.links import Links
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws.kriging import ResidualField
 from radiotwin.twin.twin import Twin
 
 MAX_LINKS = 300  # of a device, in the estimate
+MAP_ERRORS = "map_errors"  # in the provenance of a twin
+MIN_LINKS = 5  # of a device, to tell its level
+LEVEL_SD_DB, PRIOR_DEVICES = 1.5, 2.0  # of devices' levels [dB], and what that counts for
 MIN_SHARE = 0.05  # that is worth drawing: a small share takes as long to draw as a large one
 
 
@@ -31,6 +39,69 @@ class Shadowing(NamedTuple):
 
     share: float = 0.0
     length_m: float = 50.0
+
+
+@dataclass(frozen=True)
+class MapErrors:
+    """What is to be expected of a twin's errors, besides their standard deviation at a link.
+
+    Attributes:
+        share: of their variance that stays for a flight, a device's own level left out.
+        length_m: distance over which the correlation of that part falls to 1/e [m].
+        level_sd_db: standard deviation of a device's own level [dB].
+        devices: number of devices that tell it.
+    """
+
+    share: float = 0.5
+    length_m: float = 50.0
+    level_sd_db: float = LEVEL_SD_DB
+    devices: int = 0
+
+    @classmethod
+    def of(cls, twin: Twin, links: Links, seed: int) -> "MapErrors":
+        """Estimate them from the residuals of a twin.
+
+        Args:
+            twin: as it was fitted.
+            links: n measured links, with the twin's devices.
+            seed: of the selection of links.
+        """
+        rng = np.random.default_rng(seed)
+        rows = []
+        for device in np.flatnonzero([each.located for each in twin.devices]):
+            mine = np.flatnonzero((links.device == device) & np.isfinite(links.level_db))
+            if len(mine) >= MIN_LINKS:
+                rows.append(rng.choice(mine, min(MAX_LINKS, len(mine)), replace=False))
+        if not rows:
+            return cls()
+        some = links.select(np.sort(np.concatenate(rows))).located(twin.device_m)
+        predicted = twin.predict(some)
+        residual_db, precision = some.level_db - predicted.mean_db, 1.0 / predicted.sd_db**2
+        _, index = np.unique(some.device, return_inverse=True)
+        level_db = np.bincount(index, residual_db * precision) / np.bincount(index, precision)
+        field = twin.residual_field or ResidualField().fit(
+            some.device, some.receiver_m, (residual_db - level_db[index]) / predicted.sd_db, seed)
+        # Of a device's level, what its map's errors would bring anyway is left out.
+        chance = [_mean_variance(some.receiver_m[index == k], precision[index == k], field)
+                  for k in range(len(level_db))]
+        off = float(((level_db - np.median(level_db))**2 - chance).sum())
+        variance = (max(off, 0.0) + PRIOR_DEVICES * LEVEL_SD_DB**2) / (
+            len(level_db) - 1 + PRIOR_DEVICES)
+        return cls(float(field.share), float(field.length_m), float(np.sqrt(variance)),
+                   len(level_db))
+
+    @classmethod
+    def kept(cls, twin: Twin) -> "MapErrors":
+        """Return those that a twin was stored with; what is usual where it has none."""
+        return cls(**twin.provenance.get(MAP_ERRORS, {}))
+
+
+def _mean_variance(receiver_m: np.ndarray, precision: np.ndarray, field: ResidualField) -> float:
+    """Return the variance of a device's weighted mean residual, by its map's errors [dB²]."""
+    scaled = np.sqrt(precision)
+    rho = field.share * np.exp(-squareform(pdist(receiver_m)) / field.length_m)
+    np.fill_diagonal(rho, 1.0)
+    return float(scaled @ rho @ scaled / precision.sum()**2)
 
 
 def with_shadowing(radio_map: RadioMap, twin: Twin, measurements: Measurements, limit_db: float,

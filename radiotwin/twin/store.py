@@ -18,7 +18,7 @@ from radiotwin.effects.params import Seconds
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
 from radiotwin.io.files import require_folder
-from radiotwin.io.forms import Origin, Real
+from radiotwin.io.forms import MAX_POSITION_M, Origin, Real
 from radiotwin.io.inputs import parse_json
 from radiotwin.links.cell_limits import (
     FREQUENCIES_HZ,
@@ -131,6 +131,15 @@ class ChannelRecord(_Strict):
     file: Literal["channel.safetensors"]
 
 
+class _MapErrors(_Strict):
+    """Content of `MapErrors`."""
+
+    share: Annotated[float, Field(ge=0, le=1)]
+    length_m: Annotated[float, Field(gt=0, le=MAX_POSITION_M)]
+    level_sd_db: Annotated[float, Field(ge=0, le=100)]
+    devices: Annotated[int, Field(ge=0)]
+
+
 class _Provenance(BaseModel):
     """Fields of the provenance that are read; the others are only kept."""
 
@@ -140,6 +149,7 @@ class _Provenance(BaseModel):
     scene_hash: str | None = None
     origin: Origin | None = None
     receiver_heights_m: Annotated[list[Real], Field(min_length=2, max_length=2)] | None = None
+    map_errors: _MapErrors | None = None
 
 
 class TwinRecord(_Strict):
