@@ -19,6 +19,9 @@ from marl.planner import expected_data
 from radiotwin.runtime.compiled import njit
 
 NOISE_DB = 1.0  # of a reading, besides the error of the map
+# Power of the likelihood of a position: what the map has wrong is wrong in many slots (Holmes and
+# Walker 2017, Biometrika 104).
+TEMPER = 0.3
 TAIL = 4.0  # degrees of freedom of the readings' distribution: a few are far off
 NEGLIGIBLE = 1e-3  # probability of a candidate that no plan depends on
 # Of the table of the data expected in a slot: mean SNR and its standard deviation [dB].
@@ -26,8 +29,7 @@ _MEANS_DB, _SDS_DB = np.arange(-60.0, 120.5, 0.5), np.arange(0.0, 40.5, 0.5)
 
 
 class Prior(NamedTuple):
-    """Belief before take-off; K devices, N candidates of each, L levels
-    as those of the mission.
+    """Belief before take-off; K devices, N candidates of each, the L levels of the mission.
 
     Attributes:
         snr_db: (K, N, L, ny, nx) float32 mean SNR of each candidate [dB]; -inf: never received.
@@ -57,9 +59,9 @@ class Prior(NamedTuple):
         """Return the belief of UAVs that have one map alone: one candidate for each device."""
         devices = mission.devices
         return cls(mission.snr_db.swapaxes(0, 1)[:, None], mission.sigma_db.swapaxes(0, 1)[:, None],
-                   np.ones((devices, 1)), np.full(devices, float(level_sd_db)), 0.0, np.full(devices, float(silent)),
-                   float(data_spread), float(mission.shadowing_share),
-                   float(mission.shadowing_m))
+                   np.ones((devices, 1)), np.full(devices, float(level_sd_db)), 0.0,
+                   np.full(devices, float(silent)), float(data_spread),
+                   float(mission.shadowing_share), float(mission.shadowing_m))
 
 
 class _State(NamedTuple):
@@ -107,8 +109,8 @@ class Belief:
         """
         moved_m = self._mission.step_m * float(np.hypot(*(cell - self._cell[uav])))
         kept = math.exp(-moved_m / self.prior.length_m)
-        _hear(self.prior, self._state, uav, int(self._mission.level[uav]), int(cell[0]), int(cell[1]), kept,
-              snr_db.astype(float), float(self._mission.detection_db))
+        _hear(self.prior, self._state, uav, int(self._mission.level[uav]), int(cell[0]),
+              int(cell[1]), kept, snr_db.astype(float), float(self._mission.detection_db))
         self._heard |= np.isfinite(snr_db)
         self._cell[uav] = cell
 
@@ -128,13 +130,15 @@ class Belief:
         return weight / weight.sum(axis=1, keepdims=True)
 
     def expected_data(self) -> np.ndarray:
-        """Return the data units (U, K, ny, nx) that a slot on each link is expected to bring."""
+        """Return the data units (U, K, ny, nx) that a slot on each link is expected to bring.
+
+        Of a device that transmits.
+        """
         prior = self.prior
         mission = self._mission
         value = np.zeros((mission.uavs, mission.devices, *prior.snr_db.shape[3:]))
         _value(prior, self._state, self.weight, mission.level, self._cell,
                float(mission.step_m), self._table, value)
-        value *= (1.0 - self.silent)[None, :, None, None]
         return value
 
 
@@ -177,14 +181,14 @@ def _hear(prior: Prior, state: _State, uav: int, level: int, row: int, column: i
             if snr_db[k] == -np.inf:  # below the limit
                 depth = (limit_db - expected_db) / math.sqrt(spread)
                 log_tail, hazard = _below(depth)
-                state.log_weight[k, i] += log_tail
+                state.log_weight[k, i] += TEMPER * log_tail
                 shift = -hazard / math.sqrt(spread)
                 shrink = hazard * (hazard + depth) / spread
             else:
                 off_db = snr_db[k] - expected_db
                 square = off_db * off_db / spread
-                state.log_weight[k, i] -= 0.5 * (math.log(spread) + (TAIL + 1.0) * math.log1p(
-                    square / TAIL))
+                state.log_weight[k, i] -= 0.5 * TEMPER * (
+                    math.log(spread) + (TAIL + 1.0) * math.log1p(square / TAIL))
                 # A reading that is far off says less of the errors.
                 spread *= max((TAIL + square) / (TAIL + 1.0), 1.0)
                 shift, shrink = off_db / spread, 1.0 / spread

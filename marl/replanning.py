@@ -46,9 +46,12 @@ class ReplanPolicy:
         self._mission, self._prior, self._linked = believed, prior, linked
         self._every, self._iterations, self._rng = every, iterations, rng
         # Each UAV has a map of its own, by what it has heard.
-        self._value = expected_data(believed)[believed.level] if prior is None \
-            else Belief(prior, believed).expected_data()
         self._planned = believed._replace(level=np.arange(believed.uavs))
+        if prior is None:
+            self._value = expected_data(believed)[believed.level]
+        else:
+            data_units, self._value = weighted(Belief(prior, believed), believed.data_units)
+            self._planned = self._planned._replace(data_units=data_units)
         self._first = plan(self._planned, first_iterations, seed, self._value)
         self._expected = _expected_flight(self._planned, self._value, self._first.tour,
                                           self._first.visits)
@@ -148,11 +151,12 @@ class ReplanPolicy:
 
     def _improved(self, mind: "_Mind", cell: np.ndarray, battery: np.ndarray, left: np.ndarray,
                   tours: list[tuple[np.ndarray, int]], only: int) -> Plan | None:
-        mission = self._planned._replace(start=cell, battery=battery,
-                                         data_units=np.maximum(left, 0.0).astype(float))
+        data_units, value = np.maximum(left, 0.0).astype(float), self._value
+        if mind.belief is not None:
+            data_units, value = weighted(mind.belief, data_units)
+        mission = self._planned._replace(start=cell, battery=battery, data_units=data_units)
         if not mission.data_units.any():
             return None
-        value = self._value if mind.belief is None else mind.belief.expected_data()
         return improve(mission, value, np.array([tour for tour, _ in tours]),
                        np.array([count for _, count in tours]), self._iterations, self._rng,
                        only=only, temperature=LOW_TEMPERATURE)
@@ -237,6 +241,16 @@ class BeliefPlanner(Learner):
         prior = Prior.of_mission(self._mission) if self._prior is None else self._prior
         return ReplanPolicy(self._mission, prior, True, EVERY, ITERATIONS, run.planner_iterations,
                             run.seed, stream(run.seed, "planning", 1))
+
+
+def weighted(belief: Belief, data_units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return data (K,) and data expected of a slot (U, K, ny, nx) as a plan is to count them.
+
+    Both by the probability that the device transmits: it takes as long as if it did, and is worth
+    so much.
+    """
+    transmits = 1.0 - belief.silent
+    return data_units * transmits, belief.expected_data() * transmits[None, :, None, None]
 
 
 def _rest(tour: np.ndarray, count: int, reached: int, hovered: int) -> tuple[np.ndarray, int]:

@@ -19,13 +19,13 @@ from marl.heuristics import HeuristicPolicy
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy, plan
 from marl.qmix import QNetworks
+from marl.replanning import ReplanPolicy
 from marl.settings import LearnerSettings, stream
 from marl.training import AgentPolicy, Trainer
 from radiotwin import Scene, segmented_truth
 from radiotwin.runtime.console import progress
 from studies import tables
 from studies.disturbed import Disturbance, DisturbedEnvironment
-from marl.replanning import ReplanPolicy
 from studies.runner import Study
 from studies.twins import LONG
 

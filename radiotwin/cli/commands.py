@@ -8,7 +8,7 @@ from collections.abc import Callable
 import typer
 
 from radiotwin import __version__
-from radiotwin.cli import coverage, importing, model, scenes, tools
+from radiotwin.cli import coverage, importing, model, planning, scenes, tools
 from radiotwin.runtime.command import add_output_options
 from radiotwin.runtime.console import show_warnings_plainly
 
@@ -24,8 +24,8 @@ COMMANDS: dict[str, Callable[..., None]] = {  # in the order of the help text
     "export": scenes.export, "trace": scenes.trace, "gains": scenes.gains, "paths": scenes.paths,
     "survey": scenes.survey, "import": importing.import_, "fit": model.fit, "map": model.map_,
     "compare": model.compare, "coverage": coverage.coverage, "close-loop": model.close_loop,
-    "locate": model.locate, "report": tools.report, "demo": tools.demo, "doctor": tools.doctor,
-    "cache": tools.cache}
+    "locate": model.locate, "plan": planning.plan, "report": tools.report,
+    "demo": tools.demo, "doctor": tools.doctor, "cache": tools.cache}
 for name, command in COMMANDS.items():
     app.command(name)(command)
 add_output_options(app)

@@ -163,8 +163,8 @@ class UavConfig(Table):
 class MissionConfig(Table):
     """The data-harvesting mission of Chen et al. 2023."""
 
-    data_units: Number = Field(16_000.0, gt=0, le=1e15, description="data waiting at each device that "
-                                                            "declares none")
+    data_units: Number = Field(16_000.0, gt=0, le=1e15, description="data at each device that "
+                                                                     "declares none")
     rate_scale: Number = Field(100.0, gt=0, le=1e15, description="data units per slot and bit/s/Hz")
     slot_s: Number = Field(2.0, gt=0, le=86_400, description="duration of one move or hover")
 

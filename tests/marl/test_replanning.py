@@ -6,8 +6,8 @@ import pytest
 from marl.environment import Environment
 from marl.flights import fly
 from marl.planner import PlanPolicy, plan
-from studies.disturbed import Disturbance, DisturbedEnvironment
 from marl.replanning import ReplanPolicy
+from studies.disturbed import Disturbance, DisturbedEnvironment
 
 
 def policy(mission, linked, every=4, iterations=200):
@@ -51,10 +51,12 @@ def test_data_seen_in_flight_improve_the_plan(tiny):
 
 def test_without_a_link_a_uav_does_not_know_what_another_one_sees(tiny):
     mission = tiny(4, uavs=2, devices=2, snr_db=np.array([[[[30.0]], [[-np.inf]]], [[[-np.inf]], [[30.0]]]]))
+    mission = mission._replace(uav_link_db=np.array([-1000.0, 0.0]))  # out of reach of each other
     for linked, known in ((True, [[7, 9], [7, 9]]), (False, [[7, 500], [500, 9]])):
         flier = policy(mission._replace(data_units=np.array([500.0, 500.0])), linked)
-        flier.start(flier._mission, 1)
+        flier.start(mission, 1)
         frame = Environment(mission, 1, np.random.default_rng(0)).reset()
         frame.data_units[:] = [7, 9]
-        flier._look(frame)
-        np.testing.assert_array_equal(flier._seen[0], known)
+        flier.act(frame)
+        minds = flier._flights[0]
+        np.testing.assert_array_equal([minds[min(u, len(minds) - 1)].seen for u in range(2)], known)

@@ -1,0 +1,186 @@
+"""From a twin to planned flights: who flies, over which devices, where, and what that brings."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from shapely.geometry.base import BaseGeometry
+
+from marl.airspace import keep_out
+from marl.belief import Prior
+from marl.mission import MAX_UNITS, Known, Mission, make_mission
+from marl.promise import TRIED_PLANS, Promise, Size, bases, promise, sizes
+from marl.settings import stream
+from marl.worlds import twin_prior
+from radiotwin.errors import BadInput
+from radiotwin.io.cells import as_numbers, as_text, read_cells, refuse
+from radiotwin.scene import Scene
+from radiotwin.scene.config import ANTENNA_HEIGHT_M, DeviceConfig, UavConfig
+from radiotwin.twin import Twin
+
+BATTERIES = (0.5, 0.75, 1.0, 1.5, 2.0)  # that a sizing tries, times that of the mission
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanSettings:
+    """What is asked of a plan.
+
+    Attributes:
+        uavs: number of UAVs, copies of the scene's in turn; None: those of the scene.
+        battery: of each, in moves; None: that of the scene.
+        base_m: (x, y) where all start and end [m]; None: as the scene has it.
+        data: table with columns `device` and `data_units`; None: that of the scene.
+        silent: probability that a device does not transmit.
+        data_spread: data are evenly from (1 - this) to (1 + this) times what is given.
+        areas: no-fly areas in the scene's frame.
+        clearance_m: distance that UAVs keep from buildings [m].
+        sizes: whether to find how many UAVs and which battery collect the wanted share.
+        wanted: share of the data.
+        worlds: that a plan is flown in.
+        iterations: plans that a search tries.
+        seed: of all random numbers.
+    """
+
+    uavs: int | None = None
+    battery: float | None = None
+    base_m: tuple[float, float] | None = None
+    data: Path | None = None
+    silent: float = 0.0
+    data_spread: float = 0.0
+    areas: Sequence[BaseGeometry] = ()
+    clearance_m: float = 5.0
+    sizes: bool = False
+    wanted: float = 0.95
+    worlds: int = 200
+    iterations: int = 20_000
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedFlights:
+    """A plan, and what it was made of.
+
+    Attributes:
+        scene: with the UAVs that fly, and the devices where the twin has them.
+        mission: in the twin.
+        prior: what the twin believes.
+        known: positions of the devices.
+        promised: the plan, and what it collects.
+        sizes: of the sizing; empty where it was not asked for.
+    """
+
+    scene: Scene
+    mission: Mission
+    prior: Prior
+    known: Known
+    promised: Promise
+    sizes: list[Size]
+
+
+def plan_flights(twin: Twin, scene: Scene, settings: PlanSettings,
+                 on_progress: Callable[..., None] = lambda *_: None) -> PlannedFlights:
+    """Plan flights over a twin's map.
+
+    Args:
+        twin: its map, its devices and its errors.
+        scene: the city and the lattice; its UAVs, unless the settings have a base.
+        settings: what is asked.
+        on_progress: called with the per cent of the work done since, and what is done now.
+
+    Raises:
+        BadInput: no UAV, a battery that reaches nowhere, a base that is blocked, a table of data
+            that cannot be used, or a twin of another map.
+    """
+    flown = planned_scene(scene, twin, settings)
+    on_progress(0, "predicting the map")
+    radio_map, known = twin.radio_map(scene), Known.of(twin.devices)
+    mission = make_mission(flown, radio_map, known,
+                           keep_out=keep_out(flown, settings.areas, settings.clearance_m))
+    on_progress(0, "drawing worlds")
+    prior = twin_prior(twin, flown, radio_map, mission, stream(settings.seed, "choice"),
+                       settings.silent, settings.data_spread)
+    mission = mission._replace(shadowing_share=prior.share, shadowing_m=prior.length_m)
+    names = [uav.uav for uav in flown.config.uavs]
+    counts = range(1, 2 * mission.uavs + 1) if settings.sizes else range(0)
+    missions = 1 + len(bases(mission, names)) * len(counts) * len(BATTERIES)
+
+    def search(count: int) -> None:
+        on_progress(100 * count / (missions * TRIED_PLANS), "planning")
+    search(0)
+    made = settings.worlds, settings.iterations, settings.seed, search
+    promised = promise(prior, mission, *made)
+    usual = max(uav.battery for uav in flown.config.uavs)
+    table = sizes(prior, mission, names, counts, [factor * usual for factor in BATTERIES],
+                  settings.wanted, *made)
+    return PlannedFlights(flown, mission, prior, known, promised, table)
+
+
+def planned_scene(scene: Scene, twin: Twin, settings: PlanSettings) -> Scene:
+    """Return a scene with the devices of a twin where it has them, and the UAVs that fly.
+
+    Raises:
+        BadInput: no UAV, or a table of data that cannot be used.
+    """
+    declared = {device.device: device for device in scene.config.devices}
+    data = {} if settings.data is None else _read_data(settings.data,
+                                                       [each.device for each in twin.devices])
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    devices = []
+    for each in twin.devices:
+        known = bool(np.isfinite([each.x_m, each.y_m]).all())
+        given = declared.get(each.device)
+        # Not checked again: a device may be outside the extent, or nowhere.
+        devices.append(DeviceConfig.model_construct(
+            device=each.device, x_m=each.x_m if known else (x_min + x_max) / 2,
+            y_m=each.y_m if known else (y_min + y_max) / 2,
+            z_m=each.z_m if np.isfinite(each.z_m) else ANTENNA_HEIGHT_M, role=each.role,
+            data_units=data.get(each.device, None if given is None else given.data_units)))
+    config = scene.config.model_copy(update={"devices": devices, "uavs": _uavs(scene, settings)})
+    return replace(scene, config=config)
+
+
+def _read_data(path: Path, names: list[str]) -> dict[str, float]:
+    """Return the data units of a table's devices, which are all of the twin's."""
+    cells = read_cells(path, ("device", "data_units"), ())
+    device, text = (as_text(cells[name]).fillna("").str.strip()
+                    for name in ("device", "data_units"))
+    units = as_numbers(text)
+    refuse(path, "device", device, ~device.isin(names), "is no device of the twin, which has "
+           f"{', '.join(names[:10])}{', …' * (len(names) > 10)}; correct the name or leave the row "
+           "out")
+    refuse(path, "device", device, device.duplicated(), "is listed twice; leave one row out")
+    refuse(path, "data_units", text, ~((units > 0) & (units <= MAX_UNITS)),
+           f"is not a number above 0, up to {MAX_UNITS:g}; give the data that wait at the device")
+    return dict(zip(device, units.tolist(), strict=True))
+
+
+def _uavs(scene: Scene, settings: PlanSettings) -> list[UavConfig]:
+    """Return the UAVs that fly: the scene's or copies of them, with battery and base as given."""
+    own, lattice = scene.config.uavs, scene.lattice
+    path = scene.folder / "scene.toml"
+    changes: dict[str, float] = {}
+    if settings.battery is not None:
+        changes["battery"] = settings.battery
+    if settings.base_m is not None:
+        x_m, y_m = (float(axis[np.abs(axis - at).argmin()])
+                    for axis, at in zip((lattice.x_m, lattice.y_m), settings.base_m, strict=True))
+        if max(abs(x_m - settings.base_m[0]), abs(y_m - settings.base_m[1])) > lattice.step_m:
+            raise BadInput(f"--base {settings.base_m[0]:g},{settings.base_m[1]:g} is not over the "
+                           f"lattice of {path} (x {lattice.x_m[0]:g} to {lattice.x_m[-1]:g} m, y "
+                           f"{lattice.y_m[0]:g} to {lattice.y_m[-1]:g} m); give a place in it")
+        changes |= {"start_x_m": x_m, "start_y_m": y_m, "terminal_x_m": x_m, "terminal_y_m": y_m}
+    if not own:
+        if settings.base_m is None or settings.battery is None:
+            raise BadInput(f"{path} has no [[uavs]], so it is not known who flies; add them, or "
+                           "give --base X,Y, --battery MOVES and --uavs N")
+        own = [UavConfig.model_construct(uav=f"uav{number}", altitude_m=float(lattice.z_m[
+            number % len(lattice.z_m)]), battery=0.0, antenna=None)
+            for number in range(settings.uavs or 1)]
+    count = settings.uavs or len(own)
+    found = []
+    for number in range(count):
+        copy, lap = own[number % len(own)], number // len(own)
+        name = copy.uav if not lap else f"{copy.uav}-{lap + 1}"
+        found.append(copy.model_copy(update=changes | {"uav": name}))
+    return found

@@ -1,0 +1,189 @@
+"""A plan with a promise: the share of the data that it will collect, and how sure that is.
+
+The plan is searched on what the twin expects, and flown in worlds that the twin holds possible
+(`marl.worlds`), drawn apart from those that chose it. The sizing asks how many UAVs with which
+battery, and from which base, collect a wanted share in a wanted share of the worlds.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from marl.belief import Belief, Prior
+from marl.flights import evaluate
+from marl.mission import Mission
+from marl.planner import Plan, PlanPolicy, plan
+from marl.replanning import weighted
+from marl.settings import stream
+from marl.worlds import WorldSource
+
+QUANTILES = (0.1, 0.5, 0.9)
+TRIED_PLANS, CHOOSING_WORLDS = 3, 20  # of each mission, the plan that collects most in so many
+SCHEMA = "radiotwin.plan/1"
+
+
+@dataclass(frozen=True, eq=False)
+class Promise:
+    """What a plan collects in worlds that the twin holds possible.
+
+    Attributes:
+        plan: as it is flown.
+        share: (W,) of the data waiting at devices that transmit, in each world.
+        by_device: (W, K) the same of each device; NaN where it does not transmit.
+    """
+
+    plan: Plan
+    share: np.ndarray
+    by_device: np.ndarray
+
+    @property
+    def quantiles(self) -> dict[str, float]:
+        """P10, P50 and P90 of the share: nine, five and one in ten worlds have more."""
+        return _quantiles(self.share)
+
+    def chance(self, wanted: float) -> float:
+        """Return the share of the worlds in which at least a wanted share is collected."""
+        return float((self.share >= wanted).mean())
+
+    def record(self, names: Iterable[str], silent: np.ndarray) -> dict[str, Any]:
+        """Return what `plan.json` says of the share, of all data and of each device."""
+        devices = [{"device": name, "silent": float(round(s, 3)),
+                    "share": _quantiles(each[np.isfinite(each)])}
+                   for name, each, s in zip(names, self.by_device.T, silent, strict=True)]
+        return {"schema": SCHEMA, "share": self.quantiles, "worlds": len(self.share),
+                "devices": devices}
+
+
+def promise(prior: Prior, mission: Mission, worlds: int, iterations: int, seed: int,
+            on_progress: Callable[[int], None] = lambda _: None) -> Promise:
+    """Search a plan, and fly it in worlds.
+
+    Args:
+        prior: what the twin believes.
+        mission: in the twin; its UAVs are those that fly.
+        worlds: to judge the plan.
+        iterations: plans tried in a search.
+        seed: of plans and worlds.
+        on_progress: called with the number of searches done since the last call.
+    """
+    data_units, value = weighted(Belief(prior, mission), mission.data_units)
+    planned = mission._replace(level=np.arange(mission.uavs), data_units=data_units)
+    source = WorldSource(prior, mission)
+    best: tuple[float, Plan] | None = None
+    trials = [source.draw(stream(seed, "choice", number)) for number in range(CHOOSING_WORLDS)]
+    for number in range(TRIED_PLANS):
+        found = plan(planned, iterations, seed + number, value)
+        mean = float(np.mean([_flown(found, *world, stream(seed, "choice", number))[0]
+                              for number, world in enumerate(trials)]))
+        if best is None or mean > best[0]:
+            best = mean, found
+        on_progress(1)
+    assert best is not None
+    rngs = [stream(seed, "twin evaluation", number) for number in range(worlds)]
+    flown = [_flown(best[1], *source.draw(rng), rng) for rng in rngs]
+    return Promise(best[1], np.array([share for share, _ in flown]),
+                   np.array([each for _, each in flown]))
+
+
+def _flown(found: Plan, real: Mission, transmits: np.ndarray,
+           rng: np.random.Generator) -> tuple[float, np.ndarray]:
+    """Return the share of the data that a plan collects in a world, and of each device (K,)."""
+    flights = evaluate(real, PlanPolicy(found.actions), 1, rng)
+    served, taken = flights.frames.assigned[0], np.zeros(real.devices)
+    np.add.at(taken, served[served >= 0], flights.collected[0][served >= 0])
+    with np.errstate(invalid="ignore"):
+        by_device = np.where(transmits, taken / real.data_units, np.nan)
+    total = float(real.data_units.sum())
+    return (float(taken.sum()) / total if total else 1.0), by_device
+
+
+def _quantiles(share: np.ndarray) -> dict[str, float]:
+    values = np.quantile(share, QUANTILES) if len(share) else np.full(3, np.nan)
+    return {f"p{100 * q:.0f}": float(round(value, 4)) for q, value in zip(QUANTILES, values,
+                                                                          strict=True)}
+
+
+@dataclass(frozen=True)
+class Size:
+    """One way to equip a mission, and what is promised of it.
+
+    Attributes:
+        uavs: number of UAVs.
+        battery: of each, in battery units (a move costs 1).
+        base: name of the base, or `all`.
+        p10, p50, p90: of the share collected.
+        chance: share of the worlds in which the wanted share is collected.
+    """
+
+    uavs: int
+    battery: float
+    base: str
+    p10: float
+    p50: float
+    p90: float
+    chance: float
+
+
+def sized(mission: Mission, uavs: Iterable[int], battery: float) -> Mission:
+    """Return a mission with other UAVs: copies of some of its own, with another battery.
+
+    Args:
+        mission: whose UAVs are copied.
+        uavs: numbers of those that are copied, one for each that flies.
+        battery: of each, in battery units.
+    """
+    rows = np.array(list(uavs))
+    return mission._replace(
+        steps_home=mission.steps_home[rows], start=mission.start[rows],
+        battery=np.full(len(rows), int(2 * battery)), level=mission.level[rows],
+        altitude_m=mission.altitude_m[rows])
+
+
+def bases(mission: Mission, names: list[str]) -> dict[str, list[int]]:
+    """Return the bases of a mission: name of their first UAV -> UAVs that start and end there.
+
+    Of several bases, `all` uses them in turn.
+    """
+    found: dict[tuple, list[int]] = {}
+    for u in range(mission.uavs):
+        home = np.argwhere(mission.steps_home[u] == 0)
+        found.setdefault((*mission.start[u].tolist(), *home.ravel().tolist()), []).append(u)
+    named = {names[group[0]]: group for group in found.values()}
+    if len(named) > 1:
+        longest = max(len(group) for group in named.values())
+        turns = [group[number % len(group)] for number in range(longest)
+                 for group in named.values()]
+        named["all"] = turns
+    return named
+
+
+def sizes(prior: Prior, mission: Mission, names: list[str], counts: Iterable[int],
+          batteries: Iterable[float], wanted: float, worlds: int, iterations: int, seed: int,
+          on_progress: Callable[[int], None] = lambda _: None) -> list[Size]:
+    """Return what is promised for numbers of UAVs, batteries and bases.
+
+    Batteries that do not reach from a base's start to its end are left out. Other arguments are
+    those of `promise`; `names` are those of the mission's UAVs.
+    """
+    rows, counts, batteries = [], list(counts), list(batteries)
+    for base, group in bases(mission, names).items():
+        for count in counts:
+            chosen = [group[number % len(group)] for number in range(count)]
+            needed = max(int(mission.steps_home[u][tuple(mission.start[u])]) for u in chosen)
+            for battery in batteries:
+                if battery < needed:
+                    on_progress(TRIED_PLANS)
+                    continue
+                found = promise(prior, sized(mission, chosen, battery), worlds, iterations, seed,
+                                on_progress)
+                rows.append(Size(count, float(battery), base, **found.quantiles,
+                                 chance=round(found.chance(wanted), 4)))
+    return rows
+
+
+def smallest(rows: list[Size], confidence: float) -> Size | None:
+    """Return the fewest UAVs, with the least battery, that promise enough; None: no size does."""
+    enough = [row for row in rows if row.chance >= confidence]
+    return min(enough, key=lambda row: (row.uavs, row.battery), default=None)
