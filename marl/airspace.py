@@ -4,11 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
+from scipy.ndimage import distance_transform_edt, minimum_filter1d
 from shapely.geometry.base import BaseGeometry
 
 from radiotwin.scene import Scene
 
-STEP_M = 3.0  # between the points around a position at which buildings are looked for
+LOWEST_M = 0.5  # above the ground, which is no building
+STEP_M = 3.0  # about, between the points at which buildings are looked for
 
 
 def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) -> np.ndarray:
@@ -29,23 +31,36 @@ def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) ->
         cells = shapely.box(x_m - half_m, y_m - half_m, x_m + half_m, y_m + half_m)
         blocked |= shapely.intersects(shapely.union_all(list(areas)), cells)
     if clearance_m > 0:
-        positions_m = lattice.positions_m
-        near = np.zeros(len(positions_m), dtype=bool)
-        for offset_m in _around(half_m, clearance_m):
-            left = np.flatnonzero(~near)
-            near[left] = scene.city.inside(positions_m[left] + offset_m)
-        blocked |= near.reshape(lattice.shape)
+        blocked |= _near_buildings(scene, clearance_m)
     return blocked
 
 
-def _around(half_m: float, clearance_m: float) -> np.ndarray:
-    """Return offsets (n, 3) [m] to the points that a UAV comes within a clearance of."""
-    reach = int(np.ceil((half_m + clearance_m) / STEP_M))
-    axis_m = np.linspace(-half_m - clearance_m, half_m + clearance_m, 2 * reach + 1)
-    x, y = (each.ravel() for each in np.meshgrid(axis_m, axis_m))
-    along_x = np.hypot(np.maximum(np.abs(x) - half_m, 0.0), y)
-    along_y = np.hypot(x, np.maximum(np.abs(y) - half_m, 0.0))
-    near = np.minimum(along_x, along_y) <= clearance_m
-    beside = np.column_stack([x[near], y[near], np.zeros(near.sum())])
-    below = beside[np.minimum(along_x, along_y)[near] == 0] - [0.0, 0.0, clearance_m]
-    return np.concatenate([beside, below])
+def _near_buildings(scene: Scene, clearance_m: float) -> np.ndarray:
+    """Return the lattice positions (nz, ny, nx) whose moves come too near to a building.
+
+    A finer grid, with the lattice's positions in it, is looked up at each altitude, and at the
+    clearance below it.
+    """
+    lattice = scene.lattice
+    parts = max(2 * round(lattice.step_m / (2 * STEP_M)), 2)  # of a step; even, for its middle
+    step_m = lattice.step_m / parts
+    margin = int(np.ceil(clearance_m / step_m)) + parts // 2
+    x_m, y_m = (axis[0] + step_m * np.arange(-margin, (len(axis) - 1) * parts + margin + 1)
+                for axis in (lattice.x_m, lattice.y_m))
+    grid_x_m, grid_y_m = (each.ravel() for each in np.meshgrid(x_m, y_m))
+    ground_m: np.ndarray | float = 0.0
+    if lattice.ground_m is not None:
+        ground_m = np.asarray(scene.city.ground_height_m(grid_x_m, grid_y_m))
+    near = np.empty(lattice.shape, dtype=bool)
+    for level, altitude_m in enumerate(lattice.z_m):
+        inside, below = (scene.city.inside(np.column_stack([
+            grid_x_m, grid_y_m, np.broadcast_to(ground_m + height_m, grid_x_m.shape)]))
+            .reshape(len(y_m), len(x_m)) for height_m in (
+                altitude_m, max(altitude_m - clearance_m, LOWEST_M)))
+        away_m = np.where(below, 0.0, distance_transform_edt(~inside, step_m)
+                          if inside.any() else np.inf)
+        along_moves_m = np.minimum(minimum_filter1d(away_m, parts + 1, axis=0),
+                                   minimum_filter1d(away_m, parts + 1, axis=1))
+        here = slice(margin, -margin, parts)
+        near[level] = along_moves_m[here, here] <= clearance_m
+    return near
