@@ -9,6 +9,7 @@ from shapely.geometry.base import BaseGeometry
 
 from radiotwin.scene import Scene
 
+LAYERS = 4  # of the clearance below an altitude
 LOWEST_M = 0.5  # above the ground, which is no building
 STEP_M = 3.0  # about, between the points at which buildings are looked for
 
@@ -38,8 +39,8 @@ def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) ->
 def _near_buildings(scene: Scene, clearance_m: float) -> np.ndarray:
     """Return the lattice positions (nz, ny, nx) whose moves come too near to a building.
 
-    A finer grid, with the lattice's positions in it, is looked up at each altitude, and at the
-    clearance below it.
+    Sections of the city, at each altitude and below it, on a finer grid with the lattice's
+    positions in it.
     """
     lattice = scene.lattice
     parts = max(2 * round(lattice.step_m / (2 * STEP_M)), 2)  # of a step; even, for its middle
@@ -51,16 +52,20 @@ def _near_buildings(scene: Scene, clearance_m: float) -> np.ndarray:
     ground_m: np.ndarray | float = 0.0
     if lattice.ground_m is not None:
         ground_m = np.asarray(scene.city.ground_height_m(grid_x_m, grid_y_m))
-    near = np.empty(lattice.shape, dtype=bool)
+    near = np.zeros(lattice.shape, dtype=bool)
+    below_m = clearance_m * np.arange(LAYERS + 1) / LAYERS
+    # Each section counts as far as the one above it, so that nothing between them is missed.
+    beside_m = np.sqrt(clearance_m**2 - np.append(0.0, below_m[:-1])**2)
+    here = slice(margin, -margin, parts)
     for level, altitude_m in enumerate(lattice.z_m):
-        inside, below = (scene.city.inside(np.column_stack([
-            grid_x_m, grid_y_m, np.broadcast_to(ground_m + height_m, grid_x_m.shape)]))
-            .reshape(len(y_m), len(x_m)) for height_m in (
-                altitude_m, max(altitude_m - clearance_m, LOWEST_M)))
-        away_m = np.where(below, 0.0, distance_transform_edt(~inside, step_m)
-                          if inside.any() else np.inf)
-        along_moves_m = np.minimum(minimum_filter1d(away_m, parts + 1, axis=0),
-                                   minimum_filter1d(away_m, parts + 1, axis=1))
-        here = slice(margin, -margin, parts)
-        near[level] = along_moves_m[here, here] <= clearance_m
+        for down_m, reach_m in zip(below_m, beside_m, strict=True):
+            height_m = max(altitude_m - down_m, LOWEST_M)
+            inside = scene.city.inside(np.column_stack([
+                grid_x_m, grid_y_m, np.broadcast_to(ground_m + height_m, grid_x_m.shape)])
+                ).reshape(len(y_m), len(x_m))
+            if inside.any():
+                away_m = distance_transform_edt(~inside, step_m)
+                along_moves_m = np.minimum(minimum_filter1d(away_m, parts + 1, axis=0),
+                                           minimum_filter1d(away_m, parts + 1, axis=1))
+                near[level] |= along_moves_m[here, here] <= reach_m
     return near

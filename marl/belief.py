@@ -136,7 +136,7 @@ class Belief:
         """
         prior = self.prior
         mission = self._mission
-        value = np.zeros((mission.uavs, mission.devices, *prior.snr_db.shape[3:]))
+        value = np.zeros((mission.uavs, mission.devices, *prior.snr_db.shape[3:]), np.float32)
         _value(prior, self._state, self.weight, mission.level, self._cell,
                float(mission.step_m), self._table, value)
         return value

@@ -174,10 +174,10 @@ def _uavs(scene: Scene, settings: PlanSettings) -> list[UavConfig]:
         if settings.base_m is None or settings.battery is None:
             raise BadInput(f"{path} has no [[uavs]], so it is not known who flies; add them, or "
                            "give --base X,Y, --battery MOVES and --uavs N")
-        own = [UavConfig.model_construct(uav=f"uav{number}", altitude_m=float(lattice.z_m[
-            number % len(lattice.z_m)]), battery=0.0, antenna=None)
-            for number in range(settings.uavs or 1)]
-    count = settings.uavs or len(own)
+        own = [UavConfig(uav=f"uav{number}", altitude_m=altitude_m, battery=settings.battery,
+                         start_x_m=0.0, start_y_m=0.0, terminal_x_m=0.0, terminal_y_m=0.0)
+               for number, altitude_m in enumerate(lattice.z_m.tolist())]
+    count = settings.uavs or (len(own) if scene.config.uavs else 1)
     found = []
     for number in range(count):
         copy, lap = own[number % len(own)], number // len(own)

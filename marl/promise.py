@@ -20,7 +20,7 @@ from marl.settings import stream
 from marl.worlds import WorldSource
 
 QUANTILES = (0.1, 0.5, 0.9)
-TRIED_PLANS, CHOOSING_WORLDS = 3, 20  # of each mission, the plan that collects most in so many
+TRIED_PLANS, CHOOSING_WORLDS = 2, 20  # of each mission, the plan that collects most in so many
 SCHEMA = "radiotwin.plan/1"
 
 

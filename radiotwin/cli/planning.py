@@ -21,7 +21,8 @@ def plan(
         min=1, max=100, help="Number of UAVs: copies of the scene's, in turn [those of the "
                              "scene].")] = None,
     battery: Annotated[float | None, typer.Option(
-        help="Battery of each UAV in moves; a hover costs half of one [that of the scene].")
+        min=0.5, max=10_000.0, help="Battery of each UAV in moves; a hover costs half of one [that "
+                                    "of the scene].")
         ] = None,
     base: Annotated[str | None, typer.Option(
         metavar="X,Y", help="Where all UAVs start and end [m] [start and terminal in the "

@@ -48,7 +48,8 @@ def test_silent_devices_and_data_lower_and_change_the_promise(run, folder):
 
 @pytest.mark.parametrize(("options", "message"), [
     ("--base 1e6,0", "not over the lattice"),
-    ("--battery 0.2", "battery"),
+    ("--battery 0.2", "greater than or equal to 0.5"),
+    ("--uavs 0", "greater than or equal to 1"),
     ("--data none.csv", "none.csv"),
     ("--no-fly none.geojson", "none.geojson"),
     ("--clearance-m 500", "does not reach"),
