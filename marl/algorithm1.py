@@ -27,6 +27,7 @@ from marl.learner import Learner, make_learner
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy
 from marl.settings import LearnerSettings, RunSettings, stream
+from marl.worlds import twin_prior
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import declared_devices, heading_deg, link_table
@@ -105,6 +106,9 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             on_progress(run.episodes * len(rows), _summary(rows[-1], run))
             # The run may have been stopped between the checkpoint and the log.
             on_round(rows, blocks)
+            if learner.believes:  # of which no checkpoint is needed: it is made of the twin
+                campaign.tell(learner)
+                learner.prepare(campaign.mission(), on_progress)
         for number in range(len(rows), run.real_episodes):
             started = time.perf_counter()
             rng = stream(run.seed, "decisions", number)
@@ -112,6 +116,7 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             mission = campaign.mission()
             if on_learned is not None:
                 on_learned(campaign, mission)
+            campaign.tell(learner)
             blocks += [{"round": number + 1} | block
                        for block in learner.prepare(mission, on_progress)]
             campaign.log(learner, mission, rng, (number + 1) * run.episodes * learner.replicas)
@@ -191,6 +196,16 @@ class Campaign:
         if self.twin is None:
             return self.in_truth()
         return twin_mission(self.scene, self.run, self.twin, self.known, self._measurements())
+
+    def tell(self, learner: Learner) -> None:
+        """Tell a learner that asks for it what the twin leaves open."""
+        if not learner.believes:
+            return
+        prior = None
+        if self.twin is not None:
+            prior = twin_prior(self.twin, self.scene, self.twin.radio_map(self.scene),
+                               stream(self.run.seed, "learning"))
+        learner.believe(prior)
 
     def learn(self, learner: Learner | None, rng: np.random.Generator) -> None:
         """Fly a real episode, and learn the twin anew from all measurements.

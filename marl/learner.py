@@ -44,20 +44,22 @@ class Learner(ABC):
     Attributes:
         learns: whether it trains; only then can it be guided and compared over maps.
         uses_map: whether its flights depend on the map that it is prepared in.
+        believes: whether it asks what the twin leaves open (`believe`).
         replicas: copies that simulate `run.episodes` episodes each in a round.
         selection_flights: flights flown in `prepare` so far to choose between policies.
     """
 
     learns: ClassVar[bool] = True
     uses_map: ClassVar[bool] = True
+    believes: ClassVar[bool] = False
 
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         self.replicas = 1 if self.learns else 0
         self.selection_flights = 0
 
-    def believe(self, prior: "Prior | None") -> None:  # noqa: B027  most take the map as it is
-        """Take what the twin says of its own errors, before `prepare`; None: it says nothing."""
+    def believe(self, prior: "Prior | None") -> None:  # noqa: B027  most ask for none
+        """Take what the twin leaves open, before `prepare`; None: there is no twin."""
 
     @abstractmethod
     def prepare(self, mission: Mission,

@@ -98,8 +98,8 @@ def plan_flights(twin: Twin, scene: Scene, settings: PlanSettings,
     mission = make_mission(flown, radio_map, known,
                            keep_out=keep_out(flown, settings.areas, settings.clearance_m))
     on_progress(0, "drawing worlds")
-    prior = twin_prior(twin, flown, radio_map, mission, stream(settings.seed, "choice"),
-                       settings.silent, settings.data_spread)
+    prior = twin_prior(twin, flown, radio_map, stream(settings.seed, "learning"), settings.silent,
+                       settings.data_spread)
     mission = mission._replace(shadowing_share=prior.share, shadowing_m=prior.length_m)
     names = [uav.uav for uav in flown.config.uavs]
     counts = range(1, 2 * mission.uavs + 1) if settings.sizes else range(0)

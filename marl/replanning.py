@@ -218,7 +218,7 @@ class _Mind:
 class BeliefPlanner(Learner):
     """`--algorithm belief`: plan, and plan again in flight on what is heard."""
 
-    learns = False
+    learns, believes = False, True
 
     def __init__(self, setup: Setup) -> None:
         super().__init__(setup)

@@ -20,15 +20,14 @@ RADIUS_IN_SD = np.sqrt(2 * np.log(10))  # of a normal distribution, the circle w
 MAX_TRIES = 50  # of a position outside buildings
 
 
-def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, mission: Mission,
-               rng: np.random.Generator, silent: float = 0.0, data_spread: float = 0.0) -> Prior:
+def twin_prior(twin: Twin, scene: Scene, radio_map: RadioMap, rng: np.random.Generator,
+               silent: float = 0.0, data_spread: float = 0.0) -> Prior:
     """Return the belief that a twin begins with.
 
     Args:
         twin: its positions, their radii, and its errors.
         scene: of the mission.
         radio_map: the twin's.
-        mission: in the twin.
         rng: of the positions.
         silent: probability that a device does not transmit.
         data_spread: see `Prior`.
