@@ -25,7 +25,8 @@ COMMANDS = {
     "survey": ["fly_survey", "read_truth"], "import": ["import_measurements → import_files"], "fit": ["fit_twin"],
     "map": ["export_map"], "coverage": ["predict_coverage"], "compare": ["compare_held_out", "write_comparison_folder"],
     "close-loop": ["close_loop", "write_closeloop_folder", "write_corrected_scene"],
-    "locate": ["locate_devices", "position_errors"], "report": ["read_run", "write_report"], "demo": ["run_demo"],
+    "locate": ["locate_devices", "position_errors"], "plan": [],  # `marl.plan_flights`, which is not of `radiotwin`
+    "report": ["read_run", "write_report"], "demo": ["run_demo"],
     "doctor": ["diagnose"], "cache": ["cache_content", "clear_cache"],
 }
 HEAVY = ("torch", "numpy", "pandas", "matplotlib", "mitsuba", "scipy")
