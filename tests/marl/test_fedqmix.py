@@ -72,7 +72,7 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(unbroken):
     with (folder / "comparison.csv").open() as file:
         ratios = {(row["method"], row["trained_in"]): float(row["truth_ratio"]) for row in csv.DictReader(file)}
     assert all(0 < ratio <= 1 for ratio in ratios.values()), ratios
-        assert ratios["planner", "NN twin"] > ratios["random", ""]
+    assert ratios["planner", "NN twin"] > ratios["random", ""]
 
 
 @pytest.mark.slow
