@@ -1,7 +1,7 @@
 """Training of recurrent agents: exploration, memory of whole flights, schedules, updates."""
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -12,29 +12,10 @@ from marl.flights import Flights, fly
 from marl.mission import MAX_SNR_DB, Mission
 from marl.settings import LearnerSettings, stream
 
+if TYPE_CHECKING:
+    from marl.qmix import QNetworks
+
 GUIDED_SHARE = 0.25  # of the training flights, with the planner's help
-
-
-class Networks(Protocol):
-    """Interface of trained networks, such as `marl.qmix.QNetworks`."""
-
-    agent: torch.nn.Module
-    device: str
-
-    def update(self, flights: Flights, mission: Mission, learning_rate: float) -> dict[str, float]:
-        """Learn from a batch; return means to be logged."""
-
-    def weights(self) -> dict[str, np.ndarray]:
-        """Return copies of the weights that are averaged over replicas."""
-
-    def set_weights(self, weights: dict[str, np.ndarray]) -> None:
-        """Copy averaged weights into the networks."""
-
-    def state(self) -> dict:
-        """Return a checkpoint."""
-
-    def load_state(self, state: dict) -> None:
-        """Go on from a checkpoint."""
 
 
 class Trainer:
@@ -54,7 +35,7 @@ class Trainer:
                  mission: Mission, horizon: int, seed: int, number: int = 0,
                  device: str = "cpu") -> None:
         self.settings, self.horizon, self.mission = settings, horizon, mission
-        self.networks: Networks = make_networks(settings, mission, seed, device)
+        self.networks: QNetworks = make_networks(settings, mission, seed, device)
         self.replay = Replay(settings.replay, mission)
         self.episodes, self.slots = 0, 0
         self._plan: np.ndarray | None = None
@@ -82,7 +63,7 @@ class Trainer:
 
         Returns:
             Means over them: `train_ratio` of collected data, and the entries of
-            `Networks.update`; at their end: `epsilon`, `learning_rate`.
+            `QNetworks.update`; at their end: `epsilon`, `learning_rate`.
         """
         settings, ratios, losses = self.settings, [], []
         for start in range(0, episodes, settings.parallel):
