@@ -1,11 +1,11 @@
-"""Flights without learning and map: random, greedy, and from one random cell to the next."""
+"""Flights without learning and map: random, greedy, weighed, and between random cells."""
 
 from collections.abc import Callable
 
 import numpy as np
 from typing_extensions import override
 
-from marl.environment import ACTION_COUNT, Frame, feasible
+from marl.environment import ACTION_COUNT, Frame, assign, feasible, rate
 from marl.flights import Policy
 from marl.learner import Learner
 from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
@@ -15,6 +15,18 @@ from radiotwin.scene import Scene
 
 PATTERN = "random-waypoint"
 """Pattern of `radiotwin.maps.survey` that `waypoint_actions` flies."""
+
+
+WEIGHTS = np.array([0.75, 2.9, 2.88, 0.28, 0.31, 0.91, 0.06, 0.21, 0.66])
+"""Of `heuristic`, as `python -m studies.heuristic` tunes them on 20 generated missions.
+
+Of a device for a UAV: the share of its data that is left; the steps there (of the sides of the
+lattice), and the battery that lacks for them and the way home (of a full one), which count
+against it; its rate in this slot [10 bit/s/Hz]; the steps home from it, as the battery empties,
+against it; the steps from the nearest other UAV; the other devices with data about it (each
+exp(-distance / 200 m)). Then the distance at which the UAV hovers [steps], and what is added to
+it as the device empties.
+"""
 
 
 class HeuristicPolicy:
@@ -31,6 +43,21 @@ class HeuristicPolicy:
     def act(self, frame: Frame) -> np.ndarray:
         """See `marl.flights.Policy`."""
         return self._decide(self._mission, frame, self._rng)
+
+
+class WeighedPolicy:
+    """Fly `heuristic`, with the weights given."""
+
+    def __init__(self, weights: np.ndarray = WEIGHTS) -> None:
+        self._weights = weights
+
+    def start(self, mission: Mission, flights: int) -> None:
+        """See `marl.flights.Policy`."""
+        self._mission = mission
+
+    def act(self, frame: Frame) -> np.ndarray:
+        """See `marl.flights.Policy`."""
+        return weighed_actions(self._mission, frame, self._weights)
 
 
 class Random(Learner):
@@ -53,6 +80,14 @@ class Greedy(Random):
     """`--algorithm greedy`: to the nearest device with data that no other UAV has claimed."""
 
     name = "greedy"
+
+
+class Heuristic(Random):
+    """`--algorithm heuristic`: to the devices that a sum with tuned weights prefers."""
+
+    @override
+    def policy(self, rng: np.random.Generator) -> Policy:
+        return WeighedPolicy()
 
 
 def waypoint_actions(scene: Scene, mission: Mission, rng: np.random.Generator) -> np.ndarray:
@@ -108,7 +143,6 @@ def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> 
     action = np.empty((flights, uavs), dtype=np.int64)
     mask = np.empty(ACTION_COUNT, dtype=np.bool_)
     claimed = np.empty(devices, dtype=np.bool_)
-    wanted = np.empty(2, dtype=np.int64)
     for e in range(flights):
         claimed[:] = False
         for u in range(uavs):
@@ -128,22 +162,94 @@ def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> 
                 action[e, u] = HOVER if mask[HOVER] else _any_of(mask, rng)
                 continue
             claimed[target] = True
-            dx = mission.known_m[target, 0] - column * mission.step_m
-            dy = mission.known_m[target, 1] - row * mission.step_m
-            east_west, north_south = EAST if dx > 0 else WEST, NORTH if dy > 0 else SOUTH
-            half = mission.step_m / 2
-            along_x, along_y = abs(dx) > half, abs(dy) > half
-            wanted[:] = HOVER
-            if along_x and (abs(dx) >= abs(dy) or not along_y):
-                wanted[0] = east_west
-                wanted[1] = north_south if along_y else HOVER
-            elif along_y:
-                wanted[0] = north_south
-                wanted[1] = east_west if along_x else HOVER
-            if mask[wanted[0]]:
-                action[e, u] = wanted[0]
-            elif mask[wanted[1]]:
-                action[e, u] = wanted[1]
-            else:
+            action[e, u] = _towards(mission, row, column, mission.known_m[target], 0.0, mask)
+            if action[e, u] < 0:
                 action[e, u] = _any_of(mask, rng)
+    return action
+
+
+@njit(cache=True, nogil=True)
+def _towards(mission: Mission, row: int, column: int, target_m: np.ndarray, stop_m: float,
+             mask: np.ndarray) -> int:
+    """Return a move towards a point along the larger axis, else along the other; -1 for none.
+
+    Hover on top, or within `stop_m` of it.
+    """
+    dx, dy = target_m[0] - column * mission.step_m, target_m[1] - row * mission.step_m
+    along_x, along_y = abs(dx) > mission.step_m / 2, abs(dy) > mission.step_m / 2
+    if (not along_x and not along_y) or dx**2 + dy**2 <= stop_m**2:
+        return HOVER if mask[HOVER] else -1
+    first, second = EAST if dx > 0 else WEST, NORTH if dy > 0 else SOUTH
+    if not along_x or (along_y and abs(dx) < abs(dy)):
+        first, second, along_x, along_y = second, first, along_y, along_x
+    if mask[first]:
+        return first
+    second = second if along_y else HOVER
+    return second if mask[second] else -1
+
+
+@njit(cache=True, nogil=True)
+def weighed_actions(mission: Mission, frame: Frame, weights: np.ndarray) -> np.ndarray:
+    """Return (E, U) actions towards distinct targets, the pair with the highest sum first.
+
+    `weights` are as `WEIGHTS`. A UAV that is left without a target helps at its best one. Where
+    the way there is not feasible, it hovers as long as it can and then flies home.
+    """
+    flights, uavs = frame.battery.shape
+    devices, (ny, nx) = len(mission.data_units), mission.steps_home.shape[1:]
+    action = np.empty((flights, uavs), dtype=np.int64)
+    mask, target = np.empty(ACTION_COUNT, dtype=np.bool_), np.empty(uavs, dtype=np.int64)
+    score = np.empty((uavs, devices))
+    side, step_m = ny + nx, mission.step_m
+    for e in range(flights):
+        for u in range(uavs):
+            row, column = frame.cell[e, u, 0], frame.cell[e, u, 1]
+            battery = frame.battery[e, u]
+            for k in range(devices):
+                score[u, k] = -np.inf
+                x_m, y_m = mission.known_m[k]
+                if battery == 0 or frame.data_units[e, k] <= 0 or np.isnan(x_m):
+                    continue
+                at_row = min(max(int(np.rint(y_m / step_m)), 0), ny - 1)
+                at_column = min(max(int(np.rint(x_m / step_m)), 0), nx - 1)
+                steps = abs(at_row - row) + abs(at_column - column)
+                home = min(mission.steps_home[u, at_row, at_column], side)
+                nearest, company = float(side), 0.0
+                for v in range(uavs):
+                    if v != u and frame.battery[e, v] > 0:
+                        other = abs(at_row - frame.cell[e, v, 0]) + abs(at_column -
+                                                                        frame.cell[e, v, 1])
+                        nearest = min(nearest, other)
+                for j in range(devices):
+                    way_m = np.hypot(mission.known_m[j, 0] - x_m, mission.known_m[j, 1] - y_m)
+                    if j != k and frame.data_units[e, j] > 0 and not np.isnan(way_m):
+                        company += np.exp(-way_m / 200.0)
+                snr_db = frame.snr_db[e, u, k]
+                now = rate(snr_db, 0.1) if snr_db >= mission.threshold_db else 0.0
+                lacking = max(2 * (steps + home) - battery, 0) / mission.battery[u]
+                score[u, k] = (
+                    weights[0] * frame.data_units[e, k] / mission.data_units[k]
+                    - weights[1] * steps / side - weights[2] * lacking + weights[3] * now
+                    - weights[4] * home / side * (1 - battery / mission.battery[u])
+                    + weights[5] * nearest / side + weights[6] * company)
+        for u in range(uavs):
+            target[u] = np.argmax(score[u]) if score[u].max() > -np.inf else -1
+        claimed = np.empty(uavs, np.int64)
+        assign(score, False, claimed)
+        for u in range(uavs):
+            row, column = frame.cell[e, u, 0], frame.cell[e, u, 1]
+            feasible(mission, u, row, column, frame.battery[e, u], mask)
+            k, chosen = claimed[u] if claimed[u] >= 0 else target[u], -1
+            if k >= 0:
+                emptied = 1 - frame.data_units[e, k] / mission.data_units[k]
+                stop_m = step_m * (weights[7] + weights[8] * emptied)
+                chosen = _towards(mission, row, column, mission.known_m[k], stop_m, mask)
+            if chosen < 0 and mask[HOVER]:
+                chosen = HOVER
+            for move in range(ACTION_COUNT):
+                if chosen < 0 and mask[move] and (
+                        move == NO_OP or mission.steps_home[u, row + MOVES[move, 0], column + MOVES[
+                            move, 1]] < mission.steps_home[u, row, column]):
+                    chosen = move
+            action[e, u] = chosen
     return action

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin",
               "raytrace": "ray-traced twin", "path-kriging": "twin of a map that may be wrong",
               "truth": "the truth"}
-BASELINES = ("planner", "greedy", "random")  # in every table
+BASELINES = ("planner", "heuristic", "greedy", "random")  # in every table
 RECORDED = {
     truth: {"method": "qmix", "trained_in": "the truth (recorded with 0.1.0)",
             "real_episodes": 13_696, "truth_ratio": ratio, "truth_ratio_std": ratio_sd}
@@ -89,7 +89,7 @@ class Session:
                 number, rounds = len(campaign.rows) + 1, self.run.real_episodes
                 on_progress(0, f"round {number}/{rounds}")
                 if number == 1 and learner_class(self.run.algorithm).learns:
-                    for name in ("greedy", "planner"):
+                    for name in ("greedy", "heuristic", "planner"):
                         _say_row(self._baseline(name, mission, campaign.in_truth(), 1))
 
             main = run_algorithm(self.run, self.learner, scene, truth, self.out, self.resume,
@@ -199,7 +199,7 @@ class Session:
         # Random flights need no real ones. Greedy flights need the positions and a plan the map:
         # both come from the real flights, unless the settings give them.
         free = (name == "random" or run.twin == "truth"
-                or (name == "greedy" and run.privileged))
+                or (name in ("greedy", "heuristic") and run.privileged))
         row = {"real_episodes": 0 if free else real_episodes, "truth_ratio": float(ratio.mean()),
                "truth_ratio_std": float(ratio.std())}
         return _entry(name, run.twin, row)

@@ -28,6 +28,7 @@ LEARNERS: dict[str, Any] = {
     "qmix": "marl.qmix:QMIX",
     "iql": "marl.qmix:IQL",
     "greedy": "marl.heuristics:Greedy",
+    "heuristic": "marl.heuristics:Heuristic",
     "planner": "marl.planner:Planner",
     "belief": "marl.replanning:BeliefPlanner",
     "random": "marl.heuristics:Random",

@@ -56,11 +56,12 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(unbroken):
     folder, out = unbroken
     first, last = out.split("Collected in the truth")
     # What needs no training is told first, after one real flight; then the run itself; then the table.
-    assert [line.split(",")[0] for line in first.splitlines()[:4]] == [
-        "greedy", "planner in the NN twin", "fedqmix in the NN twin", "qmix in the log-distance twin"]
-    lines = [line for line in last.splitlines() if line.strip().startswith(("fedqmix", "qmix", "planner", "greedy", "random"))]
+    assert [line.split(",")[0] for line in first.splitlines()[:5]] == [
+        "greedy", "heuristic", "planner in the NN twin", "fedqmix in the NN twin", "qmix in the log-distance twin"]
+    lines = [line for line in last.splitlines() if line.strip().startswith(("fedqmix", "qmix", "planner", "heuristic", "greedy",
+                                                                               "random"))]
     assert [line.split()[:2] for line in lines] == [["fedqmix", "NN"], ["qmix", "log-distance"], ["qmix", "the"],
-                                                    ["planner", "NN"], ["greedy", "2"], ["random", "0"]]
+                                                    ["planner", "NN"], ["heuristic", "2"], ["greedy", "2"], ["random", "0"]]
     # Trained in the truth, every episode is a real one, and so are three looks at the policy.
     assert lines[2].split()[3] == str(80 + 3 * 64)
     for name in ("config.json", "metrics.csv", "checkpoint.safetensors", "comparison.csv", "curve.png", "trajectories.png",
@@ -131,7 +132,7 @@ def flat(value):
     ("--episodes 0", ["--episodes 0", "≥ 1"]),
     ("--compare true", ["--compare true", "none|twins|truth"]),
     ("--twin magic", ["--twin magic", "nn|log-distance|kriging|raytrace|path-kriging|truth"]),
-    ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|planner|belief|random"]),
+    ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|heuristic|planner|belief|random"]),
     ("--fly-again true", ["No such option: --fly-again"]),
     ("--batch 64 --replay 32", ["replay 32", "64"]),
     ("--guide planner --algorithm greedy", ["guide planner", "greedy does not learn"]),

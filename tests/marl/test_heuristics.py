@@ -2,12 +2,23 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from marl.environment import Environment, observe
 from marl.flights import fly
-from marl.heuristics import HeuristicPolicy, greedy_actions, random_actions, waypoint_actions
+from marl.heuristics import (
+    WEIGHTS,
+    HeuristicPolicy,
+    WeighedPolicy,
+    greedy_actions,
+    random_actions,
+    waypoint_actions,
+    weighed_actions,
+)
 from marl.mission import EAST, HOVER, NO_OP, NORTH
 from marl.planner import PlanPolicy
+from studies.generated import generated_mission
 
 
 def test_greedy_uavs_claim_different_devices_fly_the_longer_way_first_and_hover_on_top(tiny):
@@ -57,6 +68,30 @@ def test_greedy_collects_more_than_random(city_mission):
                           HeuristicPolicy(name, np.random.default_rng(0))).ratio(mission) for name in
                       ("greedy", "random"))
     assert greedy.mean() > chance.mean() + 0.1
+
+
+@given(st.data())
+@settings(max_examples=40, deadline=None)
+def test_every_weighed_action_is_feasible(missions, data):
+    mission = data.draw(missions)
+    weights = np.random.default_rng(data.draw(st.integers(0, 99))).uniform(0, 3, len(WEIGHTS))
+    environment = Environment(mission, 2, np.random.default_rng(0))
+    frame = environment.reset()
+    for _ in range(mission.longest):
+        action = weighed_actions(mission, frame, weights)
+        assert np.take_along_axis(observe(mission, frame)[1], action[..., None], axis=-1).all()
+        environment.step(action)
+    assert environment.done.all()
+
+
+def test_weighed_flights_collect_more_than_greedy_ones_on_missions_that_they_were_not_tuned_on():
+    gains = []
+    for seed in range(4):
+        mission = generated_mission(seed, uavs=2 + seed % 2)
+        weighed, greedy = (fly(Environment(mission, 2, np.random.default_rng(0)), policy).ratio(mission).mean() for policy in
+                           (WeighedPolicy(), HeuristicPolicy("greedy", np.random.default_rng(0))))
+        gains.append(weighed / greedy)
+    assert np.mean(gains) > 1.03
 
 
 def seen(mission, policy):

@@ -44,7 +44,7 @@ def test_every_registered_learner_is_one():
     for name in LEARNERS:
         assert issubclass(learner_class(name), Learner)
     assert [name for name in LEARNERS if learner_class(name).learns] == ["fedqmix", "qmix", "iql"]
-    assert [name for name in LEARNERS if not learner_class(name).uses_map] == ["greedy", "random"]
+    assert [name for name in LEARNERS if not learner_class(name).uses_map] == ["greedy", "heuristic", "random"]
 
 
 def test_an_installed_package_adds_a_learner(monkeypatch):
@@ -113,7 +113,7 @@ def test_only_what_learns_can_be_guided(best_of_many):
 
 def test_an_unknown_learner_is_refused_as_every_other_choice():
     with pytest.raises(BadInput, match=r"--algorithm best-of-many: Input should be 'fedqmix', .* or 'random'; allowed: "
-                                       r"fedqmix\|qmix\|iql\|greedy\|planner\|belief\|random"):
+                                       r"fedqmix\|qmix\|iql\|greedy\|heuristic\|planner\|belief\|random"):
         settings_of({"algorithm": "best-of-many"})
 
 
