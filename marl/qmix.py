@@ -1,21 +1,12 @@
 """QMIX: recurrent agents whose values a monotonic mixer combines [1], and IQL without it [2].
 
-From top to bottom: the recurrent unit, the agent, the mixer, the loss and its update, and the
-learner that trains in one map after the other. Exploration, replay memory and schedules are in
-`marl.training`.
-
-`torch.nn.GRU` spends three quarters of its time on starting small operations, because the sequence
-is long and the matrices are small. `gru` makes the walk through the sequence, forwards and
-backwards, one compiled loop. Parameters and numbers are those of `torch.nn.GRU` ([3], in the
-variant of cuDNN):
-
-    r = σ(W_r x + U_r h + b_r),  z = σ(W_z x + U_z h + b_z),
-    n = tanh(W_n x + b_n + r (U_n h + c_n)),  h' = n + z (h - n)
+From top to bottom: the agent, the mixer, the loss and its update, the policy, the trainer of a
+replica, and the learner that trains in one map after the other. Exploration and replay memory are
+in `marl.training`, the agent's recurrent unit in `marl.gru`.
 
 [1] Rashid et al., "QMIX: Monotonic value function factorisation for deep multi-agent reinforcement
     learning", ICML 2018.
 [2] Tan, "Multi-agent reinforcement learning: independent vs. cooperative agents", ICML 1993.
-[3] Cho et al., "Learning phrase representations using RNN encoder-decoder", EMNLP 2014.
 """
 
 import copy
@@ -28,180 +19,29 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
-from marl.checkpoint import COUNT, require, require_plan
+from marl.checkpoint import COUNT, GENERATOR, require, require_plan
 from marl.environment import (
     ACTION_COUNT,
+    Environment,
     Frame,
     global_state,
     observation_size,
     observe,
     state_size,
 )
-from marl.flights import Flights, Policy, evaluate
+from marl.flights import Flights, Policy, evaluate, fly
+from marl.gru import gru
 from marl.learner import Learner, Setup
 from marl.mission import Mission
 from marl.planner import PlanPolicy, plan
 from marl.replicas import Replicas
 from marl.settings import LearnerSettings, stream
-from marl.training import AgentPolicy
+from marl.training import Exploration, Replay
 from radiotwin.propagation.laws.adam import Adam
-from radiotwin.runtime.compiled import njit
 
-_ONE, _HALF = np.float32(1), np.float32(0.5)
+GUIDED_SHARE = 0.25  # of the training flights, with the planner's help
 MAX_GRADIENT_NORM = 10.0
 MIN_GAIN = 0.02  # of the collected share, for a new plan to replace the one before
-
-
-def gru(x: Tensor, memory: Tensor | None, unit: torch.nn.GRU) -> tuple[Tensor, Tensor]:
-    """Return `unit(x, memory)`, for one layer in one direction.
-
-    It is differentiable by x and the parameters; the memory is taken as a constant.
-
-    Args:
-        x: (T, B, inputs) float32
-        memory: (1, B, hidden), zero where None.
-        unit: gives the parameters.
-
-    Returns:
-        (T, B, hidden) and (1, B, hidden).
-    """
-    if x.device.type != "cpu":
-        return unit(x, memory)
-    start = x.new_zeros(x.shape[1], unit.hidden_size) if memory is None else memory[0]
-    walked = _Walk.apply(x, unit.weight_ih_l0, unit.weight_hh_l0, unit.bias_ih_l0,
-                         unit.bias_hh_l0, start)
-    return walked, walked[-1:]
-
-
-class _Walk(torch.autograd.Function):
-    """Map x (T, B, inputs) to memories (T, B, H); gates come first in all arrays."""
-
-    @staticmethod
-    def forward(context: Any, x: Tensor, weight: Tensor, recurrent: Tensor, bias: Tensor,
-                recurrent_bias: Tensor, start: Tensor) -> Tensor:
-        """See `torch.autograd.Function`; the parameters are those of `torch.nn.GRU`."""
-        slots, batch, inputs = x.shape
-        hidden = len(bias) // 3
-        # The biases of r and z add up; that of n is inside the bracket that r scales.
-        bias = bias.clone()
-        bias[:2 * hidden] += recurrent_bias[:2 * hidden]
-        # One array for all that follows, because fresh memory costs more than the arithmetic: the
-        # input's shares of the gates, then the gates r, z, n and u = U_n h + c_n in their
-        # positions, then the gradients by them.
-        work = torch.empty(4, slots, batch, hidden)
-        flat = x.reshape(slots * batch, inputs)
-        for gate in range(3):
-            rows = slice(gate * hidden, (gate + 1) * hidden)
-            torch.addmm(bias[rows], flat, weight[rows].t(), out=work[gate].view(-1, hidden))
-        memories = torch.empty(slots + 1, batch, hidden)
-        memories[0] = start
-        transposed = recurrent.view(3, hidden, hidden).transpose(1, 2).contiguous()
-        _forward(work.numpy(), transposed.numpy(), recurrent_bias[2 * hidden:].numpy(),
-                 memories.numpy())
-        context.save_for_backward(x, weight, recurrent, memories)
-        context.work = work
-        return memories[1:]
-
-    @staticmethod
-    def backward(context: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        """See `torch.autograd.Function`."""
-        x, weight, recurrent, memories = context.saved_tensors
-        slots, batch, hidden = gradient.shape
-        work, context.work = context.work, None  # overwritten: there is no second backward pass
-        _backward(gradient.contiguous().numpy(), recurrent.view(3, hidden, hidden).numpy(),
-                  memories.numpy(), work.numpy())
-        shares = work.view(4, slots * batch, hidden)
-        flat = x.reshape(slots * batch, -1)
-        before = memories[:-1].view(slots * batch, hidden)
-        of_x = shares[0] @ weight[:hidden]
-        for gate in (1, 2):
-            of_x.addmm_(shares[gate], weight[gate * hidden:(gate + 1) * hidden])
-        sums = shares.sum(1)
-        return (of_x.view_as(x), torch.cat([shares[gate].t() @ flat for gate in (0, 1, 2)]),
-                torch.cat([shares[gate].t() @ before for gate in (0, 1, 3)]),
-                sums[:3].flatten(), sums[[0, 1, 3]].flatten(), None)
-
-
-@njit(cache=True, inline="always", fastmath=True, error_model="numpy")
-def _tanh(x: np.float32) -> np.float32:
-    """Return a rational approximation, exact to two units in the last place of a float32.
-
-    Unlike exp, it is vectorised.
-    """
-    x = min(max(x, np.float32(-7.9)), np.float32(7.9))
-    s = x * x
-    p = np.float32(-2.76076847742355e-16)
-    p = p * s + np.float32(2.00018790482477e-13)
-    p = p * s + np.float32(-8.60467152213735e-11)
-    p = p * s + np.float32(5.12229709037114e-08)
-    p = p * s + np.float32(1.48572235717979e-05)
-    p = p * s + np.float32(6.37261928875436e-04)
-    p = p * s + np.float32(4.89352455891786e-03)
-    q = np.float32(1.19825839466702e-06)
-    q = q * s + np.float32(1.18534705686654e-04)
-    q = q * s + np.float32(2.26843463243900e-03)
-    q = q * s + np.float32(4.89352518554385e-03)
-    return x * p / q
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _cell(r: np.ndarray, z: np.ndarray, n: np.ndarray, u: np.ndarray, r_h: np.ndarray,
-          z_h: np.ndarray, n_h: np.ndarray, n_bias: np.ndarray, before: np.ndarray,
-          after: np.ndarray) -> None:
-    for b in range(len(before)):
-        for i in range(len(n_bias)):
-            r[b, i] = _HALF + _HALF * _tanh(_HALF * (r[b, i] + r_h[b, i]))
-        for i in range(len(n_bias)):
-            z[b, i] = _HALF + _HALF * _tanh(_HALF * (z[b, i] + z_h[b, i]))
-        for i in range(len(n_bias)):
-            u[b, i] = n_h[b, i] + n_bias[i]
-            n[b, i] = _tanh(n[b, i] + r[b, i] * u[b, i])
-        for i in range(len(n_bias)):
-            after[b, i] = n[b, i] + z[b, i] * (before[b, i] - n[b, i])
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _forward(work: np.ndarray, recurrent: np.ndarray, n_bias: np.ndarray,
-             memories: np.ndarray) -> None:
-    _, slots, batch, hidden = work.shape
-    share = np.empty((3, batch, hidden), np.float32)
-    for t in range(slots):
-        for gate in range(3):
-            np.dot(memories[t], recurrent[gate], share[gate])
-        _cell(work[0, t], work[1, t], work[2, t], work[3, t], share[0], share[1], share[2],
-              n_bias, memories[t], memories[t + 1])
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _cell_backward(gradient: np.ndarray, r: np.ndarray, z: np.ndarray, n: np.ndarray,
-                   u: np.ndarray, before: np.ndarray, carried: np.ndarray) -> None:
-    for b in range(len(before)):
-        for i in range(before.shape[1]):
-            r_bi, z_bi, n_bi = r[b, i], z[b, i], n[b, i]
-            g = carried[b, i] + gradient[b, i]
-            of_n = g * (_ONE - z_bi) * (_ONE - n_bi * n_bi)
-            r[b, i] = of_n * u[b, i] * r_bi * (_ONE - r_bi)
-            z[b, i] = g * (before[b, i] - n_bi) * z_bi * (_ONE - z_bi)
-            n[b, i] = of_n
-            u[b, i] = of_n * r_bi
-            carried[b, i] = g * z_bi
-
-
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _backward(gradient: np.ndarray, recurrent: np.ndarray, memories: np.ndarray,
-              work: np.ndarray) -> None:
-    slots, batch, hidden = gradient.shape
-    carried = np.zeros((batch, hidden), np.float32)
-    share = np.empty((3, batch, hidden), np.float32)
-    for t in range(slots - 1, -1, -1):
-        _cell_backward(gradient[t], work[0, t], work[1, t], work[2, t], work[3, t], memories[t],
-                       carried)
-        np.dot(work[0, t], recurrent[0], share[0])
-        np.dot(work[1, t], recurrent[1], share[1])
-        np.dot(work[3, t], recurrent[2], share[2])
-        for b in range(batch):
-            for i in range(hidden):
-                carried[b, i] += share[0, b, i] + share[1, b, i] + share[2, b, i]
 
 
 class Agent(nn.Module):
@@ -431,6 +271,163 @@ def td_lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: flo
     return target
 
 
+class AgentPolicy:
+    """Fly the feasible action of greatest value.
+
+    Args:
+        agent: see `Agent`; its weights are read at every slot.
+        device: torch device of the agent.
+        exploration: replaces some actions; None: none.
+        guide: (T, U) actions of a plan, and the (E,) slots for which each flight follows it before
+            the agents take over.
+    """
+
+    def __init__(self, agent: torch.nn.Module, device: str = "cpu",
+                 exploration: Exploration | None = None,
+                 guide: tuple[np.ndarray, np.ndarray] | None = None) -> None:
+        self._agent, self._device = agent, device
+        self._exploration, self._guide = exploration, guide
+
+    def start(self, mission: Mission, flights: int) -> None:
+        """See `marl.flights.Policy`."""
+        self._mission = mission
+        self._memory = None
+        self._last = np.full((flights, mission.uavs), -1, dtype=np.int64)
+        self._slot = 0
+        if self._exploration is not None:
+            self._exploration.start(flights, mission.uavs)
+
+    @torch.inference_mode()
+    def act(self, frame: Frame) -> np.ndarray:
+        """See `marl.flights.Policy`."""
+        observation, mask = observe(self._mission, frame)
+        values, self._memory = self._agent(
+            torch.from_numpy(observation).to(self._device)[None],
+            torch.from_numpy(self._last).to(self._device)[None], self._memory)
+        action = np.where(mask, values[0].cpu().numpy(), -np.inf).argmax(axis=-1)
+        if self._exploration is not None:
+            action = self._exploration.change(action, mask)
+        if self._guide is not None:
+            plan, slots = self._guide
+            wanted = plan[self._slot]
+            # A UAV that has failed cannot follow.
+            feasible = mask[:, np.arange(len(wanted)), wanted]
+            action = np.where((slots > self._slot)[:, None] & feasible, wanted, action)
+        self._last, self._slot = action, self._slot + 1
+        return action
+
+
+class Trainer:
+    """One replica: learns a policy by flying in a mission.
+
+    Args:
+        make_networks: (settings, mission, seed, device) -> networks.
+        settings: of learning.
+        mission: the rules and the map.
+        horizon: episodes over which the learning rate falls.
+        seed: of the initial weights; replicas that are averaged share it.
+        number: of the replica; gives it random numbers of its own.
+        device: torch device.
+    """
+
+    def __init__(self, make_networks: Callable[..., Any], settings: LearnerSettings,
+                 mission: Mission, horizon: int, seed: int, number: int = 0,
+                 device: str = "cpu") -> None:
+        self.settings, self.horizon, self.mission = settings, horizon, mission
+        self.networks: QNetworks = make_networks(settings, mission, seed, device)
+        self.replay = Replay(settings.replay, mission)
+        self.episodes, self.slots = 0, 0
+        self._plan: np.ndarray | None = None
+        self._rng = stream(seed, "learning", number)
+
+    def enter(self, mission: Mission, plan: np.ndarray | None = None) -> None:
+        """Go on in another map of the mission, maybe with a plan (T, U) in it to learn from."""
+        self.mission, self._plan = mission, plan
+
+    @property
+    def epsilon(self) -> float:
+        """Present share of explored slots."""
+        settings = self.settings
+        done = min(self.slots / settings.epsilon_slots, 1.0) if settings.epsilon_slots else 1.0
+        return settings.first_epsilon + done * (settings.last_epsilon - settings.first_epsilon)
+
+    @property
+    def learning_rate(self) -> float:
+        """Present learning rate."""
+        first, last = self.settings.learning_rate, self.settings.last_learning_rate
+        return first + min(self.episodes / self.horizon, 1.0) * (last - first)
+
+    def train(self, episodes: int) -> dict[str, float]:
+        """Fly some flights and learn from them.
+
+        Returns:
+            Means over them: `train_ratio` of collected data, and the entries of
+            `QNetworks.update`; at their end: `epsilon`, `learning_rate`.
+        """
+        settings, ratios, losses = self.settings, [], []
+        for start in range(0, episodes, settings.parallel):
+            flights = self._fly(min(settings.parallel, episodes - start))
+            self.replay.add(flights)
+            ratios.append(flights.ratio(self.mission))
+            before = self.episodes // settings.episodes_per_update
+            self.episodes += len(flights.length)
+            self.slots += int(flights.length.sum())
+            if self.replay.size >= settings.batch:
+                for _ in range(self.episodes // settings.episodes_per_update - before):
+                    batch = self.replay.sample(settings.batch, self._rng)
+                    losses.append(self.networks.update(batch, self.mission, self.learning_rate))
+        names = losses[0] if losses else ()
+        means = {name: float(np.mean([loss[name] for loss in losses])) for name in names}
+        return {"train_ratio": float(np.concatenate(ratios).mean()), "epsilon": self.epsilon,
+                "learning_rate": self.learning_rate, **means}
+
+    def _fly(self, count: int) -> Flights:
+        guide = None if self._plan is None else (self._plan, self._followed_slots(count))
+        exploration = Exploration(self.epsilon, self.settings.excursion_slots, self._rng)
+        policy = AgentPolicy(self.networks.agent, self.networks.device, exploration, guide)
+        return fly(self._environment(count), policy)
+
+    def _environment(self, count: int) -> Environment:
+        return Environment(self.mission, count, self._rng)
+
+    def _followed_slots(self, count: int) -> np.ndarray:
+        """Draw the slots for which each flight follows the plan.
+
+        A quarter of the flights follow it to the end, the others a random part of it, which
+        becomes shorter as training goes on.
+        """
+        assert self._plan is not None
+        longest = len(self._plan) * (1 - min(self.episodes / self.horizon, 1.0))
+        slots = self._rng.integers(0, int(longest) + 1, count)
+        before, after = (int(np.ceil(GUIDED_SHARE * number)) for number in
+                         (self.episodes, self.episodes + count))
+        slots[:after - before] = len(self._plan)
+        return slots
+
+    def weights(self) -> dict[str, np.ndarray]:
+        """Return copies of the weights that are averaged over replicas."""
+        return self.networks.weights()
+
+    def set_weights(self, weights: dict[str, np.ndarray]) -> None:
+        """Go on from averaged weights."""
+        self.networks.set_weights(weights)
+
+    def state(self) -> dict:
+        """Return a checkpoint."""
+        return {"episodes": self.episodes, "slots": self.slots,
+                "rng": self._rng.bit_generator.state, "learner": self.networks.state(),
+                "replay": self.replay.state()}
+
+    def load_state(self, state: dict) -> None:
+        """Go on from a checkpoint."""
+        require(state, {"episodes": COUNT, "slots": COUNT, "rng": GENERATOR, "learner": ...,
+                        "replay": ...})
+        self.episodes, self.slots = state["episodes"], state["slots"]
+        self._rng.bit_generator.state = state["rng"]
+        self.networks.load_state(state["learner"])
+        self.replay.load_state(state["replay"])
+
+
 class QMIX(Learner):
     """`--algorithm qmix`: train one replica in each map.
 
@@ -453,8 +450,8 @@ class QMIX(Learner):
         self.episodes, self._highest, self.mission = 0, -np.inf, mission
         self._actions: np.ndarray | None = None  # of the guide's plan
         horizon = setup.rounds * run.episodes
-        self._trainers = Replicas([(self.networks, settings, mission, horizon, run.seed, number,
-                                    setup.device) for number in numbers])
+        self._trainers = Replicas(Trainer, [(self.networks, settings, mission, horizon, run.seed,
+                                             number, setup.device) for number in numbers])
 
     @override
     def prepare(self, mission: Mission,

@@ -6,7 +6,7 @@ With them: the threads and the memory of a process that trains, checked before a
 import ctypes
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any
 
@@ -17,7 +17,6 @@ import torch
 from marl.environment import observation_size, state_size
 from marl.mission import Mission
 from marl.settings import LearnerSettings, RunSettings, learner_class
-from marl.training import Trainer
 from radiotwin.errors import RunFailed
 from radiotwin.io.budgets import TRAINING_BYTES
 from radiotwin.io.signals import deferred
@@ -82,21 +81,22 @@ class Replicas:
     single replica or core they train one after the other in this process, to the same result.
 
     Args:
-        arguments: of each `Trainer`.
+        made: class of the trainers, such as `marl.qmix.Trainer`.
+        arguments: of each of them.
     """
 
-    def __init__(self, arguments: Sequence[tuple]) -> None:
-        self._here: list[Trainer] = []
+    def __init__(self, made: Callable[..., Any], arguments: Sequence[tuple]) -> None:
+        self._here: list[Any] = []
         self._pools: list[Any] = []
         self._begun: list[Future[None]] = []
         if len(arguments) == 1 or usable_cores() == 1:
-            self._here = [Trainer(*each) for each in arguments]
+            self._here = [made(*each) for each in arguments]
             return
         try:
             for each in arguments:
                 pool, _ = start_process({})
                 self._pools.append(pool)
-                self._begun.append(pool.submit(_begin, each))
+                self._begun.append(pool.submit(_begin, made, each))
         except BaseException:  # interrupted, too
             self.close()
             raise
@@ -105,7 +105,7 @@ class Replicas:
         """Call a method of all trainers at once.
 
         Args:
-            method: name of a method of `Trainer`.
+            method: name of a method of a trainer.
             arguments: the same for all.
             each: one more argument for every replica, after the others.
 
@@ -153,14 +153,14 @@ def result_of(call: "Future[Any]") -> Any:
                         "same command with --resume to go on from the last checkpoint") from None
 
 
-_trainer: Trainer  # of a process that is nothing but a replica's
+_trainer: Any  # of a process that is nothing but a replica's
 
 
-def _begin(arguments: tuple) -> None:
+def _begin(made: Callable[..., Any], arguments: tuple) -> None:
     global _trainer
     limit_threads(1)
     keep_memory()
-    _trainer = Trainer(*arguments)
+    _trainer = made(*arguments)
 
 
 def _call(method: str, arguments: tuple) -> Any:

@@ -18,10 +18,9 @@ from marl.flights import Policy, fly
 from marl.heuristics import HeuristicPolicy
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy, plan
-from marl.qmix import QNetworks
+from marl.qmix import AgentPolicy, QNetworks, Trainer
 from marl.replanning import ReplanPolicy
 from marl.settings import LearnerSettings, stream
-from marl.training import AgentPolicy, Trainer
 from radiotwin import Scene, segmented_truth
 from radiotwin.runtime.console import progress
 from studies import tables

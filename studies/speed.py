@@ -18,10 +18,10 @@ from marl.environment import ACTION_COUNT, Environment, global_state, observe
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy, random_actions
 from marl.mission import Known, Mission, make_mission
-from marl.qmix import Agent, QNetworks
+from marl.qmix import Agent, QNetworks, Trainer
 from marl.replicas import Replicas
 from marl.settings import PRESETS
-from marl.training import Replay, Trainer
+from marl.training import Replay
 from radiotwin import Scene, close_loop, fit_twin, fly_survey, segmented_truth
 from radiotwin.links import LinkGeometry, link_geometry
 from radiotwin.propagation.laws import channel_named
@@ -121,7 +121,7 @@ def _replicas(rng: np.random.Generator, scene: Scene, settings: dict) -> dict[st
         with ThreadPoolExecutor(workers) as pool:
             found[name] = _wall_s(1, lambda pool: list(pool.map(
                 Trainer.train, trainers, [episodes] * 3)), pool)
-    with closing(Replicas(arguments)) as replicas:
+    with closing(Replicas(Trainer, arguments)) as replicas:
         replicas.call("train", 40)
         found["three processes"] = _wall_s(1, replicas.call, "train", episodes)
     results = {}

@@ -9,9 +9,8 @@ import pandas as pd
 import pytest
 import torch
 
-from marl.qmix import QNetworks
+from marl.qmix import QNetworks, Trainer
 from marl.settings import LearnerSettings
-from marl.training import Trainer
 from radiotwin.scene import Scene
 
 ROOT = Path(__file__).parents[1]

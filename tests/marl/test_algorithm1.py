@@ -18,8 +18,8 @@ from marl.flights import evaluate
 from marl.heuristics import HeuristicPolicy, waypoint_actions
 from marl.mission import Known, make_mission
 from marl.planner import PlanPolicy
+from marl.qmix import Trainer
 from marl.settings import PRESETS, RunSettings
-from marl.training import Trainer
 from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 

@@ -7,8 +7,7 @@ from marl.environment import Environment, observation_size
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy
 from marl.mission import HOVER, NO_OP
-from marl.qmix import Agent
-from marl.training import AgentPolicy
+from marl.qmix import Agent, AgentPolicy
 from studies.disturbed import Disturbance, DisturbedEnvironment
 
 

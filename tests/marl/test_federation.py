@@ -9,10 +9,9 @@ import pytest
 import marl.replicas
 from marl.fedqmix.federation import average, weighted_mean
 from marl.mission import Known, make_mission
-from marl.qmix import QNetworks
+from marl.qmix import QNetworks, Trainer
 from marl.replicas import Replicas
 from marl.settings import PRESETS
-from marl.training import Trainer
 from radiotwin.errors import RunFailed
 from radiotwin.maps.survey import segmented_truth
 
@@ -86,7 +85,7 @@ def test_federating_all_averages_moments_and_target_networks(mission):
 def test_processes_learn_the_same_as_this_one(mission, monkeypatch):
     monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 2)
     here = [Trainer(*each) for each in arguments(mission)]
-    replicas = Replicas(arguments(mission))
+    replicas = Replicas(Trainer, arguments(mission))
     try:
         records = replicas.call("train", 8)
         assert records == [trainer.train(8) for trainer in here]
@@ -110,7 +109,7 @@ def test_processes_learn_the_same_as_this_one(mission, monkeypatch):
 def test_on_one_core_replicas_learn_in_this_process(mission, monkeypatch):
     monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 1)
     here = [Trainer(*each) for each in arguments(mission)]
-    replicas = Replicas(arguments(mission))
+    replicas = Replicas(Trainer, arguments(mission))
     try:
         assert replicas.call("train", 8) == [trainer.train(8) for trainer in here]
         assert not replicas._pools

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from marl.qmix import gru
+from marl.gru import gru
 
 
 @pytest.mark.parametrize("slots, batch, inputs, hidden", [(1, 1, 3, 4), (7, 1, 5, 8), (1, 6, 5, 8), (40, 9, 16, 12)])

@@ -10,9 +10,9 @@ from marl.environment import Environment, observation_size, observe
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy
 from marl.mission import HOVER, Mission
-from marl.qmix import Agent, IndependentNetworks, QNetworks
+from marl.qmix import Agent, AgentPolicy, IndependentNetworks, QNetworks, Trainer
 from marl.settings import LearnerSettings
-from marl.training import AgentPolicy, Exploration, Replay, Trainer
+from marl.training import Exploration, Replay
 
 SETTINGS = LearnerSettings(hidden=8, mixing_width=4, parallel=4, batch=4, replay=12, epsilon_slots=400)
 POLICY = 5  # an action that nothing in these masks allows: whoever flies it is not on an excursion
