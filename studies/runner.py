@@ -33,7 +33,8 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "workers": "execution", "scheduler": "execution", "regions": "regions",
            "nested": "nested",
            "maps": "wrong_maps", "foreign": "foreign", "calibration": "calibration",
-           "sizes": "told_sizes", "reciprocity": "reciprocity", "where": "where"}
+           "sizes": "told_sizes", "belief": "belief",
+           "reciprocity": "reciprocity", "where": "where"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]
 Todo = list[tuple[str, int, dict]]

@@ -1,0 +1,146 @@
+"""Plans, planning again, and planning again on a belief, where things are not as thought: `belief`.
+
+    python -m studies belief --jobs 2
+
+The law is learnt from the anchors of one flight in the truth: of the right form where the truth is
+statistical, and of the wrong one where it is ray-traced. `positions`: unknown devices are 20 to
+40 m from where map and UAVs have them. `silent`: three devices do not transmit, and the UAVs know
+of each that it does not with a probability of 0.3. `both`. `volumes`: data are evenly 0 to twice
+what is thought. Batteries are such that who knows all collects 0.85 to 0.95. Beside: the promise of
+`radiotwin plan` for a plan on the same belief, and what it collects.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+from scipy.stats import ttest_1samp
+
+from marl.environment import Environment
+from marl.flights import Policy, fly
+from marl.heuristics import HeuristicPolicy
+from marl.mission import Known, Mission, make_mission
+from marl.planner import PlanPolicy, plan
+from marl.promise import promise
+from marl.replanning import EVERY, ITERATIONS, ReplanPolicy
+from marl.settings import stream
+from marl.worlds import twin_prior
+from radiotwin import Scene, Twin, fit_twin, fly_survey
+from radiotwin.maps.survey import read_truth
+from studies import tables
+from studies.disturbances import OFF_M, SILENT_DB
+from studies.runner import Study
+
+BATTERY = {"rbm-traced": 0.9, "rbm-segmented": 1.0, "rdm-traced": 0.95, "rdm-segmented": 1.0}
+OF_SILENT = 0.85  # of the battery, where there is less to collect
+SCENARIOS = ("positions", "silent", "both", "volumes")
+SILENT, SILENT_SHARE = 3, 0.3
+METHODS = {"fixed": "open-loop plan", "replan": "re-planning", "belief": "belief, link",
+           "belief-no-link": "belief, no link", "greedy": "greedy",
+           "clairvoyant": "plan by who knows all"}
+
+
+def belief_cases(seed: int) -> dict[str, dict]:
+    """Return every scenario in every world."""
+    return {f"{world}-{scenario}": {"world": world, "scenario": scenario, "iterations": 20_000,
+                                    "battery": battery * (OF_SILENT if scenario in
+                                                          ("silent", "both") else 1.0)}
+            for scenario in SCENARIOS for world, battery in BATTERY.items()}
+
+
+def fly_believing(seed: int, settings: dict) -> dict:
+    """Fly every method in one world, with settings as in `belief_cases`.
+
+    Returns:
+        Share of the data of devices that transmit, for each method; `promised`: P10, P50 and P90 of
+        a plan on the belief, and `kept`: what it collects.
+    """
+    name, _, truth = settings["world"].partition("-")
+    scene, scenario = _with_battery(Scene.load(tables.scene_folder(name)),
+                                    settings["battery"]), settings["scenario"]
+    rng, radio_map = np.random.default_rng([seed, 17]), read_truth(scene, truth)
+    twin = _learnt(scene, radio_map, seed, rng, scenario in ("positions", "both"))
+    known, own_map = Known.of(twin.devices), twin.radio_map(scene)
+    prior = twin_prior(twin, scene, own_map, stream(seed, "learning"),
+                       SILENT_SHARE if scenario in ("silent", "both") else 0.0,
+                       1.0 if scenario == "volumes" else 0.0)
+    believed = make_mission(scene, own_map, known)._replace(
+        shadowing_share=prior.share, shadowing_m=prior.length_m)
+    real = make_mission(scene, radio_map, known)
+    sends = np.ones(real.devices, dtype=bool)
+    if prior.silent.any():
+        sends[rng.choice(real.devices, SILENT, replace=False)] = False
+        real = real._replace(snr_db=np.where(sends[None, :, None, None], real.snr_db, -np.inf)
+                             .astype(np.float32))
+    if prior.data_spread:
+        real = real._replace(data_units=real.data_units * rng.uniform(0, 2, real.devices))
+    tries, unlinked = settings["iterations"], np.array([SILENT_DB, 0.0])
+
+    def replanned(on: bool, linked: bool = True) -> Policy:
+        mission = believed if linked else believed._replace(uav_link_db=unlinked)
+        return ReplanPolicy(mission, prior if on else None, linked, EVERY, ITERATIONS, tries, seed,
+                            stream(seed, "planning", 1))
+
+    promised = promise(prior, believed, 200, tries, seed)
+    waiting = real._replace(data_units=real.data_units * sends)
+    policies = {
+        "fixed": PlanPolicy(plan(believed, tries, seed).actions), "replan": replanned(False),
+        "belief": replanned(True), "belief-no-link": replanned(True, False),
+        "greedy": HeuristicPolicy("greedy", stream(seed, "decisions")),
+        "clairvoyant": PlanPolicy(plan(waiting, tries, seed).actions),
+        "kept": PlanPolicy(promised.plan.actions)}
+    return {method: _share(real, sends, policy, seed) for method, policy in policies.items()} | {
+        "promised": list(promised.quantiles.values())}
+
+
+def _share(real: Mission, sends: np.ndarray, policy: Policy, seed: int) -> float:
+    flown = fly(Environment(real, 4, stream(seed, "truth evaluation")), policy)
+    return float(flown.collected.sum(axis=(1, 2)).mean() / real.data_units[sends].sum())
+
+
+def _with_battery(scene: Scene, factor: float) -> Scene:
+    uavs = [uav.model_copy(update={"battery": round(2 * factor * uav.battery) / 2})
+            for uav in scene.config.uavs]
+    return replace(scene, config=scene.config.model_copy(update={"uavs": uavs}))
+
+
+def _learnt(scene: Scene, truth: object, seed: int, rng: np.random.Generator,
+            is_displaced: bool) -> Twin:
+    """Return a twin with the law of the anchors' links of one flight, and thought positions."""
+    measured = fly_survey(scene, truth, flights=1, seed=seed)  # type: ignore[arg-type]
+    anchors = [each.device for each in scene.config.devices if each.role == "anchor"]
+    names = measured.devices["device"].to_numpy()[measured.device_index]
+    twin = fit_twin(measured.select(np.isin(names, anchors)), scene, seed=seed)
+    devices = []
+    for each, true in zip(twin.devices, scene.config.devices, strict=True):
+        angle, off_m = rng.uniform(0, 2 * np.pi), rng.uniform(*OFF_M) * is_displaced
+        if each.role == "unknown":
+            each = replace(each, x_m=true.x_m + off_m * np.cos(angle), z_m=true.z_m,
+                           y_m=true.y_m + off_m * np.sin(angle), located=True, second_mode=None,
+                           credible_radius_m=OFF_M[1] * is_displaced)
+        devices.append(each)
+    return replace(twin, devices=devices)
+
+
+def belief_table(rows: pd.DataFrame) -> str:
+    """Return worlds and scenarios against methods, the gap that a belief closes, and promises."""
+    lines = []
+    for name, mine in rows.groupby("name", sort=True):
+        gap = (mine["clairvoyant"] - mine["fixed"]).mean()
+        closed = [f"{(mine[method] - mine['fixed']).mean() / gap:.0%}" if gap > 0.01 else "–"
+                  for method in ("belief", "belief-no-link")]
+        less = [method for method in ("fixed", "replan") if len(mine) > 2 and ttest_1samp(
+            mine["belief"] - mine[method], 0, alternative="less").pvalue < 0.05]
+        lines.append([str(name), str(len(mine)),
+                      *(tables.number(mine[method].mean()) for method in METHODS), *closed,
+                      ", ".join(METHODS[method] for method in less) or "none"])
+    p10, _, p90 = np.array(rows["promised"].tolist()).T
+    kept = rows["kept"].to_numpy()
+    return tables.markdown(
+        ["", "seeds", *METHODS.values(), "gap closed", "without link", "belief below (5 %)"], lines
+    ) + (f"\n\nPromises: of {len(rows)} plans, {np.mean(kept < p10):.0%} collect less than the P10 "
+         f"promised, {np.mean(kept > p90):.0%} more than the P90.")
+
+
+STUDIES = {"belief": Study("What does a belief bring in flight?", fly_believing, belief_cases,
+                           belief_table, seeds=10)}
