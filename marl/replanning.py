@@ -23,7 +23,7 @@ from marl.settings import stream
 from radiotwin.runtime.compiled import njit
 
 LOW_TEMPERATURE = 0.005  # keeps the present plan unless another one is better
-EVERY, ITERATIONS = 5, 1500  # slots between searches, and plans that each tries
+EVERY, ITERATIONS = 2, 1500  # slots between searches, and plans that each tries
 
 
 class ReplanPolicy:
