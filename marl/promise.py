@@ -1,7 +1,9 @@
 """A plan with a promise: the share of the data that it will collect, and how sure that is.
 
-The plan is searched on what the twin expects, and flown in worlds that the twin holds possible
-(`marl.worlds`), drawn apart from those that chose it. The sizing asks how many UAVs with which
+Plans are searched on what the twin expects, and on less than that: where all is expected to be
+collected with battery to spare, only a cautious plan uses the rest against what may go wrong. The
+best of them is flown in worlds that the twin holds possible (`marl.worlds`), drawn apart from those
+that chose it. The sizing asks how many UAVs with which
 battery, and from which base, collect a wanted share in a wanted share of the worlds.
 """
 
@@ -20,7 +22,8 @@ from marl.settings import stream
 from marl.worlds import WorldSource
 
 QUANTILES = (0.1, 0.5, 0.9)
-TRIED_PLANS, CHOOSING_WORLDS = 2, 20  # of each mission, the plan that collects most in so many
+CAUTION = (0.0, 0.7, 1.4, 2.1)  # standard deviations of the errors, by which plans expect less
+TRIED_PLANS, CHOOSING_WORLDS = len(CAUTION), 20  # the plan flies that collects most in so many
 SCHEMA = "radiotwin.plan/1"
 
 
@@ -68,12 +71,13 @@ def promise(prior: Prior, mission: Mission, worlds: int, iterations: int, seed: 
         seed: of plans and worlds.
         on_progress: called with the number of searches done since the last call.
     """
-    data_units, value = weighted(Belief(prior, mission), mission.data_units)
-    planned = mission._replace(level=np.arange(mission.uavs), data_units=data_units)
     source = WorldSource(prior, mission)
     best: tuple[float, Plan] | None = None
     trials = [source.draw(stream(seed, "choice", number)) for number in range(CHOOSING_WORLDS)]
-    for number in range(TRIED_PLANS):
+    for number, caution in enumerate(CAUTION):
+        belief = Belief(_cautious(prior, caution), mission)
+        data_units, value = weighted(belief, mission.data_units)
+        planned = mission._replace(level=np.arange(mission.uavs), data_units=data_units)
         found = plan(planned, iterations, seed + number, value)
         mean = float(np.mean([_flown(found, *world, stream(seed, "choice", number))[0]
                               for number, world in enumerate(trials)]))
@@ -85,6 +89,18 @@ def promise(prior: Prior, mission: Mission, worlds: int, iterations: int, seed: 
     flown = [_flown(best[1], *source.draw(rng), rng) for rng in rngs]
     return Promise(best[1], np.array([share for share, _ in flown]),
                    np.array([each for _, each in flown]))
+
+
+def _cautious(prior: Prior, caution: float) -> Prior:
+    """Return a belief in levels that are lower by so many standard deviations of their errors."""
+    if not caution:
+        return prior
+    of_device = prior.level_sd_db**2 + prior.common_sd_db**2
+    sd_db = np.sqrt(of_device[:, None, None, None, None] + prior.share * prior.sd_db**2)
+    return prior._replace(
+        snr_db=(prior.snr_db - caution * sd_db).astype(np.float32), common_sd_db=0.0,
+        level_sd_db=np.zeros_like(prior.level_sd_db),
+        sd_db=(prior.sd_db * np.sqrt(1 - prior.share)).astype(np.float32), share=0.0)
 
 
 def _flown(found: Plan, real: Mission, transmits: np.ndarray,

@@ -87,6 +87,7 @@ def plan(
 def _show(planned: "PlannedFlights", wanted: float, confidence: float) -> None:
     """Print what is promised, of all data and of each device, and the sizes."""
     from marl.promise import smallest
+    from radiotwin.display import count
 
     promised = planned.promised
     record = promised.record([each.device for each in planned.scene.config.devices],
@@ -109,5 +110,5 @@ def _show(planned: "PlannedFlights", wanted: float, confidence: float) -> None:
     enough = smallest(planned.sizes, confidence)
     say(f"no size tried collects {wanted:.0%} in {confidence:.0%} of the worlds: more UAVs "
         "(--uavs) or larger batteries (--battery) are needed" if enough is None else
-        f"{wanted:.0%} in {confidence:.0%} of the worlds needs {enough.uavs} UAVs with a battery "
-        f"of {enough.battery:g} moves, base {enough.base}")
+        f"{wanted:.0%} in {confidence:.0%} of the worlds needs {count(enough.uavs, 'UAV')} with "
+        f"a battery of {enough.battery:g} moves, base {enough.base}")
