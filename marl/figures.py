@@ -35,7 +35,7 @@ def choose_flight(flights: Flights, mission: Mission) -> int:
 
 
 def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight: int,
-                        known: Known) -> Figure:
+                        known: Known | None) -> Figure:
     """Draw one flight over the city, a panel for each UAV.
 
     Args:
@@ -43,7 +43,7 @@ def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight
         mission: that was flown.
         flights: a record.
         flight: index of the flight in it.
-        known: positions as the UAVs knew them.
+        known: positions as the UAVs knew them; None: those of the scene are no others.
     """
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     width_in = 5.6 * min(max((x_max - x_min) / (y_max - y_min), 0.6), 1.6)
@@ -63,7 +63,8 @@ def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight
         axes.set(xlim=(x_min, x_max), ylim=(y_min, y_max), aspect="equal", xlabel="x, east [m]",
                  title=f"{uav.uav}, {uav.altitude_m:g} m: {share:.0%} of all data")
     panels[0].set_ylabel("y, north [m]")
-    figure.legend(handles=_legend(), loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(handles=_legend(known is not None), loc="outside lower center", ncols=4,
+                  frameon=False)
     figure.suptitle(
         f"{scene.config.name}: {flights.ratio(mission)[flight]:.1%} collected. Paths in the colour "
         "of the device that serves the UAV; percentages: what this UAV takes of a device's data")
@@ -225,13 +226,13 @@ def _draw_path(axes: Axes, scene: Scene, mission: Mission, flights: Flights, fli
                   markeredgewidth=1.8)
 
 
-def _draw_devices(axes: Axes, scene: Scene, known: Known, colours: list,
+def _draw_devices(axes: Axes, scene: Scene, known: Known | None, colours: list,
                   share: np.ndarray) -> None:
     for k, device in enumerate(scene.config.devices):
         marker, size = ("^", 11) if device.role == "anchor" else ("*", 15)
         axes.plot(device.x_m, device.y_m, marker, color=colours[k], markersize=size,
                   markeredgecolor="black", markeredgewidth=0.8)
-        if device.role != "anchor" and device.device in known.position_m:
+        if device.role != "anchor" and known is not None and device.device in known.position_m:
             axes.plot(*known.position_m[device.device], "x", color="black", markersize=7,
                       markeredgewidth=1.6)
         label = device.device if share[k] < 0.005 else f"{device.device}: {share[k]:.0%}"
@@ -242,13 +243,15 @@ def _draw_devices(axes: Axes, scene: Scene, known: Known, colours: list,
                       path_effects=[withStroke(linewidth=2.5, foreground="white")])
 
 
-def _legend() -> list[Line2D]:
+def _legend(is_truth_known: bool) -> list[Line2D]:
     def mark(marker: str, label: str, size: float, **style: Any) -> Line2D:
         return Line2D([], [], linestyle="", marker=marker, label=label, markersize=size,
                       color="black", **style)
 
-    return [mark("^", "anchor", 9), mark("*", "unknown device, true position", 12),
-            mark("x", "its estimate", 7, markeredgewidth=1.6),
+    unknown = [mark("*", "unknown device, true position", 12),
+               mark("x", "its estimate", 7, markeredgewidth=1.6)] if is_truth_known else [
+        mark("*", "unknown device, where it is thought to be", 12)]
+    return [mark("^", "anchor", 9), *unknown,
             mark("s", "start", 9, markerfacecolor="none"),
             mark("D", "terminal", 9, markerfacecolor="none"),
             mark("o", "hover, larger for longer", 8),

@@ -65,7 +65,6 @@ class PlannedFlights:
         scene: with the UAVs that fly, and the devices where the twin has them.
         mission: in the twin.
         prior: what the twin believes.
-        known: positions of the devices.
         promised: the plan, and what it collects.
         sizes: of the sizing; empty where it was not asked for.
     """
@@ -73,7 +72,6 @@ class PlannedFlights:
     scene: Scene
     mission: Mission
     prior: Prior
-    known: Known
     promised: Promise
     sizes: list[Size]
 
@@ -94,8 +92,8 @@ def plan_flights(twin: Twin, scene: Scene, settings: PlanSettings,
     """
     flown = planned_scene(scene, twin, settings)
     on_progress(0, "predicting the map")
-    radio_map, known = twin.radio_map(scene), Known.of(twin.devices)
-    mission = make_mission(flown, radio_map, known,
+    radio_map = twin.radio_map(scene)
+    mission = make_mission(flown, radio_map, Known.of(twin.devices),
                            keep_out=keep_out(flown, settings.areas, settings.clearance_m))
     on_progress(0, "drawing worlds")
     prior = twin_prior(twin, flown, radio_map, stream(settings.seed, "learning"), settings.silent,
@@ -113,7 +111,7 @@ def plan_flights(twin: Twin, scene: Scene, settings: PlanSettings,
     usual = max(uav.battery for uav in flown.config.uavs)
     table = sizes(prior, mission, names, counts, [factor * usual for factor in BATTERIES],
                   settings.wanted, *made)
-    return PlannedFlights(flown, mission, prior, known, promised, table)
+    return PlannedFlights(flown, mission, prior, promised, table)
 
 
 def planned_scene(scene: Scene, twin: Twin, settings: PlanSettings) -> Scene:

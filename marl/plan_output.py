@@ -64,7 +64,7 @@ def write_plan(folder: Path, planned: PlannedFlights, wanted: float, facts: dict
     with atomic_path(folder / "plan.json") as temporary:
         temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     flown = evaluate(mission, PlanPolicy(promised.plan.actions), 1, np.random.default_rng(0))
-    figure = trajectories_figure(scene, mission, flown, 0, planned.known)
+    figure = trajectories_figure(scene, mission, flown, 0, None)
     p10, p50, p90 = promised.quantiles.values()
     figure.suptitle(f"{scene.config.name}: {p50:.0%} of the data expected, {p10:.0%} to {p90:.0%} "
                     "in eight of ten worlds")

@@ -112,7 +112,7 @@ def _flown(found: Plan, real: Mission, transmits: np.ndarray,
     with np.errstate(invalid="ignore"):
         by_device = np.where(transmits, taken / real.data_units, np.nan)
     total = float(real.data_units.sum())
-    return (float(taken.sum()) / total if total else 1.0), by_device
+    return (min(float(taken.sum()) / total, 1.0) if total else 1.0), by_device
 
 
 def _quantiles(share: np.ndarray) -> dict[str, float]:

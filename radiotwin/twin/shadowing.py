@@ -66,23 +66,42 @@ class MapErrors:
             links: n measured links, with the twin's devices.
             seed: of the selection of links.
         """
-        rng = np.random.default_rng(seed)
-        rows = []
-        for device in np.flatnonzero([each.located for each in twin.devices]):
-            mine = np.flatnonzero((links.device == device) & np.isfinite(links.level_db))
-            if len(mine) >= MIN_LINKS:
-                rows.append(rng.choice(mine, min(MAX_LINKS, len(mine)), replace=False))
-        if not rows:
+        located = np.array([each.located for each in twin.devices])
+        some = links.select(_sampled(links.device, located[links.device]
+                                     & np.isfinite(links.level_db), seed)).located(twin.device_m)
+        if not len(some):
             return cls()
-        some = links.select(np.sort(np.concatenate(rows))).located(twin.device_m)
         predicted = twin.predict(some)
-        residual_db, precision = some.level_db - predicted.mean_db, 1.0 / predicted.sd_db**2
-        _, index = np.unique(some.device, return_inverse=True)
+        return cls.of_residuals(some.device, some.receiver_m, some.level_db - predicted.mean_db,
+                                predicted.sd_db, seed, twin.residual_field)
+
+    @classmethod
+    def of_residuals(cls, device: np.ndarray, receiver_m: np.ndarray, residual_db: np.ndarray,
+                     sd_db: np.ndarray, seed: int, field: ResidualField | None = None
+                     ) -> "MapErrors":
+        """Estimate them from residuals.
+
+        Args:
+            device: (n,) index of each link's device.
+            receiver_m: (n, 3) [m].
+            residual_db: (n,) NaN where there is none.
+            sd_db: (n,) their standard deviation [dB].
+            seed: of the selection of links.
+            field: whose correlation they have; None: it is fitted.
+        """
+        rows = _sampled(device, np.isfinite(residual_db), seed)
+        if not len(rows):
+            return cls()
+        device, receiver_m, residual_db, sd_db = (
+            each[rows] for each in (device, receiver_m, residual_db, sd_db))
+        precision = 1.0 / sd_db**2
+        _, index = np.unique(device, return_inverse=True)
         level_db = np.bincount(index, residual_db * precision) / np.bincount(index, precision)
-        field = twin.residual_field or ResidualField().fit(
-            some.device, some.receiver_m, (residual_db - level_db[index]) / predicted.sd_db, seed)
+        if field is None:
+            field = ResidualField().fit(device, receiver_m,
+                                        (residual_db - level_db[index]) / sd_db, seed)
         # Of a device's level, what its map's errors would bring anyway is left out.
-        chance = [_mean_variance(some.receiver_m[index == k], precision[index == k], field)
+        chance = [_mean_variance(receiver_m[index == k], precision[index == k], field)
                   for k in range(len(level_db))]
         off = float(((level_db - np.median(level_db))**2 - chance).sum())
         variance = (max(off, 0.0) + PRIOR_DEVICES * LEVEL_SD_DB**2) / (
@@ -94,6 +113,16 @@ class MapErrors:
     def kept(cls, twin: Twin) -> "MapErrors":
         """Return those that a twin was stored with; what is usual where it has none."""
         return cls(**twin.provenance.get(MAP_ERRORS, {}))
+
+
+def _sampled(device: np.ndarray, usable: np.ndarray, seed: int) -> np.ndarray:
+    """Return rows of links that are usable (n,): some of each device that has enough of them."""
+    rng, rows = np.random.default_rng(seed), [np.empty(0, dtype=np.int64)]
+    for number in np.unique(device[usable]):
+        mine = np.flatnonzero((device == number) & usable)
+        if len(mine) >= MIN_LINKS:
+            rows.append(rng.choice(mine, min(MAX_LINKS, len(mine)), replace=False))
+    return np.sort(np.concatenate(rows))
 
 
 def _mean_variance(receiver_m: np.ndarray, precision: np.ndarray, field: ResidualField) -> float:

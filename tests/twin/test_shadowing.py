@@ -9,7 +9,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import fly_survey, segmented_truth
 from radiotwin.scene.lattice import Lattice
 from radiotwin.twin import fit_twin
-from radiotwin.twin.shadowing import fit_shadowing, with_shadowing
+from radiotwin.twin.shadowing import MapErrors, fit_shadowing, with_shadowing
 
 LIMIT_DB = -115.0
 
@@ -67,3 +67,26 @@ def test_the_correlation_of_an_interpolating_twin_is_that_of_its_own_field(small
             with_shadowing(radio_map, twin, measurements, -120.0, 0).write(tmp_path / "map.nc")
             attributes = RadioMap.read(tmp_path / "map.nc").dataset.attrs
             assert (attributes["shadowing_share"], attributes["shadowing_length_m"]) == (0.7, 70.0)
+
+
+@pytest.mark.parametrize("level_sd_db", [0.5, 4.0])
+def test_levels_of_devices_and_errors_that_last_are_told_apart(level_sd_db):
+    """Residuals drawn here: a level for each device, and an error with a correlation of 60 m along a street."""
+    found = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        device = np.repeat(np.arange(20), 150)
+        along_m = np.tile(np.arange(150) * 10.0, 20)
+        kept, error = np.exp(-10.0 / 60.0), np.empty(len(device))
+        for row in range(len(device)):
+            new = rng.normal()
+            error[row] = new if along_m[row] == 0 else kept * error[row - 1] + np.sqrt(1 - kept**2) * new
+        residual_db = level_sd_db * rng.normal(size=20)[device] + 5.0 * (
+            np.sqrt(0.7) * error + np.sqrt(0.3) * rng.normal(size=len(device)))
+        receiver_m = np.column_stack([along_m, np.zeros((len(device), 2))])
+        found.append(MapErrors.of_residuals(device, receiver_m, residual_db, np.full(len(device), 5.0), seed))
+    assert all(each.devices == 20 for each in found)
+    assert 0.5 < np.mean([each.share for each in found]) < 0.85
+    assert 30.0 < np.mean([each.length_m for each in found]) < 120.0
+    mean_db = np.mean([each.level_sd_db for each in found])
+    assert 0.7 * level_sd_db < mean_db < 1.3 * level_sd_db + 0.8

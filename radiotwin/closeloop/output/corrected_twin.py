@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
+
+import numpy as np
 
 import radiotwin
 from radiotwin.closeloop.predict.predictor import served
 from radiotwin.closeloop.run import Loop
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import RadiusCalibration, calibrate_radii, whole_area
+from radiotwin.twin.shadowing import MAP_ERRORS, MapErrors
 from radiotwin.twin.twin import Twin, measured_heights
 
 
@@ -29,12 +32,23 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     provenance: dict[str, Any] = {"links": len(model.links),
                                   "radiotwin_version": radiotwin.__version__}
     provenance |= measured_heights(model.links)
+    residual_db = loop.links.level_db - loop.prediction.map_db
+    sd_db = np.where(loop.links.los, *(_sd_db(residual_db[loop.links.los == los])
+                                       for los in (True, False)))
+    provenance[MAP_ERRORS] = asdict(MapErrors.of_residuals(
+        loop.links.device, loop.links.receiver_m, residual_db, sd_db, loop.seed))
     if loop.origin is not None:
         provenance |= {"origin": loop.origin.model_dump()}
     if scene is not None:
         provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}
     # Devices whose position is too uncertain to be learnt from, too: a map with them is better.
     return replace(model.twin, provenance=provenance, fitted=fitted)
+
+
+def _sd_db(residual_db: np.ndarray) -> float:
+    """Return the standard deviation of those residuals that there are; 1 dB of hardly any."""
+    known = residual_db[np.isfinite(residual_db)]
+    return max(float(known.std()), 0.1) if len(known) > 1 else 1.0
 
 
 def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
