@@ -42,7 +42,7 @@ METHODS = {"fixed": "open-loop plan", "replan": "re-planning", "belief": "belief
 
 def belief_cases(seed: int) -> dict[str, dict]:
     """Return every scenario in every world."""
-    return {f"{world}-{scenario}": {"world": world, "scenario": scenario, "iterations": 20_000,
+    return {f"{world}-{scenario}": {"world": world, "scenario": scenario, "iterations": 100_000,
                                     "battery": battery * (OF_SILENT if scenario in
                                                           ("silent", "both") else 1.0)}
             for scenario in SCENARIOS for world, battery in BATTERY.items()}
