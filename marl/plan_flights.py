@@ -19,6 +19,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.config import ANTENNA_HEIGHT_M, DeviceConfig, UavConfig
 from radiotwin.twin import Twin
 
+MAX_COUNTS = 8  # numbers of UAVs that a sizing tries, up to twice those of the mission
 BATTERIES = (0.5, 0.75, 1.0, 1.5, 2.0)  # that a sizing tries, times that of the mission
 
 
@@ -100,7 +101,8 @@ def plan_flights(twin: Twin, scene: Scene, settings: PlanSettings,
                        settings.data_spread)
     mission = mission._replace(shadowing_share=prior.share, shadowing_m=prior.length_m)
     names = [uav.uav for uav in flown.config.uavs]
-    counts = range(1, 2 * mission.uavs + 1) if settings.sizes else range(0)
+    counts = np.unique(np.linspace(1, 2 * mission.uavs, MAX_COUNTS).round().astype(int)).tolist() \
+        if settings.sizes else []
     missions = 1 + len(bases(mission, names)) * len(counts) * len(BATTERIES)
 
     def search(count: int) -> None:

@@ -51,9 +51,13 @@ class Promise:
         return float((self.share >= wanted).mean())
 
     def record(self, names: Iterable[str], silent: np.ndarray) -> dict[str, Any]:
-        """Return what `plan.json` says of the share, of all data and of each device."""
+        """Return what `plan.json` says of the share, of all data and of each device.
+
+        That of a device which transmits in none of the worlds is None.
+        """
         devices = [{"device": name, "silent": float(round(s, 3)),
-                    "share": _quantiles(each[np.isfinite(each)])}
+                    "share": _quantiles(each[np.isfinite(each)])
+                    if np.isfinite(each).any() else None}
                    for name, each, s in zip(names, self.by_device.T, silent, strict=True)]
         return {"schema": SCHEMA, "share": self.quantiles, "worlds": len(self.share),
                 "devices": devices}
@@ -116,9 +120,8 @@ def _flown(found: Plan, real: Mission, transmits: np.ndarray,
 
 
 def _quantiles(share: np.ndarray) -> dict[str, float]:
-    values = np.quantile(share, QUANTILES) if len(share) else np.full(3, np.nan)
-    return {f"p{100 * q:.0f}": float(round(value, 4)) for q, value in zip(QUANTILES, values,
-                                                                          strict=True)}
+    return {f"p{100 * q:.0f}": float(round(value, 4))
+            for q, value in zip(QUANTILES, np.quantile(share, QUANTILES), strict=True)}
 
 
 @dataclass(frozen=True)

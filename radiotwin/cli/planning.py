@@ -93,9 +93,10 @@ def _show(planned: "PlannedFlights", wanted: float, confidence: float) -> None:
     record = promised.record([each.device for each in planned.scene.config.devices],
                              planned.prior.silent)
     columns = {"device": "left", "P10": "right", "P50": "right", "P90": "right"}
-    rows = [[name, *(f"{value:.3f}" for value in share.values())] for name, share in (
-        ("all data", record["share"]), *((each["device"], each["share"])
-                                         for each in record["devices"]))]
+    rows = [[name, *(("–",) * 3 if share is None else (f"{value:.3f}" for value in share.values()))]
+            for name, share in (
+                ("all data", record["share"]), *((each["device"], each["share"])
+                                                 for each in record["devices"]))]
     print_rows(f"Share collected, in {len(promised.share)} worlds that the twin holds possible",
                columns, rows)
     for name, value in record["share"].items():
