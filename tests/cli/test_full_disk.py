@@ -112,6 +112,7 @@ COMMANDS = [
     *(f"map twin --scene scene --force -o {{disk}}/{name}" for name in ("new.zarr", *(f"old{suffix}" for suffix in (*EXPORTERS, ".png") if suffix != ".zarr"))),
     *(f"export-scene scene --force -o {{disk}}/{name}" for name in ("new", "old.glb", "old.gltf", "old.obj")),
     "report twin --scene scene --force -o {disk}/old.html", "locate links/measurements.csv --twin corrected --force -o {disk}/old.csv",
+    "plan twin --scene scene --iterations 50 --worlds 20 -o {disk}/new",
     "coverage scene --tx-power-dbm 20 --step 20 -o {disk}/new", "demo -o {disk}/new",
 ]
 
