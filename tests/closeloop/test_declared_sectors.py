@@ -173,7 +173,7 @@ def test_of_a_sector_that_nothing_tells_the_twin_knows_that_it_knows_little(tmp_
         expected, known = twin.predict(later), twin.predict(heard)
         error_db.append(later.level_db - expected.mean_db)
         within.append(np.abs(error_db[-1]) < 1.645 * expected.sd_db)
-        assert known.sd_db.mean() < 0.6 * expected.sd_db.mean()
+        assert known.sd_db.mean() < 0.7 * expected.sd_db.mean()
     assert np.mean(within) > 0.8
     assert abs(np.mean(error_db)) < 4.0
 
