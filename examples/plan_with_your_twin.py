@@ -41,11 +41,11 @@ except ImportError as error:
     print(error)
 else:
     env = HarvestEnv(in_twin, [uav.uav for uav in scene.config.uavs])
-    observations, infos = env.reset(seed=0)
+    observations, _ = env.reset(seed=0)
     collected = 0.0
     while env.agents:
         # The first action that is allowed: to hover, as long as the battery lasts.
-        actions = {agent: int(infos[agent]["action_mask"].argmax()) for agent in env.agents}
-        observations, rewards, ended, cut, infos = env.step(actions)
+        actions = {agent: int(observations[agent]["action_mask"].argmax()) for agent in env.agents}
+        observations, rewards, _, _, _ = env.step(actions)
         collected += sum(rewards.values())
     print(f"hovering at the start collects {collected / in_twin.data_units.sum():.0%} in the twin")

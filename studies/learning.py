@@ -31,6 +31,7 @@ LABELS = {"fedqmix-nn": "model-aided FedQMIX", "qmix-nn": "model-aided QMIX",
           "greedy": "greedy, distinct targets, true positions", "random": "random"}
 LEVELS = ("greedy", "random")  # need no real episode
 ENOUGH = 0.95  # of what both learners reach at least
+PLANNER_ITERATIONS = 60_000  # of the rows that are kept
 
 
 def _own(model: type[BaseModel], values: dict[str, Any]) -> dict[str, Any]:
@@ -68,7 +69,8 @@ def learn(seed: int, settings: dict) -> dict:
 def case(scene: str, truth: str, algorithm: str, twin: str = "nn", **changes: Any) -> dict:
     """Return the settings of a row: those of a preset (`fast`), and what is changed in them."""
     preset = changes.get("preset", "fast")
-    fixed = {"truth": truth, "twin": twin, "algorithm": algorithm}
+    fixed = {"truth": truth, "twin": twin, "algorithm": algorithm,
+             "planner_iterations": PLANNER_ITERATIONS}
     run = RunSettings(**fixed | RUNS[preset] | _own(RunSettings, changes))
     settings = run.model_dump(mode="json", exclude={"seed", "compare"}) | {"scene": scene}
     learner = PRESETS[preset].model_copy(update=_own(LearnerSettings, changes))
@@ -196,7 +198,8 @@ def federation_table(rows: pd.DataFrame) -> str:
 def options(settings: dict, hidden: tuple[str, ...] = ("scene", "truth", "algorithm"),
             **changed: Any) -> str:
     """Return what differs from the defaults (some `changed`), as options of `marl.fedqmix`."""
-    defaults = RunSettings().model_dump(mode="json") | LearnerSettings().model_dump() | changed
+    defaults = RunSettings(planner_iterations=PLANNER_ITERATIONS).model_dump(mode="json") \
+        | LearnerSettings().model_dump() | changed
     given = [f"--{name.replace('_', '-')} {str(value).lower()}" for name, value in settings.items()
              if name not in hidden and value != defaults.get(name)]
     return f"`{' '.join(given)}`" if given else "as it is"
