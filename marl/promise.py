@@ -3,8 +3,8 @@
 Plans are searched on what the twin expects, and on less than that: where all is expected to be
 collected with battery to spare, only a cautious plan uses the rest against what may go wrong. The
 best of them is flown in worlds that the twin holds possible (`marl.worlds`), drawn apart from those
-that chose it. The sizing asks how many UAVs with which
-battery, and from which base, collect a wanted share in a wanted share of the worlds.
+that chose it. The sizing asks how many UAVs with which battery, and from which base, collect a
+wanted share in a wanted share of the worlds.
 """
 
 from collections.abc import Callable, Iterable
