@@ -11,6 +11,7 @@ from marl.environment import CorrelatedField
 from marl.mission import Mission, levels_of, snr_offset_db
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
+from radiotwin.scene.config import ANTENNA_HEIGHT_M
 from radiotwin.twin import Twin
 from radiotwin.twin.shadowing import MapErrors
 
@@ -77,15 +78,15 @@ def draw_positions(twin: Twin, row: int, scene: Scene, count: int,
     device = twin.devices[row]
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     anywhere = not np.isfinite([device.x_m, device.y_m, device.credible_radius_m]).all()
-    z_m = device.z_m if np.isfinite(device.z_m) else 1.5
+    z_m = device.z_m if np.isfinite(device.z_m) else ANTENNA_HEIGHT_M
     drawn_m = np.full((count, 3), z_m)
     if not anywhere:
         drawn_m[:, :2] = device.x_m, device.y_m
         if not device.credible_radius_m:
             return drawn_m
-    open_ = np.ones(count, dtype=bool)
+    pending = np.ones(count, dtype=bool)
     for _ in range(MAX_TRIES):
-        n = int(open_.sum())
+        n = int(pending.sum())
         if anywhere:
             trial = rng.uniform((x_min, y_min), (x_max, y_max), (n, 2))
         else:
@@ -95,14 +96,14 @@ def draw_positions(twin: Twin, row: int, scene: Scene, count: int,
                 radius_m = min(radius_m, float(np.hypot(*np.subtract(other, centre[0]))) / 2)
                 centre[rng.random(n) < weight] = other
             trial = centre + rng.normal(0, radius_m / RADIUS_IN_SD, (n, 2))
-        drawn_m[open_, :2] = trial
-        inside = scene.city.inside(drawn_m[open_])
+        drawn_m[pending, :2] = trial
+        inside = scene.city.inside(drawn_m[pending])
         outside = ((trial < (x_min, y_min)) | (trial > (x_max, y_max))).any(axis=1)
-        open_[open_] = inside | outside
-        if not open_.any():
+        pending[pending] = inside | outside
+        if not pending.any():
             break
-    if open_.any() and not open_.all():  # hardly any room: of those that were found
-        drawn_m[open_] = drawn_m[rng.choice(np.flatnonzero(~open_), int(open_.sum()))]
+    if pending.any() and not pending.all():  # hardly any room: of those that were found
+        drawn_m[pending] = drawn_m[rng.choice(np.flatnonzero(~pending), int(pending.sum()))]
     return drawn_m
 
 
