@@ -15,7 +15,7 @@ STEP_M = 3.0  # about, between the points at which buildings are looked for
 
 
 def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) -> np.ndarray:
-    """Return the positions (nz, ny, nx) of a scene's lattice at which no UAV may be.
+    """Return where (nz, ny, nx) of a scene's lattice no UAV may be, besides inside buildings.
 
     A move goes half a step beyond a position, so all of that is looked at.
 
@@ -25,7 +25,7 @@ def keep_out(scene: Scene, areas: Sequence[BaseGeometry], clearance_m: float) ->
         clearance_m: distance that UAVs keep from buildings, beside and below them [m].
     """
     lattice = scene.lattice
-    blocked = scene.blocked.copy()
+    blocked = np.zeros(lattice.shape, dtype=bool)  # a mission adds the insides of buildings
     half_m = lattice.step_m / 2
     if areas:
         x_m, y_m = np.meshgrid(lattice.x_m, lattice.y_m)

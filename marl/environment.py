@@ -281,6 +281,12 @@ def global_state(mission: Mission, frame: Frame) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
+def uav_snr_db(mission: Mission, distance_m: float) -> float:
+    """Return the SNR between two UAVs [dB]."""
+    return mission.uav_link_db[0] + mission.uav_link_db[1] * np.log10(max(distance_m, 1.0))
+
+
+@njit(cache=True, nogil=True)
 def _scaled_snr(mission: Mission, snr_db: float) -> float:
     """Return the SNR over the threshold in 20 dB; a link that is not detected shows -2."""
     return min(max((snr_db - mission.threshold_db) / 20.0, -2.0), 3.0)
@@ -324,8 +330,7 @@ def _observe(mission: Mission, frame: Frame, observation: np.ndarray, mask: np.n
                 dy = (frame.cell[e, v, 0] - row) * mission.step_m
                 dz = mission.altitude_m[v] - mission.altitude_m[u]
                 distance_m = np.sqrt(dx**2 + dy**2 + dz**2)
-                log_distance = np.log10(max(distance_m, 1.0))
-                snr_db = mission.uav_link_db[0] + mission.uav_link_db[1] * log_distance
+                snr_db = uav_snr_db(mission, distance_m)
                 out[at] = _scaled_snr(mission, snr_db)
                 if snr_db >= mission.threshold_db:
                     out[at + 1] = 1.0

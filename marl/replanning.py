@@ -14,7 +14,7 @@ import numpy as np
 from typing_extensions import override
 
 from marl.belief import Belief, Prior
-from marl.environment import ACTION_COUNT, Frame
+from marl.environment import ACTION_COUNT, Frame, uav_snr_db
 from marl.flights import Policy
 from marl.learner import Learner, Setup
 from marl.mission import Mission
@@ -92,9 +92,7 @@ class ReplanPolicy:
                     continue
                 away_m = np.hypot(np.hypot(*(cell[u] - cell[v])),
                                   mission.altitude_m[u] - mission.altitude_m[v])
-                snr_db = mission.uav_link_db[0] + mission.uav_link_db[1] * np.log10(
-                    max(away_m, 1.0))
-                if snr_db >= mission.threshold_db:
+                if uav_snr_db(mission, float(away_m)) >= mission.threshold_db:
                     mind.learn_from(minds[v])
                     minds[v].learn_from(mind)
                     for one, other in ((mind, v), (minds[v], u)):

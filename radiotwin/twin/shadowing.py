@@ -115,12 +115,13 @@ class MapErrors:
         return cls(**twin.provenance.get(MAP_ERRORS, {}))
 
 
-def _sampled(device: np.ndarray, usable: np.ndarray, seed: int) -> np.ndarray:
+def _sampled(device: np.ndarray, usable: np.ndarray, seed: int,
+             least: int = MIN_LINKS) -> np.ndarray:
     """Return rows of links that are usable (n,): some of each device that has enough of them."""
     rng, rows = np.random.default_rng(seed), [np.empty(0, dtype=np.int64)]
     for number in np.unique(device[usable]):
         mine = np.flatnonzero((device == number) & usable)
-        if len(mine) >= MIN_LINKS:
+        if len(mine) >= least:
             rows.append(rng.choice(mine, min(MAX_LINKS, len(mine)), replace=False))
     return np.sort(np.concatenate(rows))
 
@@ -172,17 +173,13 @@ def fit_shadowing(radio_map: RadioMap, measurements: Measurements, limit_db: flo
             mean below it.
         seed: of the selection of links.
     """
-    lattice, rng = radio_map.lattice, np.random.default_rng(seed)
+    lattice = radio_map.lattice
     there_m = measurements.receiver_m.T
     x, y = (_nearest(axis_m, at_m) for axis_m, at_m in zip((lattice.x_m, lattice.y_m), there_m))
     ground_m = 0.0 if lattice.ground_m is None else lattice.ground_m[y, x]
     cell = [_nearest(lattice.z_m, there_m[2] - ground_m), y, x]
-    rows = []
-    for number, device in enumerate(measurements.devices["device"]):
-        if device in radio_map.devices:
-            mine = np.flatnonzero(measurements.device_index == number)
-            rows.append(rng.choice(mine, min(MAX_LINKS, len(mine)), replace=False))
-    some = np.sort(np.concatenate(rows))
+    on_map = measurements.devices["device"].isin(radio_map.devices).to_numpy()
+    some = _sampled(measurements.device_index, on_map[measurements.device_index], seed, 1)
     names = measurements.devices["device"].to_numpy()[measurements.device_index[some]]
     at = (np.array([radio_map.devices.index(name) for name in names]),
           *(axis[some] for axis in cell))
