@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
+from tests.quotes import unquoted_figures, wrong_quotations
 
 ROOT = Path(__file__).parents[1]
 
@@ -67,3 +68,21 @@ def test_what_the_architecture_names_is_there():
     steps, concepts = text.split("## Where is")
     assert re.findall(r"^(\d)\. ", steps, re.MULTILINE) == list("12345678")
     assert len(re.findall(r"^\| .* \| `[\w/]+\.py:", concepts, re.MULTILINE)) >= 30
+
+
+@pytest.mark.parametrize("page", [page for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+                                  if "<!--" in page.read_text(encoding="utf-8")], ids=lambda page: page.name)
+def test_figures_that_are_quoted_are_those_of_the_tables(page):
+    assert wrong_quotations(page.read_text(encoding="utf-8")) == []
+
+
+def test_a_figure_that_differs_from_its_table_is_noticed():
+    row = "<!--away: all quadrants; twin-->"
+    assert wrong_quotations(f"9.1 dB{row}, 9.05{row}") == []
+    assert [each[0] for each in wrong_quotations(f"8.9 dB{row}, 9.06{row}")] == ["8.9", "9.06"]
+    assert unquoted_figures(f"9.1 dB{row} and 8.5 dB, 3 of 4, 12 flights") == ["8.5 dB", "3 of 4"]
+
+
+def test_how_good_it_is_says_nothing_but_figures_of_tables():
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert unquoted_figures(text.split("## How good is it")[1].split("**What it does not")[0]) == []
