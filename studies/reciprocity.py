@@ -6,6 +6,7 @@ Sionna RT and by the path engine, with Sionna RT's wedge and with the reciprocal
 both gains are equal.
 """
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,7 +26,6 @@ from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import itu_material
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains, power_to_db
-from studies.region_city import city_footprints
 from studies.runner import Study
 from studies.tables import markdown, number, scene_folder
 
@@ -38,6 +38,34 @@ METHODS = {("Sionna RT", "sionna"): "Sionna RT, as released",
            ("Sionna RT", "reciprocal"): "Sionna RT, reciprocal",
            ("engine", "sionna"): "path engine, Sionna RT's wedge",
            ("engine", "luebbers"): "path engine, reciprocal"}
+
+# Plots of a block along each side; the side of a plot, and the width of a street
+PLOTS, PLOT_M, STREET_M = 3, 38.0, 20.0
+PERIOD_M = PLOTS * PLOT_M + STREET_M
+
+
+def city_footprints(buildings: int, seed: int) -> np.ndarray:
+    """Draw the buildings of a square city, at most one a plot, none touching another.
+
+    Args:
+        buildings: number of them.
+        seed: of all sides, places and heights.
+
+    Returns:
+        (n, 5) x_min, y_min, x_max, y_max, height [m]; the city's middle is at 0, 0. Sides are
+        uniform from 15 to 30 m, heights above 4 m gamma distributed with the mean 15 m.
+    """
+    rng = np.random.default_rng(seed)
+    blocks = math.ceil(math.sqrt(buildings / PLOTS**2))
+    side = PLOTS * blocks
+    plots = np.sort(rng.permutation(side**2)[:buildings])
+    row, column = np.divmod(plots, side)
+    low_m = np.column_stack([place // PLOTS * PERIOD_M + place % PLOTS * PLOT_M
+                             for place in (column, row)]) - blocks * PERIOD_M / 2
+    size_m = rng.uniform(15.0, 30.0, (buildings, 2))
+    low_m = low_m + rng.uniform(1.0, PLOT_M - size_m - 1.0)
+    height_m = np.clip(4.0 + rng.gamma(2.0, 5.5, buildings), 4.0, 60.0)
+    return np.column_stack([low_m, low_m + size_m, height_m]).round(2)
 
 
 def reciprocity_cases(seed: int) -> dict[str, dict]:

@@ -23,7 +23,7 @@ from radiotwin.trace.settings import SolverSettings
 MANY_SHAPES = 5_000
 """Shapes from which on a city is traced by tiles unless the settings say otherwise."""
 RADIUS_M = 400.0
-"""Culling radius unless the settings say otherwise; its error is in docs/results/regions.md."""
+"""Culling radius unless the settings say otherwise; its error is in docs/scale.md."""
 OMITTED_DB = 20.0
 """How far below the limit of detection a path is that is left out for its length: 1 % of the power
 of the weakest link that is detected."""
