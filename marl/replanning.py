@@ -23,7 +23,7 @@ from marl.settings import stream
 from radiotwin.runtime.compiled import njit
 
 LOW_TEMPERATURE = 0.005  # keeps the present plan unless another one is better
-EVERY, ITERATIONS = 2, 1500  # slots between searches, and plans that each tries
+EVERY, ITERATIONS = 2, 6000  # slots between searches, and plans that each tries
 
 
 class ReplanPolicy:
@@ -44,7 +44,9 @@ class ReplanPolicy:
                  iterations: int, first_iterations: int, seed: int,
                  rng: np.random.Generator) -> None:
         self._mission, self._prior, self._linked = believed, prior, linked
-        self._every, self._iterations, self._rng = every, iterations, rng
+        # A search of one tour needs less than one of all of them.
+        self._iterations = iterations if linked else iterations // 2
+        self._every, self._rng = every, rng
         # Each UAV has a map of its own, by what it has heard.
         self._planned = believed._replace(level=np.arange(believed.uavs))
         if prior is None:

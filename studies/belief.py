@@ -1,13 +1,17 @@
 """Plans, planning again, and planning again on a belief, where things are not as thought: `belief`.
 
+    python -m studies.generated 3 runs/town && radiotwin trace runs/town
+    radiotwin build-scene sionna:munich --bbox=-300,-300,300,300 --altitudes 60,65,70 --step 20
+        --devices 10 --uavs 3 --seed 1 -o runs/munich && radiotwin trace runs/munich
     python -m studies belief --jobs 2
 
 The law is learnt from the anchors of one flight in the truth: of the right form where the truth is
 statistical, and of the wrong one where it is ray-traced. `positions`: unknown devices are 20 to
 40 m from where map and UAVs have them. `silent`: three devices do not transmit, and the UAVs know
 of each that it does not with a probability of 0.3. `both`. `volumes`: data are evenly 0 to twice
-what is thought. Batteries are such that who knows all collects 0.85 to 0.95. Beside: the promise of
-`radiotwin plan` for a plan on the same belief, and what it collects.
+what is thought. Batteries are such that who knows all collects 0.85 to 0.95. Beside, for two seeds:
+the promise of `radiotwin plan` on the same belief, and what its plan collects; and the fewest UAVs
+that promise 0.9 of the data with 0.9 confidence, and what they collect.
 """
 
 from dataclasses import replace
@@ -16,12 +20,13 @@ import numpy as np
 import pandas as pd
 from scipy.stats import ttest_1samp
 
+from marl.belief import Prior
 from marl.environment import Environment
 from marl.flights import Policy, fly
 from marl.heuristics import HeuristicPolicy
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy, plan
-from marl.promise import promise
+from marl.promise import promise, sized
 from marl.replanning import EVERY, ITERATIONS, ReplanPolicy
 from marl.settings import stream
 from marl.worlds import twin_prior
@@ -31,10 +36,14 @@ from studies import tables
 from studies.disturbances import OFF_M, SILENT_DB
 from studies.runner import Study
 
-BATTERY = {"rbm-traced": 0.9, "rbm-segmented": 1.0, "rdm-traced": 0.95, "rdm-segmented": 1.0}
+BATTERY = {"rbm-traced": 0.9, "rbm-segmented": 1.0, "rdm-traced": 0.95, "rdm-segmented": 1.0,
+           "runs/town-traced": 0.75, "runs/town-segmented": 0.82,
+           "runs/munich-traced": 1.0, "runs/munich-segmented": 1.1}
 OF_SILENT = 0.85  # of the battery, where there is less to collect
 SCENARIOS = ("positions", "silent", "both", "volumes")
 SILENT, SILENT_SHARE = 3, 0.3
+PROMISED, WANTED, UAVS = 2, 0.9, range(1, 7)  # seeds with a promise; share and numbers of a sizing
+FLIGHTS = 2  # of a method in a world
 METHODS = {"fixed": "open-loop plan", "replan": "re-planning", "belief": "belief, link",
            "belief-no-link": "belief, no link", "greedy": "greedy",
            "clairvoyant": "plan by who knows all"}
@@ -42,10 +51,10 @@ METHODS = {"fixed": "open-loop plan", "replan": "re-planning", "belief": "belief
 
 def belief_cases(seed: int) -> dict[str, dict]:
     """Return every scenario in every world."""
-    return {f"{world}-{scenario}": {"world": world, "scenario": scenario, "iterations": 100_000,
-                                    "battery": battery * (OF_SILENT if scenario in
-                                                          ("silent", "both") else 1.0)}
-            for scenario in SCENARIOS for world, battery in BATTERY.items()}
+    return {f"{world.removeprefix('runs/')}-{scenario}": {
+        "world": world, "scenario": scenario, "iterations": 100_000, "promise": seed < PROMISED,
+        "battery": battery * (OF_SILENT if scenario in ("silent", "both") else 1.0)}
+        for scenario in SCENARIOS for world, battery in BATTERY.items()}
 
 
 def fly_believing(seed: int, settings: dict) -> dict:
@@ -53,9 +62,10 @@ def fly_believing(seed: int, settings: dict) -> dict:
 
     Returns:
         Share of the data of devices that transmit, for each method; `promised`: P10, P50 and P90 of
-        a plan on the belief, and `kept`: what it collects.
+        a plan on the belief, and `kept`: what it collects; `uavs`: the fewest that promise enough
+        (0: no number does), `enough`: what they collect, and `fewer`: what one UAV less collects.
     """
-    name, _, truth = settings["world"].partition("-")
+    name, _, truth = settings["world"].rpartition("-")
     scene, scenario = _with_battery(Scene.load(tables.scene_folder(name)),
                                     settings["battery"]), settings["scenario"]
     rng, radio_map = np.random.default_rng([seed, 17]), read_truth(scene, truth)
@@ -81,20 +91,39 @@ def fly_believing(seed: int, settings: dict) -> dict:
         return ReplanPolicy(mission, prior if on else None, linked, EVERY, ITERATIONS, tries, seed,
                             stream(seed, "planning", 1))
 
-    promised = promise(prior, believed, 200, tries, seed)
     waiting = real._replace(data_units=real.data_units * sends)
     policies = {
         "fixed": PlanPolicy(plan(believed, tries, seed).actions), "replan": replanned(False),
         "belief": replanned(True), "belief-no-link": replanned(True, False),
         "greedy": HeuristicPolicy("greedy", stream(seed, "decisions")),
-        "clairvoyant": PlanPolicy(plan(waiting, tries, seed).actions),
-        "kept": PlanPolicy(promised.plan.actions)}
-    return {method: _share(real, sends, policy, seed) for method, policy in policies.items()} | {
-        "promised": list(promised.quantiles.values())}
+        "clairvoyant": PlanPolicy(plan(waiting, tries, seed).actions)}
+    shares: dict = {method: _share(real, sends, policy, seed)
+                    for method, policy in policies.items()}
+    if settings["promise"]:
+        promised = promise(prior, believed, 200, tries, seed)
+        shares |= {"promised": list(promised.quantiles.values()),
+                   "kept": _share(real, sends, PlanPolicy(promised.plan.actions), seed)}
+        shares |= _sizing(prior, believed, real, sends, tries, seed)
+    return shares
+
+
+def _sizing(prior: Prior, believed: Mission, real: Mission, sends: np.ndarray, tries: int,
+            seed: int) -> dict:
+    """Return the fewest UAVs that promise enough, and what they and one less collect."""
+    fewer = np.nan
+    for uavs in UAVS:
+        chosen = [number % believed.uavs for number in range(uavs)]
+        battery = float(believed.battery[0]) / 2
+        found = promise(prior, sized(believed, chosen, battery), 200, tries // 2, seed)
+        share = _share(sized(real, chosen, battery), sends, PlanPolicy(found.plan.actions), seed)
+        if found.chance(WANTED) >= WANTED:
+            return {"uavs": uavs, "enough": share, "fewer": fewer}
+        fewer = share
+    return {"uavs": 0, "enough": np.nan, "fewer": fewer}
 
 
 def _share(real: Mission, sends: np.ndarray, policy: Policy, seed: int) -> float:
-    flown = fly(Environment(real, 4, stream(seed, "truth evaluation")), policy)
+    flown = fly(Environment(real, FLIGHTS, stream(seed, "truth evaluation")), policy)
     return float(flown.collected.sum(axis=(1, 2)).mean() / real.data_units[sends].sum())
 
 
@@ -134,12 +163,17 @@ def belief_table(rows: pd.DataFrame) -> str:
         lines.append([str(name), str(len(mine)),
                       *(tables.number(mine[method].mean()) for method in METHODS), *closed,
                       ", ".join(METHODS[method] for method in less) or "none"])
-    p10, _, p90 = np.array(rows["promised"].tolist()).T
-    kept = rows["kept"].to_numpy()
+    judged = rows[rows["kept"].notna()]
+    (p10, _, p90), kept = np.array(judged["promised"].tolist()).T, judged["kept"].to_numpy()
+    sized_rows = judged[judged["uavs"] > 0]
     return tables.markdown(
         ["", "seeds", *METHODS.values(), "gap closed", "without link", "belief below (5 %)"], lines
-    ) + (f"\n\nPromises: of {len(rows)} plans, {np.mean(kept < p10):.0%} collect less than the P10 "
-         f"promised, {np.mean(kept > p90):.0%} more than the P90.")
+    ) + (f"\n\nPromises: of {len(judged)} plans, {np.mean(kept < p10):.0%} collect less than the "
+         f"P10 promised, {np.mean(kept > p90):.0%} more than the P90. Sizes: {len(sized_rows)} of "
+         f"{len(judged)} missions have a number of UAVs, {UAVS[-1]} at most, that promises "
+         f"{WANTED:.0%} of the data with {WANTED:.0%} confidence; it collects so much in "
+         f"{(sized_rows['enough'] >= WANTED).sum()} of them, one UAV less in "
+         f"{(sized_rows['fewer'] >= WANTED).sum()}.")
 
 
 STUDIES = {"belief": Study("What does a belief bring in flight?", fly_believing, belief_cases,

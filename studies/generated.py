@@ -1,4 +1,9 @@
-"""Missions in generated cities, in the statistical truth, for tuning and for judging planners."""
+"""Missions in generated cities, in the statistical truth, for tuning and for judging planners.
+
+`python -m studies.generated SEED FOLDER` writes the scene of one such city, to be traced.
+"""
+
+import sys
 
 import numpy as np
 import trimesh
@@ -6,7 +11,14 @@ import trimesh
 from marl.mission import Mission
 from radiotwin.maps.survey import LOS_LAW, NLOS_LAW
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.presets import CityParameters, building_meshes, draw_buildings
+from radiotwin.scene.presets import (
+    PRESETS,
+    CityParameters,
+    Preset,
+    build_preset,
+    building_meshes,
+    draw_buildings,
+)
 
 STEP_M = 20.0
 TX_LESS_NOISE_DB = 103.0  # transmit power less noise, of the paper
@@ -30,12 +42,7 @@ def generated_mission(seed: int, uavs: int = 3, devices: int = 10, battery: floa
     width_m, depth_m = side_m or 20.0 * rng.integers(30, 51, 2)
     device_m = np.column_stack([rng.uniform(0, (width_m, depth_m), (devices, 2)),
                                 np.full(devices, 1.5)])
-    avenue_m = rng.uniform(160, 300)
-    parameters = CityParameters(
-        float(width_m), float(depth_m), avenue_width_m=rng.uniform(40, 90),
-        avenue_spacing_m=avenue_m, street_width_m=rng.uniform(15, 30),
-        block_mean_m=avenue_m / 2, block_min_m=avenue_m / 2.5, side_min_m=rng.uniform(40, 75),
-        mean_height_m=rng.uniform(10, 30), first_block_m=tuple(-rng.uniform(0, avenue_m, 2)))
+    parameters = _drawn_parameters(float(width_m), float(depth_m), rng)
     boxes = draw_buildings(parameters, device_m[:, :2], int(rng.integers(2**31)))
     solid = trimesh.util.concatenate(building_meshes(boxes))
     assert isinstance(solid, trimesh.Trimesh)
@@ -64,3 +71,29 @@ def generated_mission(seed: int, uavs: int = 3, devices: int = 10, battery: floa
         data_units * rng.uniform(2 / 3, 4 / 3, devices), device_m[:, :2].copy(), STEP_M, 100.0,
         10.0, -np.inf, np.array([TX_LESS_NOISE_DB + LOS_LAW.intercept_db, 10 * LOS_LAW.exponent]),
         False)
+
+
+def _drawn_parameters(width_m: float, depth_m: float, rng: np.random.Generator) -> CityParameters:
+    avenue_m = rng.uniform(160, 300)
+    return CityParameters(
+        width_m, depth_m, avenue_width_m=rng.uniform(40, 90),
+        avenue_spacing_m=avenue_m, street_width_m=rng.uniform(15, 30),
+        block_mean_m=avenue_m / 2, block_min_m=avenue_m / 2.5, side_min_m=rng.uniform(40, 75),
+        mean_height_m=rng.uniform(10, 30), first_block_m=tuple(-rng.uniform(0, avenue_m, 2)))
+
+
+def build_generated_scene(seed: int, folder: str) -> None:
+    """Write the scene folder of a generated city of 700 x 700 m with ten devices and three UAVs."""
+    rng = np.random.default_rng(seed)
+    parameters = _drawn_parameters(700.0, 700.0, rng)
+    places_m = STEP_M * rng.integers(1, 35, (12, 2))
+    PRESETS["town"] = Preset(
+        parameters, [(float(x_m), float(y_m), number < 3)
+                     for number, (x_m, y_m) in enumerate(places_m[:10])],
+        tuple(map(float, places_m[10])), tuple(map(float, places_m[11])), battery=65.0,
+        data_units=16_000.0, altitudes_m=(55.0, 60.0, 65.0), seed=seed)
+    build_preset("town", folder)
+
+
+if __name__ == "__main__":
+    build_generated_scene(int(sys.argv[1]), sys.argv[2])
