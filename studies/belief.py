@@ -152,28 +152,35 @@ def _learnt(scene: Scene, truth: object, seed: int, rng: np.random.Generator,
 
 
 def belief_table(rows: pd.DataFrame) -> str:
-    """Return worlds and scenarios against methods, the gap that a belief closes, and promises."""
-    lines = []
-    for name, mine in rows.groupby("name", sort=True):
-        gap = (mine["clairvoyant"] - mine["fixed"]).mean()
-        closed = [f"{(mine[method] - mine['fixed']).mean() / gap:.0%}" if gap > 0.01 else "–"
-                  for method in ("belief", "belief-no-link")]
-        less = [method for method in ("fixed", "replan") if len(mine) > 2 and ttest_1samp(
-            mine["belief"] - mine[method], 0, alternative="less").pvalue < 0.05]
-        lines.append([str(name), str(len(mine)),
-                      *(tables.number(mine[method].mean()) for method in METHODS), *closed,
-                      ", ".join(METHODS[method] for method in less) or "none"])
+    """Return methods, the gap that a belief closes, and promises: over all worlds, and by world."""
+    law = np.where(rows["name"].str.contains("-segmented-"), "law right", "law wrong")
+    scenario = rows["name"].str.rpartition("-")[2]
+    heads = ["rows", *METHODS.values(), "gap closed", "without link", "belief below (5 %)"]
+    pooled = [_line(name, rows[law == name]) for name in ("law right", "law wrong")] + [
+        _line(f"{name}, {each}", rows[(law == name) & (scenario == each)])
+        for name in ("law right", "law wrong") for each in SCENARIOS]
+    by_world = [_line(str(name), mine) for name, mine in rows.groupby("name", sort=True)]
     judged = rows[rows["kept"].notna()]
     (p10, _, p90), kept = np.array(judged["promised"].tolist()).T, judged["kept"].to_numpy()
     sized_rows = judged[judged["uavs"] > 0]
-    return tables.markdown(
-        ["", "seeds", *METHODS.values(), "gap closed", "without link", "belief below (5 %)"], lines
-    ) + (f"\n\nPromises: of {len(judged)} plans, {np.mean(kept < p10):.0%} collect less than the "
+    return tables.markdown(["", *heads], pooled, "All worlds") + "\n\n" + tables.markdown(
+        ["", *heads], by_world, "By world") + (
+        f"\n\nPromises: of {len(judged)} plans, {np.mean(kept < p10):.0%} collect less than the "
          f"P10 promised, {np.mean(kept > p90):.0%} more than the P90. Sizes: {len(sized_rows)} of "
          f"{len(judged)} missions have a number of UAVs, {UAVS[-1]} at most, that promises "
          f"{WANTED:.0%} of the data with {WANTED:.0%} confidence; it collects so much in "
          f"{(sized_rows['enough'] >= WANTED).sum()} of them, one UAV less in "
          f"{(sized_rows['fewer'] >= WANTED).sum()}.")
+
+
+def _line(name: str, rows: pd.DataFrame) -> list[str]:
+    gap = (rows["clairvoyant"] - rows["fixed"]).mean()
+    closed = [f"{(rows[method] - rows['fixed']).mean() / gap:.0%}" if gap > 0.01 else "–"
+              for method in ("belief", "belief-no-link")]
+    less = [METHODS[method] for method in ("fixed", "replan") if len(rows) > 2 and ttest_1samp(
+        rows["belief"] - rows[method], 0, alternative="less").pvalue < 0.05]
+    return [name, str(len(rows)), *(tables.number(rows[method].mean()) for method in METHODS),
+            *closed, ", ".join(less) or "none"]
 
 
 STUDIES = {"belief": Study("What does a belief bring in flight?", fly_believing, belief_cases,
