@@ -163,14 +163,19 @@ def belief_table(rows: pd.DataFrame) -> str:
     judged = rows[rows["kept"].notna()]
     (p10, _, p90), kept = np.array(judged["promised"].tolist()).T, judged["kept"].to_numpy()
     sized_rows = judged[judged["uavs"] > 0]
-    return tables.markdown(["", *heads], pooled, "All worlds") + "\n\n" + tables.markdown(
-        ["", *heads], by_world, "By world") + (
-        f"\n\nPromises: of {len(judged)} plans, {np.mean(kept < p10):.0%} collect less than the "
-         f"P10 promised, {np.mean(kept > p90):.0%} more than the P90. Sizes: {len(sized_rows)} of "
-         f"{len(judged)} missions have a number of UAVs, {UAVS[-1]} at most, that promises "
-         f"{WANTED:.0%} of the data with {WANTED:.0%} confidence; it collects so much in "
-         f"{(sized_rows['enough'] >= WANTED).sum()} of them, one UAV less in "
-         f"{(sized_rows['fewer'] >= WANTED).sum()}.")
+    promises = [
+        ["plans with a promise", str(len(judged))],
+        ["collect less than their P10", f"{np.mean(kept < p10):.0%}"],
+        ["collect more than their P90", f"{np.mean(kept > p90):.0%}"],
+        [f"missions that {UAVS[-1]} UAVs or fewer promise {WANTED:.0%} of the data, with "
+         f"{WANTED:.0%} confidence", str(len(sized_rows))],
+        ["of these, the fewest that promise it collect it",
+         str((sized_rows["enough"] >= WANTED).sum())],
+        ["of these, one UAV less would collect it, too",
+         str((sized_rows["fewer"] >= WANTED).sum())]]
+    return "\n\n".join([tables.markdown(["", *heads], pooled, "All worlds"),
+                        tables.markdown(["promise", "found"], promises, "Promises"),
+                        tables.markdown(["", *heads], by_world, "By world")])
 
 
 def _line(name: str, rows: pd.DataFrame) -> list[str]:
