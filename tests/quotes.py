@@ -44,6 +44,8 @@ def cell(study, where):
         for cells in rows if all(each in title for each in table) else []:
             if columns and (", ".join(cells) + ",").startswith(row + ","):
                 found[title, tuple(cells)] = [cells[i] for i in columns]
+    exact = {key: cells for key, cells in found.items() if key[1][0] == row}
+    found = exact or found
     assert len(found) == 1, f"{study}: {where}: {len(found)} rows"
     only, = found.values()
     assert len(only) == 1, f"{study}: {where}: {len(only)} columns"

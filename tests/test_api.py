@@ -77,7 +77,7 @@ def test_the_documented_lines_run(documented):
 
 
 def test_what_closeloop_json_holds_is_documented(documented):
-    described = (ROOT / "docs" / "close-the-loop.md").read_text(encoding="utf-8")
+    described = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
     assert all(f"`{key}`" in described for key in rt.make_report(documented[0]["loop"]))
 
 
