@@ -62,7 +62,8 @@ def is_quoted(said, text):
     known = [float(each) for each in numbers(text) if each]
     for each in numbers(said):
         digits = len(each.partition(".")[2])
-        if not any(abs(float(each) - value) <= 0.5 * 10**-digits + 1e-9 for value in known):
+        sign = abs if each[0] != "-" else float  # without a sign it is a size
+        if not any(abs(float(each) - sign(value)) <= 0.5 * 10**-digits + 1e-9 for value in known):
             return False
     return True
 

@@ -97,3 +97,8 @@ def test_results_are_said_with_figures_of_tables_alone(page, of_the_question):
     if page == "README.md":
         text = text.split("## How good is it")[1].split("**What it does not")[0]
     assert {each.strip("-–") for each in unquoted_figures(text)} <= of_the_question
+
+
+def test_the_docs_stay_short():
+    """Tables that are made from the code or by studies are not counted."""
+    assert sum(page.stat().st_size for page in (ROOT / "docs").glob("*.md")) <= 250_000
