@@ -188,7 +188,7 @@ def test_the_policy_names_what_the_page_holds_and_nothing_else(hostile):
 def test_long_tables_texts_and_lists_are_cut_and_counted(tmp_path):
     rows = [[f"row {n}", float(n)] for n in range(html.MAX_ROWS + 7)]
     html.write_page("run.html", tmp_path / "page.html", {
-        "title": "t" * 10**6, "page_title": "t", "viewer": None, "notes": [f"note {n}" for n in range(10_000)],
+        "title": "t" * 10**6, "page_title": "t", "viewer": None, "lead": [], "notes": [f"note {n}" for n in range(10_000)],
         "closeloop": None, "comparison": None, "planning": None, "facts": ["f"],
         "estimates": Table(("device", "x"), rows)})
     text = (tmp_path / "page.html").read_text()
