@@ -16,7 +16,7 @@ from radiotwin.runtime.cuda import FREE_SPACE_GAIN_DB, TOLERANCE_DB, TrialFailed
 from radiotwin.runtime.processes import usable_cores
 
 GIB = 2**30
-MIN_MEMORY_GIB = 4  # twice what tracing scenes/rbm takes (docs/results.md)
+MIN_MEMORY_GIB = 4  # twice what tracing scenes/rbm takes (docs/results/tracer.md)
 MIN_DISK_GIB = 2
 _REMEDY = "install the versions of sionna-rt, mitsuba and drjit that constraints.txt names"
 
