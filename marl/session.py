@@ -28,7 +28,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import read_truth
 from radiotwin.runtime.console import print_rows, progress, say
 from radiotwin.runtime.cuda import torch_device
-from radiotwin.runtime.execution.local import start_process
+from radiotwin.runtime.execution import start_process
 from radiotwin.scene import Scene
 
 if TYPE_CHECKING:

@@ -12,9 +12,8 @@ import numpy as np
 
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.runtime.console import progress
-from radiotwin.runtime.execution import Executor, Job
-from radiotwin.runtime.execution.job import peak_bytes
-from radiotwin.runtime.execution.local import LocalPool
+from radiotwin.runtime.execution import Executor, Job, LocalPool
+from radiotwin.runtime.jobs import peak_bytes
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
 from radiotwin.trace.link_job import LinkBatch, exchanged_calls, lattice_pieces, link_job

@@ -9,8 +9,7 @@ import pytest
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.runtime import cuda
 from radiotwin.runtime.cuda import FREE_SPACE_GAIN_DB
-from radiotwin.runtime.execution import Resources
-from radiotwin.runtime.execution.local import LocalPool
+from radiotwin.runtime.execution import LocalPool, Resources
 from radiotwin.trace import SolverSettings
 from radiotwin.trace.link_job import link_job
 
