@@ -28,8 +28,8 @@ from radiotwin.closeloop.scan import compare as compare_groups
 from radiotwin.links import prepare_links
 from radiotwin.links.checks import stand_anchors
 from radiotwin.links.correlation import moving_end_m
+from radiotwin.links.evidence import thin_links
 from radiotwin.links.limits import limits_to_explain
-from radiotwin.links.thinning import thin_links
 from studies.runner import Study
 from studies.tables import markdown, number
 from studies.where_pivot import THRESHOLD, robust_z, shrunken
