@@ -38,7 +38,7 @@ def test_gains(run, folder, asked, monkeypatch):
         used.append(settings)
         return np.full((len(device_m), len(points_m)), -80.0)
 
-    monkeypatch.setattr("radiotwin.trace.points.trace_gains", traced)
+    monkeypatch.setattr("radiotwin.trace.run.trace_gains", traced)
     done = run("gains scene --points points.csv --devices d0,d1 --sum coherent --seed 3 --target-db 1 -o g.csv", folder)
     assert done.returncode == 0, done.stderr
     [(*what, others)] = asked
