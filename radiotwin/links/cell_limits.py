@@ -35,6 +35,25 @@ _EARTH_M = 6_371_008.8  # mean radius (Moritz 2000, GRS80)
 _NAMED = 5  # names in a message
 
 
+_RANGES: dict[str, tuple[float, float, str]] = {
+    **dict.fromkeys(LEVELS, (-MAX_LEVEL_DB, MAX_LEVEL_DB, "is no level; allowed are {} to {}")),
+    "frequency_hz": (*FREQUENCIES_HZ, "is no frequency; allowed are {} to {} Hz; the unit is Hz"),
+    "time_s": (-MAX_TIME_S, MAX_TIME_S,
+               "is no time; allowed are {} to {} s; the unit is s, not ms"),
+    "tilt_deg": (-MAX_TILT_DEG, MAX_TILT_DEG,
+                 "is no tilt; allowed are {} (down) to {} (up)"),
+    "azimuth_deg": (-MAX_AZIMUTH_DEG, MAX_AZIMUTH_DEG,
+                    "is no azimuth; allowed are 0 (north) to 360, clockwise; leave the cell empty "
+                    "where it is not known"),
+    "cable_loss_db": (0.0, MAX_CABLE_LOSS_DB, "is no loss; allowed are {} to {} dB"),
+    "_m": (-MAX_POSITION_M, MAX_POSITION_M,
+           "is too far away; allowed are {} to {} m in the scene's frame"),
+    **{ending: (-limit, limit, "is out of range; allowed are {} to {}") for ending, limit in (
+        ("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM), ("eirp_dbm", MAX_POWER_DBM),
+        ("quality", MAX_QUALITY))}}
+"""Name of a column, or its end -> least and greatest value, and the reason to refuse others."""
+
+
 def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
                   numbers: np.ndarray) -> None:
     """Refuse numbers of a column that can only be mistakes, such as a wrong unit.
@@ -44,47 +63,20 @@ def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
         name: of the column, as in `measurements.csv` or `devices.csv`.
         numbers: (n,) in its unit; NaN where empty.
     """
-    if name in LEVELS:
-        refuse(np.abs(numbers) > MAX_LEVEL_DB,
-               f"is no level; allowed are -{MAX_LEVEL_DB:g} to {MAX_LEVEL_DB:g}")
+    for ending, (low, high, reason) in _RANGES.items():
+        if name == ending or name.endswith(ending):
+            refuse((numbers < low) | (numbers > high), reason.format(f"{low:g}", f"{high:g}"))
     if name == "gain_db":
         refuse(numbers > 0,
                "is above 0 dB, which no channel gain is; received power [dBm] goes into a column "
                "rssi_dbm, and a path loss needs a minus sign")
-    if name == "frequency_hz":
-        low, high = FREQUENCIES_HZ
-        refuse((numbers < low) | (numbers > high),
-               f"is no frequency; allowed are {low:g} to {high:g} Hz; the unit is Hz")
-    if name.endswith("_m"):
-        refuse(np.abs(numbers) > MAX_POSITION_M,
-               f"is too far away; allowed are -{MAX_POSITION_M:g} to {MAX_POSITION_M:g} m in "
-               "the scene's frame")
-    if name == "time_s":
-        refuse(np.abs(numbers) > MAX_TIME_S,
-               f"is no time; allowed are -{MAX_TIME_S:g} to {MAX_TIME_S:g} s; the unit is s, not "
-               "ms")
-        if np.isfinite(numbers).any():
-            refuse(numbers - np.nanmin(numbers) > MAX_SPAN_S,
-                   f"is more than a century ({MAX_SPAN_S:g} s) after the first time, "
-                   f"{np.nanmin(numbers):g} s; is one of them wrong, or in another unit?")
-    if name == "tilt_deg":
-        refuse(np.abs(numbers) > MAX_TILT_DEG,
-               f"is no tilt; allowed are -{MAX_TILT_DEG:g} (down) to {MAX_TILT_DEG:g} (up)")
-    if name == "azimuth_deg":
-        refuse(np.abs(numbers) > MAX_AZIMUTH_DEG,
-               "is no azimuth; allowed are 0 (north) to 360, clockwise; leave the cell empty where "
-               "it is not known")
+    if name == "time_s" and np.isfinite(numbers).any():
+        refuse(numbers - np.nanmin(numbers) > MAX_SPAN_S,
+               f"is more than a century ({MAX_SPAN_S:g} s) after the first time, "
+               f"{np.nanmin(numbers):g} s; is one of them wrong, or in another unit?")
     if name == READS:
         refuse(~np.isin(numbers, (0, 1)) & ~np.isnan(numbers),
                "is neither 0 (levels are read at the receiver) nor 1 (at the device)")
-    if name == "cable_loss_db":
-        refuse((numbers < 0) | (numbers > MAX_CABLE_LOSS_DB),
-               f"is no loss; allowed are 0 to {MAX_CABLE_LOSS_DB:g} dB")
-    for ending, limit in (("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM),
-                          ("eirp_dbm", MAX_POWER_DBM), ("quality", MAX_QUALITY)):
-        if name.endswith(ending):
-            refuse(np.abs(numbers) > limit,
-                   f"is out of range; allowed are -{limit:g} to {limit:g}")
 
 
 def no_height(height_m: np.ndarray) -> np.ndarray:

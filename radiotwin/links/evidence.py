@@ -19,7 +19,7 @@ PLACE_LENGTHS = 2.5
 UNKNOWN_M = 100.0  # side of a piece while no residual has been looked at
 MIN_PLACES = 6  # that the ground of a campaign is cut into, where it is wide enough
 NARROWER = 0.8  # from one width that is tried to the next
-LITTLE = 30  # places: fewer say little
+LITTLE = 30  # places: fewer are little evidence
 PLACE_M = 5.0  # side of a square of ground that counts as one place
 PILE, MIN_PILE = 5, 20  # times the usual number of readings at one place is a pile; and at least
 MIN_SURPLUS = 0.05  # share of all links in piles, to thin them
@@ -54,9 +54,9 @@ def _evidence(links: Links) -> np.ndarray:
 
 
 def with_evidence(links: Links, z: np.ndarray) -> Links:
-    """Return links whose pieces of evidence fit a residual (n,) over its scale, with notes on them.
+    """Return links with pieces of evidence as wide as a residual (n,) is correlated, with notes.
 
-    Done once, by the residual of the base: then all that is scored later counts the same pieces.
+    The residual is that of the base, divided by its scale: all later scores use the same pieces.
     """
     length_m = correlation_length_m(links, z)
     width_m = fitting_width_m(links, LENGTHS * length_m)
@@ -69,9 +69,9 @@ def with_evidence(links: Links, z: np.ndarray) -> Links:
 
 
 def fitting_width_m(links: Links, wanted_m: float, places: int = MIN_PLACES) -> float:
-    """Return the side of squares that the ground is cut into [m].
+    """Return the side of the squares that the ground is cut into [m].
 
-    As wanted, or less where the end that moves would then be in fewer than so many squares; at
+    It is `wanted_m`, or less if the end that moves would then be in fewer than `places` squares; at
     least the usual step between its positions.
     """
     position_m, least_m = moving_end_m(links), max(step_m(links), 0.1)
@@ -98,10 +98,10 @@ def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
 
 
 def design_effect(block: np.ndarray, z: np.ndarray, max_z: float = 4.0) -> float:
-    """Return how many links count as one (Kish 1965, 'Survey sampling', Sec. 5.4).
+    """Return the design effect: how many links count as one (Kish 1965, 'Survey sampling', 5.4).
 
-    The variance of the means of blocks (n,) over what it would be for independent links, at least
-    1. Residuals (n,) are over their scale, and outliers count as `max_z`.
+    It is the variance of the means of blocks (n,) over that of independent links, at least 1.
+    Residuals (n,) are divided by their scale, and clipped to `max_z`.
     """
     z = np.clip(z, -max_z, max_z)
     size = np.bincount(block)

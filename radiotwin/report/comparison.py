@@ -141,7 +141,7 @@ def _judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
             raise BadInput(f"{path}: a radio map can only be judged on a whole map; give --truth, "
                            "too")
         else:
-            maps[str(path)] = RadioMap.read(path)
+            maps[str(path)] = RadioMap.load(path)
     return twins, maps
 
 

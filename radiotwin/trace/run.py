@@ -305,7 +305,7 @@ def _finished(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | Non
     if not path.exists():
         return None
     try:
-        radio_map = RadioMap.read(path)
+        radio_map = RadioMap.load(path)
     except BadInput:  # something else, or damaged: to be replaced
         return None
     same = (radio_map.dataset.attrs.get("trace_hash") == trace_hash

@@ -74,7 +74,7 @@ def hostile(run_folder, server, tmp_path_factory):
                            lambda found: f"{found[1]} = {json.dumps(found[2] + attack)}", path.read_text(), flags=re.M))
     path = folder / "twin" / "twin.json"
     path.write_text(json.dumps(poisoned(json.loads(path.read_text()), attack)))
-    truth = RadioMap.read(folder / "scene" / "truth.nc")
+    truth = RadioMap.load(folder / "scene" / "truth.nc")
     names = [name + in_names for name in truth.devices]
     hostile = RadioMap(truth.dataset.assign_coords(device=np.array(names, dtype=object)).assign_attrs(source=attack))
     hostile.write(folder / "map.nc")
