@@ -38,8 +38,10 @@ from radiotwin.twin.shadowing import with_shadowing
 TWINS = {"nn": "segmented_nn", "log-distance": "log_distance", "kriging": "regression_kriging",
          "raytrace": "raytrace", "path-kriging": "path_kriging"}
 """Name of a twin on the command line -> model of `fit_twin`."""
-COUNTS = ("round", "real_episodes", "simulated_episodes", "located", "evaluation_flights")
-NUMBERS = ("truth_ratio", "truth_ratio_std", "twin_ratio", "location_error_median_m",
+FLIGHTS = ("measuring_flights", "training_flights", "selection_flights")
+"""Columns of the log: real flights by what they were for."""
+COUNTS = ("round", "real_episodes", *FLIGHTS, "simulated_episodes", "located", "evaluation_flights")
+NUMBERS = ("real_ratio", "truth_ratio", "truth_ratio_std", "twin_ratio", "location_error_median_m",
            "location_error_worst_m", "learn_twin_s", "round_s")
 """Columns of the log, of which `Campaign.log` writes rows."""
 MAX_NUMBER = 1e30  # in it
@@ -248,13 +250,11 @@ class Campaign:
             real = evaluate(mission, learner.policy(rng), run.flights,
                             stream(run.seed, "truth evaluation")).ratio(mission)
         number = len(self.rows) + 1
-        real_episodes = number if self.measured is None else len(self.measured.flights)
-        if run.twin == "truth":  # flights that choose between policies are real, too
-            real_episodes = simulated + learner.selection_flights
         errors_m = location_errors_m(self.scene, found)
         located = errors_m[np.isfinite(errors_m)]
         self.rows.append({
-            "round": number, "real_episodes": real_episodes, "simulated_episodes": simulated,
+            "round": number, **self._real_flights(learner, simulated),
+            "simulated_episodes": simulated,
             "truth_ratio": float(real.mean()), "truth_ratio_std": float(real.std()),
             "twin_ratio": float(in_twin.mean()), "located": len(located),
             "location_error_median_m": float(np.median(located)) if len(located) else np.nan,
@@ -262,10 +262,31 @@ class Campaign:
             "evaluation_flights": number * run.flights, "learn_twin_s": self.learn_s,
             "round_s": 0.0})
 
+    def _real_flights(self, learner: Learner, simulated: int) -> dict[str, float]:
+        """Return the real flights so far by what they were for, and the mean share of them all.
+
+        In a perfect twin those that train and those that choose between policies are real. The
+        share is NaN where somebody else flew, or a learner does not say what it collected.
+        """
+        if self.run.twin == "truth":
+            counts = 0, simulated, learner.selection.flights
+            collected = learner.training.collected + learner.selection.collected
+            if learner.training.flights != simulated:
+                collected = np.nan
+        elif self.measured is not None:
+            counts, collected = (len(self.measured.flights), 0, 0), np.nan
+        else:
+            assert self.reality is not None
+            counts, collected = (self.flown, 0, 0), sum(self.reality.ratios)
+        total = sum(counts)
+        return {"real_episodes": total, **dict(zip(FLIGHTS, counts, strict=True)),
+                "real_ratio": float(collected / total) if total else np.nan}
+
     def state(self, folder: Path) -> dict:
         """Return what a checkpoint has of it, and write the twin into the run's folder."""
-        tables = [] if self.reality is None else self.reality.tables
-        return {"rows": self.rows, "tables": tables,
+        tables, ratios = ([], []) if self.reality is None else (self.reality.tables,
+                                                                self.reality.ratios)
+        return {"rows": self.rows, "tables": tables, "ratios": ratios,
                 "twin": None if self.twin is None else keep_twin(self.twin, folder)}
 
     def load_state(self, state: dict, path: Path, others: Collection[str]) -> None:
@@ -276,18 +297,19 @@ class Campaign:
             path: of the checkpoint.
             others: names of those parts.
         """
-        require(state, dict.fromkeys(("rows", "tables", "twin", *others), ...))
-        run, tables = self.run, state["tables"]
+        require(state, dict.fromkeys(("rows", "tables", "ratios", "twin", *others), ...))
+        run, tables, ratios = self.run, state["tables"], [float(each) for each in state["ratios"]]
         self.rows += require_log(state["rows"], COUNTS, NUMBERS, MAX_NUMBER)
         if len(self.rows) > run.real_episodes or any(
                 row["round"] != number for number, row in enumerate(self.rows, 1)):
             raise Damaged("rounds are too many, or not in order")
         flown = self.measured is None and run.twin != "truth"
         if (state["twin"] is None) != (run.twin == "truth") or bool(tables) != flown \
-                or len(tables) > run.real_episodes:
+                or len(tables) > run.real_episodes or len(ratios) != len(tables):
             raise Damaged("the twin or its measurements are missing, or not of this run")
         if self.reality is not None:
             self.reality.tables += require_tables(tables, self.scene)
+            self.reality.ratios += ratios
         if state["twin"] is not None:
             self._see(stored_twin(state["twin"], path, self.scene))
 
@@ -314,6 +336,7 @@ class Reality:
         noise_db: standard deviation of the receivers' measurement error [dB].
         seed: of shadowing and noise.
         tables: measurements so far, one table for each flight.
+        ratios: share of all data that each of them collected.
     """
 
     scene: Scene
@@ -322,6 +345,7 @@ class Reality:
     noise_db: float
     seed: int
     tables: list[pd.DataFrame] = field(default_factory=list)
+    ratios: list[float] = field(default_factory=list)
 
     def mission(self, known: Known) -> Mission:
         """Return the mission in the truth, for UAVs that know these positions."""
@@ -334,6 +358,7 @@ class Reality:
         rng = stream(self.seed, "real flight", number)
         flights = fly(Environment(mission, 1, rng), policy)
         self.tables.append(self._measured(flights, f"f{number}", rng))
+        self.ratios += flights.ratio(mission).tolist()
         return flights
 
     def measurements(self) -> Measurements:

@@ -33,7 +33,7 @@ from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 
 NAME = "checkpoint.safetensors"
-FORMAT = 5
+FORMAT = 6
 _KEY = "checkpoint"
 _MAX_NAME = 100  # characters of what a learner logs
 

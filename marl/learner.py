@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from marl.checkpoint import COUNT, require
 from marl.flights import Policy
 from marl.mission import Mission
 from marl.settings import LearnerSettings, RunSettings, learner_class
@@ -38,6 +39,30 @@ class Setup:
     device: str = "cpu"
 
 
+@dataclass
+class Flown:
+    """Flights in the map that a learner is prepared in.
+
+    Attributes:
+        flights: number of them so far.
+        collected: sum of the shares of all data that they collected.
+    """
+
+    flights: int = 0
+    collected: float = 0.0
+
+    def add(self, ratio: np.ndarray) -> None:
+        """Count some more, by the share that each collected."""
+        self.flights += len(ratio)
+        self.collected += float(ratio.sum())
+
+    @classmethod
+    def of(cls, state: dict) -> "Flown":
+        """Return what `vars` gave a checkpoint."""
+        require(state, {"flights": COUNT, "collected": ...})
+        return cls(state["flights"], float(state["collected"]))
+
+
 class Learner(ABC):
     """Decides where the UAVs fly.
 
@@ -46,7 +71,8 @@ class Learner(ABC):
         uses_map: whether its flights depend on the map that it is prepared in.
         believes: whether it asks what the twin leaves open (`believe`).
         replicas: copies that simulate `run.episodes` episodes each in a round.
-        selection_flights: flights flown in `prepare` so far to choose between policies.
+        training: flights that it has trained with so far.
+        selection: flights flown in `prepare` so far to choose between policies.
     """
 
     learns: ClassVar[bool] = True
@@ -56,7 +82,7 @@ class Learner(ABC):
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         self.replicas = 1 if self.learns else 0
-        self.selection_flights = 0
+        self.training, self.selection = Flown(), Flown()
 
     def believe(self, prior: "Prior | None") -> None:  # noqa: B027  most ask for none
         """Take what the twin leaves open, before `prepare`; None: there is no twin."""

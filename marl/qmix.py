@@ -31,7 +31,7 @@ from marl.environment import (
 )
 from marl.flights import Flights, Policy, evaluate, fly
 from marl.gru import gru
-from marl.learner import Learner, Setup
+from marl.learner import Flown, Learner, Setup
 from marl.mission import Mission
 from marl.planner import PlanPolicy, plan
 from marl.replicas import Replicas
@@ -486,8 +486,16 @@ class QMIX(Learner):
 
     def _train(self, episodes: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Train for some episodes; return the record to be logged, and the new weights."""
-        [record], [weights] = self._trainers.call("train", episodes), self._trainers.call("weights")
-        return record, weights
+        records, each = self._trainers.call("train", episodes), self._trainers.call("weights")
+        for record in records:
+            self.training.flights += episodes
+            self.training.collected += episodes * record["train_ratio"]
+        return {name: float(np.mean([record[name] for record in records]))
+                for name in records[0]}, self._merged(each)
+
+    def _merged(self, weights: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+        """Return the weights that the replicas go on with."""
+        return weights[0]
 
     def _ratio(self, mission: Mission, agent: Agent) -> float:
         """Return the share that a policy collects, always in the same shadowing.
@@ -497,10 +505,10 @@ class QMIX(Learner):
         flights, seed = self.setup.settings.selection_flights, self.setup.run.seed
         if not flights:
             return np.nan
-        self.selection_flights += flights
         policy = AgentPolicy(agent, self.setup.device)
-        flown = evaluate(mission, policy, flights, stream(seed, "choice"))
-        return float(flown.ratio(mission).mean())
+        ratio = evaluate(mission, policy, flights, stream(seed, "choice")).ratio(mission)
+        self.selection.add(ratio)
+        return float(ratio.mean())
 
     def _better_plan(self, mission: Mission) -> np.ndarray:
         """Plan anew, but keep the plan before unless the new one is clearly better.
@@ -511,11 +519,12 @@ class QMIX(Learner):
         new = plan(mission, run.planner_iterations, run.seed).actions
         if self._actions is None:
             return new
-        self.selection_flights += 2 * run.flights
         before, after = (
             evaluate(mission, PlanPolicy(actions), run.flights, stream(run.seed, "choice"))
-            .ratio(mission).mean() for actions in (self._actions, new))
-        return new if after > before + MIN_GAIN else self._actions
+            .ratio(mission) for actions in (self._actions, new))
+        self.selection.add(before)
+        self.selection.add(after)
+        return new if after.mean() > before.mean() + MIN_GAIN else self._actions
 
     @override
     def policy(self, rng: np.random.Generator) -> Policy:
@@ -526,17 +535,17 @@ class QMIX(Learner):
         # The replicas' memories are most of a checkpoint.
         return {"episodes": self.episodes, "best": self._best.state_dict(),
                 "actions": self._actions, "highest": float(self._highest),
-                "selection_flights": self.selection_flights,
+                "training": vars(self.training), "selection": vars(self.selection),
                 "replicas": None if last else self._trainers.call("state")}
 
     @override
     def load_state(self, state: dict) -> None:
         replicas = state["replicas"]
         require(state, {"episodes": COUNT, "best": self._best.state_dict(), "actions": ...,
-                        "selection_flights": COUNT, "highest": ...,
+                        "training": ..., "selection": ..., "highest": ...,
                         "replicas": None if replicas is None else [...] * self.replicas})
         self.episodes, self._highest = state["episodes"], float(state["highest"])
-        self.selection_flights = state["selection_flights"]
+        self.training, self.selection = Flown.of(state["training"]), Flown.of(state["selection"])
         self._best.load_state_dict(state["best"])
         if state["actions"] is not None:
             self._actions = require_plan(state["actions"], self.setup.mission)

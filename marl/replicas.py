@@ -20,7 +20,7 @@ from marl.settings import LearnerSettings, RunSettings, learner_class
 from radiotwin.errors import RunFailed
 from radiotwin.io.budgets import TRAINING_BYTES
 from radiotwin.io.signals import deferred
-from radiotwin.runtime.execution.local import start_process
+from radiotwin.runtime.execution import start_process
 from radiotwin.runtime.processes import usable_cores
 
 _COPIES = 4  # of the weights: target network, and two moments of the optimiser

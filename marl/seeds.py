@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 from scipy.stats import trim_mean
 
+from marl.algorithm1 import FLIGHTS
 from marl.figures import draw_curve
-from marl.session import Session, require_free
+from marl.session import FLIGHTS_SAY, Session, flights_text, regret_text, require_free
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_path
@@ -39,8 +40,8 @@ def run_seeds(run: RunSettings, learner: LearnerSettings, out: Path, resume: boo
         for name, each in rows.items():
             curves.setdefault(name, []).append(each)
     summary = [dict(zip(("method", "trained_in"), key)) | {
-        "seeds": len(group), "real_episodes": int(group["real_episodes"].iloc[0])}
-        | over_seeds(group["truth_ratio"].to_numpy())
+        "seeds": len(group), **group[["real_episodes", *FLIGHTS]].iloc[0],
+        "regret": group["regret"].mean()} | over_seeds(group["truth_ratio"].to_numpy())
         for key, group in pd.concat(tables).groupby(["method", "trained_in"], sort=False)]
     with atomic_path(out / "seeds.csv") as temporary:
         write_csv(pd.DataFrame(summary), temporary)
@@ -49,10 +50,10 @@ def run_seeds(run: RunSettings, learner: LearnerSettings, out: Path, resume: boo
                        for rows in zip(*each)] for name, each in curves.items()},
                {}, out / "curve.png")
     print_rows(f"Collected in the truth ({run.truth}), of all data; interquartile mean of {seeds} "
-               f"seeds, and its {CONFIDENCE:.0%} band",
-               {"method": "left", "trained in": "left", "real episodes": "right",
-                "collected": "right", "from": "right", "to": "right"},
-               [[row["method"], row["trained_in"], f"{row['real_episodes']:,}",
+               f"seeds, and its {CONFIDENCE:.0%} band. {FLIGHTS_SAY}",
+               {"method": "left", "trained in": "left", "real flights": "right",
+                "regret": "right", "collected": "right", "from": "right", "to": "right"},
+               [[row["method"], row["trained_in"], flights_text(row), regret_text(row),
                  *(f"{row[name]:.3f}" for name in ("truth_ratio", "low", "high"))]
                 for row in summary])
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from marl.algorithm1 import Campaign, Outcome, run_algorithm
+from marl.algorithm1 import FLIGHTS, Campaign, Outcome, run_algorithm
 from marl.figures import choose_flight, draw_curve, save, save_animation, trajectories_figure
 from marl.flights import evaluate, track_table
 from marl.learner import make_learner
@@ -27,7 +28,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import read_truth
 from radiotwin.runtime.console import print_rows, progress, say
 from radiotwin.runtime.cuda import torch_device
-from radiotwin.runtime.execution.local import start_process
+from radiotwin.runtime.execution import start_process
 from radiotwin.scene import Scene
 
 if TYPE_CHECKING:
@@ -36,10 +37,13 @@ if TYPE_CHECKING:
 TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin",
               "raytrace": "ray-traced twin", "path-kriging": "twin of a map that may be wrong",
               "truth": "the truth"}
+NO_FLIGHTS = dict.fromkeys(("real_episodes", *FLIGHTS), 0) | {"real_ratio": np.nan}
+FLIGHTS_SAY = "Real flights: to measure + to train + to choose between policies"
 BASELINES = ("planner", "heuristic", "greedy", "random")  # in every table
 RECORDED = {
     truth: {"method": "qmix", "trained_in": "the truth (recorded with 0.1.0)",
-            "real_episodes": 13_696, "truth_ratio": ratio, "truth_ratio_std": ratio_sd}
+            "real_episodes": 13_696, "measuring_flights": 0, "training_flights": 8_000,
+            "selection_flights": 5_696, "truth_ratio": ratio, "truth_ratio_std": ratio_sd}
     for truth, ratio, ratio_sd in (
         ("1e44db1d67e1a86564b1ebba6ff3f1b0e974324272941efbf615a7f78a4a9622", 0.912, 0.018),  # RBM
         ("4e3ce2205330c13ac95f4f8ff317806c8b4a4ebaf27a5386c81856eaf44af7a5", 0.873, 0.017))}  # RDM
@@ -90,7 +94,8 @@ class Session:
                 on_progress(0, f"round {number}/{rounds}")
                 if number == 1 and learner_class(self.run.algorithm).learns:
                     for name in ("greedy", "heuristic", "planner"):
-                        _say_row(self._baseline(name, mission, campaign.in_truth(), 1))
+                        _say_row(self._baseline(name, mission, campaign.in_truth(), NO_FLIGHTS | {
+                            "real_episodes": 1, "measuring_flights": 1}))
 
             main = run_algorithm(self.run, self.learner, scene, truth, self.out, self.resume,
                                  _Log(self.out), on_progress, device, on_learned)
@@ -167,9 +172,14 @@ class Session:
             trained_in = make_mission(scene, main.twin.radio_map(scene), main.known,
                                       self.run.assignment)
         baselines = [name for name in BASELINES if name != self.run.algorithm]
-        entries += [self._baseline(name, trained_in, real, main.rows[-1]["real_episodes"])
-                    for name in baselines]
-        table = pd.DataFrame(entries)
+        entries += [self._baseline(name, trained_in, real, main.rows[-1]) for name in baselines]
+        known = make_mission(scene, truth, Known.truth(scene), self.run.assignment)
+        best = self._baseline("planner", known, known, NO_FLIGHTS) | {
+            "method": "clairvoyant", "trained_in": TRAINED_IN["truth"]}
+        table = pd.DataFrame([*entries, best])
+        # What all real flights together collected less than the clairvoyant would have.
+        table["regret"] = (table["real_episodes"] * (best["truth_ratio"] - table["real_ratio"])
+                           ).where(table["real_episodes"] > 0, 0.0)
         with atomic_path(self.out / "comparison.csv") as temporary:
             write_csv(table, temporary)
         levels = {entry["method"]: entry["truth_ratio"] for entry in entries
@@ -182,15 +192,16 @@ class Session:
              self.out / "trajectories.png")
         save_animation(scene, real, flights, typical, self.out / "flight.gif")
         print_rows(f"Collected in the truth ({self.run.truth}), of all data; mean and standard "
-                   f"deviation of {self.run.flights} flights",
-                   {"method": "left", "trained in": "left", "real episodes": "right",
-                    "collected": "right", "±": "right"},
-                   [[row.method, row.trained_in, f"{row.real_episodes:,}",
-                     f"{row.truth_ratio:.3f}", f"{row.truth_ratio_std:.3f}"]
-                    for row in table.itertuples()])
+                   f"deviation of {self.run.flights} flights. {FLIGHTS_SAY}",
+                   {"method": "left", "trained in": "left", "real flights": "right",
+                    "regret": "right", "collected": "right", "±": "right"},
+                   [[row["method"], row["trained_in"], flights_text(row), regret_text(row),
+                     f"{row['truth_ratio']:.3f}", f"{row['truth_ratio_std']:.3f}"]
+                    for row in table.to_dict("records")])
         return table
 
-    def _baseline(self, name: str, trained_in: Mission, real: Mission, real_episodes: int) -> dict:
+    def _baseline(self, name: str, trained_in: Mission, real: Mission, flown: dict) -> dict:
+        """Return the row of a method without training; `flown` has the real flights before it."""
         run = self.run.model_copy(update={"algorithm": name})
         learner = make_learner(run, self.learner, trained_in, 1)
         learner.prepare(trained_in, lambda _: None)
@@ -200,9 +211,8 @@ class Session:
         # both come from the real flights, unless the settings give them.
         free = (name == "random" or run.twin == "truth"
                 or (name in ("greedy", "heuristic") and run.privileged))
-        row = {"real_episodes": 0 if free else real_episodes, "truth_ratio": float(ratio.mean()),
-               "truth_ratio_std": float(ratio.std())}
-        return _entry(name, run.twin, row)
+        return _entry(name, run.twin, (NO_FLIGHTS if free else flown) | {
+            "truth_ratio": float(ratio.mean()), "truth_ratio_std": float(ratio.std())})
 
 
 def require_free(folder: Path, advice: str) -> None:
@@ -215,7 +225,17 @@ def require_free(folder: Path, advice: str) -> None:
 def _entry(method: str, twin: str, row: dict) -> dict:
     trained_in = TRAINED_IN[twin] if learner_class(method).uses_map else ""
     return {"method": method, "trained_in": trained_in,
-            **{name: row[name] for name in ("real_episodes", "truth_ratio", "truth_ratio_std")}}
+            **{name: row[name] for name in (*NO_FLIGHTS, "truth_ratio", "truth_ratio_std")}}
+
+
+def flights_text(row: Mapping[str, float]) -> str:
+    """Return the real flights of a row by what they were for: measuring + training + selection."""
+    return " + ".join(f"{row[name]:,.0f}" for name in FLIGHTS)
+
+
+def regret_text(row: Mapping[str, float]) -> str:
+    """Return the regret of a row, a dash where it is not known."""
+    return "–" if np.isnan(row["regret"]) else f"{row['regret']:,.1f}"
 
 
 def _compared(run: RunSettings, made: Any, learner: LearnerSettings, folder: Path,
@@ -235,7 +255,7 @@ def _compared(run: RunSettings, made: Any, learner: LearnerSettings, folder: Pat
 def _say_row(row: dict) -> None:
     """Print a row of the table before the others are there."""
     where = f" in the {row['trained_in'].removeprefix('the ')}" if row["trained_in"] else ""
-    say(f"{row['method']}{where}, real episodes {row['real_episodes']:,}: "
+    say(f"{row['method']}{where}, real flights {flights_text(row)}: "
         f"{row['truth_ratio']:.3f} ± {row['truth_ratio_std']:.3f} collected in the truth")
 
 

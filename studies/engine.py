@@ -104,9 +104,8 @@ def measure_accuracy(seed: int, settings: dict) -> dict:
         mended = SionnaPaths(scene, SAMPLES, "reciprocal")
         better = [paths for ends in chosen for paths in mended.paths(*ends)]
         for name, truth in (("released", theirs), ("mended", better)):
-            for wedge in ("sionna", "luebbers"):
-                ours = [paths for ends in chosen for paths in engine_paths(scene, *ends, wedge)]
-                out[f"{name}, {wedge}"] = compare(ours, truth)
+            ours = [paths for ends in chosen for paths in engine_paths(scene, *ends)]
+            out[name] = compare(ours, truth)
     return {"comparison": out}
 
 
@@ -213,7 +212,7 @@ def engine_table(rows: pd.DataFrame) -> str:
         name = row["name"].split(": ", 1)[1]
         if row["name"].startswith("accuracy"):
             for which, found in row["comparison"].items():
-                accuracy.append([name, *which.split(", "), *(
+                accuracy.append([name, which, *(
                     number(found[key], 2) for key in (
                         "bias_db", "rms_db", "p90_db", "rms_without_paths_they_lack_db",
                         "rms_without_paths_we_lack_db", "rms_of_common_paths_db",
@@ -222,7 +221,7 @@ def engine_table(rows: pd.DataFrame) -> str:
             cost.append([name, f"{row['faces']:,.0f}", number(row["setup_s"], 2),
                          number(row["link_ms"], 2), number(row.get("traced_ms"), 1),
                          number(row.get("times_cheaper"), 1)])
-    heads = ["scene", "Sionna RT", "wedge", "bias [dB]", "RMS [dB]", "90 % within [dB]",
+    heads = ["scene", "Sionna RT", "bias [dB]", "RMS [dB]", "90 % within [dB]",
              "RMS without paths that Sionna lacks", "RMS without paths that the engine lacks",
              "RMS of common paths", "90 % of the same paths within [dB]", "links"]
     return "\n\n".join([

@@ -19,7 +19,7 @@ SPLITS = ("calibrate", "judge")
 
 
 def foreign_table(rows: pd.DataFrame) -> str:
-    """Return what was said of each split, families, probabilities, and the cases one by one."""
+    """Return what was said of each split, families and probabilities."""
     splits = [(split, rows[rows["split"] == split]) for split in SPLITS]
     splits = [(split, part) for split, part in splits if len(part)]
     return "\n\n".join([
@@ -36,10 +36,7 @@ def foreign_table(rows: pd.DataFrame) -> str:
                  " (share of the cases with an effect in which its score is higher than in all but "
                  "1 % or 5 % of the cases without it)"),
         markdown(["case", "effect", "size", "would have been named from"], _missed_lines(rows),
-                 "Missed", " although as large as would have been named"),
-        markdown(["case", "hidden (size [dB])", "verdict", "named (probability)", "before [dB]",
-                  "after", "combined", "oracle", "best baseline"],
-                 [_case_line(row) for row in rows.itertuples()], "Case by case")])
+                 "Missed", " although as large as would have been named")])
 
 
 FAMILY_HEADS = ("first", "missed", "in intervals")
@@ -187,13 +184,3 @@ def _missed_lines(rows: pd.DataFrame) -> list[list[str]]:
     return [[row.name, f"`{name}`", number(size, 1), number(least, 1)]
             for row in rows.itertuples(index=False) for name, size, least in row.seen
             if size >= least and name not in row.named] or [["none", "–", "–", "–"]]
-
-
-def _case_line(row: Any) -> list[str]:
-    hidden = ", ".join(each["name"] for each in row.hidden) or "nothing"
-    named = [name if probability is None else f"{name} ({probability:.2f})"
-             for name, probability in zip(row.named, row.probabilities) if name not in UNNAMED]
-    best = min(row.baselines.values(), default=None)
-    return [row.name, f"{hidden} ({row.size_db:.1f})", row.verdict, ", ".join(named) or "–",
-            *(number(each, 2) for each in (row.before["rmse_db"], row.after["rmse_db"],
-                                           row.combined["rmse_db"], row.oracle_rmse_db, best))]

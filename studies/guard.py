@@ -143,7 +143,7 @@ def write_inputs(inputs: Path) -> None:
     shutil.copytree(ROOT / "examples" / "campaign", inputs / "campaign")
     shutil.copytree(ROOT / "scenes" / "rbm", inputs / "rbm" / "scene")
     scene = Scene.load(inputs / "rbm" / "scene")
-    survey = fly_survey(scene, RadioMap.read(ROOT / "scenes" / "rbm" / "truth.nc"), flights=3,
+    survey = fly_survey(scene, RadioMap.load(ROOT / "scenes" / "rbm" / "truth.nc"), flights=3,
                         pattern="random-waypoint", seed=0)
     survey.write(inputs / "rbm" / "measurements.csv")
     if (DATA / "powder_frs").is_dir():

@@ -9,7 +9,7 @@ from scipy.constants import speed_of_light
 from radiotwin.propagation.paths.candidates import candidate_search
 from radiotwin.propagation.paths.images import PathBuffer
 from radiotwin.propagation.paths.interactions import city_slabs
-from radiotwin.propagation.paths.powers import PATH_CHUNK, WEDGES, clear_paths_gains
+from radiotwin.propagation.paths.powers import PATH_CHUNK, clear_paths_gains
 from radiotwin.scene import Scene
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import Antennas, PathGains
@@ -34,9 +34,8 @@ class FoundPath:
     gain: float
 
 
-def engine_paths(
-    scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray, wedge: str
-) -> list[list[FoundPath]]:
+def engine_paths(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray
+                 ) -> list[list[FoundPath]]:
     """Return the engine's paths from one device to receivers (n, 3) without line of sight."""
     city, frequency_hz = scene.city, scene.config.radio.frequency_hz
     search, buffer = candidate_search(city, DEPTH), PathBuffer.allocate(PATH_CHUNK)
@@ -44,7 +43,7 @@ def engine_paths(
     out: list[list[FoundPath]] = [[] for _ in receiver_m]
     for clear, gain in clear_paths_gains(
             city, search, candidates, device_m, receiver_m, buffer,
-            2 * np.pi * frequency_hz / speed_of_light, slabs, WEDGES[wedge]):
+            2 * np.pi * frequency_hz / speed_of_light, slabs):
         for path, power in zip(clear, gain):
             row, count = buffer.candidate[path], buffer.count[path]
             before, after = ((facets[row] >= 0).sum() for facets in (candidates.before,

@@ -2,8 +2,8 @@
 
 Devices stand at street level, as many within 4 m of a wall, 4 to 20 m and farther off; receivers
 stand outdoors from 1.5 to 60 m. Each link is solved from its device and from its receiver, by
-Sionna RT and by the path engine, with Sionna RT's wedge and with the reciprocal one. By reciprocity
-both gains are equal.
+Sionna RT, as released and with the reciprocal wedge, and by the path engine. By reciprocity both
+gains are equal.
 """
 
 import math
@@ -36,8 +36,7 @@ DOUBT_DB = 6.0
 FREQUENCY_HZ = 2.4e9
 METHODS = {("Sionna RT", "sionna"): "Sionna RT, as released",
            ("Sionna RT", "reciprocal"): "Sionna RT, reciprocal",
-           ("engine", "sionna"): "path engine, Sionna RT's wedge",
-           ("engine", "luebbers"): "path engine, reciprocal"}
+           ("engine", "reciprocal"): "path engine"}
 
 # Plots of a block along each side; the side of a plot, and the width of a street
 PLOTS, PLOT_M, STREET_M = 3, 38.0, 20.0
@@ -132,20 +131,18 @@ def measure_reciprocity(seed: int, settings: dict) -> dict:
         for (engine, wedge), name in METHODS.items():
             # A copy of the map, so that no method finds candidates that another has kept
             solve = _sionna(xml_path, wedge, settings) if engine == "Sionna RT" else \
-                _engine(copy(city), wedge)
+                _engine(copy(city))
             solve(device_m[-1], receiver_m)  # compiles the kernels
             started = time.process_time()
             forward = np.stack([solve(each_m, receiver_m) for each_m in device_m])
             seconds[name] = (time.process_time() - started) / forward.size
             backward = np.stack([solve(each_m, device_m) for each_m in receiver_m]).T
             both[name] = forward, backward
-    released, mended, one, other = both.values()
+    released, mended, engine = both.values()
     return {"exchanged": {name: {kind: _exchanged(*gains, of_kind) for kind, of_kind in
                                  (("LoS", los), ("NLoS", ~los))} for name, gains in both.items()},
-            "changed": {name: _changed(before[0], after[0], wall_m, los)
-                        for name, before, after in (("Sionna RT", released, mended),
-                                                    ("path engine", one, other))},
-            "engine_errors": _errors(other[0], *mended, los),
+            "changed": {"Sionna RT": _changed(released[0], mended[0], wall_m, los)},
+            "engine_errors": _errors(engine[0], *mended, los),
             "link_ms": {name: 1e3 * taken for name, taken in seconds.items()}}
 
 
@@ -156,9 +153,9 @@ def _sionna(xml_path: Any, wedge: str, settings: dict) -> Callable[..., np.ndarr
     return solver.gains
 
 
-def _engine(city: CityMap, wedge: str) -> Callable[..., np.ndarray]:
+def _engine(city: CityMap) -> Callable[..., np.ndarray]:
     return lambda end_m, ends_m: power_to_db(
-        path_powers(city, end_m, ends_m, FREQUENCY_HZ, wedge=wedge).total)
+        path_powers(city, end_m, ends_m, FREQUENCY_HZ).total)
 
 
 def _exchanged(forward_db: np.ndarray, backward_db: np.ndarray, chosen: np.ndarray
@@ -226,7 +223,7 @@ def reciprocity_table(rows: pd.DataFrame) -> str:
         errors += [[row["name"], kind, f"{found['links']}", number(found["rms_db"], 2),
                     number(found["rms_without_doubtful_db"], 2), _percent(found["doubtful"])]
                    for kind, found in row["engine_errors"].items()]
-        base = row["link_ms"][METHODS["engine", "luebbers"]]
+        base = row["link_ms"][METHODS["engine", "reciprocal"]]
         times.append([row["name"], *(f"{taken / base:.2f}" for taken in row["link_ms"].values())])
     return "\n\n".join([
         markdown(["city", "method", "class", "links", "RMS [dB]", "median [dB]", "mean [dB]",
@@ -240,7 +237,7 @@ def reciprocity_table(rows: pd.DataFrame) -> str:
                  errors, "The path engine against Sionna RT",
                  f", both reciprocal; doubtful: its two ends differ by more than {DOUBT_DB:g} dB."),
         markdown(["city", *METHODS.values()], times, "Time a link",
-                 ", processor time over that of the path engine with the reciprocal wedge.")])
+                 ", processor time over that of the path engine.")])
 
 
 def _percent(share: float) -> str:

@@ -28,8 +28,8 @@ from radiotwin.closeloop.scan import compare as compare_groups
 from radiotwin.links import prepare_links
 from radiotwin.links.checks import stand_anchors
 from radiotwin.links.correlation import moving_end_m
+from radiotwin.links.evidence import thin_links
 from radiotwin.links.limits import limits_to_explain
-from radiotwin.links.thinning import thin_links
 from studies.runner import Study
 from studies.tables import markdown, number
 from studies.where_pivot import THRESHOLD, robust_z, shrunken
@@ -172,7 +172,7 @@ def _said(group: Group, sure: float, size: float, hidden: list[Truth], wrong: np
 
 
 def where_table(rows: pd.DataFrame) -> str:
-    """Return how often where is right and groups are not there, by split, and the misses."""
+    """Return how often where is right and groups are not there, by split."""
     rows = rows.assign(split=rows["name"].str.split("/").str[0])
     splits = {split: list(part.itertuples()) for split, part in rows.groupby("split")}
     figures = [_figures(part) for part in splits.values()]
@@ -182,15 +182,7 @@ def where_table(rows: pd.DataFrame) -> str:
                  f"{NOTICEABLE_DB:g} dB RMS and more on at least {MIN_LINKS} links that they "
                  "act on)"),
         markdown(["effect", *(f"{split}: {head}" for split in splits for head in FAMILY_HEADS)],
-                 _by_effect(splits), "By effect", " (right of cases)"),
-        markdown(["case", "hidden (ends; size; links; t)", "nearest group", "said"], [
-            [row.name, _named(one), number(one["almost"], 2), _list(row.said)]
-            for row in rows.itertuples() for one in row.hidden if counts(one) and not one["right"]],
-            "Missed", " (t: of the residual regressed on the true change)"),
-        markdown(["case", "hidden", "not there"], [
-            [row.name, "; ".join(map(_named, row.hidden)) or "nothing",
-             _list(each for each in row.said if each["is"] == "not there")]
-            for row in rows.itertuples() if false_groups(row)], "Not there")])
+                 _by_effect(splits), "By effect", " (right of cases)")])
 
 
 FAMILY_HEADS = ("scan", "places", "median")
@@ -243,18 +235,6 @@ def _by_effect(splits: dict[str, list[Any]]) -> list[list[str]]:
                       for key in ("right", "by_places", "first_by_median")]
         lines.append([f"`{name}`", *cells])
     return lines
-
-
-def _named(one: dict) -> str:
-    ends = " ".join("+".join(its) for its in one["ends"].values())
-    return f"{one['name']} {ends} ({one['size_db']:.1f} dB; {one['links']}; {number(one['t'], 1)})"
-
-
-def _list(said: Iterable[dict]) -> str:
-    return "; ".join(
-        f"{each['group']} {each['sight']} {each['statistic']} {each['size']:+.1f} "
-        f"({each['sure']:.2f}{', not there' * (each['is'] == 'not there')})"
-        for each in said) or "nothing"
 
 
 STUDIES = {"where": Study("Does the scan say where something is?", say_where, where_cases,

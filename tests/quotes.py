@@ -44,6 +44,8 @@ def cell(study, where):
         for cells in rows if all(each in title for each in table) else []:
             if columns and (", ".join(cells) + ",").startswith(row + ","):
                 found[title, tuple(cells)] = [cells[i] for i in columns]
+    exact = {key: cells for key, cells in found.items() if key[1][0] == row}
+    found = exact or found
     assert len(found) == 1, f"{study}: {where}: {len(found)} rows"
     only, = found.values()
     assert len(only) == 1, f"{study}: {where}: {len(only)} columns"
@@ -60,7 +62,8 @@ def is_quoted(said, text):
     known = [float(each) for each in numbers(text) if each]
     for each in numbers(said):
         digits = len(each.partition(".")[2])
-        if not any(abs(float(each) - value) <= 0.5 * 10**-digits + 1e-9 for value in known):
+        sign = abs if each[0] != "-" else float  # without a sign it is a size
+        if not any(abs(float(each) - sign(value)) <= 0.5 * 10**-digits + 1e-9 for value in known):
             return False
     return True
 

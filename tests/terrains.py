@@ -3,7 +3,7 @@
 import numpy as np
 
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.terrain import HeightGrid, triangulate
+from radiotwin.scene.readers.terrain import HeightGrid, triangulate
 
 LAT_M, LON_M = 110_608, 109_640  # metres in a degree at latitude 10°, as the maps of tests/scene/readers have them
 

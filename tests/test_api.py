@@ -77,7 +77,7 @@ def test_the_documented_lines_run(documented):
 
 
 def test_what_closeloop_json_holds_is_documented(documented):
-    described = (ROOT / "docs" / "close-the-loop.md").read_text(encoding="utf-8")
+    described = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
     assert all(f"`{key}`" in described for key in rt.make_report(documented[0]["loop"]))
 
 
@@ -137,7 +137,7 @@ def test_functions_have_defaults_where_commands_have(name):
 
 @pytest.mark.parametrize("command", [
     ["-m", "radiotwin", "--version"], ["-m", "marl.fedqmix", "--help"],
-    ["-c", "import radiotwin.propagation.paths.vectors, marl.environment, numba, sys; assert '' in sys.path"]])
+    ["-c", "import radiotwin.propagation.paths.surfaces, marl.environment, numba, sys; assert '' in sys.path"]])
 def test_an_output_folder_named_coverage_does_no_harm(tmp_path, command):
     """numba would take it for the package of that name; it is imported by both packages."""
     (tmp_path / "coverage").mkdir()

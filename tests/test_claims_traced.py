@@ -28,7 +28,7 @@ SEEDS = range(2)
 @pytest.fixture(scope="module", params=CITIES)
 def city(request):
     scene = Scene.load(SCENES / request.param)
-    return scene, RadioMap.read(scene.folder / "truth.nc")
+    return scene, RadioMap.load(scene.folder / "truth.nc")
 
 
 @pytest.fixture(scope="module")

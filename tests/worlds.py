@@ -126,7 +126,7 @@ def only_effects(monkeypatch):
 def narrow_street():
     """RBM, links of its anchors and of one unknown device in a narrow street, and its true position."""
     scene = Scene.load(RBM)
-    flown = fly_survey(scene, RadioMap.read(RBM / "truth.nc"), flights=3, pattern="random-waypoint", seed=0,
+    flown = fly_survey(scene, RadioMap.load(RBM / "truth.nc"), flights=3, pattern="random-waypoint", seed=0,
                        noise_db=1.0)
     devices = flown.devices[(flown.devices["role"] == "anchor") | (flown.devices["device"] == IN_A_NARROW_STREET)]
     every_third = np.unique(flown.table["time_s"], return_inverse=True)[1] % 3 == 0

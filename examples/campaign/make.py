@@ -22,7 +22,7 @@ import radiotwin as rt
 from radiotwin.geo import to_geographic
 from radiotwin.io.forms import Origin
 from radiotwin.scene.readers import MapOptions, build_scene_from_map
-from radiotwin.trace.points import trace_gains
+from radiotwin.trace.run import trace_gains
 
 ORIGIN = Origin(latitude_deg=47.05, longitude_deg=8.30, altitude_m=0.0)
 SIDE_M, BLOCK_M, STREET_M = 420.0, 60.0, 16.0

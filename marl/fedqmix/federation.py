@@ -88,12 +88,10 @@ class FedQMIX(QMIX):
         super().__init__(setup, numbers=range(setup.mission.uavs))
 
     @override
-    def _train(self, episodes: int) -> tuple[dict[str, float], Weights]:
-        records = self._trainers.call("train", episodes)
-        mean = average(self._trainers.call("weights"))
+    def _merged(self, weights: list[Weights]) -> Weights:
+        mean = average(weights)
         self._trainers.call("set_weights", mean)
-        return {name: float(np.mean([record[name] for record in records]))
-                for name in records[0]}, mean
+        return mean
 
 
 class Replica(QMIX):

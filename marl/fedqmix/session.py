@@ -11,7 +11,7 @@ from marl.fedqmix.federation import Weights, average, initial_weights, rounds_of
 from marl.fedqmix.settings import FederationSettings, Shared, write_app
 from marl.figures import draw_curve
 from marl.replicas import keep_memory, limit_threads
-from marl.session import require_free
+from marl.session import FLIGHTS_SAY, flights_text, require_free
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.io.files import atomic_file
@@ -94,13 +94,13 @@ class FederatedSession:
             table = pd.read_csv(party.folder / "metrics.csv")
             last = table.iloc[-1]
             curves[f"party {party.number}, {party.scene.name}"] = table.to_dict("records")
-            rows.append([str(party.number), party.scene.name, f"{last['real_episodes']:.0f}",
+            rows.append([str(party.number), party.scene.name, flights_text(last),
                          f"{last['simulated_episodes']:,.0f}", f"{last['twin_ratio']:.3f}",
                          f"{last['truth_ratio']:.3f}", f"{last['truth_ratio_std']:.3f}"])
         draw_curve(curves, {}, self.out / "curve.png")
         print_rows(f"Collected by each party's policy, of all data; mean and standard deviation of "
-                   f"{self.run.flights} flights",
-                   {"party": "left", "scene": "left", "real episodes": "right",
+                   f"{self.run.flights} flights. {FLIGHTS_SAY}",
+                   {"party": "left", "scene": "left", "real flights": "right",
                     "simulated": "right", "in its twin": "right", "in its truth": "right",
                     "±": "right"}, rows)
 

@@ -124,32 +124,22 @@ def import_(
     table with one origin, each of them a flight. The other commands read the result. A report
     counts what was left out.
     """
-    from radiotwin.importing import import_files, parse_columns, read_settings
+    options = locals()
+    from radiotwin.importing import Settings, import_files, parse_columns, read_settings
     from radiotwin.runtime.console import progress
 
-    given: dict[str, Any] = {
-        "format": format, "only": _choices(only), "sheet": sheet, "list_name": list_name,
-        "encoding": encoding, "decimal": decimal,
+    given: dict[str, Any] = {name: options[name] for name in Settings.model_fields
+                             if name in options and name != "columns"}
+    given |= {
+        "only": _choices(only), "quotes": False if no_quotes else None,
+        "path_loss": path_loss or None, "header": header.split(",") if header else None,
         "delimiter": {"tab": "\t", "\\t": "\t", "space": " ", "spaces": "  "}.get(
             delimiter or "", delimiter),
-        "skip_bad_rows": skip_bad_rows, "quotes": False if no_quotes else None,
-        "path_loss": path_loss or None,
-        "lines_before_header": lines_before_header, "lines_after_table": lines_after_table,
-        "header": header.split(",") if header else None,
-        "level_offset_db": level_offset_db,
-        "band_hz": _values(band_hz),
-        "level_unit": level_unit, "length_unit": length_unit,
-        "time_format": time_format, "time_zone": time_zone,
-        "not_detected": _values(not_detected), "not_measured": _values(not_measured),
-        "not_detected_at_or_below": not_detected_at_or_below,
-        "min_level": min_level, "max_level": max_level,
-        "min_distance_m": min_distance_m, "max_distance_m": max_distance_m,
-        "thin_m": thin_m, "place_m": place_m, "average_m": average_m, "average": average,
-        "origin": parse_origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
+        "band_hz": _values(band_hz), "not_detected": _values(not_detected),
+        "not_measured": _values(not_measured), "origin": parse_origin(origin),
         "track": _tracks(track, {
             "topic": track_topic, "time_format": track_time_format,
             "columns": parse_columns(track_columns) if track_columns else None}),
-        "track_max_gap_s": track_max_gap_s,
         "wide": [parse_columns(text) for text in wide] if wide else None}
     mapping = columns
     if columns is not None and "=" in columns and not columns.lower().endswith(".toml"):

@@ -52,9 +52,9 @@ from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, prepare_links
 from radiotwin.links.checks import stand_anchors
+from radiotwin.links.evidence import thin_links
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.links.measurements import Measurements
-from radiotwin.links.thinning import thin_links
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 

@@ -1,11 +1,19 @@
 """Files of a coverage prediction: tables, NetCDF, GeoTIFF, KMZ, and a GeoPackage.
 
-The GeoPackage has the areas of each class as vectors, and the transmitters.
+The GeoPackage (OGC 12-128r18, version 1.3) has the areas of each class as vectors, and the
+transmitters. It is made in memory: GDAL swallows some errors of a full disk, and writes the time of
+day; the same layers are the same bytes here, and are written like any other file.
+
+Maps, overlays and vectors share the classes of the rasters, with their labels and colours.
 """
 
 import io
 import json
-from collections.abc import Callable
+import sqlite3
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,21 +22,108 @@ import numpy as np
 import pandas as pd
 import shapely
 import xarray as xr
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgba_array
+from matplotlib.colors import to_hex, to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from pyproj import CRS
 
-from radiotwin.coverage.legends import Legend, drawn_rasters, file_stem, legend_of
+from radiotwin.coverage.areas import class_lists
 from radiotwin.coverage.run import Coverage
 from radiotwin.errors import BadInput
 from radiotwin.geo import local_crs, to_geographic
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_file
-from radiotwin.io.geopackage import Layer, geopackage
 from radiotwin.maps.export.geotiff import GDAL_OPTIONS, georeference, require_rasterio
 from radiotwin.maps.export.kmz import OPACITY, Overlay, enlarged_png, write_overlays
 from radiotwin.scene import Scene
+
+BELOW_COLOUR = "#c9c9c9"
+SERVER_COLOURS = "tab20"
+GREYS = 14, 15  # of these: a building is grey
+# Title, unit in labels, factor from the raster's unit to it, colours from bad to good.
+_RASTERS: dict[str, tuple[str, str, float, str]] = {
+    "received_power_dbm": ("Received power", "dBm", 1.0, "RdYlGn"),
+    "sinr_db": ("SINR", "dB", 1.0, "RdYlGn"),
+    "snr_db": ("SNR", "dB", 1.0, "RdYlGn"),
+    "rate_bps": ("Rate of one user", "Mbit/s", 1e-6, "viridis"),
+    "coverage_probability": ("Probability of coverage", "%", 100.0, "RdYlGn")}
+
+
+@dataclass(frozen=True, eq=False)
+class Legend:
+    """Classes of a raster.
+
+    Attributes:
+        title: of the raster.
+        lower: (k,) lower end of each class but the last, descending; empty for servers.
+        labels: of each class, the best first; the last is what lies below all.
+        colours: of each class, `#rrggbb`.
+    """
+
+    title: str
+    lower: tuple[float, ...]
+    labels: tuple[str, ...]
+    colours: tuple[str, ...]
+
+    def classes(self, values: np.ndarray) -> np.ndarray:
+        """Return the class of each value, -1 for NaN.
+
+        Args:
+            values: any shape; numbers of servers where there are no lower ends.
+        """
+        if not self.lower:
+            return values.astype(np.int32)
+        ends = np.asarray(self.lower[::-1], dtype=float)
+        found = len(ends) - np.searchsorted(ends, np.nan_to_num(values), side="right")
+        return np.where(np.isnan(values), -1, found).astype(np.int32)
+
+
+def legend_of(name: str, coverage: Coverage) -> Legend:
+    """Return the classes of a raster.
+
+    Args:
+        name: of a variable of `Coverage.dataset`, one of `drawn_rasters`.
+        coverage: of the network.
+    """
+    if name == "best_server":
+        palette = colormaps[SERVER_COLOURS].colors  # type: ignore[attr-defined]
+        both = [*range(0, len(palette), 2), *range(1, len(palette), 2)]  # strong before pale
+        order = [each for each in both if each not in GREYS]
+        names = [each.name for each in coverage.transmitters]
+        colours = [to_hex(palette[order[row % len(order)]]) for row in range(len(names))]
+        return Legend("Best server", (), tuple(names), tuple(colours))
+    title, unit, factor, colours_name = _RASTERS[name]
+    lower = class_lists(coverage.settings, coverage.dataset.attrs["bandwidth_hz"])[name]
+    shown = [f"{each * factor:.4g}".replace("-", "−") for each in lower]
+    if name == "coverage_probability":
+        title += f", received power ≥ {_text(coverage.settings.threshold_dbm)} dBm"
+    shades = colormaps[colours_name](np.linspace(0.95, 0.05, len(lower)))
+    return Legend(title, lower, (*(f"≥ {each} {unit}" for each in shown), f"< {shown[-1]} {unit}"),
+                  (*map(to_hex, shades), BELOW_COLOUR))
+
+
+def drawn_rasters(coverage: Coverage) -> Sequence[str]:
+    """Return the names of the rasters that are drawn, in their order."""
+    return [name for name in ("received_power_dbm", "best_server", "sinr_db", "rate_bps",
+                              "coverage_probability") if name in coverage.dataset]
+
+
+def file_stem(name: str) -> str:
+    """Return the name of a raster's files.
+
+    >>> file_stem("received_power_dbm")
+    'received_power'
+    """
+    for ending in ("_dbm", "_db", "_bps"):
+        name = name.removesuffix(ending)
+    return name
+
+
+def _text(value: float) -> str:
+    return f"{value:g}".replace("-", "−")
+
 
 LEGEND_ROWS = 24  # servers in a legend
 RASTERS = ("received_power_dbm", "received_power_sd_db", "best_server", "snr_db", "sinr_db",
@@ -252,3 +347,82 @@ FILES = frozenset({
     "coverage.json", "coverage.csv", "coverage.nc", "coverage.gpkg", "coverage.kmz",
     *(f"{file_stem(name)}{suffix}" for name in RASTERS for suffix in (".tif", ".png"))})
 """Names of all files that are written to a folder."""
+
+
+_APPLICATION, _VERSION = 0x47504B47, 10300  # "GPKG" (requirement 2)
+_CARTESIAN, _DEGREES = -1, 4326
+_CHANGED = "1970-01-01T00:00:00.000Z"  # of every layer
+_TABLES = """
+CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER NOT NULL PRIMARY KEY,
+ organization TEXT NOT NULL, organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL,
+ description TEXT);
+CREATE TABLE gpkg_contents (table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL,
+ identifier TEXT UNIQUE, description TEXT DEFAULT '', last_change DATETIME NOT NULL DEFAULT
+ (strftime('%Y-%m-%dT%H:%M:%fZ','now')), min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE,
+ srs_id INTEGER, CONSTRAINT fk_gc_r_srs_id FOREIGN KEY (srs_id) REFERENCES
+ gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT NOT NULL,
+ geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL, z TINYINT NOT NULL, m TINYINT NOT NULL,
+ CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name),
+ CONSTRAINT uk_gc_table_name UNIQUE (table_name),
+ CONSTRAINT fk_gc_tn FOREIGN KEY (table_name) REFERENCES gpkg_contents(table_name),
+ CONSTRAINT fk_gc_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys (srs_id));
+"""  # annex C
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Features of one kind.
+
+    Attributes:
+        name: of the layer.
+        kind: of all geometries, such as MULTIPOLYGON.
+        shapes: (n,) geometries of shapely, in longitude and latitude or in metres.
+        columns: Name -> (n,) texts or numbers; NaN is null.
+    """
+
+    name: str
+    kind: str
+    shapes: np.ndarray
+    columns: Mapping[str, np.ndarray]
+
+
+def geopackage(layers: Iterable[Layer], in_degrees: bool) -> bytes:
+    """Return the bytes of a GeoPackage.
+
+    Args:
+        layers: their names and those of their columns are identifiers.
+        in_degrees: coordinates are WGS84 degrees; else metres of a local frame.
+    """
+    system = _DEGREES if in_degrees else _CARTESIAN
+    with closing(sqlite3.connect(":memory:")) as database:
+        database.executescript(
+            f"PRAGMA application_id={_APPLICATION}; PRAGMA user_version={_VERSION}; {_TABLES}")
+        database.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?,?,?,?,?,?)", [
+            ("Undefined Cartesian SRS", _CARTESIAN, "NONE", -1, "undefined", None),
+            ("Undefined geographic SRS", 0, "NONE", 0, "undefined", None),
+            ("WGS 84 geodetic", _DEGREES, "EPSG", 4326,
+             CRS.from_epsg(4326).to_wkt("WKT1_GDAL"), "longitude and latitude")])
+        for layer in layers:
+            kinds = ["TEXT" if values.dtype == object else "REAL"
+                     for values in layer.columns.values()]
+            columns = "".join(f', "{name}" {kind}' for name, kind in zip(layer.columns, kinds))
+            bounds = shapely.total_bounds(layer.shapes).tolist()  # NaN, so null, without a shape
+            database.execute(f'CREATE TABLE "{layer.name}" (fid INTEGER PRIMARY KEY AUTOINCREMENT '
+                             f"NOT NULL, geom {layer.kind}{columns})")
+            database.execute("INSERT INTO gpkg_contents VALUES (?,'features',?,'',?,?,?,?,?,?)",
+                             (layer.name, layer.name, _CHANGED, *bounds, system))
+            database.execute("INSERT INTO gpkg_geometry_columns VALUES (?,'geom',?,?,0,0)",
+                             (layer.name, layer.kind, system))
+            database.executemany(
+                f'INSERT INTO "{layer.name}" VALUES (NULL,?{",?" * len(kinds)})',
+                zip(_blobs(layer.shapes, system), *(v.tolist() for v in layer.columns.values())))
+        database.commit()
+        return database.serialize()
+
+
+def _blobs(shapes: np.ndarray, system: int) -> list[bytes]:
+    """Return geometries with the header of a GeoPackage (2.1.3), with the bounds, little endian."""
+    bounds = shapely.bounds(shapes)[:, [0, 2, 1, 3]]
+    return [struct.pack("<2sBBi4d", b"GP", 0, 0b11, system, *box) + body
+            for box, body in zip(bounds, shapely.to_wkb(shapes, byte_order=1))]

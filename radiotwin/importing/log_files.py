@@ -14,7 +14,7 @@ from typing import IO
 
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import FILE_BYTES, IMPORT_FILES, ROW_BYTES, Budget
-from radiotwin.io.inputs import bounded, is_within, open_gzip, open_input
+from radiotwin.io.inputs import bounded, decode_text, is_within, open_gzip, open_input
 
 JSON = (".json", ".jsonl", ".ndjson", ".geojson", ".geojsonl")
 TEXTS = (".csv", ".tsv", ".txt", ".log", *JSON)
@@ -73,11 +73,7 @@ class LogFile:
             while block := file.read(_BLOCK_BYTES):  # asked for the limit, it would take all of it
                 data += block
                 budget.check(len(data), self)
-        try:
-            return data.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise BadInput(f"{self} is not text in UTF-8 (byte {error.start + 1}); save it as "
-                           "UTF-8") from None
+        return decode_text(bytes(data), self)
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from radiotwin.importing.source import Source, Tally, are_few
 from radiotwin.importing.units import ISO, seconds
 from radiotwin.io.cells import shown
 from radiotwin.io.forms import MAX_POSITION_M, Origin
-from radiotwin.links.cell_limits import READS
-from radiotwin.links.implausible import FAR_M, distances_m, far_notes, unmatched_notes
+from radiotwin.links.cell_limits import FAR_M, READS, distances_m, far_notes, unmatched_notes
 from radiotwin.links.measurements import DEVICE_OPTIONAL
 from radiotwin.links.site_table import SiteTable, is_site_table, local_positions, read_site_table
 

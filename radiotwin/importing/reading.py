@@ -45,8 +45,7 @@ from radiotwin.importing.units import (
 from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, shown
 from radiotwin.io.forms import name_fault
-from radiotwin.links.cell_limits import READS, refuse_limits
-from radiotwin.links.implausible import LIMITS_DEG, no_height
+from radiotwin.links.cell_limits import LIMITS_DEG, READS, no_height, refuse_limits
 from radiotwin.links.site_table import HEIGHTS, METRES
 
 ANGLES = ("heading", "pitch", "roll")

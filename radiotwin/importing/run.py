@@ -25,7 +25,7 @@ from radiotwin.importing.units import clock_notes
 from radiotwin.io.files import atomic_folder, require_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
-from radiotwin.links.implausible import FAR_M
+from radiotwin.links.cell_limits import FAR_M
 from radiotwin.links.measurements import (
     OPTIONAL,
     REQUIRED,

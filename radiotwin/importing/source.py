@@ -18,13 +18,13 @@ from numpy.typing import ArrayLike
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import as_numbers, as_text, listed, refuse, shown
 from radiotwin.io.forms import name_fault
+from radiotwin.links.cell_limits import LIMITS_DEG
+from radiotwin.links.site_table import degrees
 
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
 _ROWS_AT_ONCE = 1_000_000  # of which stripped texts are made
 _TEMPLATE = re.compile(r"\{([^{}]+)\}")
-_SEXAGESIMAL = re.compile(r"([+-]?)(\d{1,3}(?:\.\d+)?) ?[°º]? ?(?:(\d{1,2}(?:\.\d+)?) ?['′’] ?)?"
-                          r"(?:(\d{1,2}(?:\.\d+)?) ?(?:[\"″”]|'') ?)?([NSEWnsew])?")
 _SHOWN = 20  # of the problems in a message
 _FEW, _FEW_SHARE = 20, 0.1  # damaged rows that are no sign of a file that is read wrongly
 
@@ -185,9 +185,10 @@ class Source:
                 rows = slice(start, start + _ROWS_AT_ONCE)
                 text = as_text(cells.iloc[rows])
                 numbers[rows] = as_numbers(text)
-                if purpose.endswith(("latitude", "longitude")):
+                quantity = purpose.removeprefix("device_")
+                if quantity in LIMITS_DEG:
                     odd = start + np.flatnonzero(np.isnan(numbers[rows]) & (text != ""))
-                    numbers[odd] = [_degrees(text.iloc[row - start]) for row in odd]
+                    numbers[odd] = [degrees(text.iloc[row - start], quantity) for row in odd]
                 wrong[rows] = np.isnan(numbers[rows]) & (text != "")
             if wrong.any():
                 self.refuse(spec, as_text(cells), wrong, "is not a number")
@@ -212,16 +213,6 @@ class Source:
             if len(rows) < len(cells) / 2:  # else it is not the rows that are wrong
                 reason += self.bad_rows.hint(len(rows))
         refuse(self.path, spec, cells, bad, reason, lambda row: self.where(cells.index[row]))
-
-
-def _degrees(text: str) -> float:
-    """Return the degrees of a text such as `48°06'00.5"N` or `11.5 W`; NaN of another."""
-    found = _SEXAGESIMAL.fullmatch(text)
-    if found is None:
-        return np.nan
-    whole, minutes, seconds = (float(part or 0) for part in found.groups()[1:4])
-    value = whole + minutes / 60 + seconds / 3600
-    return -value if (found[1] == "-") != ((found[5] or "").upper() in ("S", "W")) else value
 
 
 def columns_of(spec: str, header: Iterable[object]) -> list[str]:

@@ -189,7 +189,7 @@ def read_text(path: Path | str, what: str = "text file",
     return decode_text(read_bytes(path, what, budget), path)
 
 
-def decode_text(data: bytes, path: Path | str) -> str:
+def decode_text(data: bytes, path: object) -> str:
     """Decode a text in UTF-8, with or without a byte-order mark.
 
     Raises:

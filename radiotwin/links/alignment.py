@@ -113,7 +113,7 @@ def _require_fit(measurements: Measurements, scene: Scene) -> None:
     ground = "" if scene.city.terrain is None else " or below the ground"
     odd = (f"{inside:.1%} of the receivers are inside buildings{ground} and {outside:.1%} outside "
            "the 3D map")
-    search = _search(scene, receiver_m)
+    search = search_shift(scene, receiver_m)
     surely = (chance_inside(scene.city, receiver_m) >= SURE).mean()
     if surely <= MAX_MISPLACED and search is not None and search.agrees:
         warnings.warn(f"{odd}. Measurements and scene are taken to be in one frame: {surely:.1%} "
@@ -164,8 +164,8 @@ class Search:
         return self.near <= -CLEAR and (self.best**2 - self.near**2) / 2 < np.log(self.tried)
 
 
-def best_shift(scene: Scene, receiver_m: np.ndarray) -> tuple[float, float] | None:
-    """Return the translation that takes receivers out of buildings and onto the map.
+def search_shift(scene: Scene, receiver_m: np.ndarray) -> Search | None:
+    """Search the translation that takes receivers out of buildings and onto the map.
 
     Receivers follow streets, so at the right place far fewer of them are in buildings than the
     density of buildings around each of them lets expect; over open ground few are anywhere. Of all
@@ -178,14 +178,8 @@ def best_shift(scene: Scene, receiver_m: np.ndarray) -> tuple[float, float] | No
         receiver_m: (n, 3) [m].
 
     Returns:
-        x, y to add [m]; None where no translation stands out.
+        the best translation [m] and its contrast; None where none takes receivers onto the map.
     """
-    search = _search(scene, receiver_m)
-    return None if search is None else search.proposed
-
-
-def _search(scene: Scene, receiver_m: np.ndarray) -> Search | None:
-    """Compare translations of receivers (n, 3) [m]; None where none takes them onto the map."""
     (low_m, high_m), reach_m = map_corners_m(scene), SEARCHED_M + 2 * COARSE_M
     low_m = np.maximum(low_m, receiver_m[:, :2].min(axis=0) - reach_m)
     high_m = np.minimum(high_m, receiver_m[:, :2].max(axis=0) + reach_m)

@@ -1,9 +1,17 @@
-"""Limits of the cells of measurements and of tables of sites, in their columns' units."""
+"""What cannot be meant in measurements and in tables of sites, or hardly.
 
-from collections.abc import Callable
+Values beyond limits, in their columns' units, placeholders, places far away, and names that nearly
+match.
+"""
+
+import re
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
 
 import numpy as np
 
+from radiotwin.display import some
+from radiotwin.errors import BadInput
 from radiotwin.io.forms import MAX_POSITION_M
 
 LEVELS = ["gain_db", "rssi_dbm"]
@@ -19,6 +27,31 @@ MAX_ANGLE_DEG = 1e6  # thousands of turns in one direction, which some compasses
 MAX_POWER_DBM = 300.0  # as of a level
 MAX_CABLE_LOSS_DB = 100.0
 MAX_QUALITY = 1e15  # whole numbers are exact up to there
+LIMITS_DEG = {"latitude": 90.0, "longitude": 360.0}
+FAR_M, MAX_APART_M = 100_000.0, 1e6  # from what is measured or mapped: odd, longer than any link
+HEIGHTS_M = (-3_000.0, 60_000.0)  # about the deepest mine (Kidd), the highest balloon (JAXA 2013)
+HIGH_M = 200.0  # above the ground: an altitude above the sea is suspected; masts are lower
+_EARTH_M = 6_371_008.8  # mean radius (Moritz 2000, GRS80)
+_NAMED = 5  # names in a message
+
+
+_RANGES: dict[str, tuple[float, float, str]] = {
+    **dict.fromkeys(LEVELS, (-MAX_LEVEL_DB, MAX_LEVEL_DB, "is no level; allowed are {} to {}")),
+    "frequency_hz": (*FREQUENCIES_HZ, "is no frequency; allowed are {} to {} Hz; the unit is Hz"),
+    "time_s": (-MAX_TIME_S, MAX_TIME_S,
+               "is no time; allowed are {} to {} s; the unit is s, not ms"),
+    "tilt_deg": (-MAX_TILT_DEG, MAX_TILT_DEG,
+                 "is no tilt; allowed are {} (down) to {} (up)"),
+    "azimuth_deg": (-MAX_AZIMUTH_DEG, MAX_AZIMUTH_DEG,
+                    "is no azimuth; allowed are 0 (north) to 360, clockwise; leave the cell empty "
+                    "where it is not known"),
+    "cable_loss_db": (0.0, MAX_CABLE_LOSS_DB, "is no loss; allowed are {} to {} dB"),
+    "_m": (-MAX_POSITION_M, MAX_POSITION_M,
+           "is too far away; allowed are {} to {} m in the scene's frame"),
+    **{ending: (-limit, limit, "is out of range; allowed are {} to {}") for ending, limit in (
+        ("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM), ("eirp_dbm", MAX_POWER_DBM),
+        ("quality", MAX_QUALITY))}}
+"""Name of a column, or its end -> least and greatest value, and the reason to refuse others."""
 
 
 def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
@@ -30,44 +63,143 @@ def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
         name: of the column, as in `measurements.csv` or `devices.csv`.
         numbers: (n,) in its unit; NaN where empty.
     """
-    if name in LEVELS:
-        refuse(np.abs(numbers) > MAX_LEVEL_DB,
-               f"is no level; allowed are -{MAX_LEVEL_DB:g} to {MAX_LEVEL_DB:g}")
+    for ending, (low, high, reason) in _RANGES.items():
+        if name == ending or name.endswith(ending):
+            refuse((numbers < low) | (numbers > high), reason.format(f"{low:g}", f"{high:g}"))
     if name == "gain_db":
         refuse(numbers > 0,
                "is above 0 dB, which no channel gain is; received power [dBm] goes into a column "
                "rssi_dbm, and a path loss needs a minus sign")
-    if name == "frequency_hz":
-        low, high = FREQUENCIES_HZ
-        refuse((numbers < low) | (numbers > high),
-               f"is no frequency; allowed are {low:g} to {high:g} Hz; the unit is Hz")
-    if name.endswith("_m"):
-        refuse(np.abs(numbers) > MAX_POSITION_M,
-               f"is too far away; allowed are -{MAX_POSITION_M:g} to {MAX_POSITION_M:g} m in "
-               "the scene's frame")
-    if name == "time_s":
-        refuse(np.abs(numbers) > MAX_TIME_S,
-               f"is no time; allowed are -{MAX_TIME_S:g} to {MAX_TIME_S:g} s; the unit is s, not "
-               "ms")
-        if np.isfinite(numbers).any():
-            refuse(numbers - np.nanmin(numbers) > MAX_SPAN_S,
-                   f"is more than a century ({MAX_SPAN_S:g} s) after the first time, "
-                   f"{np.nanmin(numbers):g} s; is one of them wrong, or in another unit?")
-    if name == "tilt_deg":
-        refuse(np.abs(numbers) > MAX_TILT_DEG,
-               f"is no tilt; allowed are -{MAX_TILT_DEG:g} (down) to {MAX_TILT_DEG:g} (up)")
-    if name == "azimuth_deg":
-        refuse(np.abs(numbers) > MAX_AZIMUTH_DEG,
-               "is no azimuth; allowed are 0 (north) to 360, clockwise; leave the cell empty where "
-               "it is not known")
+    if name == "time_s" and np.isfinite(numbers).any():
+        refuse(numbers - np.nanmin(numbers) > MAX_SPAN_S,
+               f"is more than a century ({MAX_SPAN_S:g} s) after the first time, "
+               f"{np.nanmin(numbers):g} s; is one of them wrong, or in another unit?")
     if name == READS:
         refuse(~np.isin(numbers, (0, 1)) & ~np.isnan(numbers),
                "is neither 0 (levels are read at the receiver) nor 1 (at the device)")
-    if name == "cable_loss_db":
-        refuse((numbers < 0) | (numbers > MAX_CABLE_LOSS_DB),
-               f"is no loss; allowed are 0 to {MAX_CABLE_LOSS_DB:g} dB")
-    for ending, limit in (("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM),
-                          ("eirp_dbm", MAX_POWER_DBM), ("quality", MAX_QUALITY)):
-        if name.endswith(ending):
-            refuse(np.abs(numbers) > limit,
-                   f"is out of range; allowed are -{limit:g} to {limit:g}")
+
+
+def no_height(height_m: np.ndarray) -> np.ndarray:
+    """Return which heights (k,) are placeholders, such as -9999 and 99999 [m]."""
+    return (height_m < HEIGHTS_M[0]) | (height_m > HEIGHTS_M[1])
+
+
+def tilt_notes(tilt_deg: np.ndarray) -> list[str]:
+    """Return a note where antennas (k,) are said to look upwards, and downtilts are meant."""
+    up, known = tilt_deg > 0, np.isfinite(tilt_deg)
+    if not up.any() or (tilt_deg < 0).any():
+        return []
+    return [f"{up.sum()} of {known.sum()} declared tilts are above zero, which is upwards, and "
+            "none is below; where the table counts downtilts, call the column downtilt_deg"]
+
+
+def high_notes(above_ground_m: np.ndarray) -> list[str]:
+    """Return a note where all sites (k,) are higher above the ground than masts are [m]."""
+    known_m = above_ground_m[np.isfinite(above_ground_m)]
+    if not len(known_m) or known_m.min() < HIGH_M:
+        return []
+    return [f"the lowest of {len(known_m)} sites is {known_m.min():.0f} m above the ground; if "
+            "those are altitudes above the sea, call the column altitude_m, and give the ground's "
+            "in the origin"]
+
+
+def far_notes(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str],
+              where: Callable[[int], str], what: str) -> list[str]:
+    """Return a note on sites that are odd distances away.
+
+    Args:
+        place: (k, 2) latitude and longitude [degrees], or x and y [m], of sites; NaN where unknown.
+        middle: (2,) of what they belong to.
+        axes: names of the two.
+        where: row -> the file and the site, for messages.
+        what: they belong to, such as `the readings`.
+
+    Raises:
+        BadInput: one is farther away than any link is long, or where a slip explains it: swapped
+            coordinates, a wrong sign, a decimal point at a wrong place.
+    """
+    apart_m = _apart_m(place, middle, axes)
+    far = np.flatnonzero(apart_m > FAR_M)  # not of NaN
+    if not len(far):
+        return []
+    row = int(far[np.argmax(apart_m[far])])
+    slip = _slip(place[row], middle, axes)
+    text = (f"{where(row)} at {axes[0]} {place[row, 0]:.10g}, {axes[1]} {place[row, 1]:.10g} is "
+            f"{apart_m[row] / 1000:,.0f} km from {what} ({axes[0]} {middle[0]:.10g}, {axes[1]} "
+            f"{middle[1]:.10g})" + (f"; {len(far)} are so far away" if len(far) > 1 else ""))
+    if slip or apart_m[row] > MAX_APART_M:
+        raise BadInput(f"{text}: {slip or 'both need one frame, and one unit'}")
+    return [text]
+
+
+def _slip(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> str:
+    """Return the slip that brings a place (2,) to where it belongs, or `""`.
+
+    Of local metres none is known: every decimal point that slips brings a place near the origin.
+    """
+    if "latitude" not in axes and np.linalg.norm(middle) <= FAR_M:
+        return ""
+    if "latitude" in axes and not place.any():
+        return "0, 0 is a placeholder; leave both empty where they are not known"
+    tries = [(place[::-1], f"are {axes[0]} and {axes[1]} swapped?")]
+    for sign in ([-1, 1], [1, -1], [-1, -1]):
+        turned = place * sign
+        tries.append((turned, f"is a sign wrong ({turned[0]:.10g}, {turned[1]:.10g})?"))
+    for power in (1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6):
+        for axis in ([1, 0], [0, 1], [1, 1]):
+            moved = place * 10.0 ** (power * np.array(axis))
+            tries.append((moved, f"has a decimal point slipped ({moved[0]:.10g}, "
+                                 f"{moved[1]:.10g})?"))
+    return next((text for moved, text in tries
+                 if _apart_m(moved[None], middle, axes)[0] <= FAR_M), "")
+
+
+def _apart_m(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> np.ndarray:
+    if "latitude" in axes:
+        return distances_m(place, middle)
+    return np.linalg.norm(place - middle, axis=1)
+
+
+def distances_m(place_deg: np.ndarray, middle_deg: np.ndarray) -> np.ndarray:
+    """Return distances (k,) on the sphere of latitudes and longitudes (k, 2) from one [m].
+
+    They are infinite where a latitude is none.
+    """
+    (north, east), (middle_north, middle_east) = np.radians(place_deg).T, np.radians(middle_deg)
+    chord = (np.sin((north - middle_north) / 2)**2
+             + np.cos(north) * np.cos(middle_north) * np.sin((east - middle_east) / 2)**2)
+    apart_m = 2 * _EARTH_M * np.arcsin(np.sqrt(np.clip(chord, 0, 1)))
+    return np.where(np.abs(place_deg[:, 0]) > LIMITS_DEG["latitude"], np.inf, apart_m)
+
+
+def unmatched_notes(path: Path | str, names: Iterable[str], others: Collection[str], end: str,
+                    what: str) -> list[str]:
+    """Return notes on names of a table that occur in no row of something, and those that it lacks.
+
+    Args:
+        path: of the table.
+        names: in the table.
+        others: names that occur.
+        end: what they are of, such as `device`.
+        what: they occur in, such as `the log`.
+    """
+    idle = list(dict.fromkeys(name for name in names if name not in others))
+    lacking = sorted(set(others) - set(names))
+    notes, file = [], Path(path).name
+    if idle:
+        loose = {_loosely(name): name for name in lacking}
+        pairs = [f"{name} ({loose[_loosely(name)]} there)" for name in idle
+                 if _loosely(name) in loose]
+        notes.append(f"{file}: {len(idle)} of {len(set(names)):,} names occur in no row of {what}: "
+                     f"{some(pairs or idle, _NAMED)}"
+                     + ("; names are compared letter by letter: make them equal" if pairs else ""))
+    if lacking and idle:
+        notes.append(f"{file}: {len(lacking)} of {len(others):,} {end}s of {what} are not in it: "
+                     f"{some(lacking, _NAMED)}")
+    return notes
+
+
+def _loosely(name: str) -> tuple[str, ...]:
+    """Return a name without case, marks, zeros before its numbers, and decimals that are zero."""
+    parts = re.findall(r"\d+|[^\W\d_]+", re.sub(r"(?<=\d)\.0+$", "", name.casefold()))
+    return tuple(part.lstrip("0") or "0" if part.isdigit() else part for part in parts)

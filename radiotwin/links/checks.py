@@ -5,11 +5,12 @@ that of a phone on the pavement, and one on the pavement that of a phone behind 
 positions come from satellites, a line on the map does not decide, but a probability does.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
+from radiotwin.display import some
 from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, place
 from radiotwin.io.texts import percent
@@ -32,7 +33,6 @@ MIN_LINKS = 60  # that anything can be learnt from; half of them detected
 MIN_LINKS_OF_RECEIVER = 5
 CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions so close to each other are hardly in metres
 MIN_HEAP, HEAP_RATIO = 10, 5  # equal levels that no tail has, and how far above the next values
-MAX_NAMED = 5  # names in a message
 MAX_OUTSIDE = 0.5  # share of the links
 ELSEWHERE_M = 50_000.0  # of receivers from a map: no mistake of frames or units within one place
 GROUND_M, ROOFS = 0.5, 0.95  # above it something is built; share of its corners that are roofs
@@ -138,7 +138,7 @@ def check_names(measurements: Measurements) -> list[str]:
         names = pd.Series(names, dtype=str)
         alike = names[names.str.casefold().duplicated(keep=False)]
         if len(alike):
-            notes.append(f"{what} {_shortened(alike)} differ in upper and lower case only; they "
+            notes.append(f"{what} {some(alike)} differ in upper and lower case only; they "
                          "are taken for different ones")
     used = np.isin(np.arange(len(measurements.devices)), measurements.device_index)
     idle = measurements.devices["device"][~used]
@@ -314,7 +314,7 @@ def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,
     few = (links > 0) & (links < MIN_LINKS_OF_RECEIVER) & ~dead
     has = "has {} only" if few.sum() < 2 else "have {} at most"
     reads = "reads" if stuck.sum() < 2 else "read"
-    values = _shortened([f"{value:g}" for value in low[stuck]])
+    values = some([f"{value:g}" for value in low[stuck]])
     return [(dead[end], f"{_named('receiver', names[dead])} never detected anything"),
             (stuck[end], f"{_named('receiver', names[stuck])} always {reads} {values}"),
             (few[end], f"{_named('receiver', names[few])} {has.format(links[few].max(initial=0))}; "
@@ -381,10 +381,4 @@ def _is_heap(counts: np.ndarray) -> bool:
 
 def _named(noun: str, names: Sequence[object] | np.ndarray | pd.Series) -> str:
     """Return names with what they are of: receiver a, receivers a, b."""
-    return f"{noun}{'s' if len(names) > 1 else ''} {_shortened(names)}"
-
-
-def _shortened(names: Iterable[object]) -> str:
-    texts = [str(name) for name in names]
-    more = f" and {len(texts) - MAX_NAMED:,} more" if len(texts) > MAX_NAMED else ""
-    return ", ".join(texts[:MAX_NAMED]) + more
+    return f"{noun}{'s' if len(names) > 1 else ''} {some(names)}"

@@ -1,12 +1,12 @@
-"""How far apart two links still err alike: the correlation length of a residual.
+"""Correlation length of a residual: the distance over which errors of links are correlated.
 
-It comes from the robust variogram (Cressie and Hawkins 1980, 'Robust estimation of the variogram',
-Math. Geology 12) over the positions of the end that moves, within each pair of ends and flight, so
-that what a device or a receiver has in common does not count. The level of each flight and the
-trends of each pair of ends are removed before. Detrending removes long shadows, too, so that a
-model variogram that ignored it would be biased to short lengths, by half for flights of a few
-lengths. So the model is an exponential field with a nugget (Gudmundson 1991, 'Correlation model for
-shadow fading in mobile radio systems') after the same projection, that of generalised increments
+It is estimated from the robust variogram (Cressie and Hawkins 1980, 'Robust estimation of the
+variogram', Math. Geology 12) over the positions of the end that moves, within each device, receiver
+and flight, so that errors of a whole device or receiver do not count. The level of each flight and
+the trends of each pair of ends are removed before. Detrending removes long shadows, too: a model
+variogram that ignored it would be biased to short lengths, by half for flights of a few lengths. So
+the model is an exponential field with a nugget (Gudmundson 1991, 'Correlation model for shadow
+fading in mobile radio systems') after the same projection, that of generalised increments
 (Kitanidis 1983, 'Statistical estimation of polynomial generalized covariance functions', Water
 Resources Research 19), fitted by weighted least squares (Cressie 1985, Math. Geology 17).
 """
@@ -33,10 +33,10 @@ MIN_TREND_LINKS = 60  # of a pair of ends, for its trends
 MIN_CORRELATED = 0.1  # share of the variance that is correlated, below which there is no length
 NODES = 400  # links of a pair of ends that stand for all in the projection of a field
 MAX_PAIRS = 5_000  # of links of a pair of ends, that stand for all of them
-MIN_SINGULAR = 1e-9  # of a trend, over the greatest: less is the same as another
+MIN_SINGULAR = 1e-9  # singular value of a trend over the greatest: less is linearly dependent
 MIN_SERIES = 3  # mean readings of a device by a receiver on a flight, to be a series
 MAX_STEPS = 5_000  # places whose nearest one is looked up
-MAX_Z = 4.0  # outliers count as this many scales
+MAX_Z = 4.0  # residuals are clipped to this many scales
 LENGTHS = 24  # tried, evenly on a logarithmic scale
 EXTENT_SHARE = 0.25  # of the extent: a longer correlation looks like a trend
 MIN_STEP_M = 0.1
@@ -92,7 +92,7 @@ class Trend:
         return cls(rows, left[:, singular > MIN_SINGULAR * singular[0]])
 
     def taken_from(self, z: np.ndarray) -> np.ndarray:
-        """Return the detrended residuals (m,) at its rows, of all residuals (n,)."""
+        """Return the detrended residuals (m,) of its rows, from all residuals (n,)."""
         own = z[self.rows]
         return own - self.basis @ (self.basis.T @ own)
 
@@ -192,16 +192,16 @@ def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, seco
     ends = np.searchsorted(owner[first][order], np.arange(len(trends) + 1))
     sums, weights = np.zeros((1 + len(lengths_m), BINS + 1)), np.zeros(BINS + 1)
     for number, trend in enumerate(trends):
-        mine = order[ends[number]:ends[number + 1]]
-        if not len(mine):
+        pairs = order[ends[number]:ends[number + 1]]
+        if not len(pairs):
             continue
-        some = mine[::-(-len(mine) // MAX_PAIRS)]
-        weight = len(mine) / len(some)
-        i, j = (np.searchsorted(trend.rows, rows[some]) for rows in (first, second))
+        sampled = pairs[::-(-len(pairs) // MAX_PAIRS)]
+        weight = len(pairs) / len(sampled)
+        i, j = (np.searchsorted(trend.rows, rows[sampled]) for rows in (first, second))
         left = trend.left_of(position_m, i, j, lengths_m)
-        sums += [np.bincount(index[some], weights=weight * each, minlength=BINS + 1)
+        sums += [np.bincount(index[sampled], weights=weight * each, minlength=BINS + 1)
                  for each in left]
-        weights += weight * np.bincount(index[some], minlength=BINS + 1)
+        weights += weight * np.bincount(index[sampled], minlength=BINS + 1)
     return np.where(weights > 0, sums / np.maximum(weights, 1e-9), np.nan)
 
 
@@ -228,7 +228,7 @@ def _apart_m(position_m: np.ndarray, first: np.ndarray, second: np.ndarray) -> n
 
 
 def devices_move(links: Links) -> bool:
-    """Return whether devices are positions of one that moves: most are read once by a receiver."""
+    """Return whether devices are positions of a moving device: receivers read most of them once."""
     series = pd.DataFrame({"device": links.device, "receiver": links.receiver,
                            "flight": links.flight})
     return len(series.drop_duplicates()) > len(links) / MIN_SERIES
@@ -242,20 +242,20 @@ def moving_end_m(links: Links) -> np.ndarray:
 
 
 def pair_of_ends(links: Links) -> np.ndarray:
-    """Return a label (n,) of each link's device and receiver; where devices move, of the latter."""
+    """Return a label (n,) of each link's device and receiver; of the receiver if devices move."""
     if devices_move(links):
         return links.receiver
     return links.receiver * len(links.device_names) + links.device
 
 
 def extent_m(position_m: np.ndarray) -> float:
-    """Return the diagonal of the ground that holds nearly all positions (n, 2 or 3) [m]."""
+    """Return the diagonal of the box that holds 96 % of positions (n, 2 or 3) in x and in y [m]."""
     low, high = np.quantile(position_m[:, :2], [0.02, 0.98], axis=0)
     return float(np.hypot(*(high - low)))
 
 
 def step_m(links: Links) -> float:
-    """Return the usual distance from a place to the nearest other one of its pair of ends [m]."""
+    """Return the median distance between neighbouring places of a device and receiver [m]."""
     place, offset_m = _apart(links, pair_of_ends(links))
     places = pd.DataFrame(np.round(place / MIN_STEP_M)).drop_duplicates().to_numpy() * MIN_STEP_M
     if len(places) < 2:
@@ -269,9 +269,9 @@ def step_m(links: Links) -> float:
 def correlation_length_m(links: Links, z: np.ndarray) -> float:
     """Return the distance over which the correlation of a residual falls to 1/e [m].
 
-    At least the usual step between places, which is also what a residual without any correlation
-    gives; at most a quarter of the extent of the campaign. The residuals (n,) are over their scale;
-    those of blank links do not count.
+    It is at least the usual step between places, which an uncorrelated residual gives, and at most
+    a quarter of the extent of the campaign. Residuals (n,) are divided by their scale; blank links
+    do not count.
     """
     seen = np.isfinite(links.level_db) & np.isfinite(z)
     least_m, rows, variogram = _variogram(links, seen.tobytes())
@@ -280,9 +280,9 @@ def correlation_length_m(links: Links, z: np.ndarray) -> float:
 
 @lru_cache(maxsize=REMEMBERED)
 def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram | None]:
-    """Return the least length [m], rows (m,) of the links that were seen, and what they allow.
+    """Return the least length [m], rows (m,) of the detected links, and their model variogram.
 
-    Every effect and every step asks for the same links, of which this is the slow part.
+    It is cached: every effect and every step needs it for the same links, and it is slow.
     """
     least_m, most_m = step_m(links), EXTENT_SHARE * extent_m(moving_end_m(links))
     rows = np.flatnonzero(np.frombuffer(seen, dtype=bool))
@@ -304,9 +304,9 @@ def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram 
 
 
 def _apart(links: Links, label: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return places (n, 7) [m] and the distance between series [m].
+    """Return places (n, 7) [m] and the distance between labels in the last coordinate [m].
 
-    A place is both ends' positions, and far from all places of another label (n,).
+    A place is the positions of both ends and a coordinate that keeps different labels (n,) apart.
     """
     ends_m = np.column_stack([links.receiver_m, np.nan_to_num(links.device_m[links.device])])
     offset_m = 4.0 * float(np.ptp(ends_m, axis=0).max(initial=0.0)) + 1.0

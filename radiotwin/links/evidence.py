@@ -1,4 +1,6 @@
-"""Links that err alike: pieces of evidence, and how many links count as one."""
+"""Links that err alike: pieces of evidence, how many links count as one, and which to leave out."""
+
+from __future__ import annotations
 
 import numpy as np
 import pandas as pd
@@ -17,7 +19,12 @@ PLACE_LENGTHS = 2.5
 UNKNOWN_M = 100.0  # side of a piece while no residual has been looked at
 MIN_PLACES = 6  # that the ground of a campaign is cut into, where it is wide enough
 NARROWER = 0.8  # from one width that is tried to the next
-LITTLE = 30  # places: fewer say little
+LITTLE = 30  # places: fewer are little evidence
+PLACE_M = 5.0  # side of a square of ground that counts as one place
+PILE, MIN_PILE = 5, 20  # times the usual number of readings at one place is a pile; and at least
+MIN_SURPLUS = 0.05  # share of all links in piles, to thin them
+MAX_LINKS = 120_000  # up to which all are used
+SAMPLE_LINKS = 60_000  # of more: takes minutes
 
 
 def evidence_blocks(links: Links) -> np.ndarray:
@@ -47,9 +54,9 @@ def _evidence(links: Links) -> np.ndarray:
 
 
 def with_evidence(links: Links, z: np.ndarray) -> Links:
-    """Return links whose pieces of evidence fit a residual (n,) over its scale, with notes on them.
+    """Return links with pieces of evidence as wide as a residual (n,) is correlated, with notes.
 
-    Done once, by the residual of the base: then all that is scored later counts the same pieces.
+    The residual is that of the base, divided by its scale: all later scores use the same pieces.
     """
     length_m = correlation_length_m(links, z)
     width_m = fitting_width_m(links, LENGTHS * length_m)
@@ -62,9 +69,9 @@ def with_evidence(links: Links, z: np.ndarray) -> Links:
 
 
 def fitting_width_m(links: Links, wanted_m: float, places: int = MIN_PLACES) -> float:
-    """Return the side of squares that the ground is cut into [m].
+    """Return the side of the squares that the ground is cut into [m].
 
-    As wanted, or less where the end that moves would then be in fewer than so many squares; at
+    It is `wanted_m`, or less if the end that moves would then be in fewer than `places` squares; at
     least the usual step between its positions.
     """
     position_m, least_m = moving_end_m(links), max(step_m(links), 0.1)
@@ -91,13 +98,56 @@ def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
 
 
 def design_effect(block: np.ndarray, z: np.ndarray, max_z: float = 4.0) -> float:
-    """Return how many links count as one (Kish 1965, 'Survey sampling', Sec. 5.4).
+    """Return the design effect: how many links count as one (Kish 1965, 'Survey sampling', 5.4).
 
-    The variance of the means of blocks (n,) over what it would be for independent links, at least
-    1. Residuals (n,) are over their scale, and outliers count as `max_z`.
+    It is the variance of the means of blocks (n,) over that of independent links, at least 1.
+    Residuals (n,) are divided by their scale, and clipped to `max_z`.
     """
     z = np.clip(z, -max_z, max_z)
     size = np.bincount(block)
     mean = np.bincount(block, weights=z) / np.maximum(size, 1)
     between = (size * (mean - z.mean()) ** 2).sum() / max((size > 0).sum(), 1)
     return max(float(between / max(z.var(), 1e-9)), 1.0)
+
+
+def thin_piles(links: Links) -> Links:
+    """Return links of which no place has far more than the others have, with a note.
+
+    A receiver that hovers reads one and the same error many times. What a place (of one pair of
+    ends, on one flight) has beyond `PILE` times the usual number is left out, evenly in time.
+    """
+    cell = np.floor(moving_end_m(links)[:, :2] / PLACE_M).astype(np.int64)
+    keys = np.column_stack([cell, pair_of_ends(links), links.flight])
+    order = np.lexsort((np.arange(len(links)), links.time_s, *keys.T))
+    starts = np.flatnonzero(np.r_[True, np.diff(keys[order], axis=0).any(axis=1)])
+    count = np.diff(np.r_[starts, len(links)])
+    most = max(PILE * float(np.median(count)), MIN_PILE)
+    if np.maximum(count - most, 0).sum() < MIN_SURPLUS * len(links):
+        return links
+    share = np.repeat(np.minimum(most / count, 1.0), count)
+    place = np.arange(len(links)) - np.repeat(starts, count)
+    kept = np.sort(order[np.floor((place + 1) * share) > np.floor(place * share)])
+    note = (f"receivers stayed at {(count > most).sum():,} places, where "
+            f"{len(links) - len(kept):,} of {len(links):,} links are left out, evenly in time: "
+            f"readings at one place err alike and count as one; {most:.0f} of them are used")
+    return links.select(kept).with_notes(note)
+
+
+def thin_links(links: Links, seed: int) -> Links:
+    """Return the links, or a sample of very many, with a note that says so.
+
+    The links of each flight, device and receiver are taken in the order of their times, and of as
+    many as go into the sample once, one is drawn. So all flights, devices, receivers, times and
+    blanks have the share that they have of all links, and means over the sample are not biased.
+    """
+    links = thin_piles(links)
+    n = len(links)
+    if n <= MAX_LINKS:
+        return links
+    order = np.lexsort((np.arange(n), links.time_s, links.receiver, links.device, links.flight))
+    first = np.arange(SAMPLE_LINKS + 1) * n // SAMPLE_LINKS
+    rows = np.sort(order[np.random.default_rng(seed).integers(first[:-1], first[1:])])
+    note = (f"of {n:,} links {len(rows):,} are used, drawn evenly from all flights, devices, "
+            f"receivers and times, as above {MAX_LINKS:,} the loop would take hours; errors, "
+            "evidence and residuals are those of the sample")
+    return links.select(rows).with_notes(note)

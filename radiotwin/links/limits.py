@@ -1,12 +1,12 @@
-"""The limit of detection of each receiver, from its readings: a declared one is only a claim.
+"""Estimate each receiver's limit of detection from its readings; a declared limit may be wrong.
 
-A receiver reports a level y with the probability Φ((y - limit) / width), and a link is blank too
-where it was lost whatever its level. The likelihood of a limit is that of the readings, few of
-which lie below it, and of the blanks, which a crude prediction of their levels puts below it (Tobin
-1958; the p-tobit of Deaton and Irish 1984). Width and share of lost links are averaged over.
+A receiver reports a level y with the probability Φ((y - limit) / width). A link may also be blank
+because it was lost, whatever its level. The likelihood of a limit has two factors: readings, of
+which few lie below the limit, and blanks, whose levels a crude prediction puts below it (Tobit:
+Tobin 1958; p-tobit: Deaton and Irish 1984). The width and the share of lost links are averaged out.
 
-The crude prediction has one slope over distance and a level for each end. It needs no map and no
-line of sight; devices whose position is unknown have no distance.
+The crude prediction has one slope over distance and a level for each device and receiver. It needs
+neither a map nor line of sight. Links of devices without a known position have no distance.
 """
 
 from dataclasses import dataclass
@@ -14,38 +14,39 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr, logsumexp, ndtr, stdtr
 
+from radiotwin.display import some
 from radiotwin.inference.student import DOF
 from radiotwin.io.texts import percent
 from radiotwin.links.evidence import design_effect, evidence_blocks
 from radiotwin.links.links import Links
 
-SLOPE_DB, SLOPE_SD_DB = -30.0, 10.0  # prior of the fall per decade: path-loss exponent 2 to 4
-END_SD_DB = 8.0  # prior of what one device, or one receiver, differs from the others
-MIN_LINKS = 5  # of an end that has a level of its own
+SLOPE_DB, SLOPE_SD_DB = -30.0, 10.0  # prior per decade of distance: path-loss exponent 2 to 4
+END_SD_DB = 8.0  # prior spread of the levels of devices, and of receivers
+MIN_LINKS = 5  # of a device or receiver, to estimate a level for it
 LEVEL_ROUNDS = 8  # of expectation and maximisation
 FIRST_SD_DB, MIN_SD_DB = 8.0, 6.0
 LOST = 0.02  # probability that a link is blank although its level is above the limit
-FIRST_BELOW_DB = 3.0  # how far below its limit a blank is taken to be at first
+FIRST_BELOW_DB = 3.0  # first guess of how far a blank lies below its limit
 MIN_READINGS, MIN_BLANKS = 30, 10  # of a receiver, to have a limit estimated
-BIN_DB, FINE_DB = 0.5, 0.05  # of predicted levels, and of readings, that count as equal: saves time
-WIDTHS_DB = (0.2, 0.7, 1.5, 3.0)  # of the way from never to always detected, averaged over
-WIDTH_SHARES = (0.4, 0.3, 0.2, 0.1)  # their prior: most receivers are not that undecided
+BIN_DB, FINE_DB = 0.5, 0.05  # rounding of predicted levels, and of readings, to save time
+WIDTHS_DB = (0.2, 0.7, 1.5, 3.0)  # of the transition from never to always detected
+WIDTH_SHARES = (0.4, 0.3, 0.2, 0.1)  # prior of these: most transitions are sharp
 LOST_SHARES = (1e-3, 0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)  # of the blanks
-ODD = 1e-3  # probability of a reading that should not be there
-ODD_SHARE = 2e-3  # of the readings: the lowest ones, which need not be right
+ODD = 1e-3  # probability of an outlier below the limit
+ODD_SHARE = 2e-3  # share of the lowest readings that may be outliers
 STEP_DB, MAX_STEPS = 0.25, 160  # of the limits that are tried
-BELOW_DB, HIGHEST = 8.0, 0.3  # they begin below the lowest reading, and end at that quantile
+BELOW_DB, HIGHEST = 8.0, 0.3  # first limit below the lowest reading; quantile of the last one
 SD_SHARE = np.sqrt((DOF - 2) / DOF)  # of the scale of a t distribution in its standard deviation
-MIN_NATS = 5.0  # that speak for a limit, or against a declared one: 150 to 1
-RISE_DB, FALL_DB = 2.0, 1.0  # above and below a declared limit: as good as there
-SURE_SDS = 3.0  # beyond that
-ROUNDS = 2  # of levels and limits in turn
+MIN_NATS = 5.0  # evidence for a limit, or against a declared one: odds of 150 to 1
+RISE_DB, FALL_DB = 2.0, 1.0  # above and below a declared limit: agrees with it
+SURE_SDS = 3.0  # standard deviations beyond that interval, to overrule a declared limit
+ROUNDS = 2  # alternate estimates of levels and of limits
 QUANTILE_90 = 1.645  # of the normal distribution
-MIN_OFF_DB = 0.5  # a declared limit that is off by less is right
+MIN_OFF_DB = 0.5  # a declared limit that is off by less is used
 MIN_BELOW, BELOW_SHARE = 3, 0.002  # readings below a declared limit that contradict it
-FAR_DB = 20.0  # below every reading, from which on a declared limit says nothing
-DIFFER_DB = 3.0  # between receivers, above which a note reports it
-DEAF_DB, DEAF_SDS = 6.0, 4.5  # above the usual limit: a receiver that stands out
+FAR_DB = 20.0  # a declared limit so far below all readings is ignored
+DIFFER_DB = 3.0  # difference between receivers that a note reports
+DEAF_DB, DEAF_SDS = 6.0, 4.5  # above the usual limit: an insensitive receiver
 MAX_NAMED = 5
 
 
@@ -82,16 +83,16 @@ def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarr
     distance = np.where(known, distance, distance[known].mean() if known.any() else 0.0)
     distance = distance - distance.mean()
     ends = [_frequent(device), _frequent(receiver)]
-    own_db = [np.zeros(end.max() + 1) for end in ends]
+    end_db = [np.zeros(end.max() + 1) for end in ends]
     slope_db, sd_db, variance = SLOPE_DB, FIRST_SD_DB, np.zeros(len(level_db))
     for _ in range(LEVEL_ROUNDS):
         for number, end in enumerate(ends):
-            rest = filled_db - slope_db * distance - own_db[1 - number][ends[1 - number]]
+            rest = filled_db - slope_db * distance - end_db[1 - number][ends[1 - number]]
             rest = rest - rest[counted].mean()
-            sums = np.bincount(end[counted], rest[counted], len(own_db[number]))
-            count = np.bincount(end[counted], minlength=len(own_db[number]))
-            own_db[number] = sums / (count + (sd_db / END_SD_DB) ** 2)
-        rest = filled_db - sum(own[end] for own, end in zip(own_db, ends, strict=True))
+            sums = np.bincount(end[counted], rest[counted], len(end_db[number]))
+            count = np.bincount(end[counted], minlength=len(end_db[number]))
+            end_db[number] = sums / (count + (sd_db / END_SD_DB) ** 2)
+        rest = filled_db - sum(own[end] for own, end in zip(end_db, ends, strict=True))
         x, y = distance[counted], rest[counted] - rest[counted].mean()
         x = x - x.mean()
         weight = (sd_db / SLOPE_SD_DB) ** 2
@@ -111,7 +112,7 @@ def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarr
 
 
 def _frequent(label: np.ndarray) -> np.ndarray:
-    """Return labels (n,) counted from 1; 0 stands for all that are rare."""
+    """Return labels (n,) renumbered from 1; label 0 for all with fewer than `MIN_LINKS` links."""
     frequent = np.bincount(label) >= MIN_LINKS
     return np.where(frequent, np.cumsum(frequent), 0)[label]
 
@@ -123,8 +124,8 @@ class LimitEstimate:
     Attributes:
         limit_db: mean of its posterior under a flat prior [dB].
         sd_db: standard deviation of that [dB].
-        nats: log of the odds that there is one, against links lost whatever their level.
-        over_declared_nats: by which it is likelier than the declared one; 0 without one.
+        nats: log odds of a limit against links that are lost whatever their level.
+        over_declared_nats: log-likelihood gain over the declared limit; 0 without one.
     """
 
     limit_db: float
@@ -134,20 +135,20 @@ class LimitEstimate:
 
     @property
     def is_sure(self) -> bool:
-        """Return whether a limit explains the blanks, and not only lost links."""
+        """Whether a limit explains the blanks better than lost links do."""
         return self.nats > MIN_NATS
 
 
 def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray, as_one: float,
                    declared_db: float = -np.inf) -> LimitEstimate | None:
-    """Estimate the limit of detection of one receiver; None of too few readings or blanks.
+    """Estimate one receiver's limit of detection; None if readings or blanks are too few.
 
     Args:
         level_db: (n,) readings [dB]; NaN: not detected.
         mean_db: (n,) predicted levels [dB].
         scale_db: (n,) scale of their errors, Student-t with `DOF` degrees of freedom [dB].
         as_one: number of links that count as one, as of `design_effect`.
-        declared_db: to be compared with [dB]; -inf: none.
+        declared_db: declared limit to compare with [dB]; -inf: none.
     """
     blank = np.isnan(level_db)
     read_db = np.sort(level_db[~blank])
@@ -171,11 +172,11 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarr
 
 def _nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray,
           as_one: float) -> tuple[np.ndarray, float]:
-    """Return the log-likelihood of limits (k,), and that of none at all [nats].
+    """Return the log-likelihood of limits (k,), and that of no limit [nats].
 
     Args:
-        tried_db: (k,) [dB].
-        read_db: readings in order [dB].
+        tried_db: (k,) limits [dB].
+        read_db: readings in ascending order [dB].
         mean_db: (m,) predicted levels of the blanks [dB].
         scale_db: (m,) scale of the errors of these [dB].
         as_one: number of links that count as one.
@@ -200,15 +201,15 @@ def _nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray, scale_
 
 
 def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray, list[str]]:
-    """Estimate the limit of detection of each receiver, and judge a declared one.
+    """Estimate the limit of detection of each receiver, and test a declared one.
 
     Args:
-        links: n links; their own limits are not looked at.
-        declared_db: as a scene declares it [dB]; None: nobody does.
+        links: n links; limits that they have are ignored.
+        declared_db: limit that the scene declares [dB]; None: it declares none.
 
     Returns:
-        (n,) below which a link is blank [dB]; -inf where the readings do not show it, and none is
-        declared that they allow. And notes on what is odd, a sentence each.
+        (n,) limit of each link [dB], -inf where neither the readings nor a declared limit give one;
+        and notes, a sentence each.
     """
     declared = -np.inf if declared_db is None else declared_db
     apart = _says_nothing(links, declared)
@@ -218,33 +219,33 @@ def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray
     rows = np.split(np.argsort(links.receiver, kind="stable"), np.cumsum(count)[:-1])
     found, together = _estimates(links, rows, declared)
     usual_db = _usual_db(links, rows, found, together, declared)
-    own_db, lost = np.full(len(rows), -np.inf), []
-    for receiver, mine in enumerate(rows):
-        each, level_db = found[receiver], links.level_db[mine]
+    limits_db, lost = np.full(len(rows), -np.inf), []
+    for receiver, part in enumerate(rows):
+        each, level_db = found[receiver], links.level_db[part]
         read_db = level_db[np.isfinite(level_db)]
         trusted = np.isfinite(declared) and not contradict_limit(read_db, declared)
         if each is not None and each.is_sure:
             near = abs(each.limit_db - declared) < MIN_OFF_DB  # whatever is odd in it
             trusted = near or trusted and not _overrules(each, read_db, declared)
-            own_db[receiver] = declared if trusted else each.limit_db
+            limits_db[receiver] = declared if trusted else each.limit_db
         elif len(read_db) == len(level_db):
-            own_db[receiver] = declared if trusted and usual_db == declared else -np.inf
+            limits_db[receiver] = declared if trusted and usual_db == declared else -np.inf
         elif usual_db is not None and not contradict_limit(read_db, usual_db - RISE_DB):
-            own_db[receiver] = usual_db  # its own blanks do not show it
+            limits_db[receiver] = usual_db  # its blanks do not determine one
         else:
             lost.append(receiver)
-    notes = _notes(links, rows, own_db, found, declared, lost)
+    notes = _notes(links, rows, limits_db, found, declared, lost)
     if apart is not None:
-        used = _used_instead(links, own_db, found, list(range(len(rows))))
+        used = _used_instead(links, limits_db, found, list(range(len(rows))))
         notes.insert(0, f"{apart}. {used}")
-    return own_db[links.receiver], notes
+    return limits_db[links.receiver], notes
 
 
 def _says_nothing(links: Links, declared_db: float) -> str | None:
-    """Return why a declared limit is not looked at, a sentence; None where it may be right.
+    """Return why a declared limit is ignored, a sentence; None if it may be right.
 
-    Signals of all levels arrive, so where some are too weak others are just strong enough. A limit
-    far below all readings stands for "not known", and blanks below it would be impossible.
+    Received levels vary continuously: where some links are too weak, others are just strong enough.
+    A limit far below all readings means "not known"; no blank could lie below it.
     """
     readings, lowest_db = int(np.isfinite(links.level_db).sum()), _lowest_db(links.level_db)
     blanks = len(links) - readings
@@ -258,7 +259,7 @@ def _says_nothing(links: Links, declared_db: float) -> str | None:
 
 
 def _declared(links: Links, declared_db: float) -> str:
-    """Name a declared limit by its value and by where it is declared."""
+    """Return the text of a declared limit: its value, and where it is declared."""
     of = "sensitivity_dbm less tx_power_dbm" if links.is_gain else "sensitivity_dbm"
     return (f"the declared limit of detection, {declared_db:g} {links.level_unit} ({of} of "
             "scene.toml; the default, if nobody set it),")
@@ -266,16 +267,17 @@ def _declared(links: Links, declared_db: float) -> str:
 
 def _usual_db(links: Links, rows: list[np.ndarray], found: list[LimitEstimate | None],
               together: LimitEstimate | None, declared_db: float) -> float | None:
-    """Return the limit of receivers whose own links do not show it [dB]; None: nothing is known.
+    """Return the limit of receivers whose links do not determine it [dB]; None if unknown.
 
-    The declared one, unless most other receivers overrule it, or all links together. Where none is
-    declared, that of the others, or of all links together, or the lowest reading of few links.
+    It is the declared limit, unless most other receivers, or all links together, overrule it. If
+    none is declared: the median of the other receivers, else the estimate from all links, else the
+    lowest reading.
     """
-    sure = [(each, mine) for each, mine in zip(found, rows, strict=True) if each and each.is_sure]
+    sure = [(each, part) for each, part in zip(found, rows, strict=True) if each and each.is_sure]
     if np.isfinite(declared_db):
         asked = sure or ([(together, np.arange(len(links)))] if together else [])
-        against = sum(_overrules(each, np.sort(links.level_db[mine]), declared_db)
-                      for each, mine in asked)
+        against = sum(_overrules(each, np.sort(links.level_db[part]), declared_db)
+                      for each, part in asked)
         if 2 * against <= len(asked):
             return declared_db
     if sure:
@@ -286,15 +288,15 @@ def _usual_db(links: Links, rows: list[np.ndarray], found: list[LimitEstimate | 
 
 
 def contradict_limit(read_db: np.ndarray, limit_db: float) -> bool:
-    """Return whether readings (n,) [dB] contradict a limit: not one or two odd ones."""
+    """Return whether more readings (n,) [dB] lie below a limit than outliers would."""
     below = np.count_nonzero(read_db < limit_db - FALL_DB)
     return bool(below >= max(MIN_BELOW, BELOW_SHARE * len(read_db)))
 
 
 def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) -> bool:
-    """Return whether an estimate, from readings (n,), surely differs from the declared.
+    """Return whether an estimate from readings (n,) [dB] overrules the declared limit.
 
-    A receiver that reads levels down to the declared limit has that, however few they are.
+    It does not if the receiver reads levels down to the declared limit, however few.
     """
     rise_db = found.limit_db - declared_db
     off_db = max(rise_db - RISE_DB, -rise_db - FALL_DB)
@@ -305,41 +307,42 @@ def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) ->
 
 def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
                ) -> tuple[list[LimitEstimate | None], LimitEstimate | None]:
-    """Return the estimate of each receiver's links, and that of all links together."""
+    """Return the estimate for each receiver, and that from all links together."""
     blank = np.isnan(links.level_db)
     if not blank.any():
         return [None] * len(rows), None
-    lowest_db = np.array([_lowest_db(links.level_db[mine]) for mine in rows])
-    own_db = np.where(np.isfinite(lowest_db), lowest_db, lowest_db.min())
+    lowest_db = np.array([_lowest_db(links.level_db[part]) for part in rows])
+    limits_db = np.where(np.isfinite(lowest_db), lowest_db, lowest_db.min())
     block = evidence_blocks(links)
     for _ in range(ROUNDS):
-        crude = crude_level(links.level_db, own_db[links.receiver], links.distance_m, links.device,
-                            links.receiver)
+        crude = crude_level(links.level_db, limits_db[links.receiver], links.distance_m,
+                            links.device, links.receiver)
         z = np.where(blank, 0.0, (links.level_db - crude.mean_db) / crude.sd_db)
         as_one, scale_db = design_effect(block, z), np.full(len(links), SD_SHARE * crude.sd_db)
         *found, together = [
-            receiver_limit(links.level_db[mine], crude.mean_db[mine], scale_db[mine], as_one,
-                           declared_db) for mine in (*rows, np.arange(len(links)))]
-        before_db, own_db = own_db, np.array([
+            receiver_limit(links.level_db[part], crude.mean_db[part], scale_db[part], as_one,
+                           declared_db) for part in (*rows, np.arange(len(links)))]
+        before_db, limits_db = limits_db, np.array([
             each.limit_db if each is not None and each.is_sure else limit_db
-            for each, limit_db in zip(found, own_db, strict=True)])
-        if np.abs(own_db - before_db).max() < STEP_DB:
+            for each, limit_db in zip(found, limits_db, strict=True)])
+        if np.abs(limits_db - before_db).max() < STEP_DB:
             break
     return found, together
 
 
 def _lowest_db(level_db: np.ndarray) -> float:
-    """Return the lowest of readings (n,) [dB] but for the share that may be odd; inf: none."""
+    """Return the lowest of levels (n,) [dB] above the share of outliers; inf without a reading."""
     read_db = np.sort(level_db[np.isfinite(level_db)])
     return float(read_db[int(ODD_SHARE * len(read_db))]) if len(read_db) else np.inf
 
 
-def _notes(links: Links, rows: list[np.ndarray], own_db: np.ndarray,
+def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
            found: list[LimitEstimate | None], declared_db: float, lost: list[int]) -> list[str]:
-    """Return what is odd about the limits of receivers (r,), a sentence each."""
+    """Return notes on the limits of receivers (r,), a sentence each."""
     unit, notes = links.level_unit, []
-    other = [r for r in range(len(rows)) if np.isfinite(declared_db) and own_db[r] != declared_db]
-    known_db = own_db[np.isfinite(own_db)]
+    other = [r for r, limit_db in enumerate(limits_db)
+             if np.isfinite(declared_db) and limit_db != declared_db]
+    known_db = limits_db[np.isfinite(limits_db)]
     if other:
         level_db = links.level_db[np.concatenate([rows[r] for r in other])]
         read_db = level_db[np.isfinite(level_db)]
@@ -349,9 +352,9 @@ def _notes(links: Links, rows: list[np.ndarray], own_db: np.ndarray,
             lie = (f"{below:,} of {len(read_db):,} readings ({percent(below / len(read_db))}) lie "
                    f"below it, down to {read_db.min():g}")
         notes.append(f"{_declared(links, declared_db)} is not that of the readings: {lie}. "
-                     f"{_used_instead(links, own_db, found, other)}")
+                     f"{_used_instead(links, limits_db, found, other)}")
     elif len(known_db) and np.ptp(known_db) > DIFFER_DB:
-        low, high = (links.receiver_names[int(np.flatnonzero(own_db == end)[0])]
+        low, high = (links.receiver_names[int(np.flatnonzero(limits_db == end)[0])]
                      for end in (known_db.min(), known_db.max()))
         notes.append(f"limits of detection differ between receivers: from {known_db.min():.1f} "
                      f"{unit} ({low}) to {known_db.max():.1f} {unit} ({high}), by their readings")
@@ -359,17 +362,18 @@ def _notes(links: Links, rows: list[np.ndarray], own_db: np.ndarray,
     for receivers, what in (([r for r in lost if r not in unsure], "are blank at any level"),
                             (unsure, "may be blank at any level, or below a limit")):
         if receivers:
-            names = ", ".join(links.receiver_names[r] for r in receivers[:MAX_NAMED])
-            notes.append(f"links of receiver {names}{_more(receivers)} {what}: they count as lost, "
+            names = some([links.receiver_names[r] for r in receivers], MAX_NAMED)
+            notes.append(f"links of receiver {names} {what}: they count as lost, "
                          "not as weak")
     return notes
 
 
-def _used_instead(links: Links, own_db: np.ndarray, found: list[LimitEstimate | None],
+def _used_instead(links: Links, limits_db: np.ndarray, found: list[LimitEstimate | None],
                   receivers: list[int]) -> str:
-    used = "; ".join(_used(links.receiver_names[r], own_db[r], found[r], links.level_unit)
+    used = "; ".join(_used(links.receiver_names[r], limits_db[r], found[r], links.level_unit)
                      for r in receivers[:MAX_NAMED])
-    return f"Used instead: {used}{_more(receivers)}"
+    more = len(receivers) - MAX_NAMED
+    return f"Used instead: {used}" + f" and {more:,} more" * (more > 0)
 
 
 def _used(name: str, limit_db: float, found: LimitEstimate | None, unit: str) -> str:
@@ -380,20 +384,16 @@ def _used(name: str, limit_db: float, found: LimitEstimate | None, unit: str) ->
     return f"{limit_db:.1f}{how} {unit} for {name}"
 
 
-def _more(receivers: list[int]) -> str:
-    return f" and {len(receivers) - MAX_NAMED:,} more" if len(receivers) > MAX_NAMED else ""
-
-
 def lower_median(values: np.ndarray | list[float]) -> float:
-    """Return the median; of an even number the lower of both in the middle."""
+    """Return the median; the lower of the two middle values if their number is even."""
     return float(np.sort(values)[(len(values) - 1) // 2])
 
 
 def limits_to_explain(links: Links) -> Links:
-    """Return links with the limits of faultless receivers, so that effects must explain blanks.
+    """Return links with the limits of receivers without a fault, so that effects explain blanks.
 
-    A receiver that is clearly less sensitive than most has the usual limit, and one whose links are
-    blank at any level has at most the usual one, or the lowest reading of all.
+    A receiver that is clearly less sensitive than most gets the usual limit. One whose links are
+    blank at any level gets at most the usual limit, or the lowest reading of all.
     """
     usual_db = links.usual_limit_db
     known = np.isfinite(links.limit_db)
@@ -403,9 +403,9 @@ def limits_to_explain(links: Links) -> Links:
         if blank.any():
             limit_db[:] = np.nanmin(links.level_db)
         return links.with_columns(limit_db=limit_db)
-    own_db = links.receiver_limits_db
-    off_db = own_db - usual_db
-    finite = np.isfinite(own_db)
+    limits_db = links.receiver_limits_db
+    off_db = limits_db - usual_db
+    finite = np.isfinite(limits_db)
     scatter_db = 1.48 * lower_median(np.abs(off_db[finite]))
     deaf = off_db > max(DEAF_DB, DEAF_SDS * scatter_db)
     shift_db = np.where(deaf, off_db, 0.0)[links.receiver]

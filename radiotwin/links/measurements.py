@@ -380,7 +380,7 @@ class Measurements(Summarised):
             same = False
         if not same:
             raise BadInput(f"{path} exists and is not a table of this survey's devices "
-                           f"({_enumerate(self.devices['device'])}); it is not overwritten: choose "
+                           f"({some(self.devices['device'])}); it is not overwritten: choose "
                            "another output folder, or move it away")
 
 
@@ -421,7 +421,7 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
     if undeclared.any():
         row = int(np.flatnonzero(undeclared)[0])
         raise BadInput(f"{path}: row {row + 2}, column device: {table['device'][row]!r} is not in "
-                       f"{devices_path} (it has {_enumerate(devices['device'])}); add it there or "
+                       f"{devices_path} (it has {some(devices['device'])}); add it there or "
                        "correct the name")
     _check_spread(path, table, devices_path, devices)
     unused = unused_columns(path, column_names(path), table.columns, REQUIRED + OPTIONAL + LEVELS)
@@ -509,10 +509,3 @@ def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,
                        f"({x_m:g}, {y_m:g}) m is more than {MAX_APART_M / 1000:g} km from the "
                        f"middle of the receivers of {path.name}, ({middle_m[0]:g}, "
                        f"{middle_m[1]:g}) m; both need one frame, in metres")
-
-
-def _enumerate(names: Iterable[str]) -> str:
-    """Join the first six names, and count the others."""
-    names = list(names)
-    more = f", … {len(names)} in all" if len(names) > 6 else ""
-    return ", ".join(map(str, names[:6])) + more

@@ -5,7 +5,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.io.texts import percent
-from radiotwin.links.cell_limits import READS
+from radiotwin.links.cell_limits import READS, high_notes
 from radiotwin.links.checks import (
     COPIED,
     MIN_LINKS,
@@ -24,7 +24,6 @@ from radiotwin.links.checks import (
 )
 from radiotwin.links.correlation import devices_move
 from radiotwin.links.declared import Declared, Radio, antenna_of_uavs, complete, radios_of
-from radiotwin.links.implausible import high_notes
 from radiotwin.links.limits import estimate_limits
 from radiotwin.links.links import RESTART_NOTE, Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements

@@ -21,12 +21,12 @@ from radiotwin.geo import between_frames, is_same_frame, to_local
 from radiotwin.io.budgets import DEVICES, ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, refuse, shown
 from radiotwin.io.forms import Origin, name_fault
-from radiotwin.links.cell_limits import refuse_limits
-from radiotwin.links.implausible import (
+from radiotwin.links.cell_limits import (
     HEIGHTS_M,
     LIMITS_DEG,
     high_notes,
     no_height,
+    refuse_limits,
     tilt_notes,
 )
 
@@ -446,7 +446,7 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
     numbers = as_numbers(text)
     if quantity in LIMITS_DEG:
         for i in np.flatnonzero(np.isnan(numbers) & (text != "")):
-            numbers[i] = _degrees(text.iloc[i], quantity)
+            numbers[i] = degrees(text.iloc[i], quantity)
     with_unit = np.isnan(numbers) & (text != "").to_numpy()
     by_cell = np.full(len(numbers), np.nan)
     for i in np.flatnonzero(with_unit):
@@ -514,19 +514,19 @@ def _without_blank_rows(cells: pd.DataFrame, key: str) -> pd.DataFrame:
     return cells.drop(index=nameless.index[(nameless.apply(as_text) == "").all(axis=1)])
 
 
-def _degrees(text: str, quantity: str) -> float:
+def degrees(text: str, quantity: str) -> float:
     """Return an angle in degrees, minutes and seconds, such as `48°06'12.5"N`; NaN of none."""
     found = _DMS.fullmatch(text.upper()) if len(text) <= _DMS_CHARACTERS else None
     if found is None:
         return np.nan
     before, *parts, after = found.groups()
-    degrees, minutes, seconds = (float(part or 0) for part in parts)
+    whole, minutes, seconds = (float(part or 0) for part in parts)
     end = before or after or ""
     ends = "NS" if quantity == "latitude" else "EW"
     if minutes >= 60 or seconds >= 60 or (before and after) or end not in ("", *ends):
         return np.nan
     sign = -1.0 if end == ends[1] or parts[0].startswith("-") else 1.0
-    return sign * (abs(degrees) + minutes / 60 + seconds / 3600)
+    return sign * (abs(whole) + minutes / 60 + seconds / 3600)
 
 
 def _check_positions(table: SiteTable) -> None:

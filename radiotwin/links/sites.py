@@ -1,8 +1,8 @@
-"""Links that share a place: masts with several devices, and places where several receivers were.
+"""Links that share a place: devices on one mast, and receivers that were at the same places.
 
-At a place where two receivers read one device, distance, walls and the device are the same, so what
-differs is the receivers' own. A regression over all links does not see it so clearly: receivers
-that went to different places also differ by what a model does not know of these.
+Where two receivers read one device at the same place, distance, walls and device are the same, so
+the difference of their levels is the receivers'. A regression over all links separates it less
+clearly: receivers that were at different places also differ by the model's errors there.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def site_of(links: Links, device: int) -> list[int]:
 
 
 def antenna_of(links: Links, device: int) -> list[int]:
-    """Return the device and those of its mast whose declared azimuth is the same, in order.
+    """Return the device and those on its mast with the same declared azimuth, in order.
 
     They are carriers through one antenna, or through antennas side by side.
     """
@@ -60,9 +60,9 @@ def antenna_of(links: Links, device: int) -> list[int]:
 
 
 def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
-    """Return whose signals reach a receiver on nearly the same ways as those of a device.
+    """Return devices whose signals reach a receiver along nearly the same paths as a device's.
 
-    The others of its antenna that were heard, or where there are none of its mast; at most
+    They are the other devices of its antenna that were detected, else those of its mast; at most
     `MAX_RELATIVES`.
     """
     others = ([other for other in group if other != device and other in heard]
@@ -72,7 +72,7 @@ def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Scatter of readings that should be equal, of each device.
+    """Scatter of repeated readings, which should be equal, by device.
 
     Attributes:
         squares_db2: (k,) sum of squares about the means [dB²].
@@ -84,7 +84,7 @@ class Repeats:
 
     @classmethod
     def of(cls, links: Links, *same: np.ndarray) -> Repeats:
-        """Return that of readings of one receiver and device with the same other labels (n, …)."""
+        """Group readings by receiver, device and the other labels (n, …)."""
         seen = np.isfinite(links.level_db)
         label = np.column_stack([links.device, links.receiver, *same])[seen]
         group = np.unique(label, axis=0, return_inverse=True)[1].ravel()
@@ -95,7 +95,7 @@ class Repeats:
                    np.bincount(device, 1 - 1 / count[group], devices))
 
     def sd_db(self) -> np.ndarray:
-        """Return the standard deviation of one reading (k,) [dB]; NaN of few repeats."""
+        """Return the standard deviation (k,) of a reading [dB]; NaN if there are few repeats."""
         few = self.freedom < MIN_REPEATS
         return np.where(few, np.nan, np.sqrt(self.squares_db2 / np.maximum(self.freedom, 1)))
 
@@ -110,10 +110,10 @@ def repeats_at_places(links: Links) -> Repeats:
 
 
 def shared_names(links: Links) -> dict[int, str]:
-    """Return devices that may be two transmitters of one name, and why.
+    """Return devices that may be two transmitters with one name, and why.
 
-    Cells share an identity, or the carriers of a cell a name. Then a receiver reads two levels at
-    one time, or at one place, that differ by more than readings of other devices do.
+    Cells may share an identity, or the carriers of a cell a name. Then a receiver reads two levels
+    at one time, or at one place, that differ by more than readings of other devices do.
     """
     found: dict[int, str] = {}
     timed = links.select(np.isfinite(links.time_s))
@@ -131,9 +131,9 @@ def shared_names(links: Links) -> dict[int, str]:
 
 
 def never_part(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
-    """Return the labels of one end that have the same links as a label of another end, and that.
+    """Return pairs of labels, one of each end, that have exactly the same links.
 
-    What one of the two has wrong cannot be told from what the other has.
+    An error of one of the two cannot be separated from an error of the other.
 
     Args:
         one: (n,) index of one end of each link, such as its device.
@@ -146,9 +146,9 @@ def never_part(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
 
 
 def never_apart_from(links: Links, end: str, members: set[int]) -> str | None:
-    """Return the other of `device` and `receiver` if it is never apart from one of some members.
+    """Return the other of `device` and `receiver` if a member shares all its links with one there.
 
-    Only links that were heard tell.
+    Only detected links count.
     """
     other, heard = OTHER_END[end], np.isfinite(links.level_db)
     together = never_part(getattr(links, end)[heard], getattr(links, other)[heard])
@@ -156,7 +156,7 @@ def never_apart_from(links: Links, end: str, members: set[int]) -> str | None:
 
 
 def end_notes(links: Links) -> list[str]:
-    """Return notes on ends that are never apart, and on devices that are probably two each."""
+    """Return notes on ends that share all their links, and on devices that are probably two."""
     notes = [f"device {links.device_names[device]} may be two transmitters of one name, such as "
              f"cells of one identity or carriers of a cell: {why}; if so, give each its name"
              for device, why in shared_names(links).items()]
@@ -230,30 +230,32 @@ def _difference(links: Links, first: int, second: int) -> ReceiverDifference | N
 
 
 def _pairs(links: Links, first: int, second: int) -> pd.DataFrame:
-    """Return each reading of the first with the nearest of the second to the same device."""
+    """Pair each reading of the first receiver with the nearest one of the second, by device."""
     read = np.isfinite(links.level_db)
     parts = []
     for device in np.unique(links.device):
-        mine, other = (np.flatnonzero(read & (links.device == device) & (links.receiver == each))
-                       for each in (first, second))
-        if not (len(mine) and len(other)):
+        of_device = read & (links.device == device)
+        first_rows, second_rows = (np.flatnonzero(of_device & (links.receiver == each))
+                                   for each in (first, second))
+        if not (len(first_rows) and len(second_rows)):
             continue
-        apart_m, nearest = cKDTree(links.receiver_m[other]).query(
-            links.receiver_m[mine], distance_upper_bound=SAME_M)
+        apart_m, nearest = cKDTree(links.receiver_m[second_rows]).query(
+            links.receiver_m[first_rows], distance_upper_bound=SAME_M)
         beside = np.isfinite(apart_m)
-        mine, other = mine[beside], other[nearest[beside]]
-        limit_db = np.maximum(links.limit_db[mine], links.limit_db[other])
-        strong = (links.level_db[mine] + links.level_db[other]) / 2 >= limit_db + ABOVE_LIMIT_DB
-        mine, other = mine[strong], other[strong]
-        x, y = np.floor(links.receiver_m[mine, :2] / PLACE_M).astype(int).T
+        first_rows, second_rows = first_rows[beside], second_rows[nearest[beside]]
+        limit_db = np.maximum(links.limit_db[first_rows], links.limit_db[second_rows])
+        middle_db = (links.level_db[first_rows] + links.level_db[second_rows]) / 2
+        strong = middle_db >= limit_db + ABOVE_LIMIT_DB
+        first_rows, second_rows = first_rows[strong], second_rows[strong]
+        x, y = np.floor(links.receiver_m[first_rows, :2] / PLACE_M).astype(int).T
         parts.append(pd.DataFrame({
             "device": device, "x": x, "y": y,
-            "difference_db": links.level_db[other] - links.level_db[mine]}))
+            "difference_db": links.level_db[second_rows] - links.level_db[first_rows]}))
     return pd.concat(parts) if parts else pd.DataFrame()
 
 
 def _half_db(error_db: np.ndarray, label: np.ndarray) -> float:
-    """Return half of the 90 % interval of a mean, of errors (n,) that are alike in clusters (n,).
+    """Return half the 90 % interval of a mean of errors (n,) that are correlated in clusters (n,).
 
     Liang and Zeger 1986, 'Longitudinal data analysis using generalized linear models', Biometrika
     73, with the t quantile of the number of clusters.

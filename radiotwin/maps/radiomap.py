@@ -336,8 +336,6 @@ class RadioMap(OverDevices):
         """
         return cls(load_dataset(Path(path)))
 
-    read = load  # the name of version 0.1
-
     @classmethod
     @contextmanager
     def open(cls, path: Path | str) -> Iterator[RadioMap]:

@@ -137,8 +137,8 @@ def read_truth(scene: Scene, truth: str = "traced") -> RadioMap:
         if not path.is_file():
             raise BadInput(f"{path} does not exist; run `radiotwin trace {scene.folder}` first, or "
                            "use --truth segmented")
-        return RadioMap.read(require_within(scene.folder, path, str(scene.folder)))
-    return RadioMap.read(truth)
+        return RadioMap.load(require_within(scene.folder, path, str(scene.folder)))
+    return RadioMap.load(truth)
 
 
 # A map says nothing of its links' paths. In a street, two walls and the ground give 16 paths of at

@@ -278,8 +278,7 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
     background = MapBackground(data.links, scene)
     save(groups_figure(data, report), folder / "groups.png")
     save(waterfall_figure(report), folder / "waterfall.png")
-    save(residual_map_figure(data, background, report.get("anomalies", [])),
-         folder / "residual_map.png")
+    save(residual_map_figure(data, background, report), folder / "residual_map.png")
     for name, figure in (("level_map", level_map_figure(data, background)),
                          ("drivers", dependence_figure(data))):
         if figure is not None:

@@ -6,6 +6,7 @@ from typing import Any
 
 from radiotwin.closeloop.output.result_file import check_report
 from radiotwin.display import count
+from radiotwin.effects.registry import effects_named
 from radiotwin.report import anomaly_words
 from radiotwin.report import closeloop_words as words
 from radiotwin.report.html import Table, read_picture, write_page
@@ -23,32 +24,32 @@ from radiotwin.report.labels import (
     variable_label,
 )
 
-FIGURES = (
+MAP = ("residual_map.png", "Residual on the map",
+       "Measured − predicted level on held-out links, at the position of the moving end; red: less "
+       "was measured than predicted. Purple: what was found.")
+STEPS = ("waterfall.png", "Error step by step",
+         "RMSE on held-out links, which were used neither to choose nor to fit the model: the base "
+         "alone, the change by each effect, and the result. Horizontal lines: other models, held "
+         "out in the same way, unless they are far worse.")
+FIGURES = (  # with the panels of each
     ("groups.png", "Residual by device, receiver and flight",
      "Median of the held-out residual of the base (measured minus predicted; red: less was "
-     "measured) and its scatter. Framed: groups that stand out; dashed: part of their links."),
-    ("waterfall.png", "Error step by step",
-     "RMSE on held-out links, which were used neither to choose nor to fit the model: the base "
-     "alone, the change by each effect, and the result. Horizontal lines: other models, held out "
-     "in the same way, unless they are far worse."),
-    ("residual_map.png", "Residual on the map",
-     "Measured minus predicted level on held-out links, before and after. Red: less was measured "
-     "than predicted. Purple: the effects that were found."),
+     "measured) and its scatter. Framed: groups that stand out; dashed: part of their links.", ()),
     ("level_map.png", "Levels on the map",
      "Measured level, level predicted while the link was held out, and their difference, at the "
-     "position of the moving end."),
+     "position of the moving end.", ("measured", "predicted", "difference")),
     ("drivers.png", "Dependence of the residual",
      "Mean held-out residual over the variables that it depends on most, with one standard error. "
      "Dashed: contribution of the effects to the prediction. The diffraction parameter (ν of ITU-R "
-     "P.526) says how far the map reaches into the straight line: above 0 it blocks it."),
+     "P.526) says how far the map reaches into the straight line: above 0 it blocks it.", ()),
 )
 KINDS = {"los": "", "device": "device ", "receiver": "receiver ", "flight": "flight "}
 GROUPS = {"los": "with line of sight", "nlos": "without line of sight"}
 COLUMNS = {"n": "links", "bias_db": "bias [dB]", "std_db": "standard deviation [dB]",
            "correlation": "correlation", "rmse_db": "RMSE [dB]", "mae_db": "MAE [dB]",
            "nll": "−log-likelihood [nats]"}
-CARDS = (("rmse_db", "RMSE, before and after", " dB"), ("bias_db", "bias", " dB"),
-         ("std_db", "standard deviation", " dB"), ("correlation", "correlation", ""))
+LEARNT = {"combined": "all that was learnt together",
+          "map": "its map, which has the mean at a faultless receiver, also where nothing is heard"}
 MAX_ROWS = 40  # groups with more members are left out of the tables
 MAX_COLUMNS = 30  # of the scores
 MAX_MODELS = 100
@@ -69,24 +70,26 @@ def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
     """
     folder, report = Path(folder), check_report(report)
     write_page("closeloop.html", folder / "closeloop.html", {
-        "title": title, "page_title": title, "facts": _facts(report),
+        "title": title, "page_title": title, "lead": [], "facts": _facts(report),
         "closeloop": closeloop_context(report, folder)})
 
 
 def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
-    """Collect the variables of `closeloop_sections.html` from a report that has been checked.
+    """Collect the variables of `closeloop_*.html` from a report that has been checked.
 
     Raises:
         BadInput: a damaged figure.
     """
-    candidates = report["candidates"]
-    pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
+    candidates, (lead, *more) = report["candidates"], words.summary(report)
+    pictures = [read_picture(folder, *figure) for figure in FIGURES]
+    is_changed = not all(each.get("is_declared") for each in report["effects"])
     return {
-        "lead": words.closeloop_summary(report), "rivals": words.rivals(report),
-        "verdict": words.verdict(report), "cards": _cards(report),
+        "lead": lead, "more": more, "rivals": words.rivals(report), "cards": _cards(report),
+        "map": read_picture(folder, *MAP, ("before", "after") if is_changed else ()),
+        "steps": read_picture(folder, *STEPS),
         "anomalies": Table(anomaly_words.COLUMNS, anomaly_words.rows(report), "", 2),
         "figures": [picture for picture in pictures if picture],
-        "effects": _effects(report, folder),
+        "effects": [_effect(each, folder) for each in report["effects"][:MAX_EFFECTS]],
         "more_effects": max(len(report["effects"]) - MAX_EFFECTS, 0),
         "errors": _error_table(report, ("los",)),
         "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
@@ -109,49 +112,32 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
 
 
 def _cards(report: dict) -> list[tuple[str, str]]:
-    cards = []
-    prediction = report.get("prediction")
-    if prediction:
-        cards.append(("all that was learnt together, RMSE",
-                      f"{number(prediction['combined_rmse_db'])} dB"))
-        of_map = report["error"].get("map")
-        if of_map:
-            cards.append(("RMSE of its map, which has the mean gain at a faultless receiver, also "
-                          "below the limit of detection", f"{number(of_map['rmse_db'])} dB"))
-        inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
-        if inside is not None:
-            cards.append(("held-out readings in its 90 % intervals", f"{100 * inside:.0f} %"))
-        cards.append((f"{name_label(prediction['best_baseline'])} alone",
-                      f"{number(prediction['best_baseline_rmse_db'])} dB"))
-    known = report["error"].get("after_with_quality")
-    if known:
-        cards.append(("RMSE if each reading's quality is known, as on no map",
-                      f"{number(known['rmse_db'])} dB"))
-    for key, label, unit in CARDS:
-        before, after = (number(report["error"][when].get(key))
-                         for when in ("before", "after"))
-        unchanged = before == after and not report["effects"]
-        cards.append((label, (before if unchanged else f"{before} → {after}") + unit))
+    before, after = (number(report["error"][when].get("rmse_db")) for when in ("before", "after"))
+    unchanged = before == after and not report["effects"]
+    cards = [("verdict", words.verdict(report)),
+             ("RMSE, before and after", (before if unchanged else f"{before} → {after}") + " dB")]
+    if report.get("prediction"):
+        combined = number(report["prediction"]["combined_rmse_db"])
+        cards.append(("all that was learnt together, RMSE", f"{combined} dB"))
+    inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
+    if inside is not None:
+        cards.append(("held-out readings in its 90 % intervals", f"{100 * inside:.0f} %"))
     return cards
 
 
-def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
-    """Return the effects grouped by their heading."""
-    sections: dict[str, list[dict]] = {}
-    interpolated = interpolations()
-    for effect in report["effects"][:MAX_EFFECTS]:
-        name, label = effect["name"], name_label(effect["name"])
-        heading = ("Interpolated, not explained" if name in interpolated else
-                   "Part of the base" if effect.get("is_declared") else
-                   "Effects found")
-        labels = parameter_labels(name)
-        rows = [[parameter_label(key, labels), _value(p), _interval(p), p["unit"]]
-                for key, p in effect["parameters"].items()]
-        sections.setdefault(heading, []).append({
-            "rank": effect["rank"], "name": name, "label": label, "evidence": _evidence(effect),
-            "picture": read_picture(folder, effect_picture(effect["rank"], name), label),
-            "parameters": Table(("parameter", "value", "90 % interval", "unit"), rows)})
-    return sections
+def _effect(effect: dict, folder: Path) -> dict[str, Any]:
+    """Return what the page shows of an effect."""
+    name, labels = effect["name"], parameter_labels(effect["name"])
+    label = name_label(name)
+    kind = ("interpolated, not explained" if name in interpolations() else
+            "part of the base" if effect.get("is_declared") else "")
+    has_panels = any(each.figure == "links" for each in effects_named(name))
+    rows = [[parameter_label(key, labels), _value(p), _interval(p), p["unit"]]
+            for key, p in effect["parameters"].items()]
+    return {"rank": effect["rank"], "label": label, "kind": kind, "evidence": _evidence(effect),
+            "picture": read_picture(folder, effect_picture(effect["rank"], name), label, "",
+                                    ("without it", "with it") if has_panels else ()),
+            "parameters": Table(("parameter", "value", "90 % interval", "unit"), rows)}
 
 
 def _evidence(effect: dict) -> str:
@@ -181,7 +167,8 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
     others = dict(islice(report["baselines"].items(), MAX_MODELS if "los" in kinds else 0))
     columns = list(dict.fromkeys([*COLUMNS, *(key for each in others.values() for key in each)]))
     columns = columns[:MAX_COLUMNS]
-    groups = [("all links", report["error"])] if "los" in kinds else []
+    error = report["error"]
+    groups = [("all links", error)] if "los" in kinds else []
     for kind in kinds:
         group = report["error"].get(f"by_{kind}", {})
         groups += [(GROUPS.get(name, KINDS[kind] + name), both) for name, both in group.items()
@@ -196,6 +183,8 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
             rows.append(["", "after, with each reading's own quality",
                          *(number(known.get(key)) for key in columns)])
         if place == 0:
+            others = {label: scores for key, label in LEARNT.items()
+                      if (scores := error.get(key))} | others
             rows += [["", name_label(name), *(number(scores.get(key)) for key in columns)]
                      for name, scores in others.items()]
     heldout = report["heldout"]

@@ -1,11 +1,14 @@
 """Say in sentences what a close-loop found, how probable it is and what would have been seen."""
 
+import re
 from collections import Counter
 from math import hypot
 
 from radiotwin.closeloop.verdict.criteria import LIKELY, MIN_SURE, SelectionCriteria
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER
 from radiotwin.effects.registry import effects_named
+from radiotwin.geo import to_geographic
+from radiotwin.io.forms import Origin
 from radiotwin.report.anomaly_words import MAX_NAMED, group, seen_from, some_names, where
 from radiotwin.report.labels import (
     interpolations,
@@ -13,6 +16,7 @@ from radiotwin.report.labels import (
     name_label,
     number,
     probability,
+    signed,
     variable_label,
 )
 
@@ -27,18 +31,21 @@ def closeloop_summary(report: dict) -> str:
     Args:
         report: content of `closeloop.json`.
     """
+    return " ".join(summary(report))
+
+
+def summary(report: dict) -> list[str]:
+    """Summarise the result in paragraphs: what was found or where, what speaks for it, advice."""
     why = {"effect": _effect, "located": _located, "none": _none,
            "undecided": _undecided}[report["verdict"]](report)
-    text = " ".join(filter(None, [where(report), why]))
-    text += next((f" {_side_by_side(each)}." for each in _largest_first(report)
-                  if _differ(each["difference_db"])), "")
-    interpolated = _has_interpolation(report)
-    if interpolated:
-        text += (" Interpolation of what remains, which explains nothing, brings the RMSE to "
-                 f"{number(report['error']['after']['rmse_db'])} dB.")
-    text += with_quality(report)
-    advice = (report.get("prediction") or {}).get("advice")
-    return f"{text} {advice}" if advice else text
+    rest = [f"{_side_by_side(each)}." for each in _largest_first(report)
+            if _differ(each["difference_db"])][:1]
+    if _has_interpolation(report):
+        rest.append("Interpolation of what remains, which explains nothing, brings the RMSE to "
+                    f"{number(report['error']['after']['rmse_db'])} dB.")
+    rest += [with_quality(report), (report.get("prediction") or {}).get("advice", "")]
+    parts = [why, where(report)] if report["verdict"] == "effect" else [where(report), why]
+    return list(filter(None, [*parts, " ".join(filter(None, rest))]))
 
 
 def verdict(report: dict) -> str:
@@ -60,8 +67,64 @@ def cause_names(report: dict) -> list[str]:
     counts = Counter(" or ".join(name_label(name) for name in (
         each["name"], *(other for other in each.get("indistinguishable_from", [])
                         if other.partition("_")[2] == each["name"].partition("_")[2])))
-        for each in _causes(report))
+        for each in causes(report))
     return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
+
+
+def objects(report: dict) -> list[str]:
+    """Name what was found, with size and place: "a building that the map lacks, 33 by 38 m …"."""
+    origin = (report.get("inputs") or {}).get("origin")
+    return [_object(each, Origin(**origin) if origin else None) for each in causes(report)]
+
+
+def _object(effect: dict, origin: Origin | None) -> str:
+    forms = effects_named(effect["name"])
+    form = next((each for each in forms if each.variant == effect.get("variant")), None)
+    words = form and form.in_words or name_label(effect["name"])
+    if " of a " in effect.get("variant", ""):
+        words = effect["variant"]
+    values = {name: each["value"] for name, each in effect["parameters"].items()
+              if each["value"] is not None and each.get("determined", True)}
+    members = dict.fromkeys(member for name in effect["parameters"]
+                            if (member := _member(name)) and is_changed(effect, member))
+    names = some_names([f"{member} ({values[key]:+.1f} dB)".replace("-", "−")
+                        if (key := f"offset_db[{member}]") in values else member
+                        for member in members])
+    if members:
+        named = re.sub(r"\b(the|a) (device|receiver)\b", lambda _: names, words)
+        words = named if named != words else f"{words} ({names})"
+    if {"length_m", "width_m"} <= set(values):
+        words += f", {values['length_m']:.0f} by {values['width_m']:.0f} m"
+    if "height_m" in values:
+        words += f", {values['height_m']:.0f} m high"
+    if len(members) == 1:
+        (member,) = members
+        wide, towards = (values.get(f"{each}_deg[{member}]") for each in ("beamwidth", "azimuth"))
+        if wide is not None and towards is not None:
+            words += f", {wide:.0f}° wide, towards {towards % 360:.0f}°"
+    places = [each for each in effect.get("places", []) if each.get("device", "") in ("", *members)]
+    return words + (f", at {place_words(places[0]['x_m'], places[0]['y_m'], origin)}"
+                    if len(places) == 1 else "")
+
+
+def place_words(x_m: float, y_m: float, origin: Origin | None) -> str:
+    """Return a place in latitude and longitude, in metres where the origin is not known."""
+    if origin is None:
+        return f"x {signed(x_m, 0)} m, y {signed(y_m, 0)} m"
+    longitude_deg, latitude_deg = (float(each) for each in to_geographic(origin, x_m, y_m))
+    return (f"{abs(latitude_deg):.5f}° {'NS'[latitude_deg < 0]}, "
+            f"{abs(longitude_deg):.5f}° {'EW'[longitude_deg < 0]}")
+
+
+def _member(parameter: str) -> str:
+    """Return of which member a parameter is: `tilt_deg[uav1]` -> `uav1`."""
+    return parameter.partition("[")[2].removesuffix("]")
+
+
+def is_changed(effect: dict, member: str) -> bool:
+    """Return whether an effect changes a member: an offset that may be 0 is none."""
+    offset = effect["parameters"].get(f"offset_db[{member}]")
+    return offset is None or not (offset["low"] or 0.0) <= 0.0 <= (offset["high"] or 0.0)
 
 
 def is_sure(report: dict) -> bool:
@@ -70,16 +133,17 @@ def is_sure(report: dict) -> bool:
     Steps between flights have none.
     """
     return not report["posterior"] or all(
-        (each.get("probability") or 0.0) >= MIN_SURE for each in _causes(report))
+        (each.get("probability") or 0.0) >= MIN_SURE for each in causes(report))
 
 
 def rivals(report: dict) -> str:
     """Say how probable the causes are that were found, and what else the first one may be."""
-    causes = _causes(report)
-    known = [each for each in causes if each.get("probability") is not None]
+    found_causes = causes(report)
+    known = [each for each in found_causes if each.get("probability") is not None]
     found = [f"{name_label(each['name'])} {probability(each['probability'])}" for each in known]
     text = f"Probability that it is there: {join_names(found)}. " if found else ""
-    first = next((rank for rank, each in enumerate(report["effects"], 1) if each in causes), 0)
+    first = next((rank for rank, each in enumerate(report["effects"], 1)
+                  if each in found_causes), 0)
     # What acts on one flight comes before the steps of which rivals are known.
     step = next((each for each in report["posterior"] if each["step"] == first), None)
     if step is None or report["effects"][first - 1].get("probability") is None:
@@ -110,7 +174,7 @@ def with_quality(report: dict) -> str:
     known = report["error"].get("after_with_quality")
     if not known:
         return ""
-    return (f" Where the quality of each reading is known, as on no map, it is "
+    return (f"Where the quality of each reading is known, as on no map, it is "
             f"{number(known['rmse_db'])} dB.")
 
 
@@ -148,7 +212,7 @@ def _counts(dependence: dict, report: dict) -> bool:
         effect_db is None or effect_db >= criteria["min_dependence_db"])
 
 
-def _causes(report: dict) -> list[dict]:
+def causes(report: dict) -> list[dict]:
     """Return the effects that were found and explain something."""
     interpolated = interpolations()
     return [each for each in report["effects"]
@@ -184,18 +248,18 @@ def _side_by_side(found: dict) -> str:
 
 
 def _effect(report: dict) -> str:
-    error, causes = report["error"], cause_names(report)
+    error = report["error"]
     without_cause = interpolations()
     explained = [each["heldout_rmse_db"] for each in report["candidates"]
                  if each["kept"] and each["name"] not in without_cause]
     interpolated = _has_interpolation(report)
     after = explained[-1] if explained and interpolated else error["after"]["rmse_db"]
-    found = _causes(report)
+    found = causes(report)
     it = "it" if len(found) == 1 else "them"  # one kind may have been found twice
     known = [each["probability"] for each in found if each.get("probability") is not None]
-    lacked, sure = "lacked", ""
+    start, sure = "Found", ""
     if not is_sure(report):
-        lacked = "probably lacked"
+        start = "Probable"
         if len(known) == len(found):
             rest = "" if len(found) == 1 else " each" if min(known) == max(known) else " and more"
             sure = f" (probability {probability(min(known))}{rest})"
@@ -203,7 +267,7 @@ def _effect(report: dict) -> str:
     goes = f"{'falls' if after < before else 'goes'} from {number(before)} to {number(after)} dB"
     if number(before) == number(after):
         goes = f"stays at {number(after)} dB"
-    text = (f"The model {lacked} {join_names(causes)}{sure}. With {it} the RMSE on held-out links "
+    text = (f"{start}: {'; '.join(objects(report))}{sure}. With {it} the RMSE on held-out links "
             f"{goes}.")
     left = _unnamed_beside(report)
     if left is not None:

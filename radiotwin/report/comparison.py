@@ -141,7 +141,7 @@ def _judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
             raise BadInput(f"{path}: a radio map can only be judged on a whole map; give --truth, "
                            "too")
         else:
-            maps[str(path)] = RadioMap.read(path)
+            maps[str(path)] = RadioMap.load(path)
     return twins, maps
 
 
@@ -278,7 +278,7 @@ def _estimates_figure(comparison: Comparison, models: list[str], scene: Scene) -
 
 
 def comparison_context(comparison: Comparison, folder: Path) -> dict[str, Any]:
-    """Collect the variables of `comparison_sections.html`, with the figures of a folder."""
+    """Collect what a run's page shows of a comparison, with the figures of a folder."""
     pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
     return {"lead": _summary(comparison),
             "tables": [Table(list(columns), rows, title)
@@ -286,17 +286,21 @@ def comparison_context(comparison: Comparison, folder: Path) -> dict[str, Any]:
             "figures": [picture for picture in pictures if picture]}
 
 
-def _summary(comparison: Comparison) -> str:
-    """Summarise the result in a sentence; empty without a whole map to compare on."""
+def _judged(comparison: Comparison) -> pd.DataFrame:
+    """Return RMSE over the whole map [dB] and median position error [m] of the models."""
     scores = comparison.scores.query(
         "against == 'whole map' and positions == 'estimated' and links == 'all'")
-    rmse_db = scores.set_index("model")["rmse_db"]
     located = comparison.location_summary().set_index("model")
-    if not {"segmented_nn", "log_distance"} <= set(rmse_db.index) & set(located.index):
+    return scores.set_index("model")[["rmse_db"]].join(located[["median_m"]], how="inner")
+
+
+def _summary(comparison: Comparison) -> str:
+    """Summarise the result in a sentence; empty without a whole map to compare on."""
+    judged = _judged(comparison)
+    if not set(SHOWN) <= set(judged.index):
         return ""
-    median_m = located["median_m"]
+    line, twin = judged.loc["log_distance"], judged.loc["segmented_nn"]
     return ("Fitted to a few flights, the twin predicts the gain over the whole map with an RMSE "
-            f"of {rmse_db['segmented_nn']:.1f} dB (log-distance model: "
-            f"{rmse_db['log_distance']:.1f} dB) and locates the unknown devices with a median "
-            f"error of {median_m['segmented_nn']:.1f} m (log-distance model: "
-            f"{median_m['log_distance']:.1f} m).")
+            f"of {twin.rmse_db:.1f} dB (log-distance model: {line.rmse_db:.1f} dB) and locates the "
+            f"unknown devices with a median error of {twin.median_m:.1f} m (log-distance model: "
+            f"{line.median_m:.1f} m).")

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 from radiotwin.coverage import Coverage
-from radiotwin.coverage.legends import Legend, drawn_rasters, file_stem, legend_of
+from radiotwin.coverage.output import Legend, drawn_rasters, file_stem, legend_of
 from radiotwin.report.labels import new_figure, plain, save
 from radiotwin.report.map_figures import HeightGrid
 from radiotwin.scene import Scene

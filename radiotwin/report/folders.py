@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +90,9 @@ def write_closeloop_folder(loop: Loop, scene: Scene | None, folder: Path | str, 
     """
     folder = Path(folder)
     check_closeloop_folder(folder)
-    report = make_report(loop) | ({} if inputs is None else {"inputs": inputs})
+    origin = None if scene is None else scene.config.origin
+    report = make_report(loop) | {"inputs": (inputs or {}) | (
+        {"origin": origin.model_dump()} if origin else {})}
     with atomic_folder(folder, CLOSELOOP_FILES) as temporary:
         write_closeloop_figures(loop, scene, report, temporary)
         write_report(report, temporary / "closeloop.json")
@@ -160,17 +163,19 @@ def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
     """
     path = Path(path)
     check_map_target(path, scene)
+    formats = FORMATS
     if isinstance(source, RadioMap):
         check_map_place(name, source.attributes, scene)
         whole: RadioMap | MapStream = source
     else:
         whole = source.map_stream(scene)
+        formats = FORMATS | {".png": partial(write_picture, devices=source.devices)}
     selected = select(whole, None if devices is None else list(devices),
                       None if altitudes_m is None else list(altitudes_m))
     shape = selected.lattice.shape
     if tell is not None and is_zarr(path) and len(selected.devices) * math.prod(shape) > TOLD_LINKS:
         tell(f"{path}: {size_of(shape, len(selected.devices))}")
-    write_map(selected, scene, path, FORMATS)
+    write_map(selected, scene, path, formats)
     return selected
 
 
@@ -238,7 +243,8 @@ def read_run(folder: Path | str, scene: Path | None = None, truth: str | None = 
         run.closeloop, run.closeloop_folder = read_report(found), found.parent
         table = _first(found.parent, "residuals.csv.gz")
         if table is not None:
-            run.residuals = read_table(table, RESIDUALS, {"time_s": "number or nothing"})
+            run.residuals = read_table(table, RESIDUALS, dict.fromkeys(
+                ("time_s", "measured_db"), "number or nothing"))
     found = _first(folder, "compare.json", "comparison/compare.json")
     if found is not None:
         run.comparison, run.comparison_folder = read_comparison(found), found.parent

@@ -56,14 +56,21 @@ class PictureData(str):
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of a page with its heading and its description."""
+    """A figure of a page with its heading and its description.
+
+    Attributes:
+        panels: what each of its panels shows, which are side by side and equally wide; of a figure
+            of one panel: empty.
+    """
 
     title: str
     source: PictureData
     text: str = ""
+    panels: Sequence[str] = ()
 
 
-def read_picture(folder: Path, name: str, title: str, text: str = "") -> Picture | None:
+def read_picture(folder: Path, name: str, title: str, text: str = "",
+                 panels: Sequence[str] = ()) -> Picture | None:
     """Read a PNG file to be put into a page; None where the folder does not hold it.
 
     Raises:
@@ -78,7 +85,7 @@ def read_picture(folder: Path, name: str, title: str, text: str = "") -> Picture
     width, height = struct.unpack(">II", data[16:24])
     PICTURE_PIXELS.check(width * height, path)
     encoded = base64.b64encode(data).decode()
-    return Picture(title, PictureData(f"data:image/png;base64,{encoded}"), text)
+    return Picture(title, PictureData(f"data:image/png;base64,{encoded}"), text, panels)
 
 
 def write_page(template: str, path: Path | str, context: dict[str, Any],

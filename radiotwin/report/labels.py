@@ -185,11 +185,3 @@ def hide_spines(ax: Axes) -> None:
 def shorten(text: str, max_length: int = 14) -> str:
     """Cut a name so that it fits under an axis."""
     return plain(text, max_length)
-
-
-def draw_legend_below(figure: Figure, title: str = "") -> None:
-    """Put the legend of a figure's first axes below all axes; with a title alone it is a note."""
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    if handles or title:
-        figure.legend(handles, labels, title=title, loc="outside lower center", ncols=3,
-                      frameon=False)

@@ -6,9 +6,12 @@ from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection, QuadMesh
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch
 from matplotlib.patheffects import withStroke
 
 from radiotwin.closeloop.output.residuals import rmse_db
@@ -22,17 +25,19 @@ from radiotwin.display import (
 )
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report.closeloop_data import DrawnLinks, EffectData, LoopData
+from radiotwin.report.closeloop_words import causes, is_changed
 from radiotwin.report.labels import (
     FOUND,
     MODELS,
-    draw_legend_below,
     join_names,
     name_label,
     new_figure,
     save,
+    shorten,
 )
 from radiotwin.scene import Scene
 from radiotwin.scene.plot import draw_vegetation, height_grid
+from radiotwin.twin import TwinDevice
 from radiotwin.twin.compare import comparable_db
 
 BUILDING_M = 2.0  # lowest height that is outlined
@@ -49,6 +54,8 @@ CELLS = 45  # along the longer side of the map
 MIN_CELL_M = 10.0
 MIN_LINKS = 3  # of a cell
 MAX_MARKS = 80  # more devices or receivers would hide the map
+MAX_NAMES = 30  # beside the marks
+PANEL_IN = 4.9  # width of a panel
 MARGIN_M = 30.0  # around the links of an enlarged part
 ROUND_STEPS = (1, 1.5, 2, 3, 4, 5, 7, 10)
 HALO = [withStroke(linewidth=2.5, foreground="white")]
@@ -63,48 +70,67 @@ def _lowest(radio_map: RadioMap) -> str:
     return f"{lattice.z_m[0]:g} m" + (" above the ground" if lattice.above == "ground" else "")
 
 
-def write_picture(radio_map: RadioMap, scene: Scene, path: Path | str) -> None:
-    """Write the gain of all devices at the lowest altitude as a PNG file.
+def write_picture(radio_map: RadioMap, scene: Scene, path: Path | str,
+                  devices: Sequence[TwinDevice] = ()) -> None:
+    """Write the level of all devices at the lowest altitude as a PNG file.
+
+    It is the received power where the map knows the devices' power, else the gain.
 
     Args:
         radio_map: map to draw.
         scene: whose buildings are outlined.
         path: PNG file.
+        devices: positions as a twin has them; those of others are the scene's.
     """
-    save(_radio_map_figure(radio_map, scene), path)
+    save(_radio_map_figure(radio_map, scene, devices), path)
 
 
-def _radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
-    """Draw the gain of each of `MAX_PANELS` devices at the lowest altitude, a panel for each."""
+def _radio_map_figure(radio_map: RadioMap, scene: Scene, devices: Sequence[TwinDevice]) -> Figure:
+    """Draw the level of each of `MAX_PANELS` devices at the lowest altitude, a panel for each."""
     names = radio_map.devices[:MAX_PANELS]
     radio_map = radio_map.thinned(max(-(-max(radio_map.lattice.shape[1:]) // MAX_CELLS), 1))
-    gain_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values
+    level_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values
+    common_dbm = radio_map.dataset.attrs.get("tx_power_dbm")
+    powers_dbm = [radio_map.tx_power_dbm.get(name, common_dbm) for name in names]
+    is_power = None not in powers_dbm
+    if is_power:
+        level_db = level_db + np.array(powers_dbm, dtype=float)[:, None, None]
     rows = -(-len(names) // MAX_COLUMNS)
     columns = -(-len(names) // rows)
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     figure, axes = panels(rows, columns, 2.6,
                           0.6 + 2.3 * min((y_max - y_min) / (x_max - x_min), MAX_RATIO))
-    colour_range = level_range_db(gain_db)
+    colour_range = level_range_db(level_db)
     heights = height_grid(scene, OUTLINE_CELLS)
-    position_m = true_positions_m(scene)
+    position_m, found = true_positions_m(scene), {each.device: each for each in devices}
     for number, ax in enumerate(axes.flat):
         if number >= len(names):
             ax.set_axis_off()
             continue
-        image = _draw_map(ax, gain_db[number], radio_map, heights, GAIN_COLOURS, *colour_range)
+        image = _draw_map(ax, level_db[number], radio_map, heights, GAIN_COLOURS, *colour_range)
         _mark_device(ax, position_m.get(names[number]), 8)
+        if names[number] in found:
+            _mark_twin_device(ax, found[names[number]])
         ax.set_title(plain(names[number]), fontsize=10)
         if number % columns:
             ax.set(ylabel="", yticklabels=[])
         if number + columns < len(names):
             ax.set(xlabel="", xticklabels=[])
-    figure.colorbar(image, ax=axes, label="channel gain [dB]", shrink=0.7)
+    what = "received power" if is_power else "channel gain"
+    figure.colorbar(image, ax=axes, label=f"{what} [{'dBm' if is_power else 'dB'}]", shrink=0.7)
     source = plain(str(radio_map.dataset.attrs.get("source", "")))
     left_out = len(radio_map.devices) - len(names)
-    more = f"; {left_out} more not shown" if left_out else ""
-    title = f"{source} at {_lowest(radio_map)} (triangle: device; white: not detected{more})"
+    more = f" ({left_out} more devices not shown)" if left_out else ""
+    title = f"{what.capitalize()} at {_lowest(radio_map)}, {source}{more}"
     letters = int(TITLE_LETTERS_IN * figure.get_figwidth())
     figure.suptitle(fill(title, letters, break_on_hyphens=False))
+    handles = {label: handle for ax in axes.flat[:len(names)]
+               for handle, label in zip(*ax.get_legend_handles_labels())}
+    handles["building"] = Line2D([], [], color="black", linewidth=0.8)
+    if np.isnan(level_db).any():
+        handles["not detected"] = Patch(facecolor="white", edgecolor="black")
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", frameon=False,
+                  ncols=min(len(handles), 1 + columns))
     return figure
 
 
@@ -167,12 +193,27 @@ def _draw_map(ax: Axes, level_db: np.ndarray, radio_map: RadioMap, heights: Heig
     ax.contour(height_m > BUILDING_M, levels=[0.5], origin="lower", extent=bounds, colors="black",
                linewidths=0.4, alpha=0.5)
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]", aspect="equal")
+    ax.autoscale(False)  # a mark outside must not make the map smaller
     return image
 
 
 def _mark_device(ax: Axes, position_m: np.ndarray | None, size: float) -> None:
     if position_m is not None:
-        ax.plot(*position_m[:2], "^", color="white", markeredgecolor="black", markersize=size)
+        ax.plot(*position_m[:2], "^", color="white", markeredgecolor="black", markersize=size,
+                label="device, declared")
+
+
+def _mark_twin_device(ax: Axes, device: TwinDevice) -> None:
+    """Mark a device where a twin has it, with the circle of an estimated position."""
+    position_m = np.array([device.x_m, device.y_m])
+    if device.role == "anchor":
+        _mark_device(ax, position_m, 8)
+        return
+    ax.plot(*position_m, "X", color=FOUND, markeredgecolor="white", markersize=9,
+            label="device, located" if device.located else "device, best guess")
+    if np.isfinite(device.credible_radius_m):
+        ax.add_artist(Circle(position_m, device.credible_radius_m, fill=False, color=FOUND))
+        ax.plot([], [], "o", markerfacecolor="none", color=FOUND, label="holds it with 90 %")
 
 
 class MapBackground:
@@ -226,7 +267,7 @@ class MapBackground:
         middle = np.clip(middle, np.array([x_min, y_min]) + half, np.array([x_max, y_max]) - half)
         return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
 
-    def draw(self, ax: Axes, labelled: bool = True) -> None:
+    def draw(self, ax: Axes) -> None:
         """Draw buildings, the ends that do not move, and axes in metres."""
         x_min, x_max, y_min, y_max = self.bounds
         if self._scene is not None:
@@ -238,12 +279,23 @@ class MapBackground:
             ax.contour(building, levels=[0.5], origin="lower", extent=self.bounds, colors="0.35",
                        linewidths=0.5, zorder=3)
         ax.set(xlim=(x_min, x_max), ylim=(y_min, y_max), aspect="equal", xlabel="x, east [m]",
-               ylabel="y, north [m]" if labelled else "")
-        ax.tick_params(labelleft=labelled)
-        for marker, colour, label, position_m in self._fixed_ends():
+               ylabel="y, north [m]")
+        for marker, colour, label, names, position_m in self._fixed_ends():
             if 0 < len(position_m) <= MAX_MARKS:
                 ax.scatter(position_m[:, 0], position_m[:, 1], marker=marker, s=38, color=colour,
                            edgecolors="black", linewidths=0.8, zorder=4, label=label)
+            for name, (x_m, y_m, _) in zip(names, position_m) if len(names) <= MAX_NAMES else ():
+                if x_min < x_m < x_max and y_min < y_m < y_max:
+                    ax.annotate(shorten(name), (x_m, y_m), (0, 6), textcoords="offset points",
+                                ha="center", fontsize=8, zorder=5, path_effects=HALO)
+
+    def panels(self, count: int) -> list[Axes]:
+        """Return the axes of a new figure: that of each panel, with its legend, is as wide."""
+        figure = new_figure(PANEL_IN * count, self.panel_height(PANEL_IN - 0.7) + 1.7)
+        axes = [part.add_subplot() for part in np.atleast_1d(figure.subfigures(1, count))]
+        for ax in axes:
+            self.draw(ax)
+        return axes
 
     def cell_means(self, value_db: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Average values of links (n,) [dB], NaN left out, by the cell of their moving end.
@@ -262,15 +314,18 @@ class MapBackground:
         mean_db = np.where(count >= MIN_LINKS, total / np.maximum(count, 1), np.nan)
         return edges[0], edges[1], mean_db.T
 
-    def _fixed_ends(self) -> list[tuple[str, str, str, np.ndarray]]:
-        """Return marker, colour, label and positions of each kind of end that does not move."""
+    def _fixed_ends(self) -> list[tuple[str, str, str, list[str], np.ndarray]]:
+        """Return marker, colour, label, names, positions of the kinds of ends that do not move."""
         links = self.links
         if not self.receivers_move:
-            return [("s", "black", "receiver", np.unique(links.receiver_m.round(), axis=0))]
+            return [("s", "black", "receiver", [], np.unique(links.receiver_m.round(), axis=0))]
         members = np.unique(links.variables["device"])
         anchor = np.isin(members, sorted(links.anchors))
-        return [("^", "black", "device, declared", links.device_m[members[anchor]]),
-                ("o", "white", "device, located", links.device_m[members[~anchor]])]
+        return [(marker, colour, label, [links.device_names[each] for each in chosen],
+                 links.device_m[chosen])
+                for marker, colour, label, chosen in (
+                    ("^", "black", "device, declared", members[anchor]),
+                    ("o", "white", "device, located", members[~anchor]))]
 
 
 def mark(ax: Axes, effect: EffectData) -> None:
@@ -300,14 +355,13 @@ def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:
                 ha="left" if right else "right", zorder=7, path_effects=HALO)
 
 
-def residual_map_figure(data: LoopData, background: MapBackground,
-                        anomalies: Sequence[dict] = ()) -> Figure:
+def residual_map_figure(data: LoopData, background: MapBackground, report: dict) -> Figure:
     """Draw the mean held-out residual over the positions of the moving end, before and after.
 
     Args:
         data: of the loop.
         background: map.
-        anomalies: of `closeloop.json`; places among them are framed in the panel of the base.
+        report: content of `closeloop.json`; what it names is marked.
     """
     panels = [(f"before: {name_label(data.base)}", data.before_db)]
     if data.changed:
@@ -316,22 +370,17 @@ def residual_map_figure(data: LoopData, background: MapBackground,
         panels.append((f"after: with {added}", data.after_db))
     residuals_db = [data.links.level_db - predicted_db for _, predicted_db in panels]
     cells = [background.cell_means(residual_db) for residual_db in residuals_db]
-    figure = new_figure(5.4 * len(panels) + 0.9, background.panel_height(4.9) + 1.3)
+    axes = background.panels(len(panels))
     range_db = residual_range_db(cells[0][2])
-    for number, ((title, _), residual_db, grid) in enumerate(zip(panels, residuals_db, cells)):
-        ax = figure.add_subplot(1, len(panels), number + 1)
-        background.draw(ax, labelled=number == 0)
-        image = _draw_cells(ax, grid, RESIDUAL_COLOURS, -range_db, range_db)
+    for ax, (title, _), residual_db, grid in zip(axes, panels, residuals_db, cells):
+        _frame_places(ax, report.get("anomalies", []))
+        _ring_devices(ax, data.links, report)
         for effect in data.effects:
             mark(ax, effect)
-        if number == 0:
-            _frame_places(ax, anomalies)
         ax.set_title(f"{title}\nRMSE {rmse_db(residual_db):.2f} dB", fontsize=11)
-    figure.colorbar(image, ax=figure.axes, shrink=0.85, extend="both", label=RESIDUAL_LABEL)
-    end = "receiver" if background.receivers_move else "device"
-    draw_legend_below(
-        figure, f"mean over all links with the {end} in a cell of {background.cell_m:g} m")
-    return figure
+        _draw_cells(ax, grid, RESIDUAL_COLOURS, -range_db, range_db, f"{RESIDUAL_LABEL}, mean over "
+                    f"cells of {background.cell_m:g} m")
+    return axes[0].figure.figure  # type: ignore[return-value]
 
 
 def _frame_places(ax: Axes, anomalies: Sequence[dict]) -> None:
@@ -343,6 +392,18 @@ def _frame_places(ax: Axes, anomalies: Sequence[dict]) -> None:
                     [south_m, south_m, north_m, north_m, south_m], color="black", linestyle="--",
                     linewidth=1.5, zorder=6, label=label)
             label = None
+
+
+def _ring_devices(ax: Axes, links: DrawnLinks, report: dict) -> None:
+    """Ring the devices that stand out, or that something was found of."""
+    named = {name for each in report.get("anomalies", [])
+             for name in each["members"].get("device", ())}
+    named |= {place["device"] for effect in causes(report) for place in effect.get("places", [])
+              if place.get("device") and is_changed(effect, place["device"])}
+    ringed_m = links.device_m[[name in named for name in links.device_names]]
+    if len(ringed_m):
+        ax.scatter(*ringed_m[:, :2].T, marker="o", s=160, facecolors="none", edgecolors=FOUND,
+                   linewidths=2, zorder=6, label="device that it is about")
 
 
 def level_map_figure(data: LoopData, background: MapBackground) -> Figure | None:
@@ -366,28 +427,22 @@ def level_map_figure(data: LoopData, background: MapBackground) -> Figure | None
     looks = ((GAIN_COLOURS, low_db, high_db, "measured", level),
              (GAIN_COLOURS, low_db, high_db, "predicted, held out", level),
              (RESIDUAL_COLOURS, -range_db, range_db, "measured − predicted", "difference [dB]"))
-    figure = new_figure(15.6, background.panel_height(4.3) + 1.2)
-    for number, (grid, (colours, low, high, title, label)) in enumerate(zip(cells, looks)):
-        ax = figure.add_subplot(1, 3, number + 1)
-        background.draw(ax, labelled=number == 0)
-        image = _draw_cells(ax, grid, colours, low, high)
+    axes = background.panels(3)
+    for ax, grid, (colours, low, high, title, label) in zip(axes, cells, looks):
         ax.set_title(title, fontsize=11)
-        figure.colorbar(image, ax=ax, shrink=0.85, extend="both", location="bottom", label=label)
-    draw_legend_below(figure, f"mean over the links in a cell of {background.cell_m:g} m")
-    return figure
+        _draw_cells(ax, grid, colours, low, high,
+                    f"{label}, mean over cells of {background.cell_m:g} m")
+    return axes[0].figure.figure  # type: ignore[return-value]
 
 
 def contribution_map_figure(contribution_db: np.ndarray, background: MapBackground) -> Figure:
     """Draw what an effect changes links by, (n,) [dB], over the positions of the moving end."""
-    figure = new_figure(6.6, background.panel_height(4.9) + 0.9)
-    ax = figure.add_subplot()
-    background.draw(ax)
+    (ax,) = background.panels(1)
     grid = background.cell_means(contribution_db)
     range_db = residual_range_db(grid[2])
-    image = _draw_cells(ax, grid, RESIDUAL_COLOURS, -range_db, range_db)
-    figure.colorbar(image, ax=ax, shrink=0.85, extend="both", label="contribution [dB]")
-    draw_legend_below(figure, f"mean over cells of {background.cell_m:g} m")
-    return figure
+    _draw_cells(ax, grid, RESIDUAL_COLOURS, -range_db, range_db,
+                f"contribution [dB], mean over cells of {background.cell_m:g} m")
+    return ax.figure.figure  # type: ignore[return-value]
 
 
 def affected_links_figure(effect: EffectData, background: MapBackground) -> Figure:
@@ -399,12 +454,10 @@ def affected_links_figure(effect: EffectData, background: MapBackground) -> Figu
     range_db = residual_range_db(effect.residual_db[rows])
     ends_m = links.ends_m[..., :2]
     frame = background.frame(ends_m[drawn].reshape(-1, 2))
-    figure = new_figure(11.7, background.panel_height(4.9) + 1.1)
-    for number, (title, predicted_db) in enumerate((("without the effect", effect.without_db),
-                                                    ("with the effect", effect.with_db))):
+    axes = background.panels(2)
+    for ax, (title, predicted_db) in zip(axes, (("without the effect", effect.without_db),
+                                                ("with the effect", effect.with_db))):
         residual_db = links.level_db - predicted_db
-        ax = figure.add_subplot(1, 2, number + 1)
-        background.draw(ax, labelled=number == 0)
         order = drawn[np.argsort(np.abs(residual_db[drawn]))]
         rays = LineCollection(ends_m[order], array=residual_db[order], cmap=RESIDUAL_COLOURS,
                               linewidths=0.8, alpha=0.6, zorder=2)
@@ -418,13 +471,21 @@ def affected_links_figure(effect: EffectData, background: MapBackground) -> Figu
         error = f"{rmse_db(residual_db[rows]):.2f} dB" if len(rows) else "none was detected"
         ax.set_title(f"{title}\nRMSE of the {len(rows):,} links that it changes: {error}",
                      fontsize=11)
-    figure.colorbar(dots, ax=figure.axes, shrink=0.85, extend="both", label=RESIDUAL_LABEL)
-    draw_legend_below(figure)
-    return figure
+        _draw_legends(ax, dots, RESIDUAL_LABEL)
+    return axes[0].figure.figure  # type: ignore[return-value]
 
 
 def _draw_cells(ax: Axes, grid: tuple[np.ndarray, np.ndarray, np.ndarray], colours: str,
-                low: float, high: float) -> QuadMesh:
-    """Draw means over cells, as `MapBackground.cell_means` returns them."""
-    return ax.pcolormesh(*grid, cmap=colours, vmin=low, vmax=high, zorder=2, alpha=0.9,
-                         linewidth=0, rasterized=True)
+                low: float, high: float, label: str) -> None:
+    """Draw means over cells, as `MapBackground.cell_means` returns them, and the legends."""
+    image = ax.pcolormesh(*grid, cmap=colours, vmin=low, vmax=high, zorder=2, alpha=0.9,
+                          linewidth=0, rasterized=True)
+    _draw_legends(ax, image, label)
+
+
+def _draw_legends(ax: Axes, coloured: ScalarMappable, label: str) -> None:
+    """Draw the legends of a panel below it: colours, and marks."""
+    part = ax.figure
+    part.colorbar(coloured, ax=ax, location="bottom", shrink=0.85, extend="both", label=label)
+    part.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2,
+                frameon=False, fontsize=9)

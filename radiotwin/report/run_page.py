@@ -16,13 +16,16 @@ from numpy.typing import ArrayLike
 
 from radiotwin import __version__
 from radiotwin.display import level_range_db, residual_range_db
-from radiotwin.io.forms import MAX_POSITION_M
+from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.view import moving_end
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report.closeloop_page import closeloop_context
+from radiotwin.report.closeloop_words import causes, place_words
 from radiotwin.report.comparison import comparison_context
 from radiotwin.report.folders import TRUTH, Run
 from radiotwin.report.html import Table, read_picture, write_page
+from radiotwin.report.labels import name_label
+from radiotwin.report.map_figures import RESIDUAL_LABEL
 from radiotwin.scene import Scene
 from radiotwin.scene.plot import height_grid
 from radiotwin.scene.surfaces import FLAT_M
@@ -38,6 +41,7 @@ MAX_TRACKS = 2000  # flights times UAVs
 MAX_DEVICES = 20_000  # with a mark on the city
 MAX_MAP_DEVICES = 1000  # with a map to choose
 MAX_FACES = 80_000
+MAX_NAMED = 4  # devices in a sentence
 BLOCK_CELLS = 160  # along the longer side of a city that is drawn as blocks
 ROUGH_M = 100.0  # 90 % radius above which a device is not said to be found
 SCALES = {"gain": "viridis", "sigma": "cividis", "error": "coolwarm", "link": "coolwarm_r"}
@@ -100,7 +104,10 @@ def map_layers(run: Run) -> list[dict]:
 
 
 def link_layer(run: Run) -> dict | None:
-    """Return held-out residuals of a close-loop at the moving end; None without residuals.
+    """Return held-out links of a close-loop at the moving end; None without residuals.
+
+    They have the measured level, where the file has it, and the residuals before and after. An
+    interval of 90 % is that of the residuals of all links of the same sight.
 
     A note is added to the run where links are left out.
     """
@@ -113,15 +120,33 @@ def link_layer(run: Run) -> dict | None:
         links = links.iloc[::step]
     end = moving_end(links)
     moving_m = links[[f"{end}_{axis}_m" for axis in "xyz"]].to_numpy(dtype=float)
-    names = sorted(links["device"].unique())
-    before_db, after_db = (links[f"{when}_db"].to_numpy(dtype=float)
-                           for when in ("before", "after"))
-    return {**{axis: pack_m(np.nan_to_num(moving_m[:, i])) for i, axis in enumerate("xyz")},
-            "devices": names,
-            "device": pack(pd.Index(names).get_indexer(links["device"]).astype(np.int32)),
-            "los": pack(links["los"].to_numpy().astype(np.uint8)),
-            "range_db": residual_range_db(before_db), "before": pack_db(before_db),
-            "after": pack_db(after_db)}
+    ends = {name: sorted(links[name].unique()) for name in ("device", "flight")}
+    residuals_db = {when: links[f"{when}_db"].to_numpy(dtype=float) for when in ("before", "after")}
+    high_db, los = residual_range_db(residuals_db["before"]), links["los"].to_numpy() == 1
+    fields = [{"label": f"held-out residual: {when}", "title": RESIDUAL_LABEL, "kind": "link",
+               "low": -high_db, "high": high_db, "values": pack_db(each_db),
+               "interval_db": [_interval_db(each_db[los == sight]) for sight in (False, True)]}
+              for when, each_db in residuals_db.items()]
+    layer = {**{axis: pack_m(np.nan_to_num(moving_m[:, i])) for i, axis in enumerate("xyz")},
+             **{f"{name}s": names for name, names in ends.items()},
+             **{name: pack(pd.Index(names).get_indexer(links[name]).astype(np.int32))
+                for name, names in ends.items()},
+             "los": pack(los.astype(np.uint8)), "fields": fields}
+    if "time_s" in links:
+        since_s = links["time_s"] - links.groupby("flight")["time_s"].transform("min")
+        layer["time"] = pack_m(since_s.fillna(0.0))
+    if "measured_db" in links:
+        unit = "dBm" if run.twin and run.twin.level == "rssi_dbm" else "dB"
+        fields.append(_field("held-out links: measured level", f"measured level [{unit}]",
+                             links["measured_db"].to_numpy(dtype=float), "gain"))
+        layer["unit"] = unit
+    return layer
+
+
+def _interval_db(residual_db: np.ndarray) -> list[float]:
+    """Return the ends between which 90 % of residuals are [dB]."""
+    known_db = residual_db[np.isfinite(residual_db)]
+    return np.quantile(known_db, [0.05, 0.95]).tolist() if len(known_db) else [0.0, 0.0]
 
 
 def device_layer(run: Run) -> list[dict]:
@@ -145,6 +170,19 @@ def device_layer(run: Run) -> list[dict]:
                       "radius_m": radius_m if np.isfinite(radius_m) else None,
                       "second": list(device.second_mode) if device.second_mode else None}
     return list(devices.values())
+
+
+def found_layer(run: Run) -> list[dict]:
+    """Return name, place, outline and height [m] of what a close-loop found beside the devices."""
+    found = []
+    for effect in causes(run.closeloop or {"effects": []}):
+        height_m = (effect["parameters"].get("height_m") or {}).get("value") or 0.0
+        for place in effect.get("places", []):
+            if not place.get("device"):
+                found.append({"text": name_label(effect["name"]), "x": place["x_m"],
+                              "y": place["y_m"], "outline": place.get("outline_m"),
+                              "height": height_m})
+    return found
 
 
 def flight_layer(run: Run) -> list[dict]:
@@ -317,6 +355,7 @@ def write_report(run: Run, path: Path | str) -> None:
         comparison = comparison_context(run.comparison, run.comparison_folder)
     write_page("run.html", path, {
         "title": title, "page_title": f"radiotwin: {title}", "viewer": viewer, "notes": run.notes,
+        "lead": list(filter(None, [comparison and comparison["lead"], _found_devices(run)])),
         "closeloop": _closeloop(run), "comparison": comparison, "planning": _planning(run),
         "estimates": _estimates(run), "facts": _facts(run)},
         SCRIPTS if viewer else ())
@@ -340,7 +379,7 @@ def _viewer_data(run: Run) -> dict[str, Any]:
         run.notes.append(f"Of {len(devices):,} devices the first {MAX_DEVICES:,} are drawn.")
     return {"scales": scales, "bounds": bounds_m(run), "top_m": max(heights_m, default=1.0),
             "city": city, "maps": maps, "links": link_layer(run), "devices": devices[:MAX_DEVICES],
-            "flights": flight_layer(run)}
+            "flights": flight_layer(run), "found": found_layer(run)}
 
 
 def _closeloop(run: Run) -> dict[str, Any] | None:
@@ -361,27 +400,50 @@ def _planning(run: Run) -> dict[str, Any] | None:
                 read_picture(run.folder, "trajectories.png", "Trajectories of one flight")]}
 
 
+def _located(run: Run) -> list[dict]:
+    """Return the unknown devices that have an estimated position."""
+    return [device for device in device_layer(run)
+            if device["role"] != "anchor" and device["estimate"]]
+
+
+def _origin(run: Run) -> Origin | None:
+    return run.scene.config.origin if run.scene else run.twin and run.twin.origin
+
+
+def _found_devices(run: Run) -> str:
+    """Say where the unknown devices were found; empty where none was."""
+    found = [device for device in _located(run) if _is_found(device)]
+    words = [f"{device['name']} at {place_words(*device['estimate'][:2], _origin(run))}, within "
+             f"{device['radius_m']:.0f} m" for device in found[:MAX_NAMED]]
+    more = f"; {len(found) - MAX_NAMED:,} more are in the table" if len(found) > MAX_NAMED else ""
+    return f"Located, with 90 % probability: {'; '.join(words)}{more}." if words else ""
+
+
 def _estimates(run: Run) -> Table | None:
     """Return the table of the unknown devices with a position; None where there are none."""
-    rows = []
-    for device in device_layer(run):
-        estimate, true = device["estimate"], device["true"]
-        if device["role"] == "anchor" or not estimate:
-            continue
-        error_m = np.hypot(estimate[0] - true[0], estimate[1] - true[1]) if true else np.nan
+    rows, origin = [], _origin(run)
+    for device in _located(run):
+        (x_m, y_m, _), true = device["estimate"], device["true"]
+        error_m = np.hypot(x_m - true[0], y_m - true[1]) if true else np.nan
         radius_m = np.nan if device["radius_m"] is None else device["radius_m"]
-        rows.append([device["name"], _how_sure(device), float(estimate[0]), float(estimate[1]),
+        rows.append([device["name"], _how_sure(device),
+                     place_words(x_m, y_m, origin) if origin else "–", float(x_m), float(y_m),
                      float(error_m), radius_m])
-    columns = ("device", "position", "x [m]", "y [m]", "error [m]", "90 % radius [m]")
-    return Table(columns, rows, text_columns=2) if rows else None
+    columns = ("device", "position", "latitude, longitude", "x [m]", "y [m]", "error [m]",
+               "90 % radius [m]")
+    return Table(columns, rows, text_columns=3) if rows else None
+
+
+def _is_found(device: dict) -> bool:
+    radius_m = device["radius_m"]
+    return device["located"] and radius_m is not None and radius_m <= ROUGH_M
 
 
 def _how_sure(device: dict) -> str:
     """Say in words how far the data determine a device's position."""
     if not device["located"] or device["radius_m"] is None:
         return "not determined by these data"
-    rough = device["radius_m"] > ROUGH_M
-    text = "a region, no place" if rough else "found"
+    text = "found" if _is_found(device) else "a region, no place"
     if device["second"]:
         x_m, y_m, weight = device["second"]
         text += f"; or near ({x_m:.0f}, {y_m:.0f}) m with {100 * weight:.0f} %"

@@ -61,7 +61,7 @@ def trace_trial_link(device: str) -> float:
     """Return the gain of a link of 100 m in free space at 2.4 GHz [dB], on `cpu` or `cuda`.
 
     Raises:
-        TrialFailed: It cannot be traced, or a ray went through a wall.
+        TrialFailed: it cannot be traced, a ray went through a wall, or the gain is not Friis'.
     """
     command = [sys.executable, "-P", "-c", _PROGRAM, device]
     try:
@@ -72,7 +72,11 @@ def trace_trial_link(device: str) -> float:
     if done.returncode != 0:
         lines = done.stderr.strip().splitlines()
         raise TrialFailed(lines[-1] if lines else f"exit status {done.returncode}")
-    return float(done.stdout.split()[-1])
+    gain_db = float(done.stdout.split()[-1])
+    if not abs(gain_db - FREE_SPACE_GAIN_DB) <= TOLERANCE_DB:  # NaN, too
+        raise TrialFailed(f"the link has {gain_db:.2f} dB, free space has "
+                          f"{FREE_SPACE_GAIN_DB:.2f} dB")
+    return gain_db
 
 
 @dataclass(frozen=True)
@@ -118,12 +122,9 @@ def tracing_refusal() -> str | None:
     if not has_driver():
         return NO_DRIVER
     try:
-        gain_db = trace_trial_link("cuda")
+        trace_trial_link("cuda")
     except TrialFailed as reason:
         return f"Mitsuba's CUDA variant fails ({reason})"
-    if not abs(gain_db - FREE_SPACE_GAIN_DB) <= TOLERANCE_DB:  # NaN, too
-        return (f"Mitsuba's CUDA variant gives {gain_db:.2f} dB where free space has "
-                f"{FREE_SPACE_GAIN_DB:.2f} dB")
     return None
 
 

@@ -2,8 +2,8 @@
 
 Dr.Jit loads the first libLLVM that it finds when it is imported, and never another one. A version
 below 15 leaves it without a CPU backend ("could not be found", though it was); 15 and 16 load, and
-abort the process at the first kernel that they cannot compile. Therefore each candidate is tried in
-a process of its own.
+abort the process at the first kernel that they cannot compile. So the newest library from
+`MIN_VERSION` on that loads is named to it. A library is loaded in a process of its own.
 
 `python -m radiotwin.runtime.llvm` prints the library that would be used, or the reason why there is
 none, with exit status 1.
@@ -15,18 +15,15 @@ import re
 import shutil
 import subprocess
 import sys
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from radiotwin.errors import RunFailed
-from radiotwin.io.content_hash import content_hash
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MIN_VERSION = 17  # of Dr.Jit 1.5
-PROBE_TIMEOUT_S = 120
+TIMEOUT_S = 120
 
 # libLLVM-14.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1, libLLVM.19.dylib, libLLVM.dylib and
 # LLVM-C.dll; not the parts of LLVM (libLLVMCore.so), not rustc's own (libLLVM-17-rust-1.77.0.so).
@@ -43,28 +40,16 @@ parts = [ctypes.c_uint() for _ in range(3)]
 ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*map(ctypes.byref, parts))
 print(*(part.value for part in parts))
 """
-# LLVM 15 cannot compile `minimum`. A new HOME keeps Dr.Jit from using a cached kernel.
-_PROBE = """
-import ctypes, os, sys, tempfile
-ctypes.CDLL(sys.argv[1])
-with tempfile.TemporaryDirectory() as home:
-    os.environ.update(DRJIT_LIBLLVM_PATH=sys.argv[1], HOME=home)
-    import drjit
-    from drjit.llvm import Float, UInt32
-    x = drjit.arange(Float, 1000)
-    drjit.make_opaque(x)
-    y = drjit.fma(drjit.minimum(drjit.sqrt(x), drjit.abs(x - 3)), x, 2)
-    kept = drjit.gather(Float, y, drjit.compress(y > 4))
-    total = drjit.zeros(Float, 10)
-    drjit.scatter_add(total, x, UInt32(x) % 10)
-    if len(kept) != 996 or float(total[9]) != 50400:
-        sys.exit(f"a kernel gave wrong values: {len(kept)} for 996, {float(total[9])} for 50400")
-"""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A libLLVM on this machine; its version is None where neither its name nor itself gives it."""
+    """A libLLVM on this machine.
+
+    Attributes:
+        path: of the file.
+        version: by its name, else as it reports it; None if neither gives one.
+    """
 
     path: Path
     version: tuple[int, ...] | None
@@ -80,18 +65,18 @@ def _version_in_name(name: str) -> tuple[int, ...] | None:
     return tuple(map(int, digits.split("."))) if digits else None
 
 
-def _run_python(program: str, path: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-P", "-c", program, str(path)], check=False,
-                          capture_output=True, text=True, timeout=PROBE_TIMEOUT_S)
-
-
-def _version_in_library(path: Path) -> tuple[int, ...] | None:
-    """Return the version that the library reports; None if it cannot be loaded or is below 16."""
+@cache
+def reported_version(path: Path) -> tuple[int, ...] | str:
+    """Return the version that a library reports, or why it does not; below 16 it cannot."""
     try:
-        answer = _run_python(_ASK_VERSION, path)
+        answer = subprocess.run([sys.executable, "-P", "-c", _ASK_VERSION, str(path)], check=False,
+                                capture_output=True, text=True, timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        return None
-    return tuple(map(int, answer.stdout.split())) if answer.returncode == 0 else None
+        return f"it did not load within {TIMEOUT_S} s"
+    if answer.returncode == 0:
+        return tuple(map(int, answer.stdout.split()))
+    lines = answer.stderr.strip().splitlines()
+    return lines[-1].removeprefix("OSError: ") if lines else f"exit status {answer.returncode}"
 
 
 def search_folders() -> list[Path]:
@@ -132,55 +117,22 @@ def find() -> list[Candidate]:
     if os.environ.get(VARIABLE):
         named = Path(os.environ[VARIABLE])
         paths[named.resolve() if named.is_file() else named] = None
-    candidates = [Candidate(path, _version_in_name(path.name) or _version_in_library(path))
-                  for path in paths]
+    candidates = []
+    for path in paths:
+        version = _version_in_name(path.name) or reported_version(path)
+        candidates.append(Candidate(path, None if isinstance(version, str) else version))
     return sorted(candidates, key=lambda candidate: candidate.version or (0,), reverse=True)
 
 
-def probe(path: Path) -> str | None:
-    """Compile and run a kernel in a process of its own; return why it fails, None if it works."""
-    try:
-        done = _run_python(_PROBE, path)
-    except subprocess.TimeoutExpired:
-        return f"a kernel did not end within {PROBE_TIMEOUT_S} s"
-    if done.returncode == 0:
-        return None
-    if done.returncode < 0:
-        return f"a kernel killed the process (signal {-done.returncode})"
-    lines = done.stderr.strip().splitlines()
-    complaint = lines[-1] if lines else f"a kernel ended with exit status {done.returncode}"
-    return complaint.removeprefix("OSError: ")
-
-
-def _passed(path: Path) -> Path:
-    """Return the file that exists once a library has passed, with this Dr.Jit and Python."""
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    status = path.stat()
-    key = content_hash((str(path), status.st_mtime_ns, status.st_size, version("drjit"),
-                        sys.executable))
-    return caches / "radiotwin" / f"llvm-{key}"
-
-
-@cache
 def rejection(candidate: Candidate) -> str | None:
-    """Return the reason why a library cannot be used, or None if it can.
-
-    Successful probes are remembered between runs, failures are not.
-    """
-    if candidate.version and candidate.version[0] < MIN_VERSION:
-        return f"too old: Dr.Jit needs version {MIN_VERSION} or newer"
-    try:
-        passed = _passed(candidate.path)
-    except (OSError, RuntimeError, PackageNotFoundError):  # no such file, home, or Dr.Jit
-        return probe(candidate.path)
-    if passed.exists():
-        return None
-    reason = probe(candidate.path)
-    if reason is None:
-        with suppress(OSError):  # without a writable cache the next run probes again
-            passed.parent.mkdir(parents=True, exist_ok=True)
-            passed.touch()
-    return reason
+    """Return the reason why a library cannot be used, or None if it can."""
+    too_old = f"too old: Dr.Jit needs version {MIN_VERSION} or newer"
+    if candidate.version is not None and candidate.version[0] < MIN_VERSION:
+        return too_old
+    reported = reported_version(candidate.path)
+    if isinstance(reported, str):
+        return reported
+    return too_old if reported[0] < MIN_VERSION else None
 
 
 def _eligible() -> list[Candidate]:

@@ -31,6 +31,7 @@ from radiotwin.scene.config import (
     LatticeConfig,
     RadioConfig,
     SceneConfig,
+    TerrainConfig,
     parse_config,
     write_config,
 )
@@ -58,7 +59,6 @@ from radiotwin.scene.placement import (
 )
 from radiotwin.scene.plot import draw_preview
 from radiotwin.scene.scene import Scene
-from radiotwin.scene.terrain import TerrainConfig
 from radiotwin.scene.vegetation import VegetationConfig
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "fixed": "green"}

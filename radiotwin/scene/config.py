@@ -24,7 +24,6 @@ from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import MAX_COORDINATE_M, Metres, Number, Origin, Table
 from radiotwin.io.inputs import read_toml
 from radiotwin.scene.lattice import check_lattice, positions
-from radiotwin.scene.terrain import TerrainConfig
 from radiotwin.scene.vegetation import VegetationConfig
 
 ANTENNA_HEIGHT_M = 1.5  # of a device above the ground [m]: a person, a meter, a low pole
@@ -33,6 +32,7 @@ _MAX_MESSAGES = 10
 Name = Annotated[str, Field(min_length=1, max_length=64,
                             pattern=r"^[A-Za-z0-9_+-][A-Za-z0-9_.+-]*$")]
 Altitude = Annotated[Number, Field(gt=0, le=MAX_COORDINATE_M)]
+Vertical = Literal["geoid", "ellipsoid", "unknown"]
 
 
 def _below(name: str) -> str:
@@ -167,6 +167,24 @@ class MissionConfig(Table):
                                                                      "declares none")
     rate_scale: Number = Field(100.0, gt=0, le=1e15, description="data units per slot and bit/s/Hz")
     slot_s: Number = Field(2.0, gt=0, le=86_400, description="duration of one move or hover")
+
+
+class TerrainConfig(Table):
+    """The ground of a scene, declared in `scene.toml`; without it the ground is flat, at z = 0.
+
+    Attributes:
+        shape: name of the ground's shape in `city.xml`.
+        source: file that the heights are from.
+        datum_m: height of z = 0 above the zero of `reference` [m].
+        reference: vertical reference of the file's heights.
+        kind: of that reference.
+    """
+
+    shape: str = Field(min_length=1, max_length=200)
+    source: str = Field("", max_length=300)
+    datum_m: Number = Field(0.0, ge=-12_000, le=100_000)
+    reference: str = Field("not declared", max_length=200)
+    kind: Vertical = "unknown"
 
 
 class SceneConfig(Table):

@@ -1,8 +1,7 @@
 """Extent, altitudes, devices and UAVs for a city that declares none."""
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import cycle, product
+from itertools import cycle
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
@@ -186,48 +185,23 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
     free = np.column_stack([grid.x_m[columns], grid.y_m[rows]])
     weight = grid.density()[rows, columns] + 0.01
     apart_m = 0.7 * np.sqrt(grid.built.size / count) * grid.cell_m
-    chosen: list[np.ndarray] = []
-    while len(chosen) < count:
+    chosen, placed = np.empty((count, 2)), 0
+    while placed < count:
         drawn = rng.choice(len(free), min(len(free), 1000), replace=False, p=weight / weight.sum())
-        squares = _Squares(apart_m, chosen)
-        for index in drawn:
-            if all(np.hypot(*(free[index] - other)) >= apart_m
-                   for other in squares.around(free[index])):
-                chosen.append(free[index])
-                squares.add(free[index])
-                if len(chosen) == count:
+        for point in free[drawn]:
+            if (np.hypot(*(point - chosen[:placed]).T) >= apart_m).all():
+                chosen[placed] = point
+                placed += 1
+                if placed == count:
                     break
         apart_m *= 0.8
-    positions = np.round(np.array(chosen), 1).reshape(-1, 2)
+    positions = np.round(chosen, 1)
     bottom_m = np.zeros(count) if ground is None else _height_m(ground, *positions.T)
     anchors = _spread_out(positions, min(count, max(3, round(0.3 * count))))
     return [DeviceConfig(device=f"device{number + 1:02d}", x_m=float(x), y_m=float(y),
                          z_m=round(float(bottom) + ANTENNA_HEIGHT_M, 2),
                          role="anchor" if number in anchors else "unknown")
             for number, ((x, y), bottom) in enumerate(zip(positions, bottom_m))]
-
-
-class _Squares:
-    """Points by the square of the plane they lie in, so that a new one is compared with few."""
-
-    def __init__(self, side_m: float, points: Iterable[np.ndarray]) -> None:
-        self._side_m = side_m
-        self._points: dict[tuple[int, int], list[np.ndarray]] = {}
-        for point in points:
-            self.add(point)
-
-    def _square(self, point: np.ndarray) -> tuple[int, int]:
-        column, row = np.floor(point / self._side_m)
-        return int(column), int(row)
-
-    def add(self, point: np.ndarray) -> None:
-        self._points.setdefault(self._square(point), []).append(point)
-
-    def around(self, point: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield all points that are nearer than a side, and some that are not."""
-        column, row = self._square(point)
-        for x, y in product((column - 1, column, column + 1), (row - 1, row, row + 1)):
-            yield from self._points.get((x, y), ())
 
 
 def _spread_out(positions: np.ndarray, count: int) -> set[int]:

@@ -12,16 +12,20 @@ import numpy as np
 
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.runtime.console import progress
-from radiotwin.runtime.execution import Executor, Job
-from radiotwin.runtime.execution.job import peak_bytes
-from radiotwin.runtime.execution.local import LocalPool
+from radiotwin.runtime.execution import Executor, Job, LocalPool
+from radiotwin.runtime.jobs import peak_bytes
 from radiotwin.runtime.pieces import kept
 from radiotwin.scene import Scene
-from radiotwin.trace.link_job import LinkBatch, exchanged_calls, lattice_pieces, link_job
+from radiotwin.trace.link_job import (
+    LinkBatch,
+    exchanged_calls,
+    lattice_pieces,
+    link_job,
+    with_radius,
+)
 from radiotwin.trace.run import device_indices, noise_figures, open_store
 from radiotwin.trace.settings import FINER, QUALITIES, SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, PathGains
-from radiotwin.trace.tiles import with_radius
 
 CALIBRATED = 6  # batches; the first one compiles kernels
 NOISE_SHARE = 0.1  # of the time: 1 % of the links again with ten times the rays

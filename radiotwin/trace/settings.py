@@ -60,8 +60,8 @@ class SolverSettings:
         combining: `power` adds the powers of paths (the mean over fading), `coherent` their fields.
         seed: Seed of the interactions that rays take.
         radius_m: Culling radius [m]: what lies farther from the lines of a batch's links is left
-            out (`paths` only, see `radiotwin.trace.tiles`); infinite: nothing is. None: nothing of
-            a city of up to 5,000 shapes, else 400 m.
+            out (`paths` only, see `radiotwin.trace.link_job`); infinite: nothing is. None: nothing
+            of a city of up to 5,000 shapes, else 400 m.
         compute_device: `cpu`, or `cuda`: a GPU, whose gains differ from the processor's.
     """
 

@@ -209,7 +209,7 @@ WRONG = {
     "one link detected": (put("gain_db", "", slice(1, None)), ["all levels are", "gain_db"]),
     "too few links": (lambda links, devices: (links[:30], devices), ["30 links can be used", "at least 60 are needed"]),
     "too few links of each receiver": (lambda links, devices: (links.assign(receiver=np.arange(len(links))), devices),
-                                       ["at least 60", "0, 1, 10, 100, 101 and 379 more have 1 at most; 5 are needed"]),
+                                       ["at least 60", "0, 1, 10, 100, 101, … (384 in all) have 1 at most; 5 are needed"]),
     "no number for a position": (put("receiver_x_m", "nan", [5]), ["row 7, column receiver_x_m", "'nan' is not a",
                                                                    "fill it in, or leave the row out"]),
     "no position": (put("receiver_y_m", "", [5]), ["row 7, column receiver_y_m", "is empty", "fill it in"]),

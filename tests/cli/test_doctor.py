@@ -84,7 +84,7 @@ def test_little_memory_and_disk_is_said_but_stops_nothing(untraced, monkeypatch)
     [
         ("import os; os.abort()", "tracing fails (exit status -6)"),
         ("raise ImportError('no sionna here')", "tracing fails (ImportError: no sionna here)"),
-        ("print(-70.0)", "tracing gives -70.00 dB, free space has -80.05 dB"),
+        ("print(-70.0)", "tracing fails (the link has -70.00 dB, free space has -80.05 dB)"),
     ],
 )
 def test_tracing_that_does_not_work(monkeypatch, program, said):

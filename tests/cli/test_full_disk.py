@@ -183,7 +183,7 @@ def traced_gains(scene, device_m, points_m, *_):
 
 
 def test_gains(run, disk, inputs, monkeypatch):
-    monkeypatch.setattr("radiotwin.trace.points.trace_gains", traced_gains)
+    monkeypatch.setattr("radiotwin.trace.run.trace_gains", traced_gains)
     for name in ("old.csv", "old.csv.gz"):
         fill(disk, 0, name)
         before = content(disk)

@@ -59,7 +59,7 @@ def test_a_name_that_is_not_ascii(run, folder):
 
 
 def test_a_map_of_another_scene_is_warned_of_and_one_of_another_place_is_refused(run, folder):
-    radio_map = RadioMap.read(folder / "map.nc")
+    radio_map = RadioMap.load(folder / "map.nc")
     for hash_, latitude_deg, status, arguments in (
             (Scene.load(folder / "scene").content_hash(), 47.5, 0, ""),
             ("another", 47.5, 0, "was made for another scene than scene"),

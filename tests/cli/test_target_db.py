@@ -38,7 +38,7 @@ def test_gains(run, folder, asked, monkeypatch):
         used.append(settings)
         return np.full((len(device_m), len(points_m)), -80.0)
 
-    monkeypatch.setattr("radiotwin.trace.points.trace_gains", traced)
+    monkeypatch.setattr("radiotwin.trace.run.trace_gains", traced)
     done = run("gains scene --points points.csv --devices d0,d1 --sum coherent --seed 3 --target-db 1 -o g.csv", folder)
     assert done.returncode == 0, done.stderr
     [(*what, others)] = asked
@@ -55,7 +55,7 @@ def test_trace(run, folder, asked, monkeypatch):
     monkeypatch.setattr("radiotwin.trace.run.check_gains", lambda *_: {"links": 1})
     done = run("trace scene --devices d0 --target-db 1 -o map.nc", folder)
     assert done.returncode == 0, done.stderr
-    assert RadioMap.read(folder / "map.nc").dataset.attrs["samples_per_src"] == 100_000
+    assert RadioMap.load(folder / "map.nc").dataset.attrs["samples_per_src"] == 100_000
     assert asked[0][1:3] == (1.0, ["d0"])
     assert asked[0][3].items() >= {"solver": "paths", "combining": "power", "seed": 1}.items()
 

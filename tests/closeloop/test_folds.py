@@ -44,7 +44,7 @@ def test_few_links_tell_whether_paths_are_worth_following():
     """RBM as Sionna RT traced it, and levels of a law with two classes of links there, in which no path is."""
     scene = Scene.load(RBM)
     gains_db = []
-    for truth in (RadioMap.read(RBM / "truth.nc"), segmented_truth(scene)):
+    for truth in (RadioMap.load(RBM / "truth.nc"), segmented_truth(scene)):
         links = prepare_links(fly_survey(scene, truth, flights=1, seed=2), scene)
         gains_db.append(paths_gain_db(links, scene, make_folds(links, 0), 0))
     assert gains_db[0] > 1.0 > MIN_GAIN_DB > gains_db[1]

@@ -16,8 +16,14 @@ from PIL import Image
 from pyproj import CRS, Transformer
 
 from radiotwin.coverage import CoverageSettings, predict_coverage
-from radiotwin.coverage.legends import drawn_rasters, legend_of
-from radiotwin.coverage.output import FILES, available_formats, write_formats, write_tables
+from radiotwin.coverage.output import (
+    FILES,
+    available_formats,
+    drawn_rasters,
+    legend_of,
+    write_formats,
+    write_tables,
+)
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_geographic
 from radiotwin.report import write_coverage_pictures

@@ -346,7 +346,7 @@ def run_command(module: str) -> None:
     if module == "radiotwin":
         from radiotwin.cli import main
 
-        with mock.patch("radiotwin.trace.points.trace_gains", _gains_of_nothing):
+        with mock.patch("radiotwin.trace.run.trace_gains", _gains_of_nothing):
             main()
     else:
         runpy.run_module(module, run_name="__main__")

@@ -10,8 +10,8 @@ import pytest
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import TrackFile
 from radiotwin.importing.tracks.autopilots import read_dataflash, read_tlog
-from radiotwin.importing.tracks.maps import read_kml
 from radiotwin.importing.tracks.tables import read_track_table
+from radiotwin.importing.tracks.texts import read_kml
 
 START = pd.Timestamp("2024-05-01 10:00:00Z").timestamp()
 LOG = "t,id,rssi\n" + "".join(f"{START + i},b,{-80 - i}\n" for i in range(4))

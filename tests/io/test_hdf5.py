@@ -145,7 +145,7 @@ def test_what_no_radio_map_has_is_refused_before_memory_is_taken(path, tmp_path,
     tracemalloc.start()
     try:
         with pytest.raises(BadInput, match=HOSTILE[change]):
-            RadioMap.read(path)
+            RadioMap.load(path)
         assert tracemalloc.get_traced_memory()[1] < 100e6
     finally:
         tracemalloc.stop()
@@ -158,15 +158,15 @@ def test_a_piece_that_swells_is_refused(path, monkeypatch):
         gain = file.create_dataset("gain_db", (1, 1, 100, 100), "f4", chunks=(1, 1, 100, 100), compression="gzip")
         gain.id.write_direct_chunk((0, 0, 0, 0), zlib.compress(bytes(2**22), 9))
     with pytest.raises(BadInput, match="a piece of more than 40,000 bytes when decompressed"):
-        RadioMap.read(path)
+        RadioMap.load(path)
 
 
 def test_a_pipe_is_no_radio_map(tmp_path):
     os.mkfifo(tmp_path / "map.nc")
     with pytest.raises(BadInput, match="a pipe or a device"):
-        RadioMap.read(tmp_path / "map.nc")
+        RadioMap.load(tmp_path / "map.nc")
     with pytest.raises(BadInput, match="is a folder"):
-        RadioMap.read(tmp_path)
+        RadioMap.load(tmp_path)
 
 
 def test_a_file_that_was_cut_or_changed_is_never_more_than_a_message(path, tmp_path):
@@ -177,19 +177,19 @@ def test_a_file_that_was_cut_or_changed_is_never_more_than_a_message(path, tmp_p
             changed[at] = rng.integers(256)
         (tmp_path / "changed.nc").write_bytes(changed)
         try:
-            RadioMap.read(tmp_path / "changed.nc")
+            RadioMap.load(tmp_path / "changed.nc")
         except BadInput as error:
             assert "changed.nc" in str(error) or "axis" in str(error)
 
 
 def test_netcdf_of_other_writers_is_read(path, tmp_path):
     """With shuffle and fletcher32, a boolean `los`, other variables, and packed gains."""
-    dataset = RadioMap.read(path).dataset
+    dataset = RadioMap.load(path).dataset
     dataset["more"] = ("t", np.arange(3.0))
     dataset.to_netcdf(tmp_path / "other.nc", engine="h5netcdf", encoding={
         "gain_db": {"dtype": "int16", "scale_factor": 0.5, "_FillValue": -9999, "zlib": True, "shuffle": True,
                     "fletcher32": True}})
-    again = RadioMap.read(tmp_path / "other.nc")
+    again = RadioMap.load(tmp_path / "other.nc")
     np.testing.assert_array_equal(again.gain_db, dataset["gain_db"].values)
     assert set(again.dataset.data_vars) == {"gain_db", "los"} and again.los.dtype == bool
     assert isinstance(again.dataset, xr.Dataset)

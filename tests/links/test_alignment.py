@@ -9,7 +9,7 @@ import pytest
 from radiotwin.errors import BadInput
 from radiotwin.geo import between_frames
 from radiotwin.io.forms import Origin
-from radiotwin.links.alignment import best_shift, in_scene_frame
+from radiotwin.links.alignment import in_scene_frame, search_shift
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 
@@ -51,13 +51,13 @@ def placed(scene, origin):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("wrong_m", [(60.0, -40.0), (-130.0, 20.0), (8.0, 210.0)])
 def test_the_translation_is_found(rbm, seed, wrong_m):
-    shift_m = best_shift(rbm, walked(rbm, seed) + [*wrong_m, 0.0])
+    shift_m = search_shift(rbm, walked(rbm, seed) + [*wrong_m, 0.0]).proposed
     assert shift_m is not None
     assert np.hypot(shift_m[0] + wrong_m[0], shift_m[1] + wrong_m[1]) <= 4.0  # two cells
 
 
 def test_none_is_proposed_above_the_roofs(rbm):
-    assert best_shift(rbm, walked(rbm, 0) + [100.0, 0.0, 500.0]) is None
+    assert search_shift(rbm, walked(rbm, 0) + [100.0, 0.0, 500.0]).proposed is None
 
 
 def test_unknown_frames_that_fit_are_taken_for_one(rbm):

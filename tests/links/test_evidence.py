@@ -11,8 +11,8 @@ from radiotwin.links import (
     residual_variables,
     with_evidence,
 )
+from radiotwin.links.evidence import thin_piles
 from radiotwin.links.links import clocks_restart
-from radiotwin.links.thinning import thin_piles
 from tests.worlds import synthetic_links
 
 

@@ -6,14 +6,14 @@ import pytest
 
 from radiotwin.closeloop.output.result_file import make_report
 from radiotwin.closeloop.run import close_loop
-from radiotwin.links import prepare_links, thinning
-from radiotwin.links.thinning import thin_links
+from radiotwin.links import evidence, prepare_links
+from radiotwin.links.evidence import thin_links
 
 
 @pytest.fixture
 def small_sample(monkeypatch):
-    monkeypatch.setattr(thinning, "MAX_LINKS", 1000)
-    monkeypatch.setattr(thinning, "SAMPLE_LINKS", 500)
+    monkeypatch.setattr(evidence, "MAX_LINKS", 1000)
+    monkeypatch.setattr(evidence, "SAMPLE_LINKS", 500)
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def shares(index, rows=slice(None)):
 
 def test_few_links_are_all_used(links):
     assert thin_links(links, 0) is links
-    assert thinning.MAX_LINKS > 106_455  # no data set that results were recorded of is thinned
+    assert evidence.MAX_LINKS > 106_455  # no data set that results were recorded of is thinned
 
 
 def test_every_flight_device_receiver_and_time_keeps_its_share(links, small_sample):

@@ -21,7 +21,7 @@ def example() -> RadioMap:
 
 def test_a_map_comes_back_from_its_file_as_it_was(tmp_path):
     example().write(tmp_path / "map.nc")
-    again = RadioMap.read(tmp_path / "map.nc")
+    again = RadioMap.load(tmp_path / "map.nc")
     xr.testing.assert_identical(again.dataset, example().dataset)
     assert again.devices == ["a", "b"]
     assert again.los.dtype == bool and again.gain_db.dtype == np.float32
@@ -49,15 +49,15 @@ def test_units_are_in_the_file(tmp_path):
 
 def test_what_is_not_a_radio_map_is_bad_input(tmp_path):
     with pytest.raises(BadInput, match="does not exist"):
-        RadioMap.read(tmp_path / "no.nc")
+        RadioMap.load(tmp_path / "no.nc")
     example().write(tmp_path / "map.nc")
     data = (tmp_path / "map.nc").read_bytes()
     (tmp_path / "half.nc").write_bytes(data[: len(data) // 2])
     with pytest.raises(BadInput, match="not a readable NetCDF-4 file"):
-        RadioMap.read(tmp_path / "half.nc")
+        RadioMap.load(tmp_path / "half.nc")
     xr.Dataset({"t": ("x", [1.0])}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
     with pytest.raises(BadInput, match="not a radio map"):
-        RadioMap.read(tmp_path / "other.nc")
+        RadioMap.load(tmp_path / "other.nc")
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -93,13 +93,13 @@ def test_a_part_that_is_not_as_it_must_be_is_named(tmp_path, change, message):
         dataset[name].encoding = {}
     dataset.to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
     with pytest.raises(BadInput, match=f"map.nc is not a radio map: .*{message}"):
-        RadioMap.read(tmp_path / "map.nc")
+        RadioMap.load(tmp_path / "map.nc")
 
 
 def test_one_position_is_a_map_too(tmp_path):
     one = Lattice.over(0, 10, 0, 10, 20, [50])
     RadioMap.build(["a"], one, np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1))).write(tmp_path / "map.nc")
-    assert RadioMap.read(tmp_path / "map.nc").lattice.shape == (1, 1, 1)
+    assert RadioMap.load(tmp_path / "map.nc").lattice.shape == (1, 1, 1)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 30, 40), (2, 700, 900), (1, 3, 500_000), (3, 1, 200_001)])
@@ -126,7 +126,7 @@ def test_a_stream_is_the_map_that_it_collects_to(tmp_path):
     write_blocks(stream.header, {"gain_db": np.dtype("f4"), "los": np.dtype(bool), "sigma_db": np.dtype("f4")},
                  stream.blocks(), tmp_path / "stream.nc")
     assert max(np.prod(shape) for shape in asked) <= BLOCK_VALUES
-    again = RadioMap.read(tmp_path / "stream.nc")
+    again = RadioMap.load(tmp_path / "stream.nc")
     xr.testing.assert_identical(again.dataset, RadioMap.collect(stream).dataset)
     assert again.dataset["gain_db"].sel(device="b", x=200, y=100, z=50) == -57
 

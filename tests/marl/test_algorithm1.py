@@ -119,6 +119,8 @@ def test_a_perfect_twin_counts_every_episode_as_real_and_every_flight_that_choos
     rows = execute(small_scene, run_settings(algorithm="qmix", twin="truth")).rows
     # 40 of training a round and 8 after each 20 of them; from the second round on the best so far flies once more.
     assert [row["real_episodes"] for row in rows] == [40 + 16, 80 + 40, 120 + 64]
+    assert [(row["measuring_flights"], row["training_flights"], row["selection_flights"]) for row in rows] == [
+        (0, 40, 16), (0, 80, 40), (0, 120, 64)]
     assert [row["evaluation_flights"] for row in rows] == [8, 16, 24]
     assert all(np.isnan(row["twin_ratio"]) for row in rows)
 

@@ -44,10 +44,10 @@ def test_a_damaged_checkpoint_is_bad_input(tmp_path):
 
 
 @pytest.mark.parametrize("text", [
-    "[]", "{", '{"format": 5}', '{"format": 5, "state": 3}', '{"format": 5, "state": {"$array": "7"}}',
-    '{"format": 5, "state": {"a": {"$number": "many"}}}', '{"format": 5, "state": {"a": {"$array": ["0"]}}}',
-    '{"format": 5, "state": {"a": {"$table": 3}}}', '{"format": 5, "state": {}}',
-    '{"format": 5, "state": {"a": ' + "[" * 5000 + "]" * 5000 + "}}", '{"format": 5, "state": {"a": ' + "9" * 5000 + "}}"])
+    "[]", "{", '{"format": 6}', '{"format": 6, "state": 3}', '{"format": 6, "state": {"$array": "7"}}',
+    '{"format": 6, "state": {"a": {"$number": "many"}}}', '{"format": 6, "state": {"a": {"$array": ["0"]}}}',
+    '{"format": 6, "state": {"a": {"$table": 3}}}', '{"format": 6, "state": {}}',
+    '{"format": 6, "state": {"a": ' + "[" * 5000 + "]" * 5000 + "}}", '{"format": 6, "state": {"a": ' + "9" * 5000 + "}}"])
 def test_a_document_that_makes_no_sense_is_one_message(text, tmp_path):
     (tmp_path / "state").write_bytes(pack_arrays({"0": np.zeros(3)}, "checkpoint", text))
     with pytest.raises(BadInput, match="state"):

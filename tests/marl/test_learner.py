@@ -82,7 +82,11 @@ def test_a_new_learner_runs_like_the_others(small_scene, tmp_path, best_of_many,
     assert [(row["method"], row["trained_in"], row["real_episodes"]) for row in rows[:3]] == [
         ("best-of-many", "log-distance twin", "2"), ("best-of-many", "NN twin", "2"),
         ("best-of-many", "the truth", "60")]
-    assert float(rows[2]["truth_ratio"]) > float(rows[-1]["truth_ratio"])  # than random flights
+    [random, clairvoyant] = rows[-2:]
+    assert random["method"] == "random" and float(rows[2]["truth_ratio"]) > float(random["truth_ratio"])
+    # Of two flights that measured, and of 60 that did not say what they collected.
+    missed = 2 * (float(clairvoyant["truth_ratio"]) - float(rows[0]["real_ratio"]))
+    assert float(rows[0]["regret"]) == pytest.approx(missed, abs=1e-4) and missed > 0 and rows[2]["regret"] == ""
     assert json.loads((tmp_path / "out" / "config.json").read_text())["run"]["algorithm"] == "best-of-many"
     assert "best-of-many" in capsys.readouterr().out
 

@@ -243,7 +243,7 @@ def prepared(tiny, monkeypatch, shares, learner=LEARNER, rounds=1):
 @pytest.mark.parametrize("shares, which", [([0.3, 0.6, 0.5], 1), ([0.6, 0.5, 0.4], 0), ([0.1, 0.2, 0.3], 2)])
 def test_the_policy_that_does_best_in_the_map_flies(tiny, monkeypatch, shares, which):
     learner, looked = prepared(tiny, monkeypatch, shares)
-    assert len(looked) == 3 and learner.selection_flights == 12
+    assert len(looked) == 3 and learner.selection.flights == 12
     assert torch.equal(best(learner), looked[which])
 
 
@@ -256,7 +256,7 @@ def test_an_earlier_best_flies_on_if_it_is_still_best_in_the_new_map(tiny, monke
 
 def test_without_selection_flights_the_last_policy_flies(tiny, monkeypatch):
     learner, looked = prepared(tiny, monkeypatch, [], LEARNER.model_copy(update={"selection_flights": 0}))
-    assert not looked and learner.selection_flights == 0
+    assert not looked and learner.selection.flights == 0
     [mean] = learner._trainers.call("weights")
     agent = torch.cat([torch.from_numpy(mean[f"agent.{name}"]).ravel() for name, _ in
                        learner._best.named_parameters()])

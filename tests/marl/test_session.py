@@ -124,7 +124,9 @@ def test_planners_beside_a_learner_plan_in_its_twin(small_scene, tmp_path, monke
     known = Known.of(twin.devices)
     in_twin = make_mission(small_scene, twin.radio_map(small_scene), known, run.assignment).snr_db
     in_truth = make_mission(small_scene, segmented_truth(small_scene), known, run.assignment).snr_db
-    assert [name for name, _ in planned_in] == ["planner", "heuristic", "random"]
+    assert [name for name, _ in planned_in] == ["planner", "heuristic", "random", "planner"]
+    *planned_in, (_, of_the_clairvoyant) = planned_in
+    np.testing.assert_array_equal(of_the_clairvoyant.snr_db, in_truth)
     for _, mission in planned_in:
         np.testing.assert_allclose(mission.snr_db, in_twin, atol=1e-3)
         assert np.abs(mission.snr_db - in_truth).max() > 1

@@ -68,7 +68,7 @@ def page(content, folder):
 
 
 @pytest.mark.parametrize("verdict, sentence, badge", [
-    ("effect", "The model lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB",
+    ("effect", "Found: gain of r&lt;0&gt; that changes with time. With it the RMSE on held-out links falls from 3.00 to 2.00 dB",
      "found: receiver drift"),
     ("none", "No group of links stands out, and no cause was found (probability 0.70).", "nothing stands out"),
     ("undecided", "Undecided: these measurements do not tell the cause. Likeliest: nothing is missing (0.70) and antenna pattern "
@@ -77,11 +77,11 @@ def page(content, folder):
      "(squares add up). That much at places is not said to be nothing.", "undecided"),
     ("located",
      "Device d3 reads 5.6 dB (5.1 to 6.1) less than the other device (0.99). Its cause is open: power, cable or antenna of the "
-     "device (0.70); vegetation (0.25). The residual is 3.00 dB RMSE and depends on time in flight.",
+     "device (0.70); vegetation (0.25).</p>\n<p>The residual is 3.00 dB RMSE and depends on time in flight.",
      "located: device d3; cause open")])
 def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
     text = page(report(verdict), tmp_path)
-    assert sentence in text and f"<b>{badge}</b>" in text
+    assert sentence in text and f"<dd>{badge}</dd>" in text and text.count("<dt>") <= 4
     assert text.index(sentence) < text.index("<h2>")
     assert not re.search(r'(src|href)="(?!data:)|https?://|<script', text)  # one file, no network
 
@@ -213,16 +213,42 @@ def test_numbers_that_are_not_known_are_dashes(tmp_path):
     assert "None" not in page(unknown, tmp_path) and "nan" not in page(unknown, tmp_path)
 
 
+BUILDING = {"name": "missing_obstacle", "parameters": {
+    f"{name}_m": {"value": value, "low": value - 1, "high": value + 1, "unit": "m"}
+    for name, value in (("x", 59.3), ("y", 1.2), ("length", 33.0), ("width", 37.5), ("height", 37.9))},
+    "places": [{"x_m": 59.3, "y_m": 1.2, "outline_m": [[40, -20], [80, -20], [80, 20], [40, -20]]}]}
+SECTOR = {"name": "antenna_pattern", "variant": "sector antenna of a device", "parameters": {
+    "azimuth_deg[C]": {"value": 480.0, "low": 470.0, "high": 490.0, "unit": "deg"},
+    "beamwidth_deg[C]": {"value": 90.0, "low": 80.0, "high": 100.0, "unit": "deg"}},
+    "places": [{"device": "C", "x_m": -59.3, "y_m": 1.2}]}
+OFFSETS = {"name": "device_gain_offset", "parameters": {
+    f"offset_db[{name}]": {"value": value, "low": value - 1, "high": value + 1, "unit": "dB"}
+    for name, value in (("a", -0.2), ("b", -6.8))}, "places": [{"device": name, "x_m": 0, "y_m": 0} for name in "ab"]}
+
+
+@pytest.mark.parametrize("found, sentence", [
+    (BUILDING, "a building that the map lacks, 33 by 38 m, 38 m high, at 47.05001° N, 8.30078° E."),
+    (SECTOR, "sector antenna of C, 90° wide, towards 120°, at 47.05001° N, 8.29922° E."),
+    (OFFSETS, "power, cable or antenna of b (−6.8 dB), at 47.05000° N, 8.30000° E.")], ids=lambda each: str(each)[10:25])
+def test_an_object_is_named_with_its_size_and_its_place(found, sentence, tmp_path):
+    origin = {"latitude_deg": 47.05, "longitude_deg": 8.3, "altitude_m": 0.0}
+    content = report(effects=[DRIFT | found | {"probability": 0.95}], inputs={"origin": origin})
+    assert f"Found: {sentence} With it" in closeloop_summary(content)
+    assert sentence in page(content, tmp_path)
+    assert ", at x " in closeloop_summary(content | {"inputs": {}})
+
+
 def test_what_is_not_sure_is_said_to_be_probable(tmp_path):
     text = page(report(effects=[DRIFT | {"probability": 0.561}]), tmp_path)
-    assert "The model probably lacked receiver drift (probability 0.56). With it the RMSE" in text
-    assert "<b>probable: receiver drift</b>" in text
+    assert "Probable: gain of r&lt;0&gt; that changes with time (probability 0.56). With it the RMSE" in text
+    assert "<dd>probable: receiver drift</dd>" in text
     both = [DRIFT | {"probability": 0.97}, DRIFT | {"name": "foliage", "rank": 2, "probability": 0.6}]
-    assert "probably lacked receiver drift and foliage (probability 0.60 and more). With them" \
+    assert "Probable: gain of r<0> that changes with time; vegetation (r<0>) (probability 0.60 and more). With them" \
         in closeloop_summary(report(effects=both))
-    assert "The model lacked receiver drift. With it" in closeloop_summary(report(effects=both[:1]))
+    assert "Found: gain of r<0> that changes with time. With it" in closeloop_summary(report(effects=both[:1]))
     twice = [DRIFT | {"rank": rank, "probability": 0.78} for rank in (1, 2)]
-    assert "lacked receiver drift (2 times) (probability 0.78 each). With them" in closeloop_summary(report(effects=twice))
+    assert "changes with time (probability 0.78 each). With them" in closeloop_summary(report(effects=twice))
+    assert "<dd>probable: receiver drift (2 times)</dd>" in page(report(effects=twice), tmp_path)
 
 
 def test_rivals_are_those_of_the_step_at_which_the_cause_was_found(tmp_path):
@@ -242,7 +268,7 @@ def test_a_rival_that_the_data_cannot_tell_from_it_has_no_number_beside_it():
 
 def test_a_step_between_flights_has_no_probability_and_is_called_probable(tmp_path):
     text = closeloop_summary(report(effects=[DRIFT | {"probability": None}]))
-    assert "The model probably lacked receiver drift. With it the RMSE on held-out links falls" in text
+    assert "Probable: gain of r<0> that changes with time. With it the RMSE on held-out links falls" in text
     rising = report(effects=[DRIFT | {"probability": 0.7}])
     rising["error"]["after"] |= {"rmse_db": 3.01}
     assert "goes from 3.00 to 3.01 dB" in closeloop_summary(rising)
@@ -288,7 +314,7 @@ def test_a_last_resort_is_not_called_an_explanation(tmp_path):
     filled = report("effect", effects=[DRIFT | {"probability": 0.95}, shadowing])
     filled["error"]["after"] |= {"rmse_db": 1.5}
     text = closeloop_summary(filled)
-    assert "lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB" in text
+    assert "With it the RMSE on held-out links falls from 3.00 to 2.00 dB" in text
     assert "brings the RMSE to 1.50 dB" in text and "found: receiver drift<" in page(filled, tmp_path)
 
 
@@ -350,7 +376,7 @@ def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
     error = report()["error"] | {"combined": SCORES | {"rmse_db": 1.9, "in_90_percent_interval": 0.874}}
     text = page(report(prediction=prediction, error=error), tmp_path)
     assert "held-out readings in its 90 % intervals" in text and "87 %" in text
-    assert "<span>all that was learnt together, RMSE</span><b>1.90 dB</b>" in text
+    assert "<dt>all that was learnt together, RMSE</dt><dd>1.90 dB</dd>" in text
     error["combined"] = SCORES  # of a file that was written before
     assert "in its 90 % intervals" not in page(report(prediction=prediction, error=error), tmp_path)
 

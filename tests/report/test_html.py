@@ -74,7 +74,7 @@ def hostile(run_folder, server, tmp_path_factory):
                            lambda found: f"{found[1]} = {json.dumps(found[2] + attack)}", path.read_text(), flags=re.M))
     path = folder / "twin" / "twin.json"
     path.write_text(json.dumps(poisoned(json.loads(path.read_text()), attack)))
-    truth = RadioMap.read(folder / "scene" / "truth.nc")
+    truth = RadioMap.load(folder / "scene" / "truth.nc")
     names = [name + in_names for name in truth.devices]
     hostile = RadioMap(truth.dataset.assign_coords(device=np.array(names, dtype=object)).assign_attrs(source=attack))
     hostile.write(folder / "map.nc")
@@ -188,7 +188,7 @@ def test_the_policy_names_what_the_page_holds_and_nothing_else(hostile):
 def test_long_tables_texts_and_lists_are_cut_and_counted(tmp_path):
     rows = [[f"row {n}", float(n)] for n in range(html.MAX_ROWS + 7)]
     html.write_page("run.html", tmp_path / "page.html", {
-        "title": "t" * 10**6, "page_title": "t", "viewer": None, "notes": [f"note {n}" for n in range(10_000)],
+        "title": "t" * 10**6, "page_title": "t", "viewer": None, "lead": [], "notes": [f"note {n}" for n in range(10_000)],
         "closeloop": None, "comparison": None, "planning": None, "facts": ["f"],
         "estimates": Table(("device", "x"), rows)})
     text = (tmp_path / "page.html").read_text()

@@ -84,7 +84,12 @@ def test_residuals_stand_where_the_moving_end_is(tmp_path):
     layer = layers.link_layer(run)
     np.testing.assert_allclose(unpacked(layer["x"]), run.residuals["receiver_x_m"], rtol=1e-6)
     assert layer["devices"] == ["a", "b"] and unpacked(layer["device"]).tolist() == [1, 0] * 3
-    assert unpacked(layer["before"]).tolist() == [400, NOT_DETECTED, -300, 200, 100, 0] and layer["range_db"] == 4.0
+    before, after = layer["fields"]
+    assert unpacked(before["values"]).tolist() == [400, NOT_DETECTED, -300, 200, 100, 0]
+    assert before["high"] == after["high"] == 4.0 and after["interval_db"] == [[0.0, 0.0], [0.5, 0.5]]
+    assert layer["flights"] == ["f0"] and unpacked(layer["time"]).tolist() == [0, 1, 2, 3, 4, 5]
+    *_, measured = layers.link_layer(Run(tmp_path, residuals=links().assign(measured_db=-80.0)))["fields"]
+    assert measured["kind"] == "gain" and unpacked(measured["values"]).tolist() == [-8000] * 6
     x_min, x_max, *_ = layers.bounds_m(run)
     assert x_min <= 5.0 and x_max >= run.residuals["receiver_x_m"].max()
 
@@ -108,6 +113,17 @@ def test_devices_and_tracks_beyond_what_can_be_drawn_are_counted(run_folder, mon
     assert [note.split(" are shown")[0] for note in run.notes] == [
         "Of the map truth the first 3 of 7 devices", "Of the map twin the first 3 of 7 devices",
         "Of 4 tracks of UAVs the first 3"]
+
+
+def test_what_a_close_loop_found_stands_in_the_city(tmp_path):
+    outline = [[0, 0], [10, 0], [10, 20], [0, 0]]
+    effects = [{"name": "missing_obstacle", "parameters": {"height_m": {"value": 38.0}},
+                "places": [{"x_m": 5.0, "y_m": 9.0, "outline_m": outline}]},
+               {"name": "device_gain_offset", "parameters": {}, "places": [{"device": "d1", "x_m": 0.0, "y_m": 0.0}]},
+               {"name": "mapped_vegetation", "is_declared": True, "parameters": {}, "places": [{"x_m": 0.0, "y_m": 0.0}]}]
+    assert layers.found_layer(Run(tmp_path, closeloop={"effects": effects})) == [
+        {"text": "missing obstacle", "x": 5.0, "y": 9.0, "outline": outline, "height": 38.0}]
+    assert layers.found_layer(Run(tmp_path)) == []
 
 
 def test_positions_that_no_city_has_are_not_drawn(tmp_path):

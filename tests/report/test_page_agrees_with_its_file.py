@@ -122,7 +122,7 @@ def summary(content):
     context = closeloop_context(content, Path("no-such-folder"))
     cards = [value for _, value in context["cards"]]
     rows = [cell for table in ("anomalies", "seen_from") for row in context[table].rows for cell in row]
-    text = " ".join([context["lead"], context["rivals"], context["verdict"], *cards, *rows])
+    text = " ".join([context["lead"], *context["more"], context["rivals"], *cards, *rows])
     advice = (content.get("prediction") or {}).get("advice", "")
     text = text.replace(advice, "") if advice else text
     return re.sub(r"\b[a-z]\d\b|P\.\d+|\(\d+ times\)", "", text)
@@ -177,12 +177,13 @@ def test_each_kind_of_group_is_said_in_plain_words(group, sentence):
     assert anomaly_words.sentence(group, with_members("located", [group])) == sentence
 
 
-def test_where_comes_before_why_and_a_named_cause_is_told_from_an_open_one():
+def test_what_was_found_comes_first_and_a_named_cause_is_told_from_an_open_one():
     named = with_members("effect", [LOW], effects=[DRIFT | {"name": "device_gain_offset", "probability": 0.95, "anomalies": [0],
                                                              "indistinguishable_from": []}])
     text = closeloop_summary(named)
-    assert text.startswith("Device d3 reads 5.6 dB (5.1 to 6.1) less than the seven others (0.99). Cause: power, cable or "
-                           "antenna of the device (0.70); vegetation (0.25). The model lacked device gain offset.")
+    assert text.startswith("Found: power, cable or antenna of r<0>. With it ")
+    assert text.endswith("Device d3 reads 5.6 dB (5.1 to 6.1) less than the seven others (0.99). Cause: power, cable or "
+                         "antenna of the device (0.70); vegetation (0.25).")
     either = named["effects"][0] | {"indistinguishable_from": ["receiver_gain_offset"]}
     assert "Cause: power, cable or antenna of the device or gain, cable or antenna of the receiver (0.70);" \
         in closeloop_summary(named | {"effects": [either]})

@@ -44,7 +44,7 @@ def test_a_rejected_truth_is_not_shown_by_another_way_nor_maps_over_other_lattic
     folder = shutil.copytree(run_folder / "scene", tmp_path / "scene")
     path = folder / "scene.toml"
     path.write_text(path.read_text().replace("tx_power_dbm = 0.0", "tx_power_dbm = 3.0"))
-    truth = RadioMap.read(folder / "truth.nc")
+    truth = RadioMap.load(folder / "truth.nc")
     smaller = RadioMap(truth.dataset.isel(x=slice(1, None)))
     smaller.write(folder / "part.nc")
     run = read_run(folder)

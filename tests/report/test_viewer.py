@@ -1,6 +1,7 @@
 """The page in a real browser: it shows the run's own numbers, and its controls move what they say."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from radiotwin.maps.radiomap import RadioMap
@@ -132,6 +133,24 @@ def test_the_city_turns_and_zooms(opened, path, pixels):
     assert page.evaluate("stage.city.visible") is False
     assert page.evaluate("stage.renderer.context.getContextAttributes().antialias") is False
     assert page.evaluate("stage.renderer.getPixelRatio()") == 1, "no more than needed without a graphics card"
+
+
+def test_a_click_on_a_link_tells_its_levels(opened, tmp_path):
+    links = pd.DataFrame({f"{end}_{axis}_m": [0.0, 80.0] if end == "receiver" else 40.0
+                          for end in ("receiver", "device") for axis in "xyz"})
+    links = links.assign(time_s=[5.0, 9.0], flight=["f0", "f1"], receiver="u", device="a", los=1, before_db=[4.0, -2.0],
+                         after_db=[1.0, -1.0], measured_db=[-70.0, -80.0])
+    tracks = links.rename(columns={"receiver": "uav"} | {f"receiver_{axis}_m": f"{axis}_m" for axis in "xyz"})
+    write_report(Run(tmp_path, residuals=links, tracks=tracks), tmp_path / "page.html")
+    page = opened(tmp_path / "page.html")
+    choose(page, "view", "held-out residual: after")
+    page.locator("#viewer").scroll_into_view_if_needed()
+    box, at = page.locator("#viewer").bounding_box(), page.evaluate("stage.pixel(0, 0, 0)")
+    page.mouse.click(box["x"] + at[0], box["y"] + at[1])
+    assert page.inner_text("#control-hover") == "a, f0, 0 s, LoS: measured -70.0, predicted -71.0 (90 %: -71.9 to -70.1) dB"
+    assert page.evaluate("linksOf(view())") == [0, 1]
+    page.check("#control-only")
+    assert page.evaluate("linksOf(view())") == [0], "of the chosen flight"
 
 
 def test_names_from_a_file_are_never_run(opened, tmp_path):

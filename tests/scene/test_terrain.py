@@ -12,7 +12,7 @@ from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap, perturbed_map
 from radiotwin.scene.config import parse_config
 from radiotwin.scene.lattice import Lattice
-from radiotwin.scene.terrain import HeightGrid, triangulate
+from radiotwin.scene.readers.terrain import HeightGrid, triangulate
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 from tests.terrains import incline, ridge, terrain_map
 

@@ -32,7 +32,7 @@ def batch_files(scene):
 
 def test_map_holds_the_gains_of_every_link(own_scene, law, tmp_path):
     returned = trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
-    read = RadioMap.read(tmp_path / "truth.nc")
+    read = RadioMap.load(tmp_path / "truth.nc")
     assert np.array_equal(read.gain_db, returned.gain_db, equal_nan=True)
     assert read.devices == [device.device for device in own_scene.config.devices]
     raw_db = np.stack([law(None, 2.4e9, SETTINGS).solve(device_m, own_scene.lattice.positions_m)
@@ -69,16 +69,16 @@ def test_rerun_solves_nothing_and_gives_the_same_file(own_scene, law, tmp_path):
 def test_a_place_on_the_globe_that_is_given_later_is_written_into_the_map(own_scene, law, tmp_path):
     path = tmp_path / "truth.nc"
     trace_map(own_scene, SETTINGS, path)
-    solved, plain = law.calls, RadioMap.read(path)
+    solved, plain = law.calls, RadioMap.load(path)
     config = own_scene.config
     for latitude_deg in (48.1, 48.2):
         origin = Origin(latitude_deg=latitude_deg, longitude_deg=11.5)
         write_config(config.model_copy(update={"origin": origin}), own_scene.folder / "scene.toml")
         trace_map(Scene.load(own_scene.folder), SETTINGS, path)
-        assert RadioMap.read(path).dataset.attrs["origin_latitude_deg"] == latitude_deg
+        assert RadioMap.load(path).dataset.attrs["origin_latitude_deg"] == latitude_deg
     write_config(config, own_scene.folder / "scene.toml")
     trace_map(Scene.load(own_scene.folder), SETTINGS, path)
-    assert law.calls == solved and RadioMap.read(path).dataset.identical(plain.dataset)
+    assert law.calls == solved and RadioMap.load(path).dataset.identical(plain.dataset)
 
 
 def test_only_what_is_missing_or_damaged_is_solved_again(own_scene, law, tmp_path):
@@ -158,13 +158,13 @@ def test_a_finished_map_is_known_without_its_cache(own_scene, law, tmp_path):
 
 def test_an_impossible_link_is_left_out_counted_and_told(own_scene, law, tmp_path):
     trace_map(own_scene, SETTINGS, tmp_path / "whole.nc")
-    whole = RadioMap.read(tmp_path / "whole.nc")
+    whole = RadioMap.load(tmp_path / "whole.nc")
     shutil.rmtree(own_scene.folder / "cache")
     index = np.flatnonzero(np.isfinite(whole.gain_db.reshape(DEVICES, -1)).all(axis=0))[:3]
     law.impossible_m = own_scene.lattice.positions_m[index].tolist()
     with pytest.warns(UserWarning, match=f"{3 * DEVICES} of {DEVICES * 512} links carry more power than their paths"):
         trace_map(own_scene, SETTINGS, tmp_path / "map.nc")
-    read = RadioMap.read(tmp_path / "map.nc")
+    read = RadioMap.load(tmp_path / "map.nc")
     assert read.dataset.attrs["links_impossible"] == 3 * DEVICES and whole.dataset.attrs["links_impossible"] == 0
     counts = [f"links_{name}" for name in ("detected", "without_path", "below_sensitivity", "inside_building")]
     assert [read.dataset.attrs[name] - whole.dataset.attrs[name] for name in counts] == [-3 * DEVICES, 0, 0, 0]

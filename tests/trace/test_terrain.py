@@ -10,8 +10,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.readers import MapOptions, build_scene_from_map
 from radiotwin.trace import SolverSettings
-from radiotwin.trace.points import read_points, trace_points
-from radiotwin.trace.run import warn_of_terrain
+from radiotwin.trace.run import read_points, trace_points, warn_of_terrain
 from tests.scene.readers.conftest import Map
 from tests.terrains import ridge, write_dem
 

@@ -8,10 +8,10 @@ from radiotwin.errors import BadInput
 from radiotwin.scene.folder import CityShape, read_city
 from radiotwin.scene.materials import Material
 from radiotwin.trace import SolverSettings, trace_gains, trace_map
-from radiotwin.trace.link_job import lattice_pieces
-from radiotwin.trace.tiles import (
+from radiotwin.trace.link_job import (
     PackedCity,
     batches_by_place,
+    lattice_pieces,
     longest_path_m,
     tile_of,
     with_radius,
@@ -111,7 +111,7 @@ def test_no_points_no_batches():
 def test_small_cities_are_traced_whole_and_large_ones_by_tiles(small_scene, own_scene, monkeypatch):
     settings = SolverSettings()
     assert with_radius(small_scene, settings) is settings
-    monkeypatch.setattr("radiotwin.trace.tiles.MANY_SHAPES", 3)
+    monkeypatch.setattr("radiotwin.trace.link_job.MANY_SHAPES", 3)
     assert with_radius(own_scene, settings).radius_m == 400.0
     for given in (float("inf"), 50.0):
         assert with_radius(own_scene, SolverSettings(radius_m=given)).radius_m == given

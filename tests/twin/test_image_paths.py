@@ -23,7 +23,7 @@ def twin(narrow_street, tmp_path_factory):
 
 def rmse_db(twin, scene, devices, seed):
     """Return the RMSE on flights of another seed, of all links and of those in the shadow [dB]."""
-    flown = fly_survey(scene, RadioMap.read(scene.folder / "truth.nc"), flights=1, pattern="random-waypoint", seed=seed,
+    flown = fly_survey(scene, RadioMap.load(scene.folder / "truth.nc"), flights=1, pattern="random-waypoint", seed=seed,
                        noise_db=0.0)
     flown = flown.select(flown.table["device"].isin(devices).to_numpy())
     error_db = predict(twin, scene, flown) - flown.level_db

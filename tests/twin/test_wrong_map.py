@@ -56,7 +56,7 @@ def test_a_shifted_map_is_moved_back_and_devices_stay_in_the_users_frame(narrow_
 @pytest.mark.slow
 def test_over_a_shifted_map_it_predicts_better_than_paths_alone(narrow_street, shifted):
     scene, twin = shifted
-    flown = fly_survey(narrow_street.scene, RadioMap.read(scene.folder / "truth.nc"), flights=1,
+    flown = fly_survey(narrow_street.scene, RadioMap.load(scene.folder / "truth.nc"), flights=1,
                        pattern="random-waypoint", seed=5, noise_db=0.0)
     anchors = [each.device for each in twin.devices if each.role == "anchor"]
     flown = flown.select(flown.table["device"].isin(anchors).to_numpy())

@@ -18,6 +18,7 @@ from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import LIKELY
 from radiotwin.closeloop.verdict.posterior import Step
 from radiotwin.closeloop.verdict.sensitivity import Detectable
+from radiotwin.effects.base import Effect
 from radiotwin.effects.params import Parameter
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import MAD_SD
@@ -41,7 +42,7 @@ ABSENT: dict[str, Any] = {"posterior": [], "detectable": [], "combination": [], 
                           "anomalies": [], "seen_from": [], "receivers_compared": []}
 # Of the interpolated rest.
 NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, "probability": None,
-                             "anomalies": []}
+                             "anomalies": [], "places": []}
 
 
 def compare_with_baselines(error: dict[str, Any],
@@ -84,7 +85,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
     effects = [each.record() | {
                 "rank": rank, "uses": list(each.uses), "is_declared": each.is_declared,
                 "parameters": {name: parameter.record() for name, parameter in parameters.items()},
-                "size_db": size.record(),
+                "size_db": size.record(), "places": _places(each, parameters, loop.after.links),
                 "confused_with": list(each.confused_with),
                 "indistinguishable_from": sorted({*trial.rivals,
                                                   *each.same_as(loop.after.links, parameters)}),
@@ -230,6 +231,20 @@ def check_report(report: dict[str, Any], source: object = "closeloop.json") -> d
         raise BadInput(f"{source}: schema is {repr(report.get('schema'))[:60]}, this version reads "
                        f"{SCHEMA!r}; make the run again")
     return validated(ReportRecord, ABSENT | report, source, REMEDY)
+
+
+def _places(effect: Effect, parameters: Iterable[str], links: Links) -> list[dict[str, Any]]:
+    """Return where an effect is: its mark on the map, or each device that it acts on."""
+    named = {name.partition("[")[2].removesuffix("]") for name in parameters}
+    mark = effect.mark(links)
+    if mark is not None:
+        return [{"x_m": float(mark.at_m[0]), "y_m": float(mark.at_m[1]),
+                 "outline_m": None if mark.outline_m is None else mark.outline_m.tolist()}]
+    if effect.of_receiver:  # which moves
+        return []
+    return [{"device": name, "x_m": x_m, "y_m": y_m} for name, (x_m, y_m) in
+            zip(links.device_names, links.device_m[:, :2].tolist(), strict=True)
+            if name in named and np.isfinite(x_m)]
 
 
 def _step(step: Step) -> dict[str, Any]:

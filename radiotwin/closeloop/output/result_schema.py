@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from radiotwin.effects.base import Levels
-from radiotwin.io.forms import Real, Record, Whole
+from radiotwin.io.forms import Metres, Origin, Real, Record, Whole
 
 
 class ScoresRecord(Record):
@@ -69,6 +69,18 @@ class EvidenceRecord(Record):
     evidence_nats: Real | None = None
 
 
+Corner = Annotated[list[Metres], Field(min_length=2, max_length=2)]
+
+
+class PlaceRecord(Record):
+    """Where an effect is: a building, an emitter, or a device that it acts on."""
+
+    device: str = ""
+    x_m: Metres
+    y_m: Metres
+    outline_m: Annotated[list[Corner], Field(max_length=100)] | None = None
+
+
 class EffectRecord(Record):
     """An effect that was found."""
 
@@ -81,6 +93,7 @@ class EffectRecord(Record):
     levels: Levels | None = None
     parameters: dict[str, ParameterRecord]
     size_db: ParameterRecord | None = None
+    places: list[PlaceRecord] = Field(default_factory=list)
     confused_with: list[str] = Field(default_factory=list)
     indistinguishable_from: list[str] = Field(default_factory=list)
     probability: Real | None = None
@@ -216,10 +229,11 @@ class FoldsRecord(Record):
 
 
 class InputsRecord(Record):
-    """Files that the loop was given."""
+    """Files that the loop was given, and the origin of the local frame."""
 
     measurements: str | None = None
     scene: str | None = None
+    origin: Origin | None = None
 
 
 class ReportRecord(Record):

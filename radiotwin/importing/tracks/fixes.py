@@ -6,7 +6,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.source import are_few
-from radiotwin.links.implausible import LIMITS_DEG, no_height
+from radiotwin.links.cell_limits import LIMITS_DEG, no_height
 
 ANGLES = ("heading_deg", "pitch_deg", "roll_deg")
 COLUMNS = ("latitude", "longitude", "altitude", *ANGLES)

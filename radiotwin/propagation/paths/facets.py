@@ -24,8 +24,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from radiotwin.errors import BadInput
-from radiotwin.propagation.paths.surfaces import GROUND_MATERIAL, MATERIAL, NORMAL, Surfaces
-from radiotwin.propagation.paths.vectors import cross, dot
+from radiotwin.propagation.paths.surfaces import (
+    GROUND_MATERIAL,
+    MATERIAL,
+    NORMAL,
+    Surfaces,
+    cross,
+    dot,
+)
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import CityMap
 

@@ -12,14 +12,13 @@ from radiotwin.propagation.paths.images import (
     sequence_length,
 )
 from radiotwin.propagation.paths.interactions import Slabs, diffract, reflect
-from radiotwin.propagation.paths.surfaces import MATERIAL, Surfaces
-from radiotwin.propagation.paths.vectors import Triple, dot
+from radiotwin.propagation.paths.surfaces import MATERIAL, Surfaces, Triple, dot
 from radiotwin.runtime.compiled import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def path_gains(
-    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs, wedge: int,
+    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
     buffer: PathBuffer, rows: np.ndarray,
 ) -> np.ndarray:
     """Compute the power gains of paths between vertically polarised isotropic antennas.
@@ -29,7 +28,6 @@ def path_gains(
         candidates: that the paths were found with.
         wave_number: 2 π / wavelength [1/m].
         slabs: materials of the map.
-        wedge: LUEBBERS or SIONNA, see `radiotwin.propagation.paths.interactions`.
         buffer: the paths.
         rows: (m,) paths of the buffer to compute.
 
@@ -39,15 +37,15 @@ def path_gains(
     gain = np.empty(len(rows))
     legs, field = _room()
     for i in range(len(rows)):
-        received, spread, _ = _follow(surfaces, candidates, wave_number, slabs, wedge, buffer,
-                                      rows[i], legs, field)
+        received, spread, _ = _follow(surfaces, candidates, wave_number, slabs, buffer, rows[i],
+                                      legs, field)
         gain[i] = spread * abs(received) ** 2 / (2.0 * wave_number) ** 2
     return gain
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def path_amplitudes(
-    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs, wedge: int,
+    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
     buffer: PathBuffer, rows: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute the complex gains of paths as `path_gains` does their powers.
@@ -60,7 +58,7 @@ def path_amplitudes(
     amplitude, total_m = np.empty(len(rows), dtype=np.complex128), np.empty(len(rows))
     legs, field = _room()
     for i in range(len(rows)):
-        received, spread, total_m[i] = _follow(surfaces, candidates, wave_number, slabs, wedge,
+        received, spread, total_m[i] = _follow(surfaces, candidates, wave_number, slabs,
                                                buffer, rows[i], legs, field)
         amplitude[i] = received * np.sqrt(spread) / (2.0 * wave_number) \
             * np.exp(-1j * wave_number * total_m[i])
@@ -75,7 +73,7 @@ def _room() -> tuple[np.ndarray, np.ndarray]:
 
 @njit(cache=True, error_model="numpy")
 def _follow(
-    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs, wedge: int,
+    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
     buffer: PathBuffer, path: int, legs: np.ndarray, field: np.ndarray,
 ) -> tuple[complex, float, float]:
     """Return the received field, the spreading factor of its power [1/m²], and the length [m].
@@ -96,7 +94,7 @@ def _follow(
     for k in range(count - 1):
         if k == before:
             diffract(surfaces.edges, edge, direction[k], direction[k + 1], before_m, after_m,
-                     wave_number, slabs, wedge, field)
+                     wave_number, slabs, field)
         else:
             facet = candidates.before[row, k] if k < before \
                 else candidates.after[row, k - before - 1]

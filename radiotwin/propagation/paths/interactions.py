@@ -8,16 +8,12 @@ sqrt(1 - S²) times as strong [5].
 An edge is a wedge in the uniform theory of diffraction [2]. By Keller's law the angle between ray
 and edge stays the same: the ray is straight once the half planes before and after the edge are
 folded into one. For faces that are not conductors there are heuristics only, which differ by many
-decibels away from the boundaries of shadow and reflection. There are two here:
-
-- Luebbers' [3] multiplies the two terms of the reflection boundaries by the reflection at the
-  face. He takes the angles of reflection from the incident ray, so that his coefficient changes
-  when the two ends are swapped. Here the smaller of the angles of the incident and the diffracted
-  ray to each face is taken. It is the same at the reflection boundaries and in the shadow behind a
-  lit face, for which he gave it, and it is reciprocal everywhere. For conductors it is exact.
-- Sionna RT's [6] multiplies all four terms by the reflection of the incident ray at one of the
-  faces, or by -1 where that face lies in the shadow. It is not reciprocal, and for a conductor not
-  that of [2] for the field across the edge, except near the boundaries.
+decibels away from the boundaries of shadow and reflection. This is Luebbers' [3], which multiplies
+the two terms of the reflection boundaries by the reflection at the face. He takes the angles of
+reflection from the incident ray, so that his coefficient changes when the two ends are swapped.
+Here the smaller of the angles of the incident and the diffracted ray to each face is taken. It is
+the same at the reflection boundaries and in the shadow behind a lit face, for which he gave it, and
+it is reciprocal everywhere. For conductors it is exact.
 
 The knife edge of ITU-R P.526 is not used: it has neither the angle of the wedge nor its material
 nor the polarisation, and it holds close to the shadow boundary only.
@@ -31,8 +27,6 @@ nor the polarisation, and it holds close to the shadow boundary only.
 [4] Balanis, "Advanced Engineering Electromagnetics", 2nd ed., 2012: section 5.3.
 [5] Degli-Esposti et al., "Measurement and modelling of scattering from buildings", IEEE Trans.
     Antennas Propag. 55(1), 2007: eq. 2.
-[6] Aït Aoudia et al., "Sionna RT: Technical Report", arXiv:2504.21719, 2025, in the form of Sionna
-    RT 2.2, which names Hashimoto et al. as its source.
 """
 
 from collections.abc import Sequence
@@ -50,15 +44,17 @@ from radiotwin.propagation.paths.surfaces import (
     NORMAL_N,
     START,
     TANGENT,
+    Triple,
+    cross,
+    divided,
+    dot,
 )
-from radiotwin.propagation.paths.vectors import Triple, cross, divided, dot
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import Material, constants
 
 VACUUM_PERMITTIVITY_F_M = 8.8541878128e-12  # [F/m], CODATA 2018
 MIN_SINE = 1e-9  # of the angle between ray and surface; -1 is the limit of all coefficients at 0
-LUEBBERS, SIONNA = 0, 1
 MIN_FACE_SINE = 1e-4  # of the angle between ray and face; rays closer to a face are not followed
 
 
@@ -167,40 +163,22 @@ def _fresnel_tail(a: float) -> complex:
 
 
 @njit(cache=True)
-def wedge_terms(
-    phi: float, phi_in: float, sine_edge: float, distance_m: float, wave_number: float, n: float
-) -> tuple[complex, complex]:
-    """Return the diffraction coefficients of a wedge, parted by its faces [2, eq. 25-28, 3].
-
-    Args:
-        phi: angle of the diffracted ray from face 0, across the edge [rad], 0 to n π.
-        phi_in: the same angle of the incident ray.
-        sine_edge: sine of the angle between ray and edge.
-        distance_m: s s' sin² / (s + s') of the distances s' before and s after the edge [m].
-        wave_number: 2 π / wavelength [1/m].
-        n: exterior angle of the wedge divided by π.
-
-    Returns:
-        The parts [√m] that the reflections at face 0 and at face n multiply; -1 of the sum is the
-        soft coefficient of a perfect conductor.
-    """
-    x = wave_number * distance_m
-    scale = -np.exp(-0.25j * np.pi) / (2.0 * n * np.sqrt(2.0 * np.pi * wave_number) * sine_edge)
-    return (scale * (_cotangent_term(phi - phi_in, x, n, 1)
-                     - _cotangent_term(phi + phi_in, x, n, -1)),
-            scale * (_cotangent_term(phi - phi_in, x, n, -1)
-                     - _cotangent_term(phi + phi_in, x, n, 1)))
-
-
-@njit(cache=True)
 def wedge_coefficients(
     phi: float, phi_in: float, sine_edge: float, distance_m: float, wave_number: float, n: float,
     face_0: tuple[complex, complex], face_n: tuple[complex, complex],
 ) -> tuple[complex, complex]:
     """Return the diffraction coefficients of a wedge [2, eq. 25-28, 3].
 
-    Its arguments are as of `wedge_terms`, and the reflection coefficients (TE and TM) of faces 0
-    and n at their `face_sines`; -1 and 1 stand for a perfect conductor.
+    Args:
+        phi: angle of the diffracted ray from face 0, across the edge [rad], 0 to n π.
+        phi_in: the same angle of the incident ray [rad].
+        sine_edge: sine of the angle between ray and edge.
+        distance_m: s s' sin² / (s + s') of the distances s' before and s after the edge [m].
+        wave_number: 2 π / wavelength [1/m].
+        n: exterior angle of the wedge divided by π.
+        face_0: reflection coefficients (TE, TM) of face 0 at its `face_sines`; (-1, 1) is a
+            perfect conductor.
+        face_n: the same of face n.
 
     Returns:
         The coefficients for the field along (soft) and across (hard) the edge [√m].
@@ -220,7 +198,7 @@ def wedge_coefficients(
 def face_sines(phi: float, phi_in: float, sine_edge: float, n: float) -> tuple[float, float]:
     """Return the sines of the angles at which faces 0 and n reflect, see the head of this module.
 
-    Its arguments are as of `wedge_terms`.
+    The arguments are those of `wedge_coefficients`.
     """
     return (sine_edge * abs(np.sin(min(phi, phi_in))),
             sine_edge * abs(np.sin(n * np.pi - max(phi, phi_in))))
@@ -294,7 +272,7 @@ def around_edge(
 @njit(cache=True, error_model="numpy")
 def diffract(
     edges: np.ndarray, edge: int, direction_in: np.ndarray, direction: np.ndarray, before_m: float,
-    after_m: float, wave_number: float, slabs: Slabs, wedge: int, field: np.ndarray,
+    after_m: float, wave_number: float, slabs: Slabs, field: np.ndarray,
 ) -> None:
     """Diffract the field of a ray at an edge (Kouyoumjian and Pathak, eq. 9-13), without spreading.
 
@@ -307,7 +285,6 @@ def diffract(
         after_m: length of the path after the edge [m].
         wave_number: 2 π / wavelength [1/m].
         slabs: materials of the city.
-        wedge: LUEBBERS or SIONNA.
         field: (3,) complex, changed in place.
     """
     row = edges[edge]
@@ -327,33 +304,10 @@ def diffract(
     across = divided(across, sine)
     upright_in, upright = cross(direction_in, across_in), cross(direction, across)
     distance_m = before_m * after_m / (before_m + after_m) * sine * sine
-    if wedge == LUEBBERS:
-        sine_0, sine_n = face_sines(phi, phi_in, sine, exterior / np.pi)
-        soft, hard = wedge_coefficients(
-            phi, phi_in, sine, distance_m, wave_number, exterior / np.pi,
-            reflection(sine_0, slabs, material_0), reflection(sine_n, slabs, material_n))
-        field_soft, field_hard = -soft * dot(field, upright_in), -hard * dot(field, across_in)
-    else:
-        at_0, at_n = wedge_terms(phi, phi_in, sine, distance_m, wave_number, exterior / np.pi)
-        soft, hard = _reflected(normal_0, material_0, direction_in, along, slabs, field)
-        field_soft, field_hard = at_0 * soft, at_0 * hard
-        if exterior > np.pi + phi_in:  # face n lies in the shadow
-            soft, hard = -dot(field, upright_in), -dot(field, across_in)
-        else:
-            soft, hard = _reflected(normal_n, material_n, direction_in, along, slabs, field)
-        field_soft, field_hard = field_soft + at_n * soft, field_hard + at_n * hard
+    sine_0, sine_n = face_sines(phi, phi_in, sine, exterior / np.pi)
+    soft, hard = wedge_coefficients(
+        phi, phi_in, sine, distance_m, wave_number, exterior / np.pi,
+        reflection(sine_0, slabs, material_0), reflection(sine_n, slabs, material_n))
+    field_soft, field_hard = -soft * dot(field, upright_in), -hard * dot(field, across_in)
     for i in range(3):
         field[i] = field_soft * upright[i] + field_hard * across[i]
-
-
-@njit(cache=True, error_model="numpy")
-def _reflected(
-    normal: np.ndarray, material: int, direction_in: np.ndarray, along: np.ndarray, slabs: Slabs,
-    field: np.ndarray,
-) -> tuple[complex, complex]:
-    """Return a ray's field that a face reflects, in the plane of ray and edge and across it."""
-    reflected = field.copy()
-    ray = reflect(normal, material, direction_in, slabs, reflected)
-    across = cross(along, ray)
-    across = divided(across, np.sqrt(dot(across, across)))
-    return dot(reflected, cross(ray, across)), dot(reflected, across)

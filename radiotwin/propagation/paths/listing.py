@@ -25,7 +25,7 @@ from radiotwin.maps.form import CONVENTIONS
 from radiotwin.propagation.paths.candidates import candidate_search
 from radiotwin.propagation.paths.fields import path_amplitudes
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
-from radiotwin.propagation.paths.interactions import LUEBBERS, city_slabs
+from radiotwin.propagation.paths.interactions import city_slabs
 from radiotwin.propagation.terrain import is_far, terrain_paths
 from radiotwin.runtime.console import progress
 from radiotwin.scene import Scene
@@ -107,8 +107,7 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
         near = np.flatnonzero(~far)
         parts = [_direct(city, device_m, ends_m[near], wave_number)]
         for rows in found_clear(city, search.surfaces, candidates, device_m, ends_m[near], buffer):
-            found = path_amplitudes(search.surfaces, candidates, wave_number, slabs, LUEBBERS,
-                                    buffer, rows)
+            found = path_amplitudes(search.surfaces, candidates, wave_number, slabs, buffer, rows)
             parts.append(_rays(buffer, rows, kinds[buffer.candidate[rows]], *found))
         joined = _joined(parts)
         joined = replace(joined, receiver=near[joined.receiver])

@@ -11,13 +11,12 @@ from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.candidates import DEVICE_RAYS, CandidateSearch, candidate_search
 from radiotwin.propagation.paths.fields import path_gains
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
-from radiotwin.propagation.paths.interactions import LUEBBERS, SIONNA, Slabs, city_slabs
+from radiotwin.propagation.paths.interactions import Slabs, city_slabs
 from radiotwin.propagation.paths.two_edges import paths_over_two_edges, two_edge_gains
 from radiotwin.propagation.terrain import is_far, terrain_paths
 from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import CityMap
 
-WEDGES = {"luebbers": LUEBBERS, "sionna": SIONNA}
 PATH_CHUNK = 50_000  # paths at once: about 30 MB
 DARK_CHUNK = 100  # receivers at once that only two edges may reach
 DEPTH = 4  # interactions of a path at most
@@ -143,8 +142,7 @@ COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 
 def path_powers(
     city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float, *,
-    depth: int = DEPTH, wedge: str = "luebbers", rays: int = DEVICE_RAYS,
-    candidates: Candidates | None = None,
+    depth: int = DEPTH, rays: int = DEVICE_RAYS, candidates: Candidates | None = None,
 ) -> PathPowers:
     """Follow the paths from a device to receivers and add up their powers.
 
@@ -158,8 +156,6 @@ def path_powers(
         receiver_m: (n, 3) positions of the receivers [m].
         frequency_hz: carrier frequency [Hz].
         depth: maximum number of interactions of a path, 1 to 6.
-        wedge: coefficient of diffraction: `luebbers`, reciprocal and exact for conductors; or, for
-            comparisons, that of `sionna`. See `radiotwin.propagation.paths.interactions`.
         rays: shot from the device to find what paths of several interactions visit.
         candidates: what to try instead, such as the `strongest` of a place nearby.
 
@@ -190,7 +186,7 @@ def path_powers(
     kind = _kinds(candidates, search.is_ground)
     found = [(np.zeros(0, dtype=int), np.zeros(0, dtype=int), np.zeros(0))]
     for clear, gain in clear_paths_gains(city, search, candidates, device_m, receiver_m[near],
-                                         buffer, wave_number, slabs, WEDGES[wedge]):
+                                         buffer, wave_number, slabs):
         link, points_m = near[buffer.receiver[clear]], buffer.points_m[clear]
         last, path = buffer.count[clear] - 1, np.arange(len(clear))
         np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
@@ -205,8 +201,7 @@ def path_powers(
         for first in range(0, len(dark), DARK_CHUNK):
             part = dark[first:first + DARK_CHUNK]
             pairs = paths_over_two_edges(city, search.surfaces, to_try, device_m, receiver_m[part])
-            gain = two_edge_gains(search.surfaces, wave_number, slabs, WEDGES[wedge], pairs.edge,
-                                  pairs.points_m)
+            gain = two_edge_gains(search.surfaces, wave_number, slabs, pairs.edge, pairs.points_m)
             link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)
             np.add.at(powers, (COMPONENTS.index("diffracted_2"), link), gain)
             directions.append(_directions(link, gain, legs_m[:, 0], -legs_m[:, 2]))
@@ -263,7 +258,7 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
     for clear, gain in clear_paths_gains(
             city, search, search.candidates(device_m), device_m,
             np.ascontiguousarray(receiver_m, dtype=float), buffer,
-            2 * np.pi * frequency_hz / speed_of_light, slabs, LUEBBERS):
+            2 * np.pi * frequency_hz / speed_of_light, slabs):
         parts.append(PathsWithPoints(buffer.receiver[clear], gain,
                                      buffer.points_m[clear].astype(np.float32),
                                      buffer.count[clear]))
@@ -272,12 +267,11 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
 
 def clear_paths_gains(
     city: CityMap, search: CandidateSearch, candidates: Candidates, device_m: np.ndarray,
-    receiver_m: np.ndarray, buffer: PathBuffer, wave_number: float, slabs: Slabs, wedge: int,
+    receiver_m: np.ndarray, buffer: PathBuffer, wave_number: float, slabs: Slabs,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield rows (p,) of a buffer that hold paths which nothing blocks, and their gains (p,)."""
     for clear in found_clear(city, search.surfaces, candidates, device_m, receiver_m, buffer):
-        yield clear, path_gains(search.surfaces, candidates, wave_number, slabs, wedge, buffer,
-                                clear)
+        yield clear, path_gains(search.surfaces, candidates, wave_number, slabs, buffer, clear)
 
 
 def _directions(link: np.ndarray, power: np.ndarray, departure_m: np.ndarray,

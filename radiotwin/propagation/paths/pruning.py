@@ -20,10 +20,10 @@ from radiotwin.propagation.paths.surfaces import (
     SIZE,
     START,
     TANGENT,
+    dot,
     height,
     mirrored,
 )
-from radiotwin.propagation.paths.vectors import dot
 from radiotwin.runtime.compiled import njit
 
 ROUNDING_M = 1e-6  # [m], slack of the tests for rounding in double precision

@@ -1,9 +1,11 @@
 """Facets and edges in arrays for compiled code; the last facet is the flat ground, all of z = 0.
 
 On a terrain its triangles are facets like any other, and nothing lies above the last one.
+Products of vectors of three numbers return tuples: to allocate an array takes longer than to
+compute what is in it.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +21,9 @@ NORMAL, OFFSET, ORIGIN, AXIS_U, AXIS_V, SIZE, FULL, FIRST, END, MATERIAL = (
     0, 3, 4, 7, 10, 13, 15, 16, 17, 18)
 START, ALONG, LENGTH, TANGENT, NORMAL_0, NORMAL_N, EXTERIOR, MATERIAL_0, MATERIAL_N = (
     0, 3, 6, 7, 10, 13, 16, 17, 18)
+
+Triple = tuple[float, float, float]
+Vector = np.ndarray | Triple
 
 
 class Surfaces(NamedTuple):
@@ -96,3 +101,21 @@ def mirrored(
     twice = 2.0 * height(planes, facet, x, y, z)
     return (x - twice * planes[facet, NORMAL], y - twice * planes[facet, NORMAL + 1],
             z - twice * planes[facet, NORMAL + 2])
+
+
+@njit(cache=True)
+def dot(a: Vector, b: Vector) -> Any:
+    """Return the product a · b without conjugation, complex where one of the vectors is."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def cross(a: Vector, b: Vector) -> Triple:
+    """Return the product a × b of real vectors."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit(cache=True)
+def divided(a: Vector, by: float) -> Triple:
+    """Return a vector divided by a number."""
+    return a[0] / by, a[1] / by, a[2] / by

@@ -17,8 +17,16 @@ import numpy as np
 
 from radiotwin.propagation.paths.fields import vertical
 from radiotwin.propagation.paths.interactions import Slabs, around_edge, diffract
-from radiotwin.propagation.paths.surfaces import ALONG, LENGTH, NORMAL_0, NORMAL_N, START, Surfaces
-from radiotwin.propagation.paths.vectors import cross, dot
+from radiotwin.propagation.paths.surfaces import (
+    ALONG,
+    LENGTH,
+    NORMAL_0,
+    NORMAL_N,
+    START,
+    Surfaces,
+    cross,
+    dot,
+)
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
@@ -230,8 +238,7 @@ def wave_at_edge(
 
 @njit(cache=True, error_model="numpy")
 def two_edge_gains(
-    surfaces: Surfaces, wave_number: float, slabs: Slabs, wedge: int, edge: np.ndarray,
-    points_m: np.ndarray,
+    surfaces: Surfaces, wave_number: float, slabs: Slabs, edge: np.ndarray, points_m: np.ndarray,
 ) -> np.ndarray:
     """Return the power gains (p,), linear, of paths over two edges, (p, 2) as in `EdgePairs`.
 
@@ -248,9 +255,9 @@ def two_edge_gains(
                        surfaces.edges[edge[i, 1], ALONG:ALONG + 3], direction[1])
         field[0], field[1], field[2] = vertical(direction[0])
         diffract(surfaces.edges, edge[i, 0], direction[0], direction[1], a,
-                 wave_at_edge(a, b, c, sine2)[1], wave_number, slabs, wedge, field)
+                 wave_at_edge(a, b, c, sine2)[1], wave_number, slabs, field)
         diffract(surfaces.edges, edge[i, 1], direction[1], direction[2],
-                 wave_at_edge(c, b, a, sine2)[1], c, wave_number, slabs, wedge, field)
+                 wave_at_edge(c, b, a, sine2)[1], c, wave_number, slabs, field)
         power = abs(dot(field, vertical(direction[2]))) ** 2
         spread = 1.0 / (a * c * (b * (a + b + c) + a * c * sine2))
         gain[i] = spread * power / (2.0 * wave_number) ** 2

@@ -1,8 +1,9 @@
 "use strict";
-// The overlay of the 3D picture: axes, devices and their estimates, paths and positions of the UAVs.
+// The overlay of the 3D picture: axes, what was found, devices and their estimates, paths and positions of the UAVs.
 
 const UAV_COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9"];  // Okabe and Ito
-const FOUND = "#c1121f", UNKNOWN = "#f08a00", INK = "#111";
+const FOUND = "#e5383b", UNKNOWN = "#f08a00", CAUSE = "#c05bc4";
+const MAX_NAMES = 60;  // of devices, beside their marks
 const FONT = "12px system-ui, sans-serif";
 
 function path(context, stage, points, colour, width) {
@@ -18,9 +19,11 @@ function path(context, stage, points, colour, width) {
   context.stroke();
 }
 
-function label(context, text, [x, y], colour = INK) {
-  Object.assign(context, {font: FONT, textAlign: "center", lineWidth: 3, fillStyle: colour,
-                          strokeStyle: "rgba(255, 255, 255, 0.85)"});
+// A text over a point; its ends stay in the picture.
+function label(context, stage, text, [x, y], colour = stage.ink) {
+  Object.assign(context, {font: FONT, textAlign: "center", lineWidth: 3, fillStyle: colour, strokeStyle: stage.halo});
+  const half = context.measureText(text).width / 2 + 3;
+  x = Math.max(half, Math.min(x, stage.width - half));
   context.strokeText(text, x, y);
   context.fillText(text, x, y);
 }
@@ -60,23 +63,42 @@ function drawAxes(context, stage) {
   const [x0, x1, y0, y1] = stage.data.bounds, side = Math.max(x1 - x0, y1 - y0);
   const step = roundStep(side), off = 0.03 * side;
   path(context, stage, [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0], [x0, y0, 0]], "#9aa5ad", 1);
-  const write = (text, x, y) => { const at = stage.pixel(x, y, 0); if (at) label(context, text, at, "#4a5964"); };
+  if (stage.width < 500) return;  // no room for numbers
+  const write = (text, x, y) => { const at = stage.pixel(x, y, 0); if (at) label(context, stage, text, at); };
   for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) write(x.toFixed(0), x, y0 - off);
   for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) write(y.toFixed(0), x1 + 1.3 * off, y);
   write("x, east [m]", (x0 + x1) / 2, y0 - 2.6 * off);
   write("y, north [m]", x1 + 6 * off, (y0 + y1) / 2);
 }
 
+// The part of a circle that is over the ground of the city.
 function circle(context, stage, [x, y, z], radius, dashes) {
+  const [x0, x1, y0, y1] = stage.data.bounds, points = [];
+  for (let n = 0; n <= 96; n++) {
+    const at = [x + radius * Math.cos(n * Math.PI / 48), y + radius * Math.sin(n * Math.PI / 48), z];
+    points.push(at[0] >= x0 && at[0] <= x1 && at[1] >= y0 && at[1] <= y1 ? at : null);
+  }
   context.setLineDash(dashes);
-  path(context, stage, Array.from({length: 97}, (_, n) => [x + radius * Math.cos(n * Math.PI / 48),
-                                                           y + radius * Math.sin(n * Math.PI / 48), z]), FOUND, 1);
+  path(context, stage, points, FOUND, 1.5);
   context.setLineDash([]);
+}
+
+// What a close-loop found: a building as its edges, anything else as a cross, with its name.
+function drawFound(context, stage) {
+  for (const {text, x, y, outline, height} of stage.data.found) {
+    const corners = outline ?? [[x, y]], raised = z => corners.map(([east, north]) => [east, north, z]);
+    if (outline) for (const line of [raised(0), raised(height), ...corners.map(at => [[...at, 0], [...at, height]])])
+      path(context, stage, line, CAUSE, 2.5);
+    const at = stage.pixel(x, y, height);
+    if (!at) continue;
+    if (!outline) mark(context, "cross", at, 7, CAUSE);
+    label(context, stage, text, [at[0], at[1] - 12], CAUSE);
+  }
 }
 
 function drawDevices(context, stage) {
   const {devices} = stage.data;
-  for (const {estimate, true: position, radius_m: radius, located, second} of devices) {
+  for (const {name, estimate, true: position, radius_m: radius, located, second} of devices) {
     if (!estimate) continue;
     const [x, y, z] = estimate;
     if (position) path(context, stage, [position, estimate], FOUND, 1.5);
@@ -84,14 +106,17 @@ function drawDevices(context, stage) {
     const place = second && stage.pixel(second[0], second[1], z);
     if (place) ring(context, place);
     const at = stage.pixel(x, y, z);
-    if (at) mark(context, "cross", at, 5, FOUND);
+    if (!at) continue;
+    mark(context, "cross", at, 5, FOUND);
+    const within = radius === null ? "" : ` ± ${radius.toFixed(0)} m`;
+    if (devices.length <= MAX_NAMES) label(context, stage, name + within, [at[0], at[1] + 19], FOUND);
   }
   for (const device of devices) {
     const at = device.true && stage.pixel(...device.true);
     if (!at) continue;
     const anchor = device.role === "anchor";
-    mark(context, anchor ? "diamond" : "circle", at, anchor ? 6 : 5, anchor ? INK : UNKNOWN);
-    if (devices.length <= 60) label(context, device.name, [at[0], at[1] - 9]);
+    mark(context, anchor ? "diamond" : "circle", at, anchor ? 6 : 5, anchor ? stage.ink : UNKNOWN);
+    if (devices.length <= MAX_NAMES) label(context, stage, device.name, [at[0], at[1] - 9]);
   }
 }
 
@@ -101,6 +126,6 @@ function drawFlight(context, stage, uavs) {
     const at = stage.pixel(...position);
     if (!at) return;
     mark(context, "circle", at, 7, UAV_COLOURS[number % UAV_COLOURS.length]);
-    label(context, name, [at[0], at[1] - 11]);
+    label(context, stage, name, [at[0], at[1] - 11]);
   });
 }

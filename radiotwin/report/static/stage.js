@@ -18,7 +18,10 @@ const COLOURED = {
       gl_PointSize = size;
       gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
     }`,
-  fragmentShader: "precision mediump float; varying vec3 shown; void main() { gl_FragColor = vec4(shown, 1.0); }"};
+  fragmentShader: `precision mediump float;
+    uniform float lightness;  // of the city and its ground
+    varying vec3 shown;
+    void main() { gl_FragColor = vec4(lightness * shown, 1.0); }`};
 const CELLS = {
   vertexShader: `${POSITION}
     attribute vec2 uv;
@@ -35,6 +38,7 @@ const CELLS = {
       gl_FragColor = vec4(colour.rgb, 0.72 * colour.a);
     }`};
 const GROUND = [0.945, 0.953, 0.957];
+const DARK = window.matchMedia("(prefers-color-scheme: dark)");
 const DOT_PIXELS = 6;
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
 
@@ -52,25 +56,34 @@ class Stage {
     this.data = data;
     this.renderer = new THREE.WebGLRenderer();
     this.renderer.setPixelRatio(sharpness(this.renderer.context));
-    this.renderer.setClearColor(0xffffff);
     this.overlay = document.createElement("canvas");
     container.append(this.renderer.domElement, this.overlay);
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(35, 1, 1, 1e6);
     this.camera.up.set(0, 0, 1);
-    this.coloured = new THREE.RawShaderMaterial({...COLOURED, side: THREE.DoubleSide,
-                                                 uniforms: {size: {value: DOT_PIXELS * this.renderer.getPixelRatio()}}});
+    const coloured = () => new THREE.RawShaderMaterial({...COLOURED, side: THREE.DoubleSide, uniforms: {
+      size: {value: DOT_PIXELS * this.renderer.getPixelRatio()}, lightness: {value: 1}}});
+    this.coloured = coloured();
     this.city = data.city ? this.addCity(data.city) : new THREE.Object3D();
     this.addGround();
     this.slice = this.addSlice();
-    this.dots = new THREE.Points(new THREE.BufferGeometry(), this.coloured);
+    this.dots = new THREE.Points(new THREE.BufferGeometry(), coloured());
     this.dots.frustumCulled = this.dots.visible = false;
     this.scene.add(this.dots);
     this.drawings = [];  // functions of the overlay's context, called after each frame
     this.fit();
     this.look("oblique");
     this.listen();
+    this.paint(DARK.matches);
+    DARK.addEventListener("change", () => { this.paint(DARK.matches); this.redraw(); });
     new ResizeObserver(() => { if (this.fit()) this.draw(); }).observe(container);
+  }
+
+  paint(dark) {
+    this.ink = dark ? "#e2e7eb" : "#111";
+    this.halo = dark ? "rgba(20, 25, 30, 0.85)" : "rgba(255, 255, 255, 0.85)";
+    this.renderer.setClearColor(dark ? 0x14191e : 0xffffff);
+    this.coloured.uniforms.lightness.value = dark ? 0.4 : 1;
   }
 
   addCity({x, y, z, i, j, k}) {
@@ -156,6 +169,10 @@ class Stage {
     this.container.addEventListener("pointerdown", event => {
       this.container.setPointerCapture(event.pointerId);
       pointers.set(event.pointerId, event);
+      this.pressed = event;
+    });
+    this.container.addEventListener("click", event => {  // no drag
+      if (Math.hypot(event.clientX - this.pressed?.clientX, event.clientY - this.pressed?.clientY) < 5) this.pick?.(event);
     });
     for (const end of ["pointerup", "pointercancel"])
       this.container.addEventListener(end, event => pointers.delete(event.pointerId));
@@ -200,13 +217,16 @@ class Stage {
 
   // What is on the canvases as one picture: browsers print WebGL as nothing.
   print() {
+    this.paint(false);
     this.draw();
     const both = document.createElement("canvas"), [glass] = this.container.getElementsByTagName("canvas");
     Object.assign(both, {width: this.overlay.width, height: this.overlay.height});
     const context = both.getContext("2d");
     for (const each of [glass, this.overlay]) context.drawImage(each, 0, 0, both.width, both.height);
-    this.printed ??= this.container.appendChild(Object.assign(new Image(), {className: "printed", alt: ""}));
+    this.printed ??= this.container.appendChild(Object.assign(new Image(), {className: "printed", alt: "The city as it is shown"}));
     this.printed.src = both.toDataURL();
+    this.paint(DARK.matches);
+    this.redraw();
   }
 
   zoom(factor) { this.far = Math.min(Math.max(this.far * factor, 5), 1e5); }

@@ -1,11 +1,11 @@
 "use strict";
-// The controls: which map, device and altitude is shown, and which moment of which flight. The page
-// holds all data as JSON (layers.py); nothing is fetched.
+// The controls: which map or links, device and altitude is shown, and which moment of which flight. The page
+// holds all data as JSON (run_page.py); nothing is fetched.
 
-const NOT_DETECTED = -32768;  // stands for NaN among levels (packing.py)
+const NOT_DETECTED = -32768;  // stands for NaN among levels (run_page.py)
 const PLAY_MS = 40, PLAY_FRAMES = 400;
 const HOVER_PIXELS = 8;
-const HOLES = "Holes: not detected.", DOTS = "Each dot is a held-out link, at the position of its moving end.";
+const HOLES = "Holes: not detected.", DOTS = "Each dot is a held-out link, at the position of its moving end; click one for its levels.";
 
 const control = name => document.getElementById("control-" + name);
 const chosen = name => Number(control(name).value);
@@ -24,8 +24,7 @@ function unpack(value) {
 
 const data = unpack(JSON.parse(document.getElementById("radiotwin-data").textContent));
 const views = data.maps.flatMap(map => map.fields.map(field => ({map, field, label: field.label})));
-if (data.links) for (const when of ["before", "after"])
-  views.push({links: when, label: `held-out residual (measured − predicted): ${when}`});
+for (const field of data.links?.fields ?? []) views.push({field, label: field.label});
 const view = () => views[chosen("view")];
 
 function colourOf(scale, share) {  // (r, g, b) of 0 to 255
@@ -61,8 +60,7 @@ function ticksBetween(low, high) {
 function drawView() {
   const shown = view();
   if (!shown) return;
-  const scale = shown.map ? shown.field.kind : "link";
-  const [low, high] = shown.map ? [shown.field.low, shown.field.high] : [-data.links.range_db, data.links.range_db];
+  const {kind: scale, low, high, title} = shown.field;
   const share = value => (value - low) / (high - low);
   if (shown.map) {
     const {map} = shown, cells = levelsOf(shown), rgba = new Uint8Array(4 * cells.length);
@@ -71,12 +69,12 @@ function drawView() {
   } else {
     const links = linksOf(shown);
     stage.showDots(links.flatMap(n => [data.links.x[n], data.links.y[n], data.links.z[n]]),
-                   links.flatMap(n => colourOf(scale, share(data.links[shown.links][n] / 100)).map(part => part / 255)));
+                   links.flatMap(n => colourOf(scale, share(shown.field.values[n] / 100)).map(part => part / 255)));
   }
+  control("only").parentElement.hidden = Boolean(shown.map) || !data.links.time;
   const bar = control("colours"), stops = data.scales[scale].map(colour => `rgb(${colour})`), los = scale === "los";
   bar.style.background = los ? `linear-gradient(to right, ${stops[0]} 50%, ${stops.at(-1)} 50%)`
                              : `linear-gradient(to right, ${stops})`;
-  const title = shown.map ? shown.field.title : "measured − predicted [dB]";
   control("title").textContent = title;
   const ticks = los ? [[0.25, "no"], [0.75, "yes"]] : ticksBetween(low, high).map(at => [share(at), at.toString().replace("-", "−")]);
   bar.replaceChildren(...ticks.map(([at, text]) => {
@@ -96,11 +94,12 @@ function levelsOf({map, field}) {
                     value => field.kind === "los" ? value : value === NOT_DETECTED ? null : value / 100);
 }
 
-// Indices of the links that the chosen view shows.
-function linksOf({links: when}) {
-  const device = chosen("device") - 1, {links} = data;
-  return Array.from(links.x.keys()).filter(
-    n => links[when][n] !== NOT_DETECTED && (device < 0 || links.device[n] === device));
+// Indices of the links that the chosen view shows: of a device, of a flight up to the chosen time.
+function linksOf({field}) {
+  const {links} = data, device = chosen("device") - 1, only = control("only").checked;
+  const flight = links.flights.indexOf(data.flights[chosen("flight")]?.name);
+  return Array.from(links.x.keys()).filter(n => field.values[n] !== NOT_DETECTED && (device < 0 || links.device[n] === device)
+    && (!only || (links.flight[n] === flight && links.time[n] <= chosen("time") + 1e-3)));
 }
 
 // Flights
@@ -127,7 +126,7 @@ function uavsNow() {
 
 function showTime() {
   control("clock").textContent = `${chosen("time").toFixed(0)} of ${data.flights[chosen("flight")].end_s.toFixed(0)} s`;
-  stage.redraw();
+  if (control("only").checked && !view()?.map) drawView(); else stage.redraw();
 }
 
 function chooseFlight() {  // at its end, where all of its path is shown
@@ -157,19 +156,44 @@ function play() {
   control("play").setAttribute("aria-label", player ? "pause" : "play");
 }
 
+let picked = null;  // a link
+function linkUnder(event) {
+  const box = stage.container.getBoundingClientRect(), {x, y, z} = data.links;
+  return linksOf(view()).find(n => {
+    const at = stage.pixel(x[n], y[n], z[n]);
+    return at && Math.hypot(at[0] + box.left - event.clientX, at[1] + box.top - event.clientY) < HOVER_PIXELS;
+  }) ?? null;
+}
+
+// What is known of a link: residual, and levels where the file has them.
+function textOf(n) {
+  const {links} = data, measured = links.fields.find(({kind}) => kind === "gain");
+  const shown = view().field.interval_db ? view().field : links.fields[1];  // before, or else after
+  const residual = shown.values[n] / 100, ends = shown.interval_db[links.los[n]];
+  const what = [links.devices[links.device[n]], links.flights[links.flight[n]],
+                ...links.time ? [`${links.time[n].toFixed(0)} s`] : [], links.los[n] ? "LoS" : "NLoS"].join(", ");
+  if (!measured || measured.values[n] === NOT_DETECTED || shown.values[n] === NOT_DETECTED) return `${what}: ${residual.toFixed(1)} dB`;
+  const level = measured.values[n] / 100, predicted = level - residual;
+  return `${what}: measured ${level.toFixed(1)}, predicted ${predicted.toFixed(1)} `
+    + `(90 %: ${(predicted + ends[0]).toFixed(1)} to ${(predicted + ends[1]).toFixed(1)}) ${links.unit}`;
+}
+
+function drawPicked(context) {
+  if (picked === null || !view() || view().map) return;
+  const {links, devices} = data, at = [links.x[picked], links.y[picked], links.z[picked]];
+  const device = devices.find(({name}) => name === links.devices[links.device[picked]]);
+  path(context, stage, [at, device?.estimate ?? device?.true], stage.ink, 1.5);
+  const pixel = stage.pixel(...at);
+  if (pixel) ring(context, pixel);
+}
+
 // The level under the pointer
 function textUnder(event) {
   const shown = view();
   if (!shown) return "";
   if (!shown.map) {
-    const box = stage.container.getBoundingClientRect();
-    const near = linksOf(shown).find(n => {
-      const at = stage.pixel(data.links.x[n], data.links.y[n], data.links.z[n]);
-      return at && Math.hypot(at[0] + box.left - event.clientX, at[1] + box.top - event.clientY) < HOVER_PIXELS;
-    });
-    if (near === undefined) return "";
-    const name = data.links.devices[data.links.device[near]], sight = data.links.los[near] ? "LoS" : "NLoS";
-    return `${name}, ${sight}: ${(data.links[shown.links][near] / 100).toFixed(2)} dB`;
+    const n = linkUnder(event) ?? picked;
+    return n === null ? "" : textOf(n);
   }
   const {map, field} = shown, z = map.z[chosen("altitude")], at = stage.under(event, z);
   if (!at) return "";
@@ -190,17 +214,23 @@ function start() {
     container.textContent = "The city cannot be drawn without WebGL, which this browser does not provide: " + error.message;
     return;
   }
-  stage.drawings.push(context => drawAxes(context, stage),
+  stage.drawings.push(context => drawAxes(context, stage), context => drawFound(context, stage),
                       context => { if (control("devices").checked) drawDevices(context, stage); },
-                      context => drawFlight(context, stage, uavsNow()));
+                      context => drawFlight(context, stage, uavsNow()), drawPicked);
+  stage.pick = event => {
+    picked = view() && !view().map ? linkUnder(event) : null;
+    control("hover").textContent = textUnder(event);
+    stage.redraw();
+  };
   stage.hover = event => { control("hover").textContent = textUnder(event); };
   fill(control("view"), views.map(({label}) => label));
+  control("view").value = Math.max(views.findIndex(({map}) => map?.name.startsWith("twin")), 0);
   fill(control("flight"), data.flights.map(({name}) => name));
   document.getElementById("flight-controls").hidden = data.flights.length === 0;
   document.getElementById("scale").hidden = views.length === 0;
   control("buildings").parentElement.hidden = !data.city;
   control("view").onchange = chooseView;
-  control("device").onchange = control("altitude").onchange = drawView;
+  control("device").onchange = control("altitude").onchange = control("only").onchange = drawView;
   control("flight").onchange = chooseFlight;
   control("time").oninput = showTime;
   control("play").onclick = play;

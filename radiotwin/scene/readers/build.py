@@ -41,7 +41,13 @@ from radiotwin.scene.readers.features import (
     left_out_problems,
     problems_of,
 )
-from radiotwin.scene.readers.gis_files import read_geojson, read_geopackage, read_geoparquet
+from radiotwin.scene.readers.gis_files import (
+    LINES,
+    read_geojson,
+    read_geopackage,
+    read_geoparquet,
+    read_json_map,
+)
 from radiotwin.scene.readers.heights import (
     KNOWN,
     READ_COLUMNS,
@@ -53,7 +59,6 @@ from radiotwin.scene.readers.heights import (
     no_height_text,
 )
 from radiotwin.scene.readers.heights import source_text as height_text
-from radiotwin.scene.readers.json_maps import LINES, read_json_map
 from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml
 from radiotwin.scene.readers.plausible import implausible_heights
 from radiotwin.scene.readers.shapefiles import read_shapefile
@@ -120,21 +125,11 @@ def _building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How to read a map.
+    """How to read a map: arguments of `radiotwin.build_scene` of the same names.
 
     Attributes:
-        bbox_deg: (south, west, north, east) [degrees]: only buildings that reach into it are kept,
-            and it becomes the extent; None: all of the file.
-        default_height_m: height of buildings whose tags give none [m]; None: 10 m, with a warning,
-            and an error where a table has columns of numbers and none of them is known.
-        height_column: column that goes before all known ones; None: the known ones.
-        materials: by tag.
-        terrain: GeoTIFF of the ground's heights; None: the ground is flat.
-        crs: coordinate reference system of a file that names none; None: such a file is refused,
-            and GeoJSON is in degrees.
-        layers: of a GeoPackage or an archive of Shapefiles; none: those that hold buildings.
-        terrain_unit: of a terrain that names none, `m` or `ft`; None: metres, and one whose plan is
-            in feet is refused.
+        bbox_deg: (south, west, north, east) [degrees]; `bbox` there.
+        materials: by tag; `material_table` and `materials` there.
     """
 
     bbox_deg: Bounds | None = None

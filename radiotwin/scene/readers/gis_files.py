@@ -1,4 +1,4 @@
-"""Readers of GeoJSON, GeoPackage [1] and GeoParquet [2]: columns of a table become tags.
+"""Readers of GeoJSON and other JSON maps, GeoPackage [1], GeoParquet [2]: columns become tags.
 
 Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only such
 rows are buildings; else every polygon is one. `_` may stand for the `:` of a tag, and case does not
@@ -6,14 +6,17 @@ matter. The tags in GDAL's column `other_tags` are read, too.
 
 GeoPackages are read by SQLite, and the well-known binary of GeoParquet by pyarrow, without GDAL. It
 looks at a file's content, not at its ending: a `.gpkg` can be an XML that names other files or
-servers.
+servers. Well-known binary [3] is checked before GEOS reads it, whose reader calls itself for every
+level of nesting: a few kilobytes can hold more levels than a stack has room for.
 
 [1] https://www.geopackage.org/spec140
 [2] https://geoparquet.org/releases/v1.1.0
+[3] OGC 06-103r4, Simple feature access, section 8.2; with the flags of PostGIS (EWKB).
 """
 
 import re
 import sqlite3
+import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,10 +27,11 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from radiotwin.errors import BadInput
-from radiotwin.io.budgets import COLUMNS, DOCUMENT_BYTES, FEATURES, FILE_BYTES
+from radiotwin.io.budgets import COLUMNS, DOCUMENT_BYTES, FEATURES, FILE_BYTES, NESTING
 from radiotwin.io.cells import read_cells, require_pyarrow
-from radiotwin.io.inputs import open_input, parse_json, read_text
+from radiotwin.io.inputs import decode_text, open_gzip, open_input, parse_json, read_text
 from radiotwin.io.sqlite_tables import open_tables, require_table, scan, stored_columns
+from radiotwin.scene.readers.cityjson import cityjson_map
 from radiotwin.scene.readers.features import (
     BUILDING_KEYS,
     Feature,
@@ -38,6 +42,7 @@ from radiotwin.scene.readers.features import (
 )
 from radiotwin.scene.readers.heights import ALIASES
 from radiotwin.scene.readers.layers import choose_layers, join_layers
+from radiotwin.scene.readers.osm import assemble, osm_of_json
 from radiotwin.scene.readers.systems import (
     WGS84,
     chosen_system,
@@ -45,7 +50,6 @@ from radiotwin.scene.readers.systems import (
     find_system,
     plane_unit_m,
 )
-from radiotwin.scene.readers.wkb import area_of_wkb
 
 _OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*+)"', re.DOTALL)
 _NAME_LENGTH = 200  # characters of an id that are kept
@@ -57,6 +61,45 @@ ELEVATIONS = "z of the coordinates"  # as a report of what is not used names it
 UNREAD = ("building(s) have no geometry, or one that is not read (not finite, a curve, a surface "
           "in space): left out; `ogr2ogr -nlt CONVERT_TO_LINEAR` makes polygons of curves")
 _ENVELOPE_DOUBLES = (0, 4, 6, 6, 8)  # of a geometry's header, by its code
+_Z, _M, _SRID = 0x80000000, 0x40000000, 0x20000000  # flags of EWKB
+_POINT, _RINGS = (1,), (3, 17)  # a polygon, a triangle
+_POSITIONS = (2, 8)  # a line, a circular string
+_COLLECTIONS = (4, 5, 6, 7, 9, 10, 11, 12, 15, 16)
+_PLANE = (1, 2, 3, 4, 5, 6, 7)  # that GEOS has as we need them: without arcs and surfaces in space
+LINES = (".jsonl", ".ndjson", ".geojsonl", ".geojsons", ".geojsonseq")
+"""Endings of files with a feature in each line."""
+_GEOJSON = ("FeatureCollection", "Feature", "Polygon", "MultiPolygon")
+_RECORD = "\x1e"  # may begin each line (RFC 8142)
+
+
+def read_json_map(path: Path, crs: str | None = None) -> MapFile:
+    """Read a map in JSON; one that names no coordinate reference system may need `crs`.
+
+    Raises:
+        BadInput: no such file, none of the three, or an impossible value, with the object's name.
+    """
+    with open_gzip(path, "map in JSON", DOCUMENT_BYTES) as file:
+        text = decode_text(file.read(), path)
+    if path.name.lower().removesuffix(".gz").endswith(LINES):
+        lines = [line for line in text.replace(_RECORD, "").split("\n") if line.strip()]
+        FEATURES.check(len(lines), path)
+        documents = [parse_json(line, f"{path}, row {row}") for row, line in
+                     enumerate(lines, start=1)]
+    else:
+        documents = [parse_json(text, path)]
+    head = documents[0] if documents and isinstance(documents[0], dict) else {}
+    if head.get("type") == "CityJSON":
+        return cityjson_map(path, documents, crs)
+    if head.get("type") in _GEOJSON:
+        return geojson_map(path, head if len(documents) == 1 else
+                           {"type": "FeatureCollection", "features": documents}, crs)
+    if not isinstance(head.get("elements"), list):
+        raise BadInput(f"{path} is neither CityJSON (\"type\": \"CityJSON\"), GeoJSON, nor an "
+                       "answer of Overpass ([out:json]); export the map as one of them")
+    if crs is not None:
+        raise BadInput(f"{path} is in longitude and latitude, as all of OpenStreetMap; leave --crs "
+                       "out")
+    return assemble(osm_of_json(path, head))
 
 
 def read_geojson(path: Path, crs: str | None = None) -> MapFile:
@@ -419,3 +462,63 @@ def _name(path: Path, own: dict | str) -> str:
     except CRSError as error:
         raise BadInput(f"{path}: its coordinate reference system is unknown ({error!s:.100}); "
                        "export it in EPSG:4326") from None
+
+
+def area_of_wkb(data: bytes, source: object) -> BaseGeometry | None:
+    """Return a geometry in well-known binary, with its z.
+
+    Args:
+        data: one geometry.
+        source: of it, for the message.
+
+    Returns:
+        None of one that is not finite, or has curves or surfaces in space.
+
+    Raises:
+        BadInput: geometries within geometries, too many levels of them.
+        shapely.errors.GEOSException: damaged.
+    """
+    if not _kinds(data, source) <= {*_PLANE}:
+        return None
+    area = shapely.from_wkb(data)
+    while any(part.geom_type == "GeometryCollection" for part in shapely.get_parts(area)):
+        area = shapely.GeometryCollection(list(shapely.get_parts(shapely.get_parts(area))))
+    return area if np.isfinite(shapely.get_coordinates(area)).all() else None
+
+
+def _kinds(data: bytes, source: object) -> set[int]:
+    """Return the kinds of a geometry and all within it."""
+    found: set[int] = set()
+    at, waiting = 0, [1]  # geometries that are still to come, by level
+    try:
+        while waiting:
+            if not waiting[-1]:
+                waiting.pop()
+                continue
+            waiting[-1] -= 1
+            order = "<" if data[at] else ">"
+            code, = struct.unpack_from(order + "I", data, at + 1)
+            at += 9 if code & _SRID else 5
+            more, kind = divmod(code & ~(_Z | _M | _SRID), 1000)
+            has_z, has_m = more in (1, 3) or code & _Z, more in (2, 3) or code & _M
+            size = 8 * (2 + bool(has_z) + bool(has_m))
+            found.add(kind)
+            if kind in _POINT:
+                at += size
+                continue
+            count, = struct.unpack_from(order + "I", data, at)
+            at += 4
+            if kind in _POSITIONS:
+                at += count * size
+            elif kind in _RINGS:
+                for _ in range(count):
+                    corners, = struct.unpack_from(order + "I", data, at)
+                    at += 4 + corners * size
+            elif kind in _COLLECTIONS:
+                waiting.append(count)
+                NESTING.check(len(waiting) - 2, source)
+            else:
+                raise shapely.errors.GEOSException(f"unknown kind of geometry {code}")
+    except (struct.error, IndexError):
+        raise shapely.errors.GEOSException("cut off") from None
+    return found

@@ -4,6 +4,14 @@ Heights are from a GeoTIFF, at the nodes of a grid in the local frame. GDAL open
 driver for GeoTIFF alone, so a file that is something else under its name (a VRT, which names other
 files or servers) is refused, and looks at no file beside it. It reads windows in full resolution:
 for others it would open the overviews that a file names.
+
+Triangles approximate the heights, refined greedily [1]: a Delaunay triangulation [2] of few nodes
+takes in, round by round, the node of each triangle that is farthest from it, until none is farther
+than a tolerance or there are as many triangles as are wanted.
+
+[1] Garland, Heckbert, "Fast polygonal approximation of terrains and height fields", CMU-CS-95-181,
+    1995.
+[2] Barber, Dobkin, Huhdanpaa, "The Quickhull algorithm for convex hulls", ACM TOMS 22(4), 1996.
 """
 
 import re
@@ -17,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.spatial import Delaunay
 
 from radiotwin.errors import BadInput, optional_package
 from radiotwin.geo import to_geographic, to_local
@@ -26,12 +35,12 @@ from radiotwin.io.inputs import check_input
 from radiotwin.runtime.console import progress
 from radiotwin.scene.checks import Problem, warning
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.config import TerrainConfig, Vertical
 from radiotwin.scene.folder import source_text
 from radiotwin.scene.readers.heights import FOOT_M, UNITS_M
 from radiotwin.scene.readers.plausible import STEP_M, steep_steps, zero_voids
 from radiotwin.scene.readers.solids import Prism
 from radiotwin.scene.readers.systems import find_system, plane_unit_m
-from radiotwin.scene.terrain import GroundMesh, HeightGrid, Kind, TerrainConfig, triangulate
 
 if TYPE_CHECKING:
     from pyproj import CRS
@@ -48,11 +57,119 @@ _METRES = ("", "m", "metre", "metres", "meter", "meters")
 _GDAL = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO",
          "GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 2**26}
 Bounds = tuple[float, float, float, float]
+BORDER_NODES = 8  # of the first triangulation, along each side
 TOLERANCE_M = 0.5  # of the triangles: better than most terrain models are
 MAX_FACES = 20_000
 SKIRT_M = 1.0  # that walls reach below the lowest ground under them, so that no gap opens
 SAMPLE_M = 2.0  # along outlines: on a slope of 45 degrees the ground falls by a skirt in half of it
 FLAT_FACT = "flat, at z = 0: a map holds no terrain (--terrain FILE.tif adds one)"
+
+
+@dataclass(frozen=True, eq=False)
+class HeightGrid:
+    """Heights of the ground at the nodes of a regular grid in the local frame.
+
+    Attributes:
+        x_m: (nx,) east coordinates, ascending [m].
+        y_m: (ny,) north coordinates, ascending [m].
+        height_m: (ny, nx) heights above the zero of the vertical reference [m].
+        filled: share of the nodes that the source has no height for; they have the nearest one.
+        reference: name of the vertical reference, for people.
+        kind: of the reference.
+        notes: on how the source was read.
+    """
+
+    x_m: np.ndarray
+    y_m: np.ndarray
+    height_m: np.ndarray
+    filled: float = 0.0
+    reference: str = "not declared"
+    kind: Vertical = "unknown"
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class GroundMesh:
+    """Triangles of the ground, all facing up.
+
+    Attributes:
+        vertices: (v, 3) [m].
+        faces: (f, 3) indices of vertices, counter-clockwise seen from above.
+        max_error_m: largest distance of a node of the grid from the triangles, upwards [m].
+        rms_error_m: root mean square of these distances [m].
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    max_error_m: float
+    rms_error_m: float
+
+
+def triangulate(grid: HeightGrid, tolerance_m: float, max_faces: int) -> GroundMesh:
+    """Approximate the heights of a grid by few triangles.
+
+    Args:
+        grid: heights; at least 2 x 2 nodes.
+        tolerance_m: distance of a node from the triangles that is small enough [m].
+        max_faces: number of triangles that is not exceeded by more than the borders' first ones.
+
+    Returns:
+        Triangles whose corners are nodes of the grid; they cover its rectangle without gaps.
+    """
+    height_m = np.asarray(grid.height_m, dtype=float)
+    rows, columns = np.indices(height_m.shape)
+    # Whole numbers: nodes in a line stay in a line, and the rectangle has no notches
+    node = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+    z_m, chosen = height_m.ravel(), _border(height_m.shape)
+    while True:
+        mesh = Delaunay(node[chosen])
+        triangle, error_m = _errors(mesh, node, z_m, chosen)
+        room = (max_faces - len(mesh.simplices)) // 2  # a node in a triangle makes two more
+        worst = _worst_of_each(triangle, error_m, tolerance_m)[:max(room, 0)]
+        if not len(worst):
+            break
+        chosen = np.union1d(chosen, worst)
+    corners = np.column_stack([grid.x_m[columns.ravel()[chosen]], grid.y_m[rows.ravel()[chosen]],
+                               z_m[chosen]])
+    return GroundMesh(corners, _upward(node[chosen], mesh.simplices), float(error_m.max()),
+                      float(np.sqrt(np.mean(error_m**2))))
+
+
+def _border(shape: tuple[int, ...]) -> np.ndarray:
+    """Return the (n,) flat indices of some nodes along the border, the corners among them."""
+    across, up = (np.unique(np.linspace(0, size - 1, min(size, BORDER_NODES)).round().astype(int))
+                  for size in (shape[1], shape[0]))
+    return np.unique(np.concatenate([across, (shape[0] - 1) * shape[1] + across,
+                                     up * shape[1], up * shape[1] + shape[1] - 1]))
+
+
+def _upward(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the (f, 3) triangles of points (n, 2) counter-clockwise, without flat ones."""
+    a, b, c = points[faces].swapaxes(0, 1)
+    double_area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    faces = np.where((double_area < 0)[:, None], faces[:, ::-1], faces)
+    return faces[np.abs(double_area) > 0.5].astype(np.int64)  # of whole numbers: 0, or 1 and more
+
+
+def _errors(mesh: Delaunay, node: np.ndarray, z_m: np.ndarray,
+            chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (n,) triangle that each node lies in, and its distance from it, upwards [m]."""
+    triangle = mesh.find_simplex(node)
+    affine = mesh.transform[triangle]
+    share = np.einsum("nij,nj->ni", affine[:, :2], node - affine[:, 2])
+    share = np.column_stack([share, 1 - share.sum(axis=1)])
+    at_m = np.einsum("ni,ni->n", share, z_m[chosen][mesh.simplices[triangle]])
+    error_m = np.nan_to_num(np.abs(at_m - z_m))  # not a number: in a flat triangle of the border
+    error_m[chosen] = 0.0
+    return triangle, error_m
+
+
+def _worst_of_each(triangle: np.ndarray, error_m: np.ndarray, tolerance_m: float) -> np.ndarray:
+    """Return the farthest node of each triangle that has one beyond a tolerance, worst first."""
+    order = np.argsort(-error_m, kind="stable")
+    order = order[error_m[order] > tolerance_m]
+    _, first = np.unique(triangle[order], return_index=True)
+    return order[np.sort(first)]
 
 
 def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = None) -> HeightGrid:
@@ -171,7 +288,7 @@ def _pixels_of(file: Any, system: "CRS", origin: Origin) -> Any:
 
 
 def _vertical(path: Path, file: Any, system: "CRS",
-              declared: str | None) -> tuple[float, str, Kind]:
+              declared: str | None) -> tuple[float, str, Vertical]:
     """Return the factor to metres, the name of the vertical reference, and its kind."""
     vertical = next((part for part in system.sub_crs_list if part.is_vertical), None)
     axis = vertical.axis_info[0] if vertical is not None else (
@@ -196,7 +313,7 @@ def _vertical(path: Path, file: Any, system: "CRS",
         raise BadInput(f"{path} has heights in {unit[:40]!r}; allowed are metres and feet: convert "
                        "them (`gdal_calc.py`), or correct the unit (`gdal_edit.py -units m`)")
     if vertical is not None:
-        kind: Kind = "ellipsoid" if "ellipsoid" in vertical.name.lower() else "geoid"
+        kind: Vertical = "ellipsoid" if "ellipsoid" in vertical.name.lower() else "geoid"
         return factor, vertical.name, kind
     if axis is not None:
         return factor, f"ellipsoid of {system.name}", "ellipsoid"

@@ -24,11 +24,11 @@ def test_netcdf_follows_the_conventions(radio_map, scene, tmp_path):
         mapping = dataset[dataset["gain_db"].attrs["grid_mapping"]]
         assert CRS.from_cf(mapping.attrs).equals(CRS(local_crs(scene.config.origin)), ignore_axis_order=True)
         assert "_FillValue" not in dataset["x"].encoding and np.isnan(dataset["gain_db"].encoding["_FillValue"])
-    again = RadioMap.read(path)
+    again = RadioMap.load(path)
     assert again.dataset.attrs["origin_latitude_deg"] == 47.5 and set(again.dataset.data_vars) == {
         "gain_db", "los", "sigma_db"}
     again.write(tmp_path / "again.nc")
-    xr.testing.assert_identical(RadioMap.read(tmp_path / "again.nc").dataset, again.dataset)
+    xr.testing.assert_identical(RadioMap.load(tmp_path / "again.nc").dataset, again.dataset)
 
 
 def test_without_an_origin_there_is_no_grid_mapping(radio_map, small_scene, tmp_path):

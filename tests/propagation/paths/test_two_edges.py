@@ -26,9 +26,9 @@ def two_roofs(*heights_m):
     return CityMap(np.concatenate([one.vertices, other.vertices]), np.concatenate([one.faces, other.faces + 6]))
 
 
-def over_free(city, from_m, to_m, kind, wedge="luebbers"):
+def over_free(city, from_m, to_m, kind):
     """Power of paths over one or two edges, over that of free space."""
-    powers = path_powers(city, from_m, to_m[None], FREQUENCY_HZ, depth=2, wedge=wedge)
+    powers = path_powers(city, from_m, to_m[None], FREQUENCY_HZ, depth=2)
     return getattr(powers, kind)[0] / (WAVELENGTH_M / (4 * np.pi * np.linalg.norm(to_m - from_m))) ** 2
 
 
@@ -43,13 +43,12 @@ def above_line(height_m, x_m, from_m, to_m):
     return height_m - (from_m[1] + (x_m - from_m[0]) / (to_m[0] - from_m[0]) * (to_m[1] - from_m[1]))
 
 
-@pytest.mark.parametrize("wedge", ["luebbers", "sionna"])
-def test_two_parallel_edges_are_a_product(wedge):
+def test_two_parallel_edges_are_a_product():
     """Each edge is the other's end of the path; the spreading is Millington's (ITU-R P.526-15, eq. 36)."""
-    got = over_free(two_roofs(30, 34), DEVICE_M, RECEIVER_M, "diffracted_2", wedge)
+    got = over_free(two_roofs(30, 34), DEVICE_M, RECEIVER_M, "diffracted_2")
     ridges_m = np.array([[0, 0, 30]]), np.array([[60, 0, 34]])
-    first = over_free(sharp_roof(0, 30), DEVICE_M, ridges_m[1][0], "diffracted", wedge)
-    second = over_free(sharp_roof(60, 34), ridges_m[0][0], RECEIVER_M, "diffracted", wedge)
+    first = over_free(sharp_roof(0, 30), DEVICE_M, ridges_m[1][0], "diffracted")
+    second = over_free(sharp_roof(60, 34), ridges_m[0][0], RECEIVER_M, "diffracted")
     legs = ((DEVICE_M, ridges_m[0]), (ridges_m[0], ridges_m[1]), (ridges_m[1], RECEIVER_M))
     a, b, c = (np.linalg.norm(end - start) for start, end in legs)
     # Each power is over that of the straight line, whose lengths are not those of the bent ways

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.runtime import processes
-from radiotwin.runtime.execution import Executor, Job, Resources, local, open_executor
-from radiotwin.runtime.execution.job import NoCache
+from radiotwin.runtime import execution, processes
+from radiotwin.runtime.execution import Executor, Job, Resources, open_executor
+from radiotwin.runtime.jobs import NoCache
 from radiotwin.runtime.processes import usable_cores
 from tests.runtime.execution.jobs import (
     PLACES,
@@ -142,7 +142,7 @@ def test_more_memory_than_there_is_ends_in_one_message():
 
 
 def test_no_more_room_is_asked_for_than_there_are_pieces(monkeypatch):
-    monkeypatch.setattr(local, "free_memory_bytes", lambda: 3 * 2**30)
+    monkeypatch.setattr(execution, "free_memory_bytes", lambda: 3 * 2**30)
     with open_executor("4") as executor:
         assert executor.run(Job("squares", square, Resources(memory_bytes=2**30)), [1, 2]) == [1, 4]
         with pytest.raises(RunFailed, match="4 worker.s. may take 1.0 GiB of memory each, and 3 would fit"):

@@ -20,7 +20,7 @@ from radiotwin.scene.materials import STANDARD
 from radiotwin.scene.readers import MapOptions, build_scene_from_map, with_pairs
 from radiotwin.scene.readers.citygml import read_citygml
 from radiotwin.scene.readers.extrude import make_blocks
-from radiotwin.scene.readers.json_maps import read_json_map
+from radiotwin.scene.readers.gis_files import read_json_map
 from radiotwin.scene.readers.solids import find_contacts, make_shell_prisms
 from tests.scene.readers import city_models as made
 

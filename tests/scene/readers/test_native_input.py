@@ -15,7 +15,7 @@ import shapely
 from radiotwin.errors import BadInput
 from radiotwin.scene.meshes import cut_polygon, is_closed
 from radiotwin.scene.readers import build_scene
-from radiotwin.scene.readers.wkb import area_of_wkb
+from radiotwin.scene.readers.gis_files import area_of_wkb
 from tests.scene.readers import city_models as made
 from tests.terrains import write_dem
 

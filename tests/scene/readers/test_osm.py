@@ -7,7 +7,7 @@ import shapely
 from radiotwin.errors import BadInput
 from radiotwin.scene.readers import build_scene
 from radiotwin.scene.readers.features import left_out_problems
-from radiotwin.scene.readers.json_maps import read_json_map
+from radiotwin.scene.readers.gis_files import read_json_map
 from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml, stitch
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from radiotwin.errors import BadInput, RunFailed, optional_package
 from radiotwin.io.signals import deferred, kept_from_children
-from radiotwin.runtime.execution.job import (
+from radiotwin.runtime.jobs import (
     SHARE_ROUNDING,
     Death,
     Outcome,

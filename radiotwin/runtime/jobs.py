@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, Generic, Protocol, TypeVar
 
 from radiotwin.runtime.processes import die_with_parent
@@ -127,15 +126,12 @@ class PieceRunner:
         return outcome
 
 
-@cache
-def of_this_process() -> PieceRunner:
-    """Return the runner of a process that is nothing but a worker."""
-    return PieceRunner()
+_of_this_process = PieceRunner()
 
 
 def run_piece(piece: Any, function: bytes | None = None) -> Outcome:
     """Run a piece in a process that is nothing but a worker; see `PieceRunner.run`."""
-    return of_this_process().run(piece, function)
+    return _of_this_process.run(piece, function)
 
 
 def begin(parent: int) -> int:
