@@ -21,7 +21,7 @@ from scipy.constants import speed_of_light
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import PATHS, RESPONSE_VALUES, ROWS
 from radiotwin.io.files import atomic_file, require_suffix, require_writable
-from radiotwin.maps.form import CONVENTIONS
+from radiotwin.maps.file import CONVENTIONS
 from radiotwin.propagation.paths.candidates import candidate_search
 from radiotwin.propagation.paths.fields import path_amplitudes
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
