@@ -431,12 +431,12 @@ def _estimates(run: Run) -> Table | None:
         (x_m, y_m, _), true = device["estimate"], device["true"]
         error_m = np.hypot(x_m - true[0], y_m - true[1]) if true else np.nan
         radius_m = np.nan if device["radius_m"] is None else device["radius_m"]
-        rows.append([device["name"], _how_sure(device),
-                     place_words(x_m, y_m, origin) if origin else "–", float(x_m), float(y_m),
+        place = [place_words(x_m, y_m, origin)] if origin else []
+        rows.append([device["name"], _how_sure(device), *place, float(x_m), float(y_m),
                      float(error_m), radius_m])
-    columns = ("device", "position", "latitude, longitude", "x [m]", "y [m]", "error [m]",
-               "90 % radius [m]")
-    return Table(columns, rows, text_columns=3) if rows else None
+    texts = ["device", "position"] + ["latitude, longitude"] * bool(origin)
+    return Table([*texts, "x [m]", "y [m]", "error [m]", "90 % radius [m]"], rows,
+                 text_columns=len(texts)) if rows else None
 
 
 def _is_found(device: dict) -> bool:
