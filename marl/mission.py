@@ -186,7 +186,7 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: st
         rate_scale=float(config.mission.rate_scale),
         threshold_db=float(config.radio.snr_threshold_db),
         detection_db=float(config.gain_limit_db + to_snr_db),
-        uav_link_db=np.array([to_snr_db + LOS_LAW.intercept_db, 10 * LOS_LAW.exponent]),
+        uav_link_db=np.array([to_snr_db + LOS_LAW.intercept_db, -10 * LOS_LAW.exponent]),
         max_rate=assignment == "max-rate",
         shadowing_share=float(radio_map.dataset.attrs.get("shadowing_share", 0.0)),
         shadowing_m=float(radio_map.dataset.attrs.get("shadowing_length_m", 50.0)))

@@ -69,7 +69,7 @@ def generated_mission(seed: int, uavs: int = 3, devices: int = 10, battery: floa
         np.full(uavs, hovers), np.arange(uavs) % len(altitudes_m),
         np.array([altitudes_m[u % len(altitudes_m)] for u in range(uavs)]),
         data_units * rng.uniform(2 / 3, 4 / 3, devices), device_m[:, :2].copy(), STEP_M, 100.0,
-        10.0, -np.inf, np.array([TX_LESS_NOISE_DB + LOS_LAW.intercept_db, 10 * LOS_LAW.exponent]),
+        10.0, -np.inf, np.array([TX_LESS_NOISE_DB + LOS_LAW.intercept_db, -10 * LOS_LAW.exponent]),
         False)
 
 

@@ -138,11 +138,11 @@ def measure_reciprocity(seed: int, settings: dict) -> dict:
             seconds[name] = (time.process_time() - started) / forward.size
             backward = np.stack([solve(each_m, device_m) for each_m in receiver_m]).T
             both[name] = forward, backward
-    released, mended, engine = both.values()
+    released, mended, ours = both.values()
     return {"exchanged": {name: {kind: _exchanged(*gains, of_kind) for kind, of_kind in
                                  (("LoS", los), ("NLoS", ~los))} for name, gains in both.items()},
             "changed": {"Sionna RT": _changed(released[0], mended[0], wall_m, los)},
-            "engine_errors": _errors(engine[0], *mended, los),
+            "engine_errors": _errors(ours[0], *mended, los),
             "link_ms": {name: 1e3 * taken for name, taken in seconds.items()}}
 
 

@@ -118,7 +118,7 @@ def coverage(
 
 def _world(source: Path, scene: Path | None, model: str | None) -> "Scene":
     """Return the scene of a source, once the options that go with it are checked."""
-    from radiotwin.maps.form import is_map
+    from radiotwin.maps.file import is_map
     from radiotwin.scene import Scene
 
     if (source / "scene.toml").exists():

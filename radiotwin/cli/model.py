@@ -106,7 +106,7 @@ def map_(
     It holds the gain of every device over the scene's lattice.
     """
     from radiotwin.io.inputs import keep_inputs, keep_others
-    from radiotwin.maps.form import is_map
+    from radiotwin.maps.file import is_map
     from radiotwin.report import check_map_target, export_map
     from radiotwin.scene import Scene
 

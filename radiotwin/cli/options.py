@@ -73,7 +73,7 @@ def open_model(path: Path) -> "Iterator[RadioMap | Twin]":
     Raises:
         BadInput: it is neither.
     """
-    from radiotwin.maps.form import is_map
+    from radiotwin.maps.file import is_map
     from radiotwin.maps.radiomap import RadioMap
     from radiotwin.twin import Twin
 

@@ -20,8 +20,7 @@ HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
 Limit = float | np.ndarray | None
 """Level below which nothing is detected [dB], for all links or each (n,); None or -inf: unknown."""
 MIN_SD_DB, MAX_SD_DB = 0.1, 100.0  # of a fitted standard deviation: far outside what is measured
-# Mean and sd of a normal prior: it decides only where the distances hardly differ.
-EXPONENT_PRIOR = (-3.0, 2.0)
+EXPONENT_PRIOR = 3.0, 2.0  # mean, standard deviation: it decides where distances hardly differ
 
 
 def robust_sd(values: np.ndarray) -> float:
@@ -115,11 +114,11 @@ def gaussian_nll_torch(level: torch.Tensor, mean: torch.Tensor, log_sd: torch.Te
 
 @dataclass(frozen=True)
 class LogDistanceLine:
-    """gain = intercept + 10 * exponent * log10(d / 1 m) + N(0, sd^2), the log-distance law.
+    """gain = intercept - 10 * exponent * log10(d / 1 m) + N(0, sd^2), the log-distance law.
 
     Attributes:
         intercept_db: mean gain at 1 m [dB].
-        exponent: path-loss exponent, negative where the gain falls with distance.
+        exponent: path-loss exponent, positive where the gain falls with distance.
         sd_db: standard deviation [dB].
     """
 
@@ -129,7 +128,7 @@ class LogDistanceLine:
 
     def mean_db(self, log_distance: np.ndarray) -> np.ndarray:
         """Return the mean gain [dB] at log10(d / 1 m), any shape."""
-        return self.intercept_db + 10.0 * self.exponent * log_distance
+        return self.intercept_db - 10.0 * self.exponent * log_distance
 
 
 def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
@@ -152,7 +151,7 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
     u, v = (x - x_mid) / x_scale, y - y_mid
     u_below = (log_distance[~detected] - x_mid) / x_scale
     limit = limits_of(limit_db, len(level_db))[~detected] - y_mid
-    prior_slope, prior_sd = (10.0 * x_scale * value for value in EXPONENT_PRIOR)
+    prior_loss, prior_sd = (10.0 * x_scale * value for value in EXPONENT_PRIOR)
 
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
         level, slope, log_sd = theta
@@ -160,7 +159,7 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
         z, z_below = h * (v - level - slope * u), h * (limit - level - slope * u_below)
         log_phi = log_ndtr(z_below)
         ratio = np.exp(-0.5 * z_below**2 - HALF_LOG_2PI - log_phi)
-        pull = (slope - prior_slope) / prior_sd
+        pull = (slope + prior_loss) / prior_sd
         value = 0.5 * z @ z + len(z) * log_sd - log_phi.sum() + 0.5 * pull**2
         gradient = [
             h * (ratio.sum() - z.sum()),
@@ -176,7 +175,7 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
     level, slope, log_sd = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds,
                                     options={"ftol": 1e-14, "gtol": 1e-8}).x
     slope_db = slope / x_scale
-    return LogDistanceLine(float(y_mid + level - slope_db * x_mid), float(slope_db / 10.0),
+    return LogDistanceLine(float(y_mid + level - slope_db * x_mid), float(-slope_db / 10.0),
                            float(np.exp(log_sd)))
 
 

@@ -39,8 +39,7 @@ from radiotwin.display import (
 from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, origin_attributes, place
 from radiotwin.io.forms import Origin
-from radiotwin.maps.file import load_dataset, open_dataset, write_parts
-from radiotwin.maps.form import (
+from radiotwin.maps.file import (
     ATTRIBUTES,
     DIMS,
     GROUND,
@@ -49,8 +48,11 @@ from radiotwin.maps.form import (
     MapBlock,
     MapStream,
     header,
+    load_dataset,
+    open_dataset,
     parts_of,
     placed_attributes,
+    write_parts,
 )
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice

@@ -83,8 +83,8 @@ class FlightGrid:
 
 
 # Parameters of Chen et al. 2023
-LOS_LAW = LogDistanceLine(-30.0, -2.5, 2**0.5)
-NLOS_LAW = LogDistanceLine(-35.0, -3.04, 5**0.5)
+LOS_LAW = LogDistanceLine(-30.0, 2.5, 2**0.5)
+NLOS_LAW = LogDistanceLine(-35.0, 3.04, 5**0.5)
 
 
 def segmented_truth(scene: Scene) -> RadioMap:

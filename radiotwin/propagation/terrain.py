@@ -42,7 +42,7 @@ class Profiles(NamedTuple):
 
 
 class TerrainPaths(NamedTuple):
-    """What reaches n receivers along the profile.
+    """Power that reaches n receivers over the terrain profile.
 
     Attributes:
         gain: (n,) power gain between isotropic antennas, linear.
@@ -60,7 +60,7 @@ def is_far(device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:
 
 def terrain_paths(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
                   frequency_hz: float) -> TerrainPaths:
-    """Return what reaches receivers (n, 3) along the profiles from a device (3,) [m]."""
+    """Return the power at receivers (n, 3) over the profiles from a device (3,) [m]."""
     found = TerrainPaths(np.zeros(len(receiver_m)), (device_m + receiver_m) / 2)
     for rows, profiles in _profiles(city, device_m, receiver_m):
         way_m = receiver_m[rows] - device_m

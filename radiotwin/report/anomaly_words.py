@@ -1,16 +1,20 @@
 """Say which groups of links read otherwise than their peers, by how much, and why perhaps."""
 
 from collections.abc import Collection, Sequence
+from typing import Any
 
 from radiotwin.closeloop.verdict.criteria import LIKELY, MIN_SURE
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER
 from radiotwin.display import count
 from radiotwin.effects.registry import effects_named
+from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
 from radiotwin.report.labels import (
     DATES_S,
     join_names,
     name_label,
+    origin_of,
+    place_words,
     probability,
     signed,
     variable_label,
@@ -55,7 +59,7 @@ def where(report: dict) -> str:
 
 def sentence(anomaly: dict, report: dict) -> str:
     """Say how a group reads otherwise than its peers: "Device d3 reads 5.6 dB less than …"."""
-    who, is_plural = group(anomaly)
+    who, is_plural = group(anomaly, origin_of(report))
     sight = SIGHT.get(anomaly.get("sight", "all"))
     start = f"{sight} {who}" if sight else who
     maybe = "" if anomaly["probability"] >= MIN_SURE else "probably "
@@ -97,8 +101,11 @@ def cause(name: str, members: Collection[str]) -> str:
     return " or ".join(dict.fromkeys(words)) or name_label(name)
 
 
-def group(anomaly: dict) -> tuple[str, bool]:
-    """Return a group in words, such as "device d3 on flight f2", and whether it is a plural."""
+def group(anomaly: dict, origin: Origin | None = None) -> tuple[str, bool]:
+    """Return a group in words, such as "device d3 on flight f2", and whether it is a plural.
+
+    Its place is in latitude and longitude where the origin of the frame is given.
+    """
     members = {end: names for end in ENDS if (names := anomaly["members"].get(end))}
     text = ""
     one = anomaly["family"] in ENDS and len(members) > 1  # they have the same links
@@ -107,7 +114,7 @@ def group(anomaly: dict) -> tuple[str, bool]:
         text += f"{joined}{end}{'s' * (len(names) > 1)} {some_names(names)}"
     text += " (they never part)" * one
     is_plural = bool(members) and len(next(iter(members.values()))) > 1
-    ranges = [_range(name, *ends) for name, ends in _ranges(anomaly)]
+    ranges = [_range(name, *ends, origin=origin) for name, ends in _ranges(anomaly)]
     if not members:
         text, is_plural = "links", True
     return " ".join([text, *ranges]), is_plural
@@ -118,7 +125,7 @@ def rows(report: dict) -> list[list[str]]:
     found = []
     for index, each in enumerate(report.get("anomalies", [])):
         sight = SIGHT.get(each.get("sight", "all"))
-        group_words = group(each)[0] + (f", {sight}" if sight else "")
+        group_words = group(each, origin_of(report))[0] + (f", {sight}" if sight else "")
         found.append([
             group_words, statistic(each), size(each), interval(each["size"]),
             probability(each["probability"]), f"{each['links']:,}",
@@ -234,8 +241,12 @@ def _ranges(anomaly: dict) -> list[tuple[str, Sequence[float | None]]]:
     return [*found, *ranges.items()]
 
 
-def _range(name: str, *ends: float | None) -> str:
+def _range(name: str, *ends: Any, origin: Origin | None) -> str:
     """Return a range in words: "at distances of 100 to 300 m"."""
+    if name == "place" and origin:
+        west_m, east_m, south_m, north_m = ends
+        middle = place_words((west_m + east_m) / 2, (south_m + north_m) / 2, origin)
+        return f"at or through {east_m - west_m:.0f} by {north_m - south_m:.0f} m about {middle}"
     if name == "place":
         west, east, south, north = (_whole(each) for each in ends)
         return f"at or through x {west} to {east} m, y {south} to {north} m"

@@ -7,7 +7,6 @@ from math import hypot
 from radiotwin.closeloop.verdict.criteria import LIKELY, MIN_SURE, SelectionCriteria
 from radiotwin.closeloop.verdict.posterior import NONE, OTHER
 from radiotwin.effects.registry import effects_named
-from radiotwin.geo import to_geographic
 from radiotwin.io.forms import Origin
 from radiotwin.report.anomaly_words import MAX_NAMED, group, seen_from, some_names, where
 from radiotwin.report.labels import (
@@ -15,8 +14,9 @@ from radiotwin.report.labels import (
     join_names,
     name_label,
     number,
+    origin_of,
+    place_words,
     probability,
-    signed,
     variable_label,
 )
 
@@ -54,7 +54,7 @@ def verdict(report: dict) -> str:
         start = "found" if is_sure(report) else "probable"
         return f"{start}: {join_names(cause_names(report))}"
     if report["verdict"] == "located":
-        groups = [group(each)[0] for each in report["anomalies"]]
+        groups = [group(each, origin_of(report))[0] for each in report["anomalies"]]
         return f"located: {some_names(groups)}; cause open"
     return {"none": "nothing stands out"}.get(report["verdict"], report["verdict"])
 
@@ -73,8 +73,7 @@ def cause_names(report: dict) -> list[str]:
 
 def objects(report: dict) -> list[str]:
     """Name what was found, with size and place: "a building that the map lacks, 33 by 38 m …"."""
-    origin = (report.get("inputs") or {}).get("origin")
-    return [_object(each, Origin(**origin) if origin else None) for each in causes(report)]
+    return [_object(each, origin_of(report)) for each in causes(report)]
 
 
 def _object(effect: dict, origin: Origin | None) -> str:
@@ -105,15 +104,6 @@ def _object(effect: dict, origin: Origin | None) -> str:
     places = [each for each in effect.get("places", []) if each.get("device", "") in ("", *members)]
     return words + (f", at {place_words(places[0]['x_m'], places[0]['y_m'], origin)}"
                     if len(places) == 1 else "")
-
-
-def place_words(x_m: float, y_m: float, origin: Origin | None) -> str:
-    """Return a place in latitude and longitude, in metres where the origin is not known."""
-    if origin is None:
-        return f"x {signed(x_m, 0)} m, y {signed(y_m, 0)} m"
-    longitude_deg, latitude_deg = (float(each) for each in to_geographic(origin, x_m, y_m))
-    return (f"{abs(latitude_deg):.5f}° {'NS'[latitude_deg < 0]}, "
-            f"{abs(longitude_deg):.5f}° {'EW'[longitude_deg < 0]}")
 
 
 def _member(parameter: str) -> str:

@@ -19,7 +19,7 @@ from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import Real, Record, Whole, read_record, validated
 from radiotwin.links.measurements import Measurements
-from radiotwin.maps.form import is_zarr
+from radiotwin.maps.file import is_zarr
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report.html import Table, read_picture
 from radiotwin.report.labels import LOS_COLOUR, MODELS, NLOS_COLOUR, save

@@ -28,8 +28,7 @@ from radiotwin.links.alignment import in_known_frame
 from radiotwin.links.measurements import read_measurements
 from radiotwin.maps.export import EXPORTERS, check_format, select, write_map
 from radiotwin.maps.export.tables import check_map_place
-from radiotwin.maps.file import check_target, size_of
-from radiotwin.maps.form import NETCDF, ZARR, MapStream, is_zarr
+from radiotwin.maps.file import NETCDF, ZARR, MapStream, check_target, is_zarr, size_of
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import segmented_truth
 from radiotwin.report.closeloop_figures import write_closeloop_figures

@@ -11,7 +11,9 @@ from matplotlib.figure import Figure
 
 from radiotwin.display import plain
 from radiotwin.effects.registry import LAST_RESORTS, catalogue, effects_named
+from radiotwin.geo import to_geographic
 from radiotwin.io.files import atomic_file
+from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 
@@ -146,6 +148,21 @@ def signed(value: float, digits: int = 1) -> str:
     """Return a number with a few digits; one that is rounded to 0 has no sign."""
     text = f"{value:,.{digits}f}"
     return text.removeprefix("-") if not float(text.replace(",", "")) else text.replace("-", "−")
+
+
+def origin_of(report: dict) -> Origin | None:
+    """Return the origin of the local frame of a `closeloop.json`; None where it is not known."""
+    origin = (report.get("inputs") or {}).get("origin")
+    return Origin(**origin) if origin else None
+
+
+def place_words(x_m: float, y_m: float, origin: Origin | None) -> str:
+    """Return a place in latitude and longitude, in metres where the origin is not known."""
+    if origin is None:
+        return f"x {signed(x_m, 0)} m, y {signed(y_m, 0)} m"
+    longitude_deg, latitude_deg = (float(each) for each in to_geographic(origin, x_m, y_m))
+    return (f"{abs(latitude_deg):.5f}° {'NS'[latitude_deg < 0]}, "
+            f"{abs(longitude_deg):.5f}° {'EW'[longitude_deg < 0]}")
 
 
 def probability(value: float | None) -> str:

@@ -212,7 +212,8 @@ def _mark_twin_device(ax: Axes, device: TwinDevice) -> None:
     ax.plot(*position_m, "X", color=FOUND, markeredgecolor="white", markersize=9,
             label="device, located" if device.located else "device, best guess")
     if np.isfinite(device.credible_radius_m):
-        ax.add_artist(Circle(position_m, device.credible_radius_m, fill=False, color=FOUND))
+        ax.add_artist(Circle((device.x_m, device.y_m), device.credible_radius_m,
+                             fill=False, color=FOUND))
         ax.plot([], [], "o", markerfacecolor="none", color=FOUND, label="holds it with 90 %")
 
 
@@ -292,7 +293,8 @@ class MapBackground:
     def panels(self, count: int) -> list[Axes]:
         """Return the axes of a new figure: that of each panel, with its legend, is as wide."""
         figure = new_figure(PANEL_IN * count, self.panel_height(PANEL_IN - 0.7) + 1.7)
-        axes = [part.add_subplot() for part in np.atleast_1d(figure.subfigures(1, count))]
+        parts = figure.subfigures(1, count, squeeze=False)[0]
+        axes = [part.add_subplot() for part in parts]
         for ax in axes:
             self.draw(ax)
         return axes
@@ -402,8 +404,8 @@ def _ring_devices(ax: Axes, links: DrawnLinks, report: dict) -> None:
               if place.get("device") and is_changed(effect, place["device"])}
     ringed_m = links.device_m[[name in named for name in links.device_names]]
     if len(ringed_m):
-        ax.scatter(*ringed_m[:, :2].T, marker="o", s=160, facecolors="none", edgecolors=FOUND,
-                   linewidths=2, zorder=6, label="device that it is about")
+        ax.scatter(ringed_m[:, 0], ringed_m[:, 1], marker="o", s=160, facecolors="none",
+                   edgecolors=FOUND, linewidths=2, zorder=6, label="device that it is about")
 
 
 def level_map_figure(data: LoopData, background: MapBackground) -> Figure | None:

@@ -20,11 +20,11 @@ from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.view import moving_end
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report.closeloop_page import closeloop_context
-from radiotwin.report.closeloop_words import causes, place_words
+from radiotwin.report.closeloop_words import causes
 from radiotwin.report.comparison import comparison_context
 from radiotwin.report.folders import TRUTH, Run
 from radiotwin.report.html import Table, read_picture, write_page
-from radiotwin.report.labels import name_label
+from radiotwin.report.labels import name_label, place_words
 from radiotwin.report.map_figures import RESIDUAL_LABEL
 from radiotwin.scene import Scene
 from radiotwin.scene.plot import height_grid
@@ -407,14 +407,19 @@ def _located(run: Run) -> list[dict]:
 
 
 def _origin(run: Run) -> Origin | None:
-    return run.scene.config.origin if run.scene else run.twin and run.twin.origin
+    if run.scene is not None:
+        return run.scene.config.origin
+    return None if run.twin is None else run.twin.origin
 
 
 def _found_devices(run: Run) -> str:
     """Say where the unknown devices were found; empty where none was."""
     found = [device for device in _located(run) if _is_found(device)]
-    words = [f"{device['name']} at {place_words(*device['estimate'][:2], _origin(run))}, within "
-             f"{device['radius_m']:.0f} m" for device in found[:MAX_NAMED]]
+    words = []
+    for device in found[:MAX_NAMED]:
+        x_m, y_m, _ = device["estimate"]
+        words.append(f"{device['name']} at {place_words(x_m, y_m, _origin(run))}, within "
+                     f"{device['radius_m']:.0f} m")
     more = f"; {len(found) - MAX_NAMED:,} more are in the table" if len(found) > MAX_NAMED else ""
     return f"Located, with 90 % probability: {'; '.join(words)}{more}." if words else ""
 
@@ -426,12 +431,12 @@ def _estimates(run: Run) -> Table | None:
         (x_m, y_m, _), true = device["estimate"], device["true"]
         error_m = np.hypot(x_m - true[0], y_m - true[1]) if true else np.nan
         radius_m = np.nan if device["radius_m"] is None else device["radius_m"]
-        rows.append([device["name"], _how_sure(device),
-                     place_words(x_m, y_m, origin) if origin else "–", float(x_m), float(y_m),
+        place = [place_words(x_m, y_m, origin)] if origin else []
+        rows.append([device["name"], _how_sure(device), *place, float(x_m), float(y_m),
                      float(error_m), radius_m])
-    columns = ("device", "position", "latitude, longitude", "x [m]", "y [m]", "error [m]",
-               "90 % radius [m]")
-    return Table(columns, rows, text_columns=3) if rows else None
+    texts = ["device", "position"] + ["latitude, longitude"] * bool(origin)
+    return Table([*texts, "x [m]", "y [m]", "error [m]", "90 % radius [m]"], rows,
+                 text_columns=len(texts)) if rows else None
 
 
 def _is_found(device: dict) -> bool:

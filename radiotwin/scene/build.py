@@ -373,10 +373,16 @@ def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, optio
     """
     shapes, material_problems = _city_shapes(city, options.frequency_hz)
     city.problems.extend(material_problems)
-    plan = _plan(city, declared, options)
+    config, built_fraction, tallest_m, tallest = _plan(city, declared, options)
     if not check_only:
-        write_scene(out_folder, shapes, plan.config, buildings)
-    return _report(city, shapes, plan, declared, options, None if check_only else out_folder)
+        write_scene(out_folder, shapes, config, buildings)
+    return BuildReport(
+        declared.source, None if check_only else out_folder, config.radio.frequency_hz, len(shapes),
+        sum(len(shape.mesh.faces) for shape in shapes), config.extent.bounds, tallest_m, tallest,
+        built_fraction, tuple(config.lattice.altitudes_m), len(config.devices), len(config.uavs),
+        _materials_in_use(city, shapes, config.radio.frequency_hz), _by_severity(city.problems),
+        declared.facts, config.lattice.step_m, options.altitudes_m is not None,
+        config.lattice.above or "datum")
 
 
 def write_scene(folder: Path, shapes: list[CityShape], config: SceneConfig,
@@ -402,15 +408,9 @@ def _city_shapes(city: ImportedCity, frequency_hz: float
     return shapes, problems
 
 
-@dataclass(frozen=True, eq=False)
-class _Plan:
-    config: SceneConfig
-    built_fraction: float
-    tallest_m: float
-    tallest: str
-
-
-def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Plan:
+def _plan(city: ImportedCity, declared: Declared, options: BuildOptions
+          ) -> tuple[SceneConfig, float, float, str]:
+    """Return `scene.toml`, the built fraction, and the tallest building's height [m] and name."""
     assert city.surfaces is not None  # without an error among the problems
     surfaces, solid = city.surfaces, ~city.ground
     if declared.extent is None:
@@ -446,8 +446,8 @@ def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Pla
     }
     if declared.origin is not None:
         config |= {"origin": declared.origin, "crs": local_crs(declared.origin)}
-    return _Plan(parse_config(config, Path("scene.toml")), grid.fraction,
-                 float(heights_m[highest]), city.names[highest] if solid.any() else "")
+    return (parse_config(config, Path("scene.toml")), grid.fraction, float(heights_m[highest]),
+            city.names[highest] if solid.any() else "")
 
 
 def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[str, str]:
@@ -461,24 +461,16 @@ def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[
     return known
 
 
-def _report(city: ImportedCity, shapes: list[CityShape], plan: _Plan, declared: Declared,
-            options: BuildOptions, folder: Path | None) -> BuildReport:
-    config, uses = plan.config, []
-    as_declared = dict(zip((shape.material for shape in shapes), city.materials))
+def _materials_in_use(city: ImportedCity, shapes: list[CityShape],
+                      frequency_hz: float) -> tuple[MaterialUse, ...]:
+    uses, declared = [], dict(zip((shape.material for shape in shapes), city.materials))
     for material, count in Counter(shape.material for shape in shapes).most_common():
-        before = as_declared[material]
+        before = declared[material]
         assert before is not None
         kind = ("own constants" if before.itu is None else
                 "ITU" if before.itu == material.name else f"ITU {before.itu}")
-        uses.append(MaterialUse(material.name, kind, count,
-                                *constants(before, config.radio.frequency_hz)))
-    return BuildReport(
-        declared.source, folder, config.radio.frequency_hz, len(shapes),
-        sum(len(shape.mesh.faces) for shape in shapes), config.extent.bounds,
-        plan.tallest_m, plan.tallest, plan.built_fraction, tuple(config.lattice.altitudes_m),
-        len(config.devices), len(config.uavs), tuple(uses), _by_severity(city.problems),
-        declared.facts, config.lattice.step_m, options.altitudes_m is not None,
-        config.lattice.above or "datum")
+        uses.append(MaterialUse(material.name, kind, count, *constants(before, frequency_hz)))
+    return tuple(uses)
 
 
 def _by_severity(problems: list[Problem]) -> tuple[Problem, ...]:

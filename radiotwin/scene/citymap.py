@@ -41,7 +41,7 @@ SAME_CORNER_M = 0.01  # corners closer than this are one [m]
 EARTH_RADIUS_M = 8.5e6  # 4/3 of the Earth's, for refraction (ITU-R P.526-15, Sec. 1)
 FAR_M = 5_000.0  # between ends for which the Earth is round [m]; its bulge is 0.4 m there
 BEND_M = 1_000.0  # pieces that are straight of a line of sight over the round Earth
-HEIGHT_SD_M = 3.0  # of a roof of which nothing is said: one storey
+HEIGHT_SD_M = 3.0  # of a roof whose accuracy is unknown: one storey
 MIN_HEIGHT_SHARE = 0.2  # of a building's height that is left, whatever the error
 _MAX_SD_M, _MAX_AREA_M2 = 1000.0, 1e9
 
@@ -65,11 +65,7 @@ def _distinct(triangles: np.ndarray) -> np.ndarray:
     Embree looks at all copies of a triangle for every ray that meets one.
     """
     words = np.ascontiguousarray(triangles).reshape(len(triangles), 9).view(np.uint32)
-    factors = np.random.default_rng().integers(1, 2**63, 9, dtype=np.uint64)
-    _, first, kind = np.unique(words @ factors, return_index=True, return_inverse=True)
-    original = first[kind]
-    is_copy = (original < np.arange(len(words))) & (words == words[original]).all(axis=1)
-    return np.flatnonzero(~is_copy)
+    return np.flatnonzero(~pd.DataFrame(words).duplicated())
 
 
 class CityMap:
@@ -80,10 +76,10 @@ class CityMap:
         faces: (f, 3) indices of vertices, counter-clockwise seen from outside.
         materials: Of the city; by default one, a slab of concrete of `Material`'s thickness.
         material: (f,) row of `materials` of each face; None: all are of the first.
-        vegetation: Which no ray meets; None: there is none.
+        vegetation: Volumes that block no ray; None: there are none.
         terrain: (f,) bool, faces of a ground that is not flat; None: the ground is flat, at z = 0.
         height_sd_m: (f,) standard deviation of the mapped height of the building that each face
-            belongs to [m], NaN where nothing is said; None: nothing is said of any.
+            belongs to [m], NaN where unknown; None: unknown for all.
     """
 
     never_changes = True
@@ -169,12 +165,12 @@ class CityMap:
                        self.vegetation, terrain, height_sd_m)
 
     def with_vertices(self, vertices: np.ndarray) -> CityMap:
-        """Return the map with its vertices elsewhere, (v, 3) [m]."""
+        """Return the map with other positions (v, 3) [m] of its vertices."""
         return CityMap(vertices, self.faces, self.materials, self.material, self.vegetation,
                        self.terrain, self.height_sd_m)
 
     def state(self) -> tuple[Any, ...]:
-        """Return all that decides the answers of a map, and what paths over it are."""
+        """Return everything that queries of this map and paths over it depend on."""
         known = (self.vertices, self.faces, self.materials, self.material, self.vegetation.state())
         return (*known, self.terrain, self.height_sd_m)
 
@@ -211,7 +207,7 @@ class CityMap:
         return los
 
     def hidden_by_ground(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-        """Return whether the terrain alone lies between points, as of `line_of_sight`."""
+        """Return whether the terrain blocks the line of sight; arguments as for `line_of_sight`."""
         if self.terrain is None:
             return np.zeros(np.broadcast_shapes(np.shape(a_m), np.shape(b_m))[:-1], dtype=bool)
         return ~self.ground.line_of_sight(a_m, b_m)
@@ -229,10 +225,6 @@ class CityMap:
             left = np.flatnonzero(clear)
             clear[left] = self.line_of_sight(start_m[left], end_m[left])
         return clear
-
-    def first_face(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-        """Return the (n,) first face from a to b, both (n, 3) [m]; -1 where none lies between."""
-        return self.first_hits(a_m, b_m)[1]
 
     def height_at(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> np.ndarray:
         """Return the height of the highest surface above each point of the plane.
@@ -252,7 +244,7 @@ class CityMap:
 
     @cached_property
     def ground(self) -> CityMap:
-        """The terrain alone; there must be one."""
+        """Map of the terrain without buildings; requires a terrain."""
         assert self.terrain is not None
         used, faces = np.unique(self.faces[self.terrain], return_inverse=True)
         faces = faces.reshape(-1, 3)
@@ -426,9 +418,9 @@ class CityMap:
 
 
 def building_of_vertex(city: CityMap) -> np.ndarray:
-    """Return the building (v,) that each corner belongs to; -1: only ground.
+    """Return the building (v,) that each vertex belongs to; -1: only ground.
 
-    A building is what is joined by its triangles, above the ground.
+    A building is a set of triangles above the ground that are connected by shared corners.
     """
     corners, index = np.unique(np.round(city.vertices / SAME_CORNER_M).astype(np.int64), axis=0,
                                return_inverse=True)

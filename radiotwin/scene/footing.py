@@ -1,4 +1,4 @@
-"""Where a device stands whose place the map has inside a building or below the ground.
+"""Corrected positions of devices that the map puts inside a building or below the ground.
 
 Roofs, walls and the ground of a map are off. A mast on a roof that is mapped too high is inside
 the building, and so is a lamp at a wall that is mapped too far out. Such a device is moved to where
@@ -38,11 +38,11 @@ class Footing:
 
 
 def footing(city: CityMap, point_m: np.ndarray) -> Footing | None:
-    """Return where a device (3,) [m] inside a building or below the ground stands.
+    """Find the likeliest position outdoors of a device (3,) [m] that the map puts indoors.
 
     Returns:
-        the place that the smallest error of the map explains, at most `MAX_SDS` standard
-        deviations; None where there is none.
+        the position that needs the smallest error of the map, in its standard deviations; None if
+        all need more than `MAX_SDS`.
     """
     found = [each for each in (_above(city, point_m, to_ground=True),
                                _above(city, point_m, to_ground=False), _beside(city, point_m))
@@ -51,7 +51,7 @@ def footing(city: CityMap, point_m: np.ndarray) -> Footing | None:
 
 
 def standing(city: CityMap, points_m: np.ndarray) -> np.ndarray:
-    """Return devices (n, 3) [m] where they stand; one that nothing explains stays inside."""
+    """Return positions (n, 3) [m] of devices, the misplaced ones moved as `footing` says."""
     places_m = points_m.copy()
     for row in np.flatnonzero(city.misplaced(points_m) != ""):
         found = footing(city, points_m[row])
@@ -67,11 +67,11 @@ def _above(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | Non
     surface_m, sd_m, what = ground_m, GROUND_SD_M, "the ground"
     if not to_ground:
         surface_m, sd_m, what = *_roof_m(city, x_m, y_m), "the roof"
-    there_m = np.array([x_m, y_m, surface_m + CLEARANCE_M])
-    if surface_m < z_m or (not to_ground and surface_m <= ground_m) or city.inside(there_m)[0]:
+    above_m = np.array([x_m, y_m, surface_m + CLEARANCE_M])
+    if surface_m < z_m or (not to_ground and surface_m <= ground_m) or city.inside(above_m)[0]:
         return None
-    return Footing(there_m, (surface_m - z_m) / sd_m,
-                   f"{there_m[2] - z_m:.1f} m up, to {CLEARANCE_M:g} m above {what}, which the map "
+    return Footing(above_m, (surface_m - z_m) / sd_m,
+                   f"{above_m[2] - z_m:.1f} m up, to {CLEARANCE_M:g} m above {what}, which the map "
                    f"has {surface_m - z_m:.1f} m too high (standard deviation {sd_m:.1f} m)")
 
 
@@ -99,11 +99,11 @@ def _beside(city: CityMap, point_m: np.ndarray) -> Footing | None:
     nearest = int(free.any(axis=1).argmax())
     wall_m, ways = float(steps_m[nearest]), towards[free[nearest]]
     across = ways.sum(axis=0) / max(np.linalg.norm(ways.sum(axis=0)), 1e-9)
-    for direction in (across, ways[0]):  # between two walls their mean is no way out
-        there_m = point_m + (wall_m + CLEARANCE_M) * direction
-        if not city.inside(there_m)[0]:
+    for direction in (across, ways[0]):  # between two walls their mean may point along both
+        outside_m = point_m + (wall_m + CLEARANCE_M) * direction
+        if not city.inside(outside_m)[0]:
             break
-    return Footing(there_m, wall_m / WALL_SD_M,
+    return Footing(outside_m, wall_m / WALL_SD_M,
                    f"{wall_m + CLEARANCE_M:.1f} m sideways, to {CLEARANCE_M:g} m outside the wall, "
                    f"which the map has {wall_m:.1f} m too far out (standard deviation "
                    f"{WALL_SD_M:g} m)")

@@ -159,7 +159,8 @@ class Preset:
 
     Attributes:
         city: Parameters of the city.
-        devices: (x_m, y_m, is_anchor) of each device.
+        devices_m: (x, y) of the devices [m].
+        anchors: numbers of the devices whose positions a survey reports, from 0.
         start_m, terminal_m: (x, y) where all UAVs start and end [m].
         battery: Battery units of each UAV.
         data_units: Data at each device.
@@ -168,7 +169,8 @@ class Preset:
     """
 
     city: CityParameters
-    devices: list[tuple[float, float, bool]]
+    devices_m: tuple[tuple[float, float], ...]
+    anchors: tuple[int, ...]
     start_m: tuple[float, float]
     terminal_m: tuple[float, float]
     battery: float
@@ -177,37 +179,31 @@ class Preset:
     seed: int = 0
 
 
-def _devices(text: str) -> list[tuple[float, float, bool]]:
-    """Parse '(20,200) (60,320)* …'; an asterisk marks an anchor."""
-    devices = []
-    for word in text.split():
-        x_m, y_m = word.strip("()*").replace(")", "").split(",")
-        devices.append((float(x_m), float(y_m), word.endswith("*")))
-    return devices
-
-
 PRESETS = {
     "rbm": Preset(
         CityParameters(600, 800, avenue_width_m=60, avenue_spacing_m=200, street_width_m=20,
                        block_mean_m=100, block_min_m=80, side_min_m=50, mean_height_m=15,
                        first_block_m=(-169, -34)),
-        _devices("(20,200) (60,320)* (60,760) (120,600) (200,80) (320,120)* (320,760) (460,720) "
-                 "(460,200) (580,520)*"),
+        ((20, 200), (60, 320), (60, 760), (120, 600), (200, 80), (320, 120), (320, 760),
+         (460, 720), (460, 200), (580, 520)),
+        anchors=(1, 5, 9),
         start_m=(320, 460), terminal_m=(320, 460), battery=60, data_units=16_000,
         altitudes_m=(55, 60, 65)),
     "rdm": Preset(
         CityParameters(1000, 1200, avenue_width_m=90, avenue_spacing_m=300, street_width_m=30,
                        block_mean_m=120, block_min_m=100, side_min_m=75, side_mean_m=100,
                        mean_height_m=30, first_block_m=(-72, -25)),
-        _devices("(200,700) (280,1100)* (360,500) (460,400) (540,700)* (660,220) (600,1100) "
-                 "(660,800) (800,520)* (860,920)"),
+        ((200, 700), (280, 1100), (360, 500), (460, 400), (540, 700), (660, 220), (600, 1100),
+         (660, 800), (800, 520), (860, 920)),
+        anchors=(1, 4, 8),
         start_m=(280, 300), terminal_m=(660, 920), battery=80, data_units=20_000,
         altitudes_m=(55, 60, 65)),
     "small": Preset(
         CityParameters(300, 300, avenue_width_m=40, avenue_spacing_m=160, street_width_m=20,
                        block_mean_m=70, block_min_m=60, side_min_m=40, mean_height_m=18,
                        first_block_m=(-100, -60)),
-        _devices("(80,40)* (280,60) (80,200) (160,120) (280,280) (200,200)* (80,280)*"),
+        ((80, 40), (280, 60), (80, 200), (160, 120), (280, 280), (200, 200), (80, 280)),
+        anchors=(0, 5, 6),
         start_m=(80, 120), terminal_m=(80, 120), battery=40, data_units=8_000,
         altitudes_m=(55, 60)),
 }
@@ -223,8 +219,8 @@ def preset_config(name: str) -> SceneConfig:
                       y_min_m=0, y_max_m=preset.city.depth_m),
         lattice=LatticeConfig(step_m=20, altitudes_m=list(preset.altitudes_m)),
         devices=[DeviceConfig(device=f"d{i}", x_m=x_m, y_m=y_m,
-                              role="anchor" if anchor else "unknown")
-                 for i, (x_m, y_m, anchor) in enumerate(preset.devices)],
+                              role="anchor" if i in preset.anchors else "unknown")
+                 for i, (x_m, y_m) in enumerate(preset.devices_m)],
         uavs=[UavConfig(uav=f"uav{i}", altitude_m=altitude_m, start_x_m=start_x_m,
                         start_y_m=start_y_m, terminal_x_m=terminal_x_m, terminal_y_m=terminal_y_m,
                         battery=preset.battery)
@@ -238,8 +234,7 @@ def preset_config(name: str) -> SceneConfig:
 def preset_boxes(name: str) -> np.ndarray:
     """Return the buildings (n, 5) of a preset: x_min, y_min, x_max, y_max, height [m]."""
     preset = _find(name)
-    devices_m = np.array([(x_m, y_m) for x_m, y_m, _ in preset.devices])
-    return draw_buildings(preset.city, devices_m, preset.seed)
+    return draw_buildings(preset.city, np.array(preset.devices_m, dtype=float), preset.seed)
 
 
 def build_preset(name: str, folder: Path | str) -> None:

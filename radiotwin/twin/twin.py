@@ -32,7 +32,7 @@ from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import read_bytes, read_text, require_within
 from radiotwin.links.declared import NOTHING, Declared
 from radiotwin.links.links import Columns, Ends, Links, Prediction, World
-from radiotwin.maps.form import POWERS, MapStream
+from radiotwin.maps.file import POWERS, MapStream
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.kriging import RegressionKriging, ResidualField

@@ -123,7 +123,7 @@ def test_published_laws_say_nothing_of_devices_that_are_nowhere(links):
     """A lost device stands at 0, 0 in the arrays, which no law may be judged by."""
     device_m = links.device_m.copy()
     device_m[3] = np.nan
-    folds = [Model.build(links, LogDistance(LogDistanceLine(-35.0, -2.6, 2.0)), 5.0, device_m=device_m,
+    folds = [Model.build(links, LogDistance(LogDistanceLine(-35.0, 2.6, 2.0)), 5.0, device_m=device_m,
                              train=links.flight != flight).fit() for flight in range(6)]
     model = CrossFit(folds[0], tuple(folds), links.flight, None)
     found, _ = held_out_baselines(model, [Part(each.links) for each in folds], 0)

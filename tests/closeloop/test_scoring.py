@@ -39,7 +39,7 @@ def moved(make_links):
     receiver_m = np.column_stack([rng.uniform(-150, 400, 300), rng.uniform(-150, 350, 300), rng.uniform(20, 60, 300)])
     distance_m = np.linalg.norm(receiver_m[:, None] - (DEVICES_M + MOVED_M), axis=2).ravel()
     links = make_links(DEVICES_M, receiver_m, level_db=-40 - 22 * np.log10(distance_m) + rng.normal(0, 0.5, 600))
-    channel = SlowLaw(LogDistanceLine(-40.0, -2.2, 0.5))
+    channel = SlowLaw(LogDistanceLine(-40.0, 2.2, 0.5))
     return SimpleNamespace(whole=Model.build(links, channel, 5.0).fit(), links=links), channel
 
 

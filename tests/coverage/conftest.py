@@ -44,7 +44,7 @@ def write_scene(folder, shapes=(), devices=(), half_m=500.0, ground_z_m=lambda x
 
 def make_twin(devices, exponent=2.0, intercept_db=FREE_SPACE_AT_1_M_DB, sd_db=1e-6, level="gain_db"):
     """Return a twin of declared devices with the law intercept - 10 exponent log10(d)."""
-    return Twin(FittedModel.of_channel(LogDistance(LogDistanceLine(intercept_db, -exponent, sd_db))),
+    return Twin(FittedModel.of_channel(LogDistance(LogDistanceLine(intercept_db, exponent, sd_db))),
                 [TwinDevice.anchor(*device) for device in devices], level, None)
 
 

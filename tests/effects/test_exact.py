@@ -119,7 +119,7 @@ def two_answers_model(make_links, seed):
     true_m = DECLARED_M + np.array([[*MOVE_M, 0.0], [0.0, 0.0, 0.0]])
     distance_m = np.linalg.norm(receiver_m[:, None] - true_m, axis=2).ravel()
     links = make_links(DECLARED_M, receiver_m, level_db=-40 - 22 * np.log10(distance_m) + rng.normal(0, 0.5, 1400))
-    return Model.build(links, TwoAnswers(LogDistanceLine(-40.0, -2.2, 0.5)), 5.0)
+    return Model.build(links, TwoAnswers(LogDistanceLine(-40.0, 2.2, 0.5)), 5.0)
 
 
 def found_along_paths(model):

@@ -17,7 +17,7 @@ from radiotwin.twin.model.model import Fit, FittedModel, Model, device_sd_db
 def test_positions_are_sought_without_what_follows_paths_or_many_maps():
     """Each of thousands of places would need its own paths."""
     effects = LockLoss(), WallReflection(), RoofHeights()
-    model = FittedModel(LogDistance(LogDistanceLine(-40.0, 2.2, 3.0)), effects, (np.zeros(0),) * 3, np.zeros(2), np.array([2.0]), 5.0,
+    model = FittedModel(LogDistance(LogDistanceLine(-40.0, -2.2, 3.0)), effects, (np.zeros(0),) * 3, np.zeros(2), np.array([2.0]), 5.0,
                         np.zeros((1, 3)), ("u0",), np.nan, 0.0)
     assert [each.name for each in model.for_positions().effects] == ["lock_loss"]
     assert len(model.effects) == 3
@@ -51,7 +51,7 @@ def test_what_devices_have_in_common_is_not_underestimated_for_few_of_them(make_
         device_m = np.column_stack([rng.uniform(0, 500, (devices, 2)), np.full(devices, 10.0)])
         links = make_links(device_m, [[250.0, 250.0, 100.0 + 5 * i] for i in range(20)])
         level_db = -40 - 20 * np.log10(links.distance_m) + rng.normal(0, 1, devices)[links.device] + rng.normal(0, 1, len(links))
-        channel = LogDistance(LogDistanceLine(-40.0, -2.0, 1.0))
+        channel = LogDistance(LogDistanceLine(-40.0, 2.0, 1.0))
         model = Model.build(links.with_columns(level_db=level_db), channel, 5.0)
         found.append(device_sd_db(Fit(np.zeros(model.level_columns.shape[1]), np.array([1.0]), 0.0, model)) ** 2)
     assert np.mean(found) == pytest.approx(1.0, abs=0.2)

@@ -97,7 +97,7 @@ def test_a_map_has_it_and_does_not_have_what_belongs_to_receivers(small_scene):
                for device, position_m in zip(small_scene.config.devices, small_scene.device_m)]
 
     def mapped(effects):
-        channel = LogDistance(LogDistanceLine(-40.0, 2.2, 3.0))
+        channel = LogDistance(LogDistanceLine(-40.0, -2.2, 3.0))
         fitted = FittedModel(channel, tuple(effect.with_params(params) for effect, params in effects),
                              (np.zeros(0),) * len(effects), np.zeros(2), np.array([2.0]), 5.0, small_scene.device_m, ("g0",), np.nan, 0.0)
         return Twin(fitted, devices, "gain_db", None).radio_map(small_scene)

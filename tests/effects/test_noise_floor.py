@@ -48,7 +48,7 @@ def flown(make_links):
 @pytest.mark.parametrize("kind", [LogDistance, KnownLevels])
 def test_only_the_receiver_that_has_one_gets_a_floor(flown, kind):
     assert np.isnan(flown.level_db[flown.receiver != RAISED]).mean() > 0.05
-    model = Model.build(flown, kind(LogDistanceLine(-20.0, -3.0, 3.0)), 5.0)
+    model = Model.build(flown, kind(LogDistanceLine(-20.0, 3.0, 3.0)), 5.0)
     before = model.fit()
     found = add_effect(before, NoiseFloor())
     floors_db = found.effects[-1].params.receivers
@@ -66,7 +66,7 @@ def test_weak_links_that_scatter_widely_read_no_floor(make_links):
     expected_db = -22 - 30 * np.log10(links.distance_m)
     level_db = np.maximum(expected_db, -90 + rng.normal(0, 12, len(links))) + rng.normal(0, 2.0, len(links))
     links.level_db[:] = np.where(receiver == 1, level_db, expected_db + rng.normal(0, 2.0, len(links)))
-    model = Model.build(links, KnownLevels(LogDistanceLine(-20.0, -3.0, 3.0)), 5.0)
+    model = Model.build(links, KnownLevels(LogDistanceLine(-20.0, 3.0, 3.0)), 5.0)
     found = add_effect(model.fit(), NoiseFloor()).effects[-1]
     for own, floor_db in found.params.receivers.items():
         assert (links.level_db[receiver == own] < floor_db - 6.1).mean() <= 0.011
@@ -93,7 +93,7 @@ def test_receivers_that_gain_nothing_by_a_floor_are_left_without(make_links):
     noise_db = np.where(receiver < 3, FLOOR_DB, -np.inf)
     level_db = 10 * np.log10(10 ** (level_db / 10) + 10 ** (noise_db / 10))
     links.level_db[:] = np.where(level_db < LIMIT_DB, np.nan, level_db)
-    model = Model.build(links, KnownLevels(LogDistanceLine(-20.0, -3.0, 3.0)), 5.0)
+    model = Model.build(links, KnownLevels(LogDistanceLine(-20.0, 3.0, 3.0)), 5.0)
     fit = add_effect(model.fit(), NoiseFloor())
     found, inputs = fit.effects[-1], fit.model.terms[-1].inputs
     assert set(found.params.receivers) == {0, 1, 2} and found.params.alone
@@ -106,7 +106,7 @@ def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
     los = flown.distance_m < 400
     links = flown.with_columns(known_los=los, level_db=flown.level_db + 25.0 * los)
     index = np.arange(len(links)) // 25 % 5
-    channel = KnownLevels(LogDistanceLine(-20.0, -3.0, 3.0))
+    channel = KnownLevels(LogDistanceLine(-20.0, 3.0, 3.0))
     whole, *folds = (Model.build(links.with_los(los), channel, 5.0, channel_db=channel.predict(links.geometry)[0]
                                      + 25.0 * los, train=index != number).fit() for number in range(-1, 5))
     model = CrossFit(whole, tuple(folds), index, None)
@@ -118,7 +118,7 @@ def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
 
 def test_a_floor_that_begins_as_high_as_it_may_be_is_still_searched_below(flown):
     """Where the highest of the floors that are tried is the highest allowed, only lower ones are left."""
-    model = Model.build(flown, KnownLevels(LogDistanceLine(-40.0, -2.5, 4.0)), 5.0)
+    model = Model.build(flown, KnownLevels(LogDistanceLine(-40.0, 2.5, 4.0)), 5.0)
     highest_db = FLOOR_DB + 4.0
     params = NoiseFloor.Params(receivers={RAISED: highest_db}, highest={RAISED: highest_db}, alone=True)
     with_floor = model.with_effects([NoiseFloor().with_params(params)])

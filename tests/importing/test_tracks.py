@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
+from radiotwin.importing.tracks.autopilots import read_ulog
 from radiotwin.importing.tracks.fixes import make_fixes
 from radiotwin.importing.tracks.texts import read_gpx, read_nmea
-from radiotwin.importing.tracks.ulog import read_ulog
 
 START = pd.Timestamp("2024-03-01 10:00:00Z").timestamp()
 COLUMNS = {"level": "rssi", "device": "id", "time": "t"}

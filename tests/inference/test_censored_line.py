@@ -6,14 +6,14 @@ from scipy.stats import norm
 
 from radiotwin.inference.gaussian import LogDistanceLine, fit_line, fit_sd_db, shift_line
 
-TRUE = np.array([-35.0, -3.04, 5.0**0.5])
+TRUE = np.array([-35.0, 3.04, 5.0**0.5])
 LIMIT_DB = -107.0
 
 
 def draw(seed, n=600):
     rng = np.random.default_rng(seed)
     x = rng.uniform(np.log10(60.0), np.log10(800.0), n)
-    return x, TRUE[0] + 10.0 * TRUE[1] * x + TRUE[2] * rng.standard_normal(n)
+    return x, TRUE[0] - 10.0 * TRUE[1] * x + TRUE[2] * rng.standard_normal(n)
 
 
 def parameters(line):
@@ -23,7 +23,7 @@ def parameters(line):
 def test_without_censoring_it_is_least_squares():
     x, y = draw(0)
     slope, intercept = np.polyfit(x, y, 1)
-    expected = [intercept, slope / 10.0, np.std(y - intercept - slope * x)]
+    expected = [intercept, -slope / 10.0, np.std(y - intercept - slope * x)]
     assert parameters(fit_line(x, y, None)) == pytest.approx(expected, abs=2e-3)
 
 
@@ -56,7 +56,7 @@ def test_maximum_of_the_likelihood():
     line, seen = fit_line(x, y, LIMIT_DB), ~np.isnan(y)
 
     def log_likelihood(theta):
-        mean = theta[0] + 10.0 * theta[1] * x
+        mean = theta[0] - 10.0 * theta[1] * x
         return (
             norm.logpdf(y[seen], mean[seen], theta[2]).sum()
             + norm.logcdf(LIMIT_DB, mean[~seen], theta[2]).sum()
@@ -71,17 +71,17 @@ def test_maximum_of_the_likelihood():
 def test_one_distance_only_gives_the_priors_exponent():
     y = -80.0 + 0.5 * np.random.default_rng(0).standard_normal(50)
     line = fit_line(np.full(50, 2.0), y, None)
-    assert line.exponent == pytest.approx(-3.0, abs=0.1)
+    assert line.exponent == pytest.approx(3.0, abs=0.1)
     assert line.mean_db(np.array(2.0)) == pytest.approx(y.mean(), abs=0.01)
 
 
 def test_exact_levels_have_the_least_sigma():
     x = np.linspace(1.8, 2.8, 30)
     line = fit_line(x, -30.0 - 25.0 * x, None)
-    assert parameters(line) == pytest.approx([-30.0, -2.5, 0.1], abs=1e-3)
+    assert parameters(line) == pytest.approx([-30.0, 2.5, 0.1], abs=1e-3)
 
 
-LINE = LogDistanceLine(-30.0, -2.5, 4.0)
+LINE = LogDistanceLine(-30.0, 2.5, 4.0)
 
 
 def test_shift_is_the_priors_without_data_and_the_datas_with_much():

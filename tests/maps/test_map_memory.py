@@ -8,8 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from radiotwin.maps.file import write_parts
-from radiotwin.maps.form import MapStream
+from radiotwin.maps.file import MapStream, write_parts
 from radiotwin.scene import Scene
 
 pytest.importorskip("zarr", reason="the package zarr is not installed")

@@ -11,8 +11,7 @@ import pytest
 import xarray as xr
 
 from radiotwin.errors import BadInput
-from radiotwin.maps.file import write_parts
-from radiotwin.maps.form import BLOCK_VALUES, MapStream
+from radiotwin.maps.file import BLOCK_VALUES, MapStream, write_parts
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import export_map
 from radiotwin.scene.lattice import Lattice

@@ -6,7 +6,7 @@ import xarray as xr
 
 from radiotwin.cli.options import open_model
 from radiotwin.errors import BadInput
-from radiotwin.maps.form import BLOCK_VALUES, MapStream, parts_of, write_blocks
+from radiotwin.maps.file import BLOCK_VALUES, MapStream, parts_of, write_blocks
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene.lattice import Lattice
 

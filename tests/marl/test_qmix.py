@@ -211,13 +211,13 @@ def test_flights_of_an_earlier_twin_are_seen_with_the_positions_known_now(tiny):
 
 
 class Seen:
-    """Flights with a given collected share."""
+    """As many flights as `LEARNER` selects by, each with a given collected share."""
 
     def __init__(self, share):
         self._share = share
 
     def ratio(self, mission):
-        return np.array([self._share])
+        return np.full(LEARNER.selection_flights, self._share)
 
 
 def best(learner):

@@ -178,14 +178,14 @@ def test_effects_of_the_map_are_drawn_on_it(small_scene, tmp_path):
                             (WallReflection, {"strength_db": 0.0, "level_db": 0.0})):
         changed = with_model(loop, with_effect(loop.before, effect, params))
         data = collect(changed)
-        place = {"family": "place", "members": {"device": ["d1"]}, "ranges": {"x_m": [25.0, 50.0], "y_m": [0.0, 25.0]}}
+        place = {"family": "place", "members": {"device": data.links.device_names[1:2]}, "ranges": {"x_m": [25.0, 50.0], "y_m": [0.0, 25.0]}}
         figure = residual_map_figure(data, MapBackground(data.links, small_scene), {"effects": [], "anomalies": [place]})
         before, after, *_ = figure.axes  # then colour bars
         assert [part.bbox.width for part in figure.subfigs] == [figure.bbox.width / 2] * 2, "a page shows one half of it"
         frames = [[line.get_xydata() for line in ax.lines if line.get_linestyle() == "--"] for ax in (before, after)]
         assert [len(each) for each in frames] == [1, 1]
         rings = [each for each in before.collections if each.get_label() == "device that it is about"]
-        assert rings[0].get_offsets().tolist() == [data.links.device_m[data.links.device_names.index("d1"), :2].tolist()]
+        assert rings[0].get_offsets().tolist() == data.links.device_m[1:2, :2].tolist()
         assert frames[0][0].min(axis=0).tolist() == [25.0, 0.0] and frames[0][0].max(axis=0).tolist() == [50.0, 25.0]
         save(drawn(changed, small_scene), tmp_path / "effect.png")
         assert (tmp_path / "effect.png").stat().st_size > 5000

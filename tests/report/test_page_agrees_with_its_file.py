@@ -177,6 +177,13 @@ def test_each_kind_of_group_is_said_in_plain_words(group, sentence):
     assert anomaly_words.sentence(group, with_members("located", [group])) == sentence
 
 
+def test_a_place_is_in_latitude_and_longitude_where_the_origin_is_known():
+    place = next(group for group, _ in GROUPS if group["family"] == "place")
+    content = with_members("located", [place], inputs={"origin": {"latitude_deg": 47.0, "longitude_deg": 8.0}})
+    words = "inks at or through 100 by 100 m about 47.00090° N, 7.99934° E"
+    assert words in anomaly_words.sentence(place, content) and words in anomaly_words.rows(content)[0][0]
+
+
 def test_what_was_found_comes_first_and_a_named_cause_is_told_from_an_open_one():
     named = with_members("effect", [LOW], effects=[DRIFT | {"name": "device_gain_offset", "probability": 0.95, "anomalies": [0],
                                                              "indistinguishable_from": []}])

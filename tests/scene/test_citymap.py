@@ -139,5 +139,5 @@ def test_copies_of_a_building_change_nothing(random_links):
     np.testing.assert_array_equal(copies.line_of_sight(a_m, b_m), city.line_of_sight(a_m, b_m))
     np.testing.assert_array_equal(copies.height_at(a_m[:, 0], a_m[:, 1]), city.height_at(a_m[:, 0], a_m[:, 1]))
     np.testing.assert_array_equal(copies.inside(a_m), city.inside(a_m))
-    first = copies.first_face(a_m, b_m)
+    first = copies.first_hits(a_m, b_m)[1]
     assert set(first.tolist()) <= {-1, *range(24)} and (first >= 0).any()

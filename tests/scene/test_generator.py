@@ -13,7 +13,7 @@ def test_a_generated_city_keeps_its_parameters(name):
     assert (boxes[:, :2] >= 0).all() and (boxes[:, 2] <= city.width_m).all() and (boxes[:, 3] <= city.depth_m).all()
     assert (boxes[:, 2:4] - boxes[:, :2] >= city.side_kept_m - 0.02).all()
     assert boxes[:, 4].min() >= city.min_height_m and boxes[:, 4].max() <= city.max_height_m
-    for x_m, y_m, _ in preset.devices:
+    for x_m, y_m in preset.devices_m:
         gap_x = np.maximum(boxes[:, 0] - x_m, x_m - boxes[:, 2])
         gap_y = np.maximum(boxes[:, 1] - y_m, y_m - boxes[:, 3])
         assert np.maximum(gap_x, gap_y).min() >= city.clearance_m - 0.02
@@ -21,7 +21,7 @@ def test_a_generated_city_keeps_its_parameters(name):
 
 def test_generated_buildings_are_closed_and_a_seed_gives_them_again():
     preset = PRESETS["small"]
-    free = np.array([(x_m, y_m) for x_m, y_m, _ in preset.devices])
+    free = np.array(preset.devices_m, dtype=float)
     first, again, other = (draw_buildings(preset.city, free, seed) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert first.shape != other.shape or not np.array_equal(first, other)

@@ -128,12 +128,3 @@ def test_many_devices_and_uavs_take_little_time():
 def test_an_extent_like_a_line_is_refused():
     with pytest.raises(BadInput, match="an extent of 100000 x 0.001 m is but a line"):
         BuiltGrid.over(Extent(x_min_m=0, x_max_m=1e5, y_min_m=0, y_max_m=1e-3), None)
-def test_many_devices_and_uavs_take_no_time_by_their_square():
-    grid = BuiltGrid(np.arange(0.5, 500), np.arange(0.5, 500), np.zeros((500, 500), dtype=bool))
-    devices = place_devices(3000, grid, None, np.random.default_rng(0))
-    positions = np.array([(device.x_m, device.y_m) for device in devices])
-    assert len(np.unique(positions, axis=0)) == 3000
-    assert sum(device.role == "anchor" for device in devices) == 900
-    extent = Extent(x_min_m=0, x_max_m=500, y_min_m=0, y_max_m=500)
-    uavs = place_uavs(9000, extent, LatticeConfig(step_m=20, altitudes_m=[30, 40]), None)
-    assert len(uavs) == 9000 and [uav.altitude_m for uav in uavs[:3]] == [30, 40, 30]

@@ -34,7 +34,7 @@ def test_a_device_is_found_by_three_packets_of_each_gateway_and_by_the_silence_o
         "receiver_x_m": gateway_m[gateway, 0], "receiver_y_m": gateway_m[gateway, 1], "receiver_z_m": 1.5,
         "device": "x", "gain_db": gain_db})
     devices = pd.DataFrame({"device": ["x"], "x_m": np.nan, "y_m": np.nan, "z_m": 1.5, "role": "unknown"})
-    channel = LogDistance(LogDistanceLine(-40.0, -2.5, 2.0))
+    channel = LogDistance(LogDistanceLine(-40.0, 2.5, 2.0))
     fitted = FittedModel(channel, (), (), np.zeros(2), np.array([2.0]), 30.0, np.array([[100.0, 100.0, 1.5]]), ("g0",),
                          np.nan, 0.0)
     twin = Twin(fitted, [TwinDevice.anchor("a", 100.0, 100.0, 1.5)], "gain_db", LIMIT_DB)

@@ -13,7 +13,7 @@ from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin.compare import predict
 from radiotwin.twin.model.model import FittedModel
 
-LINE = LogDistanceLine(-40.0, -2.5, 2.0)
+LINE = LogDistanceLine(-40.0, 2.5, 2.0)
 
 
 def twin(channel, classes):

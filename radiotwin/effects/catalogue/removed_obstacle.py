@@ -175,7 +175,7 @@ def only_blocker(links: Links) -> np.ndarray:
     alone = np.full(len(links), -1)
     rows = np.flatnonzero(~links.los)
     a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
-    near, far = links.city.first_face(a_m, b_m), links.city.first_face(b_m, a_m)
+    near, far = links.city.first_hits(a_m, b_m)[1], links.city.first_hits(b_m, a_m)[1]
     same = (near >= 0) & (far >= 0) & (label[near] == label[far])
     if links.city.terrain is not None:
         same &= ~links.city.terrain[near]

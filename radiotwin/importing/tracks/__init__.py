@@ -11,12 +11,11 @@ from radiotwin.errors import BadInput
 from radiotwin.importing.log_files import BINARIES, TEXTS
 from radiotwin.importing.settings import HEIGHTS, Settings, TrackFile
 from radiotwin.importing.source import Source, Tally
-from radiotwin.importing.tracks.autopilots import read_dataflash, read_tlog
+from radiotwin.importing.tracks.autopilots import read_dataflash, read_tlog, read_ulog
 from radiotwin.importing.tracks.fixes import COLUMNS, Fixes
 from radiotwin.importing.tracks.rosbag import is_rosbag, read_rosbag
 from radiotwin.importing.tracks.tables import read_track_table
 from radiotwin.importing.tracks.texts import read_geojson, read_gpx, read_kml, read_nmea
-from radiotwin.importing.tracks.ulog import read_ulog
 from radiotwin.io.cells import listed
 from radiotwin.io.inputs import open_input
 

@@ -12,7 +12,7 @@ from radiotwin.io.budgets import MAP_VALUES
 from radiotwin.maps.export.geotiff import write_geotiff
 from radiotwin.maps.export.kmz import write_kmz
 from radiotwin.maps.export.tables import write_csv, write_dataset, write_numpy
-from radiotwin.maps.form import MapStream
+from radiotwin.maps.file import MapStream
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 

@@ -12,7 +12,7 @@ from radiotwin.errors import BadInput, optional_package
 from radiotwin.geo import local_crs
 from radiotwin.io.files import atomic_file, atomic_path
 from radiotwin.io.forms import Origin
-from radiotwin.maps.form import MapBlock, MapStream
+from radiotwin.maps.file import MapBlock, MapStream
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 

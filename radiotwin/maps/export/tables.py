@@ -18,8 +18,7 @@ from radiotwin.errors import BadInput
 from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import write_csv as write_table
 from radiotwin.io.files import atomic_file, atomic_path
-from radiotwin.maps.file import write_parts
-from radiotwin.maps.form import MapBlock, MapStream
+from radiotwin.maps.file import MapBlock, MapStream, write_parts
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice

@@ -59,5 +59,5 @@ class Adam:
         """Resume from what `state_dict` returned for tensors of the same shapes."""
         self.count = state["count"]
         for name in ("mean", "square"):
-            for mine, given in zip(getattr(self, name), state[name], strict=True):
-                mine.copy_(given)
+            for moment, stored in zip(getattr(self, name), state[name], strict=True):
+                moment.copy_(stored)

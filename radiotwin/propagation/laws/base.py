@@ -24,7 +24,6 @@ ANY_LEVEL_SD_DB = 300.0  # of a level that is free: wider than the range of meas
 MAX_DB = 1e4  # of a level, a residual or an intercept
 MAX_SD_DB = 1e3
 MAX_POSITION_M = 1e8  # ten times what a measurement may have
-_LINE = np.array([MAX_DB, 100.0, MAX_SD_DB])  # intercept [dB], exponent, standard deviation [dB]
 
 
 class ChannelModel(ABC):
@@ -217,18 +216,6 @@ def require_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int 
         raise ValueError(f"{name} has the shape {array.shape}")
     if array.dtype.kind not in "fiu" or not ((array >= low) & (array <= high)).all():
         raise ValueError(f"{name} holds something else than numbers from {low:g} to {high:g}")
-    return array
-
-
-def require_lines(array: np.ndarray) -> np.ndarray:
-    """Return log-distance lines (…, 3) after a check: intercept [dB], exponent, sd [dB].
-
-    Raises:
-        ValueError: one is impossible.
-    """
-    if not (array.dtype.kind == "f" and (np.abs(array) <= _LINE).all()
-            and (array[..., 2] > 0).all()):
-        raise ValueError("a line's intercept, exponent or standard deviation is impossible")
     return array
 
 

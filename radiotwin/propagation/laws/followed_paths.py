@@ -127,7 +127,7 @@ class Rays:
 
     @classmethod
     def of(cls, links: Links, of_device: bool, straight: bool = False) -> "Rays":
-        """Return those at the devices or at the receivers of links.
+        """Return the rays of links at their devices, or at their receivers.
 
         Without a map, or if `straight`, each link has one, along the straight line.
         """
@@ -198,13 +198,13 @@ class _Followed(NamedTuple):
 
 
 _Position = tuple[float, float, float]  # [m]
-_NewPaths = tuple[np.ndarray, PathDirections]  # as of `_Followed`
+_NewPaths = tuple[np.ndarray, PathDirections]  # powers and paths of `_Followed`
 
 _remembered: OrderedDict[tuple[CityMap, _Position, float], _Followed] = OrderedDict()
 
 
 def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
-    """Yield of each device: its links, what was followed, and each link's row of that."""
+    """Yield for each device the rows of its links, its paths, and each link's row in these."""
     city = geometry.city
     if city is None:
         raise BadInput("the channel image_paths follows paths over a 3D map, and none is given; "
@@ -213,9 +213,9 @@ def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, 
     batch = np.cumsum(count) // BATCH_LINKS
     for number in np.unique(batch):
         rows = [np.flatnonzero(geometry.device == device) for device in devices[batch == number]]
-        wanted = [(followed_from_m(geometry, row), geometry.receiver_m[mine])
-                  for row, mine in zip(first[batch == number], rows, strict=True)]
-        yield from ((mine, *found) for mine, found in zip(
+        wanted = [(followed_from_m(geometry, row), geometry.receiver_m[device_links])
+                  for row, device_links in zip(first[batch == number], rows, strict=True)]
+        yield from ((device_links, *found) for device_links, found in zip(
             rows, _follow(city, wanted, geometry.frequency_hz), strict=True))
 
 
@@ -264,7 +264,7 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
 
 def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
                frequency_hz: float) -> list[_NewPaths]:
-    """Return powers and paths as of `_Followed` from positions to ends (n, 3)."""
+    """Follow the paths from positions to ends (n, 3); return powers and paths as in `_Followed`."""
     if not asked:  # usually all paths are remembered, and no progress bar is needed
         return []
 
@@ -327,7 +327,7 @@ def _keys(positions_m: np.ndarray) -> np.ndarray:
 
 
 class UprightBox(NamedTuple):
-    """Where a box stands.
+    """An upright box, such as an unknown building.
 
     Attributes:
         centre_m: x and y [m].
@@ -351,7 +351,7 @@ class Power(NamedTuple):
 
 
 class KnownPaths:
-    """The stronger paths of n links over a map, each link's followed when it is first asked for."""
+    """The stronger paths of n links over a map; a link's paths are followed on first use."""
 
     def __init__(self, geometry: LinkGeometry, city: CityMap) -> None:
         self._geometry, self._city = geometry, city
@@ -371,7 +371,7 @@ class KnownPaths:
                      np.bincount(link, power_past, n)[rows])
 
     def follow(self, rows: np.ndarray) -> None:
-        """Follow the paths of links (r,), of which some may be known."""
+        """Follow the paths of links (r,) that are not known yet."""
         geometry, parts = self._geometry, [self._paths] if self._paths else []
         rows = rows[~self._is_followed[rows]]
         if not len(rows):
@@ -380,13 +380,13 @@ class KnownPaths:
             of_device = rows[geometry.device[rows] == device]
             position_m = np.array(followed_from_m(geometry, int(of_device[0])))
             for first in range(0, len(of_device), LINK_CHUNK):
-                mine = of_device[first:first + LINK_CHUNK]
-                found = paths_with_points(self._city, position_m, geometry.receiver_m[mine],
+                chunk = of_device[first:first + LINK_CHUNK]
+                found = paths_with_points(self._city, position_m, geometry.receiver_m[chunk],
                                           geometry.frequency_hz)
-                strongest = np.zeros(len(mine))
+                strongest = np.zeros(len(chunk))
                 np.maximum.at(strongest, found.receiver, found.power)
                 kept = found.power > WEAKEST * strongest[found.receiver]
-                parts.append((mine[found.receiver[kept]], found.power[kept],
+                parts.append((chunk[found.receiver[kept]], found.power[kept],
                               found.points_m[kept], found.points[kept]))
         self._paths = tuple(np.concatenate(each) for each in zip(*parts, strict=True))
         followed = geometry.select(rows)

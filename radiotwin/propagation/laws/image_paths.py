@@ -47,37 +47,46 @@ Offsets = tuple[float, float]
 """Levels of reflected and of diffracted paths above those of the map [dB]."""
 
 
-def scale_db(own_db: float | np.ndarray, square_db: np.ndarray) -> np.ndarray:
-    """Return the Student-t scale (n,) [dB] of a class's own scale and the map's errors (n,)."""
-    return np.sqrt(own_db**2 + square_db * (DOF - 2) / DOF)
+def scale_db(class_scale_db: float | np.ndarray, square_db: np.ndarray) -> np.ndarray:
+    """Return the Student-t scale (n,) [dB] of links over a map with errors.
+
+    Args:
+        class_scale_db: scale of the class where errors of the map do nothing [dB].
+        square_db: (n,) mean square of what errors of the map do [dB²].
+    """
+    return np.sqrt(class_scale_db**2 + square_db * (DOF - 2) / DOF)
 
 
 def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
               square_db: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Fit level and scale to links of one class, perhaps from an earlier fit on.
+    """Fit level and error scale of the links of one class (maximum likelihood).
 
-    Levels of links (n,), their limits, and those of the followed paths are in dB, the mean square
-    of what the map's errors do in dB².
+    Args:
+        level_db: (n,) measured levels [dB]; NaN: not detected.
+        limits_db: (n,) below which levels are not detected [dB].
+        paths: (n,) levels of the followed paths [dB].
+        square_db: (n,) mean square of what errors of the map do [dB²].
+        start: result of an earlier fit to start from; None: the median offset.
 
     Returns:
-        (2,) offset of measured levels from those of the paths [dB], and logarithm of the scale
-        where the map's errors do nothing.
+        (2,) offset of measured levels from those of the paths [dB], and logarithm of the error
+        scale where errors of the map do nothing.
     """
     if start is None:
         seen = np.isfinite(level_db)
         start = np.array([np.median((level_db - paths)[seen]), 0.5])
 
     def nll(numbers: np.ndarray) -> float:
-        own_db = float(np.exp(np.clip(numbers[1], -3, 4)))
+        class_scale_db = float(np.exp(np.clip(numbers[1], -3, 4)))
         return float(student.censored_nll(level_db, limits_db, paths + numbers[0],
-                                          scale_db(own_db, square_db), DOF).sum())
+                                          scale_db(class_scale_db, square_db), DOF).sum())
 
     found = minimize(nll, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02})
     return np.array([found.x[0], np.clip(found.x[1], -3, 4)])
 
 
 class LinkFit:
-    """Both classes of some links, fitted again and again, each time from where the last one ended.
+    """Repeated fits of both classes of some links, each started from the result of the last one.
 
     Attributes:
         level_db: (n,) [dB]; NaN: not detected.
@@ -105,22 +114,27 @@ class LinkFit:
         nll, z = np.zeros((2, len(self.level_db)))
         square_db = np.zeros(len(los)) if square_db is None else square_db
         for state in (False, True):
-            mine = los == state
-            if not np.isfinite(self.level_db[mine]).any():
+            of_class = los == state
+            if not np.isfinite(self.level_db[of_class]).any():
                 continue
-            offset_db, log_own = self._start[state] = fit_class(
-                self.level_db[mine], self.limits_db[mine], paths_db[mine], square_db[mine],
+            level_db, limits_db = self.level_db[of_class], self.limits_db[of_class]
+            offset_db, log_scale = self._start[state] = fit_class(
+                level_db, limits_db, paths_db[of_class], square_db[of_class],
                 self._start.get(state))
-            mean_db = paths_db[mine] + offset_db
-            sd_db = scale_db(float(np.exp(log_own)), square_db[mine])
-            nll[mine] = student.censored_nll(self.level_db[mine], self.limits_db[mine], mean_db,
-                                             sd_db, DOF)
-            z[mine] = np.nan_to_num((self.level_db[mine] - mean_db) / sd_db)
+            mean_db = paths_db[of_class] + offset_db
+            errors_db = scale_db(float(np.exp(log_scale)), square_db[of_class])
+            nll[of_class] = student.censored_nll(level_db, limits_db, mean_db, errors_db, DOF)
+            z[of_class] = np.nan_to_num((level_db - mean_db) / errors_db)
         return nll, z
 
 
 def links_as_one(links: LinkGeometry, z: np.ndarray) -> float:
-    """Return how many links count as one, by their residuals over the scale (n,)."""
+    """Return how many links carry the information of one, as neighbours err alike.
+
+    Args:
+        links: n links.
+        z: (n,) residuals over their scale.
+    """
     block = np.column_stack([links.device, np.floor(links.receiver_m[:, :2] / BLOCK_M)])
     label = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)
     return design_effect(label, z)
@@ -156,12 +170,12 @@ class ImagePaths(ChannelModel):
 
     def fit_diffuse(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                     antenna_db: np.ndarray | float = 0.0) -> Self:
-        """Fit the diffuse power to links without line of sight, as of `fit`, beside their level.
+        """Fit the diffuse power and a level to the links without line of sight.
 
         Args:
             links: n links.
-            level_db: (n,) as of `fit`.
-            limit_db: as of `fit`.
+            level_db: (n,) as in `fit` [dB].
+            limit_db: as in `fit` [dB].
             antenna_db: (n,) what antennas add to the power of the followed paths [dB].
         """
         nlos = links.select(~links.los)
@@ -170,7 +184,7 @@ class ImagePaths(ChannelModel):
         limits_db = limits_of(limit_db, len(links))[~links.los]
         level_db = np.where(blank, limits_db, level_db)
         known = np.isfinite(level_db)
-        # Blanks alone say no more than that it is weak, and the least is.
+        # Links that were not detected alone only say that it is weak: take the weakest
         if known.sum() < MIN_NLOS or blank[known].all():
             self.diffuse = DIFFUSE_DEFAULT
             return self
@@ -179,17 +193,17 @@ class ImagePaths(ChannelModel):
         near_m = min(float(np.quantile(links.distance_m, NEAR_QUANTILE)), 100.0)
 
         def loss(numbers: np.ndarray) -> float:
-            inside = _within_bounds(numbers, near_m, links.frequency_hz)
-            error_db = level_db - _with_diffuse_db(power, nlos.distance_m, *inside)
+            clipped = _clip_diffuse(numbers, near_m, links.frequency_hz)
+            error_db = level_db - _with_diffuse_db(power, nlos.distance_m, *clipped)
             error_db = error_db - np.median(error_db[known & ~blank])
             error_db = np.where(blank, np.minimum(error_db, 0.0), error_db)[known]
             misfit = np.log1p((error_db / ERROR_SCALE_DB) ** 2).sum()
-            return float(misfit + np.abs(numbers - inside).sum())
+            return float(misfit + np.abs(numbers - clipped).sum())
 
         starts = [np.array([start_db, DIFFUSE_DEFAULT[1]]) for start_db in DIFFUSE_STARTS_DB]
         found = minimize(loss, min(starts, key=loss), method="Nelder-Mead",
                          options={"xatol": 0.1, "fatol": 0.5}).x
-        gain_db, exponent = _within_bounds(found, near_m, links.frequency_hz)
+        gain_db, exponent = _clip_diffuse(found, near_m, links.frequency_hz)
         self.diffuse = float(gain_db), float(exponent)
         return self
 
@@ -241,11 +255,11 @@ class ImagePaths(ChannelModel):
 
 
 def _seen_gains(links: LinkGeometry) -> np.ndarray:
-    """Return the power (n,) of the paths over a map, with lines of sight as the links have them.
+    """Return the power (n,) of the paths over a map, with the links' own lines of sight.
 
-    They may have others than the map: something is in the way, or gone; or paths are those from
-    beside an estimated position. The direct path is lost, then, or is there as in free space, and
-    all other paths stay.
+    A link's line of sight may differ from the map's: an effect adds or removes an obstacle, or the
+    paths start beside an estimated position. Then the direct path is dropped, or added as in free
+    space; all other paths stay.
     """
     gains = interaction_gains(links)
     other = (gains[:, 0] > 0) != links.los
@@ -254,23 +268,19 @@ def _seen_gains(links: LinkGeometry) -> np.ndarray:
 
 
 def stored_diffuse(value: Any) -> tuple[float, float]:
-    """Return the diffuse power that a file has: gain at 100 m [dB], and exponent.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return gain at 100 m [dB] and exponent of stored diffuse power; ValueError if damaged."""
     if not isinstance(value, list) or len(value) != 2:
         raise ValueError("the diffuse power is not a gain and an exponent")
     named = dict(zip(("gain", "exponent"), value, strict=True))
     return require_number(named, "gain", -300.0, 100.0), require_number(named, "exponent", 0, 20)
 
 
-def _within_bounds(numbers: np.ndarray, near_m: float, frequency_hz: float) -> np.ndarray:
-    """Return the nearest diffuse power (2,) that is weaker than free space from a distance on [m].
+def _clip_diffuse(numbers: np.ndarray, near_m: float, frequency_hz: float) -> np.ndarray:
+    """Clip gain [dB] and exponent (2,) of diffuse power to weaker than free space beyond `near_m`.
 
-    A level of links without line of sight is fitted beside it. Where paths bring nothing that
-    readings show, diffuse power above that of free space would take their place, and then that of
-    the links with line of sight.
+    Without that limit, diffuse power would replace paths that explain no measurement, and then
+    the paths of links with line of sight, too: the level of links without line of sight is fitted
+    together with it.
     """
     gain_db, exponent = np.clip(numbers, *DIFFUSE_BOUNDS)
     most_db = -free_space_db(np.array(100.0), frequency_hz) - MIN_LOSS_DB \
@@ -286,12 +296,12 @@ def _with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,
 
 def paths_db(links: LinkGeometry, diffuse: tuple[float, float], offsets_db: Offsets = (0.0, 0.0)
              ) -> np.ndarray:
-    """Return the level (n,) [dB] of followed paths and diffuse power, as of `ImagePaths`."""
+    """Return the level (n,) [dB] of followed paths and diffuse power, see `ImagePaths`."""
     return _level_db(interaction_gains(links), links.distance_m, diffuse, offsets_db)
 
 
 def moved(links: LinkGeometry, east_m: float, north_m: float) -> LinkGeometry:
-    """Return links with both ends moved over their map; their line of sight is its."""
+    """Return links with both ends moved over their map, and the line of sight there."""
     step_m = np.array([east_m, north_m, 0.0])
     device_m, receiver_m = links.device_m + step_m, links.receiver_m + step_m
     los = links.los if links.city is None else links.city.line_of_sight(device_m, receiver_m)
@@ -300,11 +310,16 @@ def moved(links: LinkGeometry, east_m: float, north_m: float) -> LinkGeometry:
 
 def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                 diffuse: tuple[float, float]) -> Offsets:
-    """Return what reflections and diffractions carry beside those over the map [dB].
+    """Estimate how much stronger reflections and diffractions are than over the map [dB].
 
-    The most likely ones under a normal prior of `OFFSET_SD_DB`, which keeps them at 0 where levels
-    do not tell the two apart: each class of line of sight has a level of its own. Levels and limits
-    are as of `ImagePaths.fit`, the diffuse power is as of `ImagePaths`.
+    Maximum a posteriori under a normal prior of `OFFSET_SD_DB`, which keeps both at 0 where levels
+    cannot tell them apart, since each class of line of sight has a level of its own.
+
+    Args:
+        links: n links.
+        level_db: (n,) as in `ImagePaths.fit` [dB].
+        limit_db: as in `ImagePaths.fit` [dB].
+        diffuse: as in `ImagePaths`.
     """
     fit, gains = LinkFit(level_db, limit_db), interaction_gains(links)
     distance_m = links.distance_m
@@ -312,9 +327,9 @@ def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
     as_one = links_as_one(links, fit.fit(links.los, undisturbed_db)[1])
 
     def loss(offsets_db: np.ndarray) -> float:
-        inside = np.clip(offsets_db, -MAX_OFFSET_DB, MAX_OFFSET_DB)
+        clipped_db = np.clip(offsets_db, -MAX_OFFSET_DB, MAX_OFFSET_DB)
         prior = 0.5 * (offsets_db**2).sum() / OFFSET_SD_DB**2
-        level_db = _level_db(gains, distance_m, diffuse, inside)
+        level_db = _level_db(gains, distance_m, diffuse, clipped_db)
         return fit.fit(links.los, level_db)[0].sum() / as_one + float(prior)
 
     simplex = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])

@@ -117,7 +117,7 @@ class ResidualField:
 
     def with_points(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray,
                     kind: np.ndarray | None = None) -> Self:
-        """Return a field of the same correlation with other points, as of `fit`."""
+        """Return a field of the same correlation with other points, given as in `fit`."""
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
         field = type(self)(self.max_pairs, self.is_local)
         field.share, field.kind_share, field.length_m = self.share, self.kind_share, self.length_m
@@ -127,7 +127,7 @@ class ResidualField:
 
     def _store(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray,
                kind: np.ndarray) -> dict[int, np.ndarray]:
-        """Store the points, as of `fit`; return the rows of each series."""
+        """Store the points, given as in `fit`; return the rows of each series."""
         rows_of_series = _rows_by_series(series)
         limit = self._limit(len(rows_of_series))
         self.fields = {}
@@ -145,7 +145,7 @@ class ResidualField:
 
     def predict(self, series: np.ndarray, position_m: np.ndarray,
                 kind: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (n,) of the residual at points, as of `fit`.
+        """Return mean and standard deviation (n,) of the residual at points, given as in `fit`.
 
         Far from points that are stored, and in unknown series, they are 0 and 1. Memory does not
         grow with n.
@@ -215,7 +215,7 @@ class ResidualField:
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any],
                    is_local: bool = False) -> Self:
-        """Return the field that `state` described; `is_local` as of `__init__`."""
+        """Return the field that `state` described; `is_local` as in `__init__`."""
         field = cls(is_local=is_local)
         require_names("settings", settings, ["devices", "share", "kind_share", "length_m"])
         numbers = settings["devices"]
@@ -389,7 +389,7 @@ class RegressionKriging(ChannelModel):
         return self
 
     def refit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit) -> Self:
-        """Return a model of the same correlation that is fitted to other links, as of `fit`."""
+        """Return a model of the same correlation that is fitted to other links, see `fit`."""
         model = type(self)()
         model.fixed_m = self.fixed_m
         model.field = self.field.with_points(*model._residual(links, level_db, limit_db))

@@ -13,22 +13,23 @@ from radiotwin.inference.gaussian import Limit, LogDistanceLine, fit_line, shift
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.base import (
     MAX_DB,
+    MAX_SD_DB,
     MIN_DETECTED,
     ChannelModel,
     drop_uninformative,
     require_array,
-    require_lines,
     require_names,
 )
 
 # Prior of the gap between the lines: in 3GPP TR 38.901 UMi, at 100 m and 2.4 GHz, LoS lies 19 dB
 # above NLoS.
 NLOS_LOSS_DB, NLOS_LOSS_SD_DB = 20.0, 10.0
+MAX_EXPONENT = 100.0  # of a stored line
 BORROWED_SD_DB = 8.0  # least sd of a borrowed line: UMi NLoS has 7.8 dB (TR 38.901 table 7.4.1-1)
 
 
 class LogDistance(ChannelModel):
-    """gain = intercept + 10 * exponent * log10(d / 1 m) + N(0, sd^2), with or without LoS."""
+    """gain = intercept - 10 * exponent * log10(d / 1 m) + N(0, sd^2), with or without LoS."""
 
     name = "log_distance"
     uses_map = False
@@ -49,20 +50,18 @@ class LogDistance(ChannelModel):
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        line = self.line
-        return {"line": np.array([line.intercept_db, line.exponent, line.sd_db])}, {}
+        return {"line": _stored(self.line)}, {}
 
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
         require_names("settings", settings, [])
         require_names("arrays", arrays, ["line"])
-        line = require_lines(require_array(arrays, "line", (3,), -MAX_DB, MAX_DB))
-        return cls(LogDistanceLine(*map(float, line)))
+        return cls(_line(require_array(arrays, "line", (3,), -MAX_DB, MAX_DB)))
 
 
 class SegmentedLogDistance(ChannelModel):
-    """gain = intercept_s + 10 * exponent_s * log10(d / 1 m) + N(0, sd_s^2), s = LoS or NLoS.
+    """gain = intercept_s - 10 * exponent_s * log10(d / 1 m) + N(0, sd_s^2), s = LoS or NLoS.
 
     The segmented law of Chen et al., 'Model-aided federated reinforcement learning for multi-UAV
     trajectory planning in IoT networks' (GLOBECOM Workshops 2023). A class with fewer than
@@ -113,22 +112,35 @@ class SegmentedLogDistance(ChannelModel):
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        intercept_db, exponent, sd_db = self.state()[0]["lines"][links.los.astype(np.intp)].T
-        return intercept_db + 10.0 * exponent * links.log_distance, sd_db
+        intercept_db, slope, sd_db = self.state()[0]["lines"][links.los.astype(np.intp)].T
+        return intercept_db + 10.0 * slope * links.log_distance, sd_db
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return `lines`: (2, 3) intercept [dB], exponent, sd [dB] of NLoS, then of LoS."""
-        lines = [[line.intercept_db, line.exponent, line.sd_db] for line in (self.nlos, self.los)]
-        return {"lines": np.array(lines)}, {"borrowed": self.borrowed}
+        """Return `lines` (2, 3) as `_stored` has them, of NLoS, then of LoS."""
+        lines = np.array([_stored(self.nlos), _stored(self.los)])
+        return {"lines": lines}, {"borrowed": self.borrowed}
 
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
         require_names("settings", settings, ["borrowed"])
         require_names("arrays", arrays, ["lines"])
-        lines = require_lines(require_array(arrays, "lines", (2, 3), -MAX_DB, MAX_DB))
+        nlos, los = map(_line, require_array(arrays, "lines", (2, 3), -MAX_DB, MAX_DB))
         if settings["borrowed"] not in (None, "los", "nlos"):
             raise ValueError("borrowed is none of null, los, nlos")
-        nlos, los = (LogDistanceLine(*map(float, row)) for row in lines)
         return cls(los, nlos, settings["borrowed"])
+
+
+def _stored(line: LogDistanceLine) -> np.ndarray:
+    """Return (3,) intercept [dB], minus the path-loss exponent, standard deviation [dB]."""
+    return np.array([line.intercept_db, -line.exponent, line.sd_db])
+
+
+def _line(stored: np.ndarray) -> LogDistanceLine:
+    """Return the line that `_stored` described; ValueError if it is impossible."""
+    if stored.dtype.kind != "f" or not (abs(stored[1]) <= MAX_EXPONENT
+                                        and 0 < stored[2] <= MAX_SD_DB):
+        raise ValueError("a line's intercept, exponent or standard deviation is impossible")
+    intercept_db, slope, sd_db = map(float, stored)
+    return LogDistanceLine(intercept_db, -slope, sd_db)

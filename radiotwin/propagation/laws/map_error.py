@@ -127,8 +127,8 @@ def _mean_square_db(links: LinkGeometry, base_db: np.ndarray,
     changes = []
     with progress("following paths over wrong maps", total=MEMBERS) as advance:
         for member in range(MEMBERS):
-            there = replace(links, city=perturbed_map(city, *size_m, seed + member))
-            changes.append(paths_db(there, *power) - base_db)  # line of sight stays the map's
+            wrong = replace(links, city=perturbed_map(city, *size_m, seed + member))
+            changes.append(paths_db(wrong, *power) - base_db)  # with the map's line of sight
             advance(1)
     return np.mean(np.square(changes), axis=0)
 
@@ -147,9 +147,9 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
     Arguments are those of `estimate_map_error`.
 
     Returns:
-        zeros where there are too few links, or no shift. Walls that are off each in their own way
-        look like another shift about each device; so one that is found without a device must
-        explain the links of that device, and more than errors of single walls do.
+        zeros if there are too few links, or no shift. Independent errors of single walls look like
+        a different shift about each device. So a shift must also explain the links of a device
+        that was left out, and must explain more than errors of single walls do.
     """
     limits_db = limits_of(limit_db, len(links))
     known = np.isfinite(level_db) | np.isfinite(limits_db)
@@ -169,29 +169,29 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
         tried = _try_shifts(links, LinkFit(level_db, limits_db), diffuse)
     best, shifts = _likeliest(tried), np.array(list(tried))
     by_device = np.array([np.bincount(device, nll) for nll in tried.values()])
-    # Of each device: the best shift for the others, and what it gains by that.
-    without = (by_device.sum(axis=1)[:, None] - by_device).argmin(axis=0)
-    gains = by_device[0] - by_device[without, np.arange(len(without))]
-    # The signed root of twice a likelihood ratio is near to normal, the ratio itself is skewed.
-    roots = np.sign(gains) * np.sqrt(2 * np.abs(gains))
+    # Leave one device out: the best shift for the others, and what that gains for this device
+    left_out = (by_device.sum(axis=1)[:, None] - by_device).argmin(axis=0)
+    gain_nats = by_device[0] - by_device[left_out, np.arange(len(left_out))]
+    # The signed root of twice a likelihood ratio is near to normal, the ratio itself is skewed
+    roots = np.sign(gain_nats) * np.sqrt(2 * np.abs(gain_nats))
     chance = ttest_1samp(roots, 0, alternative="greater").pvalue
     if np.hypot(*best) < SEEN_SHIFT_M or not chance < SURE:
         return NO_SHIFT
-    here, there = (_estimate_sizes(each, level_db, limits_db, diffuse, (0.0, 0.0), seed)
-                   for each in (links, moved(links, *best)))
-    if here.nll - there.nll < SURE_NATS * there.as_one:  # walls that are off explain as much
+    unshifted, shifted = (_estimate_sizes(each, level_db, limits_db, diffuse, (0.0, 0.0), seed)
+                          for each in (links, moved(links, *best)))
+    if unshifted.nll - shifted.nll < SURE_NATS * shifted.as_one:  # wrong walls explain as much
         return NO_SHIFT
     # The jackknife (Tukey 1958), both axes taken together.
-    square_m2 = ((shifts[without] - best)**2).sum() * (len(without) - 1) / len(without)
+    square_m2 = ((shifts[left_out] - best)**2).sum() * (len(left_out) - 1) / len(left_out)
     radius_m = RADIUS_SDS * float(np.sqrt(square_m2 / 2))
     return best[0], best[1], max(radius_m, STEPS_M[-1])
 
 
 def _try_shifts(links: LinkGeometry, fit: LinkFit, diffuse: tuple[float, float]
                 ) -> dict[tuple[float, float], np.ndarray]:
-    """Return shifts, no shift first, and the negative log-likelihood of each link (n,) [nats].
+    """Return the negative log-likelihood of each link (n,) [nats] for each shift, (0, 0) first.
 
-    Those on rings, and from the best one in steps to what is better.
+    Tried are shifts on rings, then a descent from the best one in steps.
     """
     tried: dict[tuple[float, float], np.ndarray] = {}
 
@@ -318,7 +318,10 @@ def estimate_map_error(links: LinkGeometry, level_db: np.ndarray, limit_db: Limi
 
 def estimate_other_errors(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                           seed: int) -> Found:
-    """Do as `estimate_map_error` for a map that is not shifted."""
+    """Estimate errors of walls, roofs and materials of a map that is not shifted.
+
+    Arguments and result are those of `estimate_map_error`.
+    """
     diffuse = ImagePaths().fit_diffuse(links, level_db, limit_db).diffuse
     limits_db = limits_of(limit_db, len(links))
     known = np.flatnonzero(np.isfinite(level_db) | np.isfinite(limits_db))

@@ -68,7 +68,7 @@ class PathKriging(ChannelModel):
         """Make a model to be fitted.
 
         Args:
-            found: the map's error and the diffuse power where they are known already, as of
+            found: the map's error and the diffuse power if they are known already, see
                 `estimate_map_error`.
             lost: see the class.
         """
@@ -145,11 +145,11 @@ class PathKriging(ChannelModel):
                      mean_db: np.ndarray, square_db: np.ndarray) -> None:
         heard = [int(np.isfinite(level_db[links.los == los]).sum()) for los in (False, True)]
         for los in (False, True):
-            mine = links.los == los
             if heard[los]:
-                offset_db, log_own = fit_class(level_db[mine], limit_db[mine], mean_db[mine],
-                                               square_db[mine])
-                self.classes[int(los)] = offset_db, np.exp(log_own)
+                of_class = links.los == los
+                offset_db, log_scale = fit_class(level_db[of_class], limit_db[of_class],
+                                                 mean_db[of_class], square_db[of_class])
+                self.classes[int(los)] = offset_db, np.exp(log_scale)
         for los in (False, True):
             if not heard[los]:  # nothing is known of it but what the other shows
                 self.classes[int(los)] = self.classes[1 - int(los)]
@@ -157,8 +157,8 @@ class PathKriging(ChannelModel):
     def _at_paths(self, links: LinkGeometry, mean_db: np.ndarray, square_db: np.ndarray
                   ) -> tuple[np.ndarray, np.ndarray]:
         """Return mean and standard deviation (n,) [dB] without what is interpolated."""
-        level_db, own_db = self.classes[links.los.astype(int)].T
-        return mean_db + level_db, SPREAD_FACTOR * scale_db(own_db, square_db)
+        offset_db, class_scale_db = self.classes[links.los.astype(int)].T
+        return mean_db + offset_db, SPREAD_FACTOR * scale_db(class_scale_db, square_db)
 
     def _held_out_weight(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                          mean_db: np.ndarray, square_db: np.ndarray) -> np.ndarray:
@@ -172,10 +172,10 @@ class PathKriging(ChannelModel):
         rng = np.random.default_rng(self.seed)
         fold = rng.permutation(np.arange(label.max() + 1) % FOLDS)[label]
         errors_db = np.full((2, len(links)), np.nan)
-        own = *self._at_paths(links, mean_db, square_db), self.field
-        law = *self.kriging.law.predict(links), self.kriging.field
-        for row, (there_db, sd_db, field) in enumerate((own, law)):
-            residual = standardised(level_db, there_db, sd_db, limit_db)
+        by_paths = *self._at_paths(links, mean_db, square_db), self.field
+        by_law = *self.kriging.law.predict(links), self.kriging.field
+        for row, (trend_db, sd_db, field) in enumerate((by_paths, by_law)):
+            residual = standardised(level_db, trend_db, sd_db, limit_db)
             for number in range(FOLDS):
                 rest, held = fold != number, fold == number
                 if not held.any() or not rest.any():
@@ -183,14 +183,15 @@ class PathKriging(ChannelModel):
                 refitted = field.with_points(links.device[rest], links.receiver_m[rest],
                                              residual[rest])
                 mean, _ = refitted.predict(links.device[held], links.receiver_m[held])
-                errors_db[row, held] = level_db[held] - there_db[held] - sd_db[held] * mean
+                errors_db[row, held] = level_db[held] - trend_db[held] - sd_db[held] * mean
         weight = np.ones(2)
         for los in (False, True):
-            mine = (links.los == los) & np.isfinite(errors_db).all(axis=0)
-            by_paths, by_law = errors_db[:, mine]
-            apart = by_law - by_paths
-            if (apart**2).sum() > 0:
-                weight[int(los)] = np.clip((by_law * apart).sum() / (apart**2).sum(), 0.0, 1.0)
+            of_class = (links.los == los) & np.isfinite(errors_db).all(axis=0)
+            paths_error_db, law_error_db = errors_db[:, of_class]
+            gap_db = law_error_db - paths_error_db
+            if (gap_db**2).sum() > 0:
+                weight[int(los)] = np.clip((law_error_db * gap_db).sum() / (gap_db**2).sum(),
+                                           0.0, 1.0)
         return weight
 
     @override

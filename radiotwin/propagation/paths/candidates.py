@@ -81,7 +81,7 @@ class Ways(NamedTuple):
 def _open_ways(
     city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
 ) -> Ways:
-    """Return those of ways (w,) by which the device, at (3,) [m], sees a point of the edge."""
+    """Return the ways (of w) on which the device at (3,) [m] sees some point of the edge."""
     lit_m, source_m, samples = _lit_parts(surfaces, before, edge, device_m)
     points = PathBuffer.allocate(SAMPLE_CHUNK + int(samples.max(initial=0)))
     one_by_one = Candidates(before, np.full(len(edge), -1), before[:, :0])
@@ -100,7 +100,7 @@ def _open_ways(
 def _lit_parts(
     surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lit part and the source as of `Ways`, and the number of points (w,) to try."""
+    """Return lit part and source as in `Ways`, and the number of points (w,) to try."""
     image = np.empty((MAX_INTERACTIONS + 1, 3))
     lit_m, source_m = np.zeros((len(edge), 2)), np.zeros((len(edge), 2))
     samples = np.zeros(len(edge), dtype=np.int64)
@@ -128,9 +128,10 @@ def _sample(
     lit_m: np.ndarray, samples: np.ndarray, is_seen: np.ndarray, first: int, way: int,
     points: PathBuffer,
 ) -> tuple[int, int]:
-    """Put paths to points of lit parts, just off the edge, in a buffer, from a way on.
+    """Put paths to points on lit parts of edges, just off the edge, into a buffer.
 
-    Of each way that is not known to be open every `SAMPLE_STEP`-th point from the `first` on.
+    Begins at row `way`. Ways known to be open are passed; of the others every `SAMPLE_STEP`-th
+    point is tried, from number `first` on.
 
     Returns:
         Their number, and the way to go on with.
@@ -176,9 +177,17 @@ def _with_facets_after(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Combine each way to an edge with the sequences of facets after it that rays can reach.
 
-    Those of edge e are the rows `first[e]` to `end[e]` of `after` (m, b), the empty one first, each
-    after its `parent` (m,), the row of the sequence without the last facet. Returns the row of the
-    way (c,), and that of `after` (c,).
+    Args:
+        surfaces: facets and edges.
+        ways: ways to edges.
+        first: (e,) first row of each edge in `after`: the empty sequence.
+        end: (e,) row after the last one of each edge.
+        after: (m, b) facets after an edge; then -1.
+        parent: (m,) row of the sequence without its last facet, which comes earlier.
+        depth: maximum number of interactions.
+
+    Returns:
+        (c,) rows of the ways, and (c,) rows of `after`.
     """
     most = total = 0
     for way in range(len(ways.edge)):
@@ -396,7 +405,7 @@ class CandidateSearch:
         return found
 
     def pairs_of_edges(self, edges: np.ndarray) -> EdgePairsToTry:
-        """Return what to try as the second edge after edges (s,) of a device's candidates."""
+        """Return the edges to try as second edge, after edges (s,) that a device sees."""
         with self._one_at_a_time:
             after, first = self._after, self._first_after[edges]
             row, within = expand(self._end_after[edges] - first)
@@ -431,10 +440,10 @@ class CandidateSearch:
                           np.concatenate([none[:, 1:], after[row]]))
 
     def _corner_sequences(self, facing: np.ndarray) -> np.ndarray:
-        """Return sequences (n, depth) of two facets that meet at a reentrant corner.
+        """Return sequences (n, depth) of two facets of a reentrant corner, the first in (f,).
 
-        Of which the device is before the first (f,). Such corners send rays back where they come
-        from; from far away the strips that do so are too narrow for the rays that are shot.
+        Such corners reflect rays back to where they come from. From far away the strips that do so
+        are too narrow to be hit by the rays that are shot.
         """
         corners = self.facets.corners
         found = corners[np.isin(corners[:, 0], facing)] if self._depth > 1 else corners[:0]

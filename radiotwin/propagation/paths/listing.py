@@ -7,11 +7,10 @@ factor and the impulse response of its paths.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -21,7 +20,7 @@ from scipy.constants import speed_of_light
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import PATHS, RESPONSE_VALUES, ROWS
 from radiotwin.io.files import atomic_file, require_suffix, require_writable
-from radiotwin.maps.form import CONVENTIONS
+from radiotwin.maps.file import CONVENTIONS
 from radiotwin.propagation.paths.candidates import candidate_search
 from radiotwin.propagation.paths.fields import path_amplitudes
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
@@ -52,8 +51,7 @@ _LONG_NAMES = {
 EDGE_TAPS = 16  # before the first and after the last path: a path between two taps rings that long
 
 
-@dataclass(frozen=True, eq=False)
-class Rays:
+class Rays(NamedTuple):
     """Paths from one device, sorted by receiver and delay.
 
     Attributes:
@@ -90,7 +88,7 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
                 depth: int = 4) -> Iterator[tuple[Rays, int]]:
     """Follow paths of up to `depth` interactions from a device (3,) to receivers (n, 3) [m].
 
-    With those along terrain, as of `radiotwin.propagation.paths.powers.PathPowers`.
+    Paths along terrain are included, see `radiotwin.propagation.paths.powers.PathPowers`.
 
     Yields:
         The paths to the next receivers, whose rows are among all, and the number of these.
@@ -110,13 +108,13 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
             found = path_amplitudes(search.surfaces, candidates, wave_number, slabs, buffer, rows)
             parts.append(_rays(buffer, rows, kinds[buffer.candidate[rows]], *found))
         joined = _joined(parts)
-        joined = replace(joined, receiver=near[joined.receiver])
+        joined = joined._replace(receiver=near[joined.receiver])
         dark = np.setdiff1d(near, joined.receiver)
         rows = np.append(np.flatnonzero(far), dark[city.hidden_by_ground(device_m, ends_m[dark])])
         joined = _joined([joined, _along_terrain(city, device_m, ends_m, rows, wave_number)])
         order = np.lexsort((joined.length_m, joined.receiver))
-        rays = Rays(*(getattr(joined, each.name)[order] for each in fields(Rays)))
-        yield replace(rays, receiver=rays.receiver + first), len(ends_m)
+        rays = Rays(*(each[order] for each in joined))
+        yield rays._replace(receiver=rays.receiver + first), len(ends_m)
 
 
 def _direct(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, wave_number: float) -> Rays:
@@ -131,7 +129,7 @@ def _direct(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, wave_number
 
 def _along_terrain(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, rows: np.ndarray,
                    wave_number: float) -> Rays:
-    """Return what reaches some ends (rows) along the profile: a path by way of its edge each."""
+    """Return one path over the terrain profile for each of some ends (rows)."""
     ends_m = ends_m[rows]
     along = terrain_paths(city, device_m, ends_m, wave_number * speed_of_light / (2 * np.pi))
     legs = along.edge_m - device_m, along.edge_m - ends_m
@@ -168,8 +166,7 @@ def _kinds(candidates: Candidates) -> np.ndarray:
 
 
 def _joined(parts: list[Rays]) -> Rays:
-    return Rays(*(np.concatenate([getattr(part, each.name) for part in parts])
-                  for each in fields(Rays)))
+    return Rays(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
 def list_paths(scene: Scene, points_m: np.ndarray, out_path: Path | str | None = None,
@@ -270,8 +267,8 @@ def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.nda
                         gain_dbi += antenna.gain_dbi(way)
                 count += len(gain_dbi)
                 PATHS.check(count, f"paths of {len(index)} devices to {len(points_m)} points")
-                yield replace(rays, receiver=row * len(points_m) + points[rays.receiver],
-                              amplitude=rays.amplitude * 10 ** (gain_dbi / 20))
+                yield rays._replace(receiver=row * len(points_m) + points[rays.receiver],
+                                    amplitude=rays.amplitude * 10 ** (gain_dbi / 20))
                 advance(receivers)
 
 
@@ -400,8 +397,8 @@ def angular_spread_deg(angle_rad: np.ndarray, power: np.ndarray, link: np.ndarra
 def k_factor_db(power: np.ndarray, direct: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
     """Return the power of the direct path over that of all others (links,) [dB].
 
-    A path (p,) is direct if it has no interaction; others as of `rms_spread`. NaN where there is no
-    direct path, or no other.
+    A path (p,) is direct if it has no interaction; the other arguments are those of `rms_spread`.
+    NaN where there is no direct path, or no other.
     """
     first, rest = sums(power * direct, link, links), sums(power * ~direct, link, links)
     with np.errstate(divide="ignore", invalid="ignore"):

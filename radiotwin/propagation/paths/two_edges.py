@@ -118,7 +118,7 @@ def _possible(
 def _cone_meets(edges: np.ndarray, edge: int, from_m: np.ndarray, end_m: np.ndarray) -> bool:
     """Return whether rays from a point over an edge may meet a segment (2, 3) [m].
 
-    They leave the edge where (q - s) d = (t - s) (d + r), as of `pruning.narrow`; True may be
+    They leave the edge where (q - s) d = (t - s) (d + r), see `pruning.narrow`; True may be
     wrong, False never is.
     """
     _, s, d = around_edge(edges, edge, from_m[0], from_m[1], from_m[2])
@@ -242,7 +242,7 @@ def two_edge_gains(
 ) -> np.ndarray:
     """Return the power gains (p,), linear, of paths over two edges, (p, 2) as in `EdgePairs`.
 
-    Others as of `radiotwin.propagation.paths.fields.path_gains`.
+    The other arguments are those of `radiotwin.propagation.paths.fields.path_gains`.
     """
     gain = np.empty(len(edge))
     direction, field = np.empty((3, 3)), np.empty(3, dtype=np.complex128)

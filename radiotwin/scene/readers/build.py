@@ -262,7 +262,7 @@ def build_scene_from_map(
     table = _building_table(prisms, shape_of, ground.config is not None)
     counts = Counter(table.drop_duplicates(["building", "height_from"])["height_from"])
     vegetation, unusable = make_vegetation(found.vegetation, origin,
-                                           _both(around.bounds, extent.bounds))
+                                           _enclosing(around.bounds, extent.bounds))
     city.problems.extend(unusable)
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
@@ -292,7 +292,7 @@ def _facts(
 
 def _not_used(found: MapFile, features: list[Feature],
               map_options: MapOptions) -> tuple[tuple[str, str], ...]:
-    """Return a line on tags, columns and layers that change nothing."""
+    """Return the report's line on tags, columns and layers that are not used."""
     declared = map_options.height_column
     used = READ_COLUMNS | READ_TAGS | set(map_options.materials.by_tag) | (
         {declared.name, declared.ground} if declared else set())
@@ -412,8 +412,8 @@ def _bounds_m(prisms: list[Prism], origin: Origin, bbox_deg: Bounds | None) -> B
     return box
 
 
-def _both(one_m: Bounds, other_m: Bounds) -> Bounds:
-    """Return (x_min, x_max, y_min, y_max) of what holds two areas [m]."""
+def _enclosing(one_m: Bounds, other_m: Bounds) -> Bounds:
+    """Return the smallest (x_min, x_max, y_min, y_max) around two boxes [m]."""
     return (min(one_m[0], other_m[0]), max(one_m[1], other_m[1]),
             min(one_m[2], other_m[2]), max(one_m[3], other_m[3]))
 

@@ -123,15 +123,15 @@ class MapFile:
 
 
 def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:
-    """Return one problem about several features, with their number and first names; none: empty."""
+    """Return one problem that counts and lists features; an empty list if there are none."""
     return [Problem(severity, "", f"{len(names)} {text} ({listed(names)})")] if names else []
 
 
 def left_out_problems(left_out: Sequence[LeftOut],
                       bbox_deg: tuple[float, float, float, float] | None) -> list[Problem]:
-    """Return one problem about all that was left out for the same reason.
+    """Return one problem for each reason why features were left out.
 
-    Only what reaches into the box (south, west, north, east) [degrees] is named; None: all.
+    Only features that reach into the box (south, west, north, east) [degrees] count; None: all.
     """
     by_reason: dict[str, list[str]] = {}
     for one in left_out:
@@ -153,7 +153,7 @@ def is_building(tags: Mapping[str, str]) -> bool:
 
 
 def hidden(name: str, tags: Mapping[str, str], place: BaseGeometry | None) -> LeftOut | None:
-    """Return a building that is below the ground, inside of another or not there; None: none."""
+    """Return why a building is left out (underground, indoors, not standing); None: it is kept."""
     for key in BUILDING_KEYS:
         if tags.get(key, "").strip().lower() in _LIFECYCLE:
             return LeftOut(f"{name}: {key}={tags[key]}", NOT_THERE, place)
@@ -204,9 +204,10 @@ def _is_set(tags: Mapping[str, str], key: str) -> bool:
 
 
 def check_crowding(bounds: np.ndarray, source: object) -> None:
-    """Raise BadInput if too many things, by their bounds (n, 4), lie on top of each other.
+    """Raise BadInput if too many bounding boxes (n, 4) overlap.
 
-    In a city the middle of a building lies in the boxes around a few: itself, what it is a part of.
+    Counted are the boxes that contain the centre of each box. In a city these are few: that of the
+    building itself, and of the building that it is a part of.
     """
     bounds = bounds[np.isfinite(bounds).all(axis=1)]
     boxes: Any = shapely.box(*bounds.T)

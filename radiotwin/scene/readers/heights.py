@@ -148,7 +148,7 @@ def check_declared(column: HeightColumn, rows: Iterable[Mapping[str, str]], sour
 
 
 def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
-    """Return what to say if no row has a known height; None if no column is of numbers."""
+    """Return the error message for rows without a usable height; None if no column has numbers."""
     counts: dict[str, int] = {}
     for tags in rows:
         for key, value in tags.items():
@@ -248,7 +248,7 @@ def height_of(tags: Mapping[str, str], default_m: float,
 
 def _first(tags: Mapping[str, str], keys: Iterable[tuple[str, float]], unusable: list[str],
            least_m: float = 0.0) -> float:
-    """Return the first usable of some tags [m], by their unit; 0 without one."""
+    """Return the first usable length [m] among tags, given with their units; 0 if there is none."""
     for key, unit_m in keys:
         if key in tags:
             value_m = parse_length_m(tags[key]) if unit_m == 1 else unit_m * number(tags[key])
@@ -259,10 +259,13 @@ def _first(tags: Mapping[str, str], keys: Iterable[tuple[str, float]], unusable:
 
 
 def height_sds_m(top_m: np.ndarray, sd_m: np.ndarray) -> np.ndarray:
-    """Return how well the height of each building of a map is known (n,) [m], of defaults, too.
+    """Return the standard deviations (n,) of heights [m], with estimates for defaults.
 
-    A default is off as far as heights of the same map that are known lie from it. Tops (n,) are
-    above the ground [m], standard deviations (n,) as `Height` has them [m].
+    The error of a default is estimated as the RMS difference of the map's known heights from it.
+
+    Args:
+        top_m: (n,) heights of the tops above the ground [m].
+        sd_m: (n,) standard deviations [m]; NaN: of a default.
     """
     guessed = np.isnan(sd_m)
     if guessed.any():

@@ -1,4 +1,4 @@
-"""Values of maps and terrains that can be read, and that can hardly be meant.
+"""Warnings about implausible heights in maps, and voids in terrains.
 
 A building of more than 300 m is rare: some 200 of them exist [1]; the most slender is 24 times as
 tall as wide [2]. No city has a median above 60 m, and a room is 2.1 m high at least [5]. Rasters
@@ -37,11 +37,10 @@ _AROUND = np.ones((3, 3), dtype=bool)
 
 def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
                         columns: Mapping[str, Mapping[str, str]]) -> list[Problem]:
-    """Return a warning about buildings that are hardly as tall as their map has them.
+    """Return a warning about buildings whose height is implausible.
 
     Args:
-        buildings: name, height and site in the local frame [m] of each; of a height that is a
-            default nothing is said.
+        buildings: name, height and site in the local frame [m]; default heights are not judged.
         columns: by name of a building, its tags.
     """
     tallest: dict[str, tuple[str, Height, BaseGeometry]] = {}
@@ -87,7 +86,7 @@ def _width_m(site: BaseGeometry) -> float:
 
 def _hint(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
           columns: Mapping[str, Mapping[str, str]]) -> str:
-    """Return what a column of heights may hold instead, and how to say so."""
+    """Return the remedy: what the column may hold instead, and the option for that."""
     if source == "model":
         return "; are the model's elevations in metres?"
     column = source.split(" - ")[0]
@@ -102,7 +101,7 @@ def _hint(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
 
 def _ground_column(known: Sequence[tuple[str, Height, BaseGeometry]],
                    columns: Mapping[str, Mapping[str, str]]) -> str | None:
-    """Return a column whose difference to the heights is that of usual buildings."""
+    """Return a column that may be the ground's elevation: subtracting it gives usual heights."""
     rows = [(height.top_m, columns.get(name, {})) for name, height, _ in known]
     for column in sorted({column for _, tags in rows for column in tags}):
         above_m = np.array([top_m - number(tags.get(column, "")) for top_m, tags in rows])
@@ -113,10 +112,14 @@ def _ground_column(known: Sequence[tuple[str, Height, BaseGeometry]],
 
 
 def zero_voids(height_m: np.ndarray, pixel_m: float) -> np.ndarray:
-    """Return which pixels (rows, columns) [m] are zeros that stand for no data, or mixed with them.
+    """Return a mask of zeros that mean "no data", and of pixels interpolated with such zeros.
 
-    These are regions of zeros with a wall of 30 m and of 45 degrees around nine tenths of them, and
-    the pixels that an interpolation has mixed with them.
+    A region of zeros means "no data" if nine tenths of its border are steps of more than 30 m and
+    steeper than 45 degrees.
+
+    Args:
+        height_m: (rows, columns) [m].
+        pixel_m: side of a pixel [m].
     """
     region, count = ndimage.label(height_m == 0.0, _AROUND)
     if not count:
@@ -139,7 +142,7 @@ def zero_voids(height_m: np.ndarray, pixel_m: float) -> np.ndarray:
 
 
 def steep_steps(height_m: np.ndarray, pixel_m: float) -> tuple[float, int]:
-    """Return the largest step between neighbouring pixels [m], and how many are hardly natural."""
+    """Return the largest step between neighbouring pixels [m], and how many are implausible."""
     steps_m = np.concatenate([np.abs(np.diff(height_m, axis=axis)).ravel() for axis in (0, 1)])
     steps_m = steps_m[np.isfinite(steps_m)]
     steep = steps_m > max(STEP_M, STEP_SLOPE * pixel_m)

@@ -107,7 +107,7 @@ def make_prisms(
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
     lowest_m: dict[str, float] = {}  # by building
-    for feature, area, (whole, site) in _resolve_parts(wholes, parts, defects):
+    for feature, area, (building, site) in _resolve_parts(wholes, parts, defects):
         height = height_of(feature.tags, default_height_m, height_column)
         if is_below_zero(feature.tags, "layer") or is_below_zero(feature.tags, "level"):
             defects.add("layer", feature.name)
@@ -122,8 +122,8 @@ def make_prisms(
         material, material_from = table.material_of(feature.tags)
         prisms += [Prism(feature.name, polygon, height, material, material_from, site=site)
                    for polygon in shapely.get_parts(area)]
-        if not whole.is_part:  # what a part without its outline stands on is not known
-            lowest_m[whole.name] = min(lowest_m.get(whole.name, np.inf), height.bottom_m)
+        if not building.is_part:  # what a part without its outline stands on is not known
+            lowest_m[building.name] = min(lowest_m.get(building.name, np.inf), height.bottom_m)
     for name, bottom_m in lowest_m.items():
         if bottom_m > HEADROOM_M:
             defects.add("floating", name)
@@ -175,7 +175,7 @@ class _Defects:
 
 
 def _clean(features: Sequence[Feature], origin: Origin, defects: _Defects) -> list[Area]:
-    """Return the features of which something is left, with their areas in the local frame."""
+    """Return features with their cleaned areas in the local frame, without empty ones."""
     areas = shapely.transform([feature.area for feature in features],
                               lambda points: np.column_stack(to_local(origin, *points.T)))
     return [(feature, kept) for feature, area in zip(features, areas)
@@ -184,7 +184,7 @@ def _clean(features: Sequence[Feature], origin: Origin, defects: _Defects) -> li
 
 def _clean_one(feature: Feature, area: BaseGeometry,
                defects: _Defects) -> shapely.MultiPolygon | None:
-    """Return the valid polygons of an area that are no slivers; None where nothing is left."""
+    """Return the valid polygons of an area without slivers; None if none is left."""
     invalid = not area.is_valid
     area, shared_m2 = _united(area)
     if area.area < GRID_M**2:
@@ -238,7 +238,8 @@ def _resolve_parts(
 ) -> list[tuple[Feature, shapely.MultiPolygon, Area]]:
     """Return parts with inherited tags, and buildings without the areas of their parts.
 
-    With each comes the whole building with its area; a part that lies in none is its own.
+    The third entry is the building, with its area, that a part belongs to: the smallest one around
+    it, or the part itself if there is none.
     """
     tree, found = shapely.STRtree([area for _, area in wholes]), 0
     whole_m2 = [area.area for _, area in wholes]
@@ -249,13 +250,13 @@ def _resolve_parts(
         owners = [int(index) for index in tree.query(inside, predicate="within")]
         found += len(owners)
         PART_PAIRS.check(found, "the map")
-        whole = feature, area
+        building = feature, area
         if owners:
             owner = min(owners, key=whole_m2.__getitem__)
             parts_of.setdefault(owner, []).append(area)
-            whole = wholes[owner]
-            feature = _inherit(feature, whole[0])
-        resolved.append((feature, area, whole))
+            building = wholes[owner]
+            feature = _inherit(feature, building[0])
+        resolved.append((feature, area, building))
     for index, (feature, area) in enumerate(wholes):
         if index in parts_of:
             rest = _polygons(area.difference(shapely.union_all(parts_of[index])))
@@ -374,7 +375,7 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
 
 
 def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
-    """Return prisms that know the area of their whole building: heights count from its ground."""
+    """Return prisms with `site` set to the area of their whole building."""
     areas: dict[str, list[BaseGeometry]] = {}
     for prism in prisms:
         areas.setdefault(prism.name, []).append(prism.area)
@@ -383,7 +384,7 @@ def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
 
 
 def elevation_fact(features: Sequence[Feature]) -> str:
-    """Return where the ground of buildings with shells was, a line for a report."""
+    """Return the report's line on the elevations of the ground below buildings with shells."""
     ground_m = [feature.shell.ground_m for feature in features if feature.shell is not None]
     return (f"buildings begin at {min(ground_m):.1f} to {max(ground_m):.1f} m above the file's "
             "vertical datum; each was put on the ground")

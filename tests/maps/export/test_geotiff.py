@@ -60,7 +60,7 @@ def test_missing_package_names_what_to_install(radio_map, scene, tmp_path, monke
 
 def test_a_large_map_is_written_in_parts(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("radiotwin.maps.export.geotiff._WHOLE_VALUES", 1000)
-    monkeypatch.setattr("radiotwin.maps.form.BLOCK_VALUES", 700)
+    monkeypatch.setattr("radiotwin.maps.file.BLOCK_VALUES", 700)
     gain_db = np.random.default_rng(0).uniform(-120, -60, (2, 2, 50, 90)).astype(np.float32)
     lattice = Lattice(np.arange(90.0), np.arange(50.0), np.array([50.0, 60.0]))
     radio_map = RadioMap.build(["d0", "d1"], lattice, gain_db, gain_db > -80)
@@ -86,6 +86,6 @@ def test_a_large_file_that_is_not_what_was_written_is_not_kept(radio_map, scene,
 
 def test_a_large_table_is_written_in_parts(radio_map, scene, tmp_path, monkeypatch):
     write_csv(radio_map, scene, tmp_path / "whole.csv")
-    monkeypatch.setattr("radiotwin.maps.form.BLOCK_VALUES", 3)
+    monkeypatch.setattr("radiotwin.maps.file.BLOCK_VALUES", 3)
     write_csv(radio_map, scene, tmp_path / "parts.csv")
     assert (tmp_path / "parts.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()

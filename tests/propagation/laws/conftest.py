@@ -8,7 +8,7 @@ import pytest
 from radiotwin.links import LinkGeometry
 
 ANCHOR_M = np.array([[60.0, 320.0, 1.5], [320.0, 120.0, 1.5], [580.0, 520.0, 1.5]])
-LAW = {True: (-30.0, -2.5, 2.0**0.5), False: (-35.0, -3.04, 5.0**0.5)}
+LAW = {True: (-30.0, 2.5, 2.0**0.5), False: (-35.0, 3.04, 5.0**0.5)}
 
 
 @dataclass
@@ -23,7 +23,7 @@ class World:
 def paper_law(distance_m, los, elevation_rad):
     """The published segmented law [dB]."""
     lines = np.array([LAW[False], LAW[True]])[los.astype(int)]
-    return lines[:, 0] + 10.0 * lines[:, 1] * np.log10(distance_m)
+    return lines[:, 0] - 10.0 * lines[:, 1] * np.log10(distance_m)
 
 
 def law_with_break_point(distance_m, los, elevation_rad):

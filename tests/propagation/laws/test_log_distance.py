@@ -12,7 +12,7 @@ def test_recovers_its_own_law(world):
 
     data = world(0, 4000, limit_db=-105.0, law=law, los_range_m=1e-3)
     model = LogDistance().fit(data.links, data.level_db, -105.0)
-    assert model.line.exponent == pytest.approx(-2.8, abs=0.06)
+    assert model.line.exponent == pytest.approx(2.8, abs=0.06)
     assert model.line.sd_db == pytest.approx(5.0**0.5, rel=0.05)
     mean_db, sigma_db = model.predict(data.links)
     assert np.sqrt(np.mean((mean_db - data.mean_db) ** 2)) < 0.25

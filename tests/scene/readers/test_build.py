@@ -51,9 +51,9 @@ def test_the_map_knows_how_well_it_knows_its_heights(table, report):
     city = Scene.load(report.folder).city
     for name in ("way/101", "way/103"):
         x_m, y_m = table.loc[name, ["x_m", "y_m"]]
-        face = city.first_face(np.array([[x_m, y_m, 99.0]]), np.array([[x_m, y_m, 0.0]]))
+        face = city.first_hits(np.array([[x_m, y_m, 99.0]]), np.array([[x_m, y_m, 0.0]]))[1]
         assert city.height_sd_m[face] == pytest.approx(told[name])
-    below = city.first_face(np.array([[-75.2, -8.5, 99.0]]), np.array([[-75.2, -8.5, -1.0]]))
+    below = city.first_hits(np.array([[-75.2, -8.5, 99.0]]), np.array([[-75.2, -8.5, -1.0]]))[1]
     assert np.isnan(city.height_sd_m[below]).all()  # the ground has no height
 
 

@@ -17,7 +17,7 @@ AREA_M = (-100.0, 600.0, -100.0, 600.0)
 
 def overconfident(scale_db):
     """Return a model of the open ground that takes errors for so small."""
-    channel = LogDistance(LogDistanceLine(-35.0, -2.6, 2.0))
+    channel = LogDistance(LogDistanceLine(-35.0, 2.6, 2.0))
     return FittedModel(channel, (), (), np.zeros(2), np.array([scale_db]), 5.0, np.zeros((5, 3)), ("r0", "r1"), 0.0, 0.0)
 
 

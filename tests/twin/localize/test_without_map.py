@@ -35,7 +35,7 @@ class Counting(LogDistance):
     """The law of the open ground, and how many links it was asked for at once."""
 
     def __init__(self):
-        super().__init__(LogDistanceLine(-35.0, -2.6, 2.0))
+        super().__init__(LogDistanceLine(-35.0, 2.6, 2.0))
         self.asked = []
 
     def predict(self, links):
