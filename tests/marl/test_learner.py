@@ -117,7 +117,7 @@ def test_only_what_learns_can_be_guided(best_of_many):
 
 def test_an_unknown_learner_is_refused_as_every_other_choice():
     with pytest.raises(BadInput, match=r"--algorithm best-of-many: Input should be 'fedqmix', .* or 'random'; allowed: "
-                                       r"fedqmix\|qmix\|iql\|greedy\|heuristic\|planner\|belief\|random"):
+                                       r"fedqmix\|qmix\|iql\|greedy\|heuristic\|policy\|planner\|belief\|random"):
         settings_of({"algorithm": "best-of-many"})
 
 
