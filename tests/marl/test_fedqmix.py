@@ -132,7 +132,7 @@ def flat(value):
     ("--episodes 0", ["--episodes 0", "≥ 1"]),
     ("--compare true", ["--compare true", "none|twins|truth"]),
     ("--twin magic", ["--twin magic", "nn|log-distance|kriging|raytrace|path-kriging|truth"]),
-    ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|heuristic|planner|belief|random"]),
+    ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|heuristic|policy|planner|belief|random"]),
     ("--fly-again true", ["No such option: --fly-again"]),
     ("--batch 64 --replay 32", ["replay 32", "64"]),
     ("--guide planner --algorithm greedy", ["guide planner", "greedy does not learn"]),
