@@ -15,6 +15,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -69,7 +70,7 @@ def judge(path: Path) -> None:
         for truth in ("traced", "segmented"):
             missions[f"{name} {truth}"] = make_mission(scene, read_truth(scene, truth),
                                                        Known.truth(scene))
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, mission in missions.items():
         network = read_network(WEIGHTS)
         policies: dict[str, Policy] = {
