@@ -11,7 +11,9 @@ from studies.generated import _lowest_sight_m, generated_mission, redrawn
 
 def test_sight_over_boxes_is_that_over_their_meshes():
     devices_m = np.array([[40.0, 60.0, 1.5], [151.0, 199.0, 1.5]])
-    boxes = draw_buildings(CityParameters(300.0, 300.0), devices_m[:, :2], 1)
+    parameters = CityParameters(300.0, 300.0, avenue_width_m=60.0, avenue_spacing_m=200.0, street_width_m=20.0, block_mean_m=100.0,
+                                block_min_m=80.0, side_min_m=60.0, mean_height_m=20.0, first_block_m=(-50.0, -50.0))
+    boxes = draw_buildings(parameters, devices_m[:, :2], 1)
     solid = trimesh.util.concatenate(building_meshes(boxes))
     city = CityMap(solid.vertices, solid.faces)
     cells_m = np.random.default_rng(0).uniform(0, 300, (400, 2))
