@@ -108,7 +108,7 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             on_progress(run.episodes * len(rows), _summary(rows[-1], run))
             # The run may have been stopped between the checkpoint and the log.
             on_round(rows, blocks)
-            if learner.believes:  # of which no checkpoint is needed: it is made of the twin
+            if not learner.state(True):  # it needs no checkpoint: it is made of the twin
                 campaign.tell(learner)
                 learner.prepare(campaign.mission(), on_progress)
         for number in range(len(rows), run.real_episodes):

@@ -10,6 +10,7 @@ which take a fifth of the memory, and makes features of them again.
 from typing import NamedTuple
 
 import numpy as np
+from numba.typed import List
 from scipy.fft import fft2, next_fast_len
 
 from marl.mission import COSTS, MOVES, NO_OP, Mission
@@ -106,6 +107,44 @@ class Environment:
     def done(self) -> np.ndarray:
         """(E,) bool: all batteries are empty."""
         return (self.frame.battery == 0).all(axis=1)
+
+
+class ManyWorlds:
+    """W flights side by side, each in a world of its own, by the same compiled rules.
+
+    Worlds may differ in size; arrays over UAVs are padded to `uavs` of them. Shadowing is drawn
+    anew in every slot.
+
+    Attributes:
+        missions: W worlds.
+        frames: their states, each of a single flight; `step` overwrites them.
+        battery: (W, uavs) int64 left, in hovers; 0 for UAVs that a world does not have.
+    """
+
+    def __init__(self, missions: list[Mission], uavs: int, rng: np.random.Generator) -> None:
+        self.missions, self._rng = List(missions), rng
+        self.frames = List([empty_frame((1,), mission) for mission in missions])
+        self.battery = np.zeros((len(missions), uavs), np.int64)
+        self._lasting = np.zeros((0, 1, 1, 1), np.float32)
+        for world, mission in enumerate(missions):
+            self.put(world, mission)
+
+    def put(self, world: int, mission: Mission) -> None:
+        """Begin a flight of a mission, in place of the one of a number (0 to W - 1)."""
+        frame = empty_frame((1,), mission)
+        frame.cell[0], frame.battery[0] = mission.start, mission.battery
+        frame.data_units[0] = mission.data_units
+        _sense(mission, frame, np.ones(1, np.bool_), self._lasting, self._rng)
+        self.missions[world], self.frames[world] = mission, frame
+        self.battery[world] = 0
+        self.battery[world, :mission.uavs] = mission.battery
+
+    def step(self, action: np.ndarray) -> np.ndarray:
+        """Fly one slot; actions and collected data (W, uavs) are as of `Environment.step`."""
+        collected = np.zeros(action.shape, np.float32)
+        _step_all(self.missions, self.frames, action, self._lasting, self._rng, collected,
+                  self.battery)
+        return collected
 
 
 class CorrelatedField:
@@ -252,6 +291,16 @@ def _step(mission: Mission, frame: Frame, action: np.ndarray, lasting: np.ndarra
             frame.battery[e, u] -= COSTS[action[e, u]]
     _sense(mission, frame, flying, lasting, rng)
     return collected
+
+
+@njit(cache=True, nogil=True)
+def _step_all(missions: "List[Mission]", frames: "List[Frame]", action: np.ndarray,
+              lasting: np.ndarray, rng: np.random.Generator, collected: np.ndarray,
+              battery: np.ndarray) -> None:
+    for w in range(len(missions)):
+        uavs = len(missions[w].start)
+        collected[w, :uavs] = _step(missions[w], frames[w], action[w:w + 1, :uavs], lasting, rng)[0]
+        battery[w, :uavs] = frames[w].battery[0]
 
 
 def observation_size(mission: Mission) -> int:

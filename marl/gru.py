@@ -13,41 +13,46 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import PackedSequence
 
 from radiotwin.runtime.compiled import njit
 
 _ONE, _HALF = np.float32(1), np.float32(0.5)
 
 
-def gru(x: Tensor, memory: Tensor | None, unit: torch.nn.GRU) -> tuple[Tensor, Tensor]:
-    """Return `unit(x, memory)`, for one layer in one direction.
+def gru(x: Tensor, sizes: np.ndarray, memory: Tensor | None,
+        unit: torch.nn.GRU) -> tuple[Tensor, Tensor]:
+    """Return what `unit` makes of sequences of different lengths, for one layer in one direction.
 
-    It is differentiable by x and the parameters; the memory is taken as a constant.
+    They are packed as by `torch.nn.utils.rnn.PackedSequence`: slot by slot, the longest first. The
+    result is differentiable by x and the parameters; the memory is taken as a constant.
 
     Args:
-        x: (T, B, inputs) float32
-        memory: (1, B, hidden), zero where None.
+        x: (N, inputs) float32
+        sizes: (T,) int64 number of sequences that reach each slot, their sum is N.
+        memory: (sizes[0], hidden) before the first slot, zero where None.
         unit: gives the parameters.
 
     Returns:
-        (T, B, hidden) and (1, B, hidden).
+        (N, hidden), and the (sizes[-1], hidden) of the last slot.
     """
     if x.device.type != "cpu":
-        return unit(x, memory)
-    start = x.new_zeros(x.shape[1], unit.hidden_size) if memory is None else memory[0]
-    walked = _Walk.apply(x, unit.weight_ih_l0, unit.weight_hh_l0, unit.bias_ih_l0,
-                         unit.bias_hh_l0, start)
-    return walked, walked[-1:]
+        packed = PackedSequence(x, torch.from_numpy(sizes))
+        walked = unit(packed, None if memory is None else memory[None])[0].data
+    else:
+        start = x.new_zeros(int(sizes[0]), unit.hidden_size) if memory is None else memory
+        walked = _Walk.apply(x, unit.weight_ih_l0, unit.weight_hh_l0, unit.bias_ih_l0,
+                             unit.bias_hh_l0, start, sizes)
+    return walked, walked[len(walked) - int(sizes[-1]):]
 
 
 class _Walk(torch.autograd.Function):
-    """Map x (T, B, inputs) to memories (T, B, H); gates come first in all arrays."""
+    """Map x (N, inputs) to memories (N, H); gates come first in all arrays."""
 
     @staticmethod
     def forward(context: Any, x: Tensor, weight: Tensor, recurrent: Tensor, bias: Tensor,
-                recurrent_bias: Tensor, start: Tensor) -> Tensor:
+                recurrent_bias: Tensor, start: Tensor, sizes: np.ndarray) -> Tensor:
         """See `torch.autograd.Function`; the parameters are those of `torch.nn.GRU`."""
-        slots, batch, inputs = x.shape
         hidden = len(bias) // 3
         # The biases of r and z add up; that of n is inside the bracket that r scales.
         bias = bias.clone()
@@ -55,38 +60,34 @@ class _Walk(torch.autograd.Function):
         # One array for all that follows, because fresh memory costs more than the arithmetic: the
         # input's shares of the gates, then the gates r, z, n and u = U_n h + c_n in their
         # positions, then the gradients by them.
-        work = torch.empty(4, slots, batch, hidden)
-        flat = x.reshape(slots * batch, inputs)
+        work = torch.empty(4, len(x), hidden)
         for gate in range(3):
             rows = slice(gate * hidden, (gate + 1) * hidden)
-            torch.addmm(bias[rows], flat, weight[rows].t(), out=work[gate].view(-1, hidden))
-        memories = torch.empty(slots + 1, batch, hidden)
-        memories[0] = start
+            torch.addmm(bias[rows], x, weight[rows].t(), out=work[gate])
+        memories = torch.cat([start, torch.empty(len(x), hidden)])  # that before each slot, too
         transposed = recurrent.view(3, hidden, hidden).transpose(1, 2).contiguous()
         _forward(work.numpy(), transposed.numpy(), recurrent_bias[2 * hidden:].numpy(),
-                 memories.numpy())
+                 memories.numpy(), sizes)
         context.save_for_backward(x, weight, recurrent, memories)
-        context.work = work
-        return memories[1:]
+        context.work, context.sizes = work, sizes
+        return memories[len(start):]
 
     @staticmethod
     def backward(context: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         """See `torch.autograd.Function`."""
         x, weight, recurrent, memories = context.saved_tensors
-        slots, batch, hidden = gradient.shape
-        work, context.work = context.work, None  # overwritten: there is no second backward pass
+        hidden = gradient.shape[1]
+        shares, context.work = context.work, None  # overwritten: there is no second backward pass
+        before = torch.empty_like(gradient)
         _backward(gradient.contiguous().numpy(), recurrent.view(3, hidden, hidden).numpy(),
-                  memories.numpy(), work.numpy())
-        shares = work.view(4, slots * batch, hidden)
-        flat = x.reshape(slots * batch, -1)
-        before = memories[:-1].view(slots * batch, hidden)
+                  memories.numpy(), shares.numpy(), before.numpy(), context.sizes)
         of_x = shares[0] @ weight[:hidden]
         for gate in (1, 2):
             of_x.addmm_(shares[gate], weight[gate * hidden:(gate + 1) * hidden])
         sums = shares.sum(1)
-        return (of_x.view_as(x), torch.cat([shares[gate].t() @ flat for gate in (0, 1, 2)]),
+        return (of_x, torch.cat([shares[gate].t() @ x for gate in (0, 1, 2)]),
                 torch.cat([shares[gate].t() @ before for gate in (0, 1, 3)]),
-                sums[:3].flatten(), sums[[0, 1, 3]].flatten(), None)
+                sums[:3].flatten(), sums[[0, 1, 3]].flatten(), None, None)
 
 
 @njit(cache=True, inline="always", fastmath=True, error_model="numpy")
@@ -128,15 +129,18 @@ def _cell(r: np.ndarray, z: np.ndarray, n: np.ndarray, u: np.ndarray, r_h: np.nd
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _forward(work: np.ndarray, recurrent: np.ndarray, n_bias: np.ndarray,
-             memories: np.ndarray) -> None:
-    _, slots, batch, hidden = work.shape
-    share = np.empty((3, batch, hidden), np.float32)
-    for t in range(slots):
+def _forward(work: np.ndarray, recurrent: np.ndarray, n_bias: np.ndarray, memories: np.ndarray,
+             sizes: np.ndarray) -> None:
+    share = np.empty((3, sizes[0], memories.shape[1]), np.float32)
+    before, first = 0, 0  # rows of the slot before in `memories`, and of this slot in `work`
+    for size in sizes:
+        rows, after = slice(first, first + size), sizes[0] + first
+        memory = memories[before:before + size]
         for gate in range(3):
-            np.dot(memories[t], recurrent[gate], share[gate])
-        _cell(work[0, t], work[1, t], work[2, t], work[3, t], share[0], share[1], share[2],
-              n_bias, memories[t], memories[t + 1])
+            np.dot(memory, recurrent[gate], share[gate, :size])
+        _cell(work[0, rows], work[1, rows], work[2, rows], work[3, rows], share[0], share[1],
+              share[2], n_bias, memory, memories[after:after + size])
+        before, first = after, first + size
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -155,17 +159,23 @@ def _cell_backward(gradient: np.ndarray, r: np.ndarray, z: np.ndarray, n: np.nda
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _backward(gradient: np.ndarray, recurrent: np.ndarray, memories: np.ndarray,
-              work: np.ndarray) -> None:
-    slots, batch, hidden = gradient.shape
-    carried = np.zeros((batch, hidden), np.float32)
-    share = np.empty((3, batch, hidden), np.float32)
-    for t in range(slots - 1, -1, -1):
-        _cell_backward(gradient[t], work[0, t], work[1, t], work[2, t], work[3, t], memories[t],
-                       carried)
-        np.dot(work[0, t], recurrent[0], share[0])
-        np.dot(work[1, t], recurrent[1], share[1])
-        np.dot(work[3, t], recurrent[2], share[2])
-        for b in range(batch):
+def _backward(gradient: np.ndarray, recurrent: np.ndarray, memories: np.ndarray, work: np.ndarray,
+              before: np.ndarray, sizes: np.ndarray) -> None:
+    hidden = gradient.shape[1]
+    carried = np.zeros((sizes[0], hidden), np.float32)
+    share = np.empty((3, sizes[0], hidden), np.float32)
+    first = len(gradient)
+    for t in range(len(sizes) - 1, -1, -1):
+        size = sizes[t]
+        first -= size
+        rows = slice(first, first + size)
+        start = first + sizes[0] - sizes[t - 1] if t > 0 else 0
+        before[rows] = memories[start:start + size]
+        _cell_backward(gradient[rows], work[0, rows], work[1, rows], work[2, rows], work[3, rows],
+                       before[rows], carried)
+        np.dot(work[0, rows], recurrent[0], share[0, :size])
+        np.dot(work[1, rows], recurrent[1], share[1, :size])
+        np.dot(work[3, rows], recurrent[2], share[2, :size])
+        for b in range(size):
             for i in range(hidden):
                 carried[b, i] += share[0, b, i] + share[1, b, i] + share[2, b, i]

@@ -30,26 +30,10 @@ it as the device empties.
 
 
 class HeuristicPolicy:
-    """Fly `random` or `greedy`."""
+    """Fly `random`, `greedy`, or `heuristic` with the weights given."""
 
-    def __init__(self, name: str, rng: np.random.Generator) -> None:
-        self._decide = {"random": random_actions, "greedy": greedy_actions}[name]
-        self._rng = rng
-
-    def start(self, mission: Mission, flights: int) -> None:
-        """See `marl.flights.Policy`."""
-        self._mission = mission
-
-    def act(self, frame: Frame) -> np.ndarray:
-        """See `marl.flights.Policy`."""
-        return self._decide(self._mission, frame, self._rng)
-
-
-class WeighedPolicy:
-    """Fly `heuristic`, with the weights given."""
-
-    def __init__(self, weights: np.ndarray = WEIGHTS) -> None:
-        self._weights = weights
+    def __init__(self, name: str, rng: np.random.Generator, weights: np.ndarray = WEIGHTS) -> None:
+        self._name, self._rng, self._weights = name, rng, weights
 
     def start(self, mission: Mission, flights: int) -> None:
         """See `marl.flights.Policy`."""
@@ -57,7 +41,10 @@ class WeighedPolicy:
 
     def act(self, frame: Frame) -> np.ndarray:
         """See `marl.flights.Policy`."""
-        return weighed_actions(self._mission, frame, self._weights)
+        if self._name == "heuristic":
+            return weighed_actions(self._mission, frame, self._weights)
+        decide = {"random": random_actions, "greedy": greedy_actions}[self._name]
+        return decide(self._mission, frame, self._rng)
 
 
 class Random(Learner):
@@ -85,9 +72,7 @@ class Greedy(Random):
 class Heuristic(Random):
     """`--algorithm heuristic`: to the devices that a sum with tuned weights prefers."""
 
-    @override
-    def policy(self, rng: np.random.Generator) -> Policy:
-        return WeighedPolicy()
+    name = "heuristic"
 
 
 def waypoint_actions(scene: Scene, mission: Mission, rng: np.random.Generator) -> np.ndarray:

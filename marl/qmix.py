@@ -36,7 +36,7 @@ from marl.mission import Mission
 from marl.planner import PlanPolicy, plan
 from marl.replicas import Replicas
 from marl.settings import LearnerSettings, stream
-from marl.training import Exploration, Replay
+from marl.training import Batch, Exploration, Replay
 from radiotwin.propagation.laws.adam import Adam
 
 GUIDED_SHARE = 0.25  # of the training flights, with the planner's help
@@ -59,19 +59,19 @@ class Agent(nn.Module):
         self.head = nn.Linear(hidden, ACTION_COUNT)
         _initialise(self, generator)
 
-    def forward(self, observation: Tensor, last_action: Tensor, memory: Tensor | None = None,
-                ) -> tuple[Tensor, Tensor]:
-        """Walk through a sequence.
+    def forward(self, observation: Tensor, last_action: Tensor, sizes: np.ndarray,
+                memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Walk through flights, packed as in `Batch`.
 
         Args:
-            observation: (T, E, U, observation_size)
-            last_action: (T, E, U) int64, of the slot before; -1 in the first one.
-            memory: (1, E * U, hidden) from the slot before the first; None for zero.
+            observation: (N, U, observation_size)
+            last_action: (N, U) int64, of the slot before; -1 in the first one.
+            sizes: (T,) int64 flights in each slot.
+            memory: (sizes[0] * U, hidden) from the slot before the first; None for zero.
 
         Returns:
-            (T, E, U, 6) action values, and the memory after the last slot.
+            (N, U, 6) action values, and the memory after the last slot.
         """
-        slots, flights = observation.shape[:2]
         # The product of a matrix and a one-hot vector is a column of it: an embedding.
         weight, size = self.encoder.weight, observation.shape[-1]
         rows = torch.cat([weight[:, size:size + ACTION_COUNT].t(),
@@ -79,9 +79,8 @@ class Agent(nn.Module):
         encoded = nn.functional.linear(observation, weight[:, :size], self.encoder.bias)
         encoded = encoded + nn.functional.embedding(last_action % (ACTION_COUNT + 1), rows)
         encoded = torch.relu(encoded + weight[:, size + ACTION_COUNT:].t())
-        encoded = encoded.reshape(slots, flights * self.uavs, self.hidden)
-        remembered, memory = gru(encoded, memory, self.memory)
-        return self.head(remembered).reshape(slots, flights, self.uavs, ACTION_COUNT), memory
+        remembered, memory = gru(encoded.flatten(0, 1), self.uavs * sizes, memory, self.memory)
+        return self.head(remembered).unflatten(0, (-1, self.uavs)), memory
 
 
 class Mixer(nn.Module):
@@ -153,21 +152,22 @@ class QNetworks:
         Returns:
             `loss`, `gradient_norm` and `mean_value` (mean of Q_tot).
         """
-        settings = self.settings
-        observation, mask, state, action, reward, valid = self._tensors(flights, mission)
-        last_action = torch.cat([torch.full_like(action[:1], -1), action[:-1]])
-        values, _ = self.agent(observation, last_action)
-        chosen = self.mix(values.gather(-1, action.unsqueeze(-1)).squeeze(-1), state, self.modules)
+        settings, batch = self.settings, self._batch(flights, mission)
+        values, _ = self.agent(batch.observation, batch.last_action, batch.sizes)
+        chosen = self.mix(values.gather(-1, batch.action.unsqueeze(-1)).squeeze(-1), batch.state,
+                          self.modules)
         with torch.no_grad():
-            target_values, _ = self.targets["agent"](observation, last_action)
+            target_values, _ = self.targets["agent"](batch.observation, batch.last_action,
+                                                     batch.sizes)
             # Double Q-learning: the online network chooses the action, the target network
             # gives its value.
             ranked = (values.detach() if settings.double_q else target_values)
-            best = ranked.masked_fill(~mask, -torch.inf).argmax(-1, keepdim=True)
-            best = self.mix(target_values.gather(-1, best).squeeze(-1), state, self.targets)
-            target = td_lambda_targets(reward, best, valid, settings.discount, settings.td_lambda)
-        count = valid.sum() * chosen[0, 0].numel()
-        loss = ((chosen - target) * valid).square().sum() / count
+            best = ranked.masked_fill(~batch.mask, -torch.inf).argmax(-1, keepdim=True)
+            best = self.mix(target_values.gather(-1, best).squeeze(-1), batch.state, self.targets)
+            target = td_lambda_targets(batch.reward, batch.unpacked(best), batch.valid,
+                                       settings.discount, settings.td_lambda)
+            target = target[batch.slot, batch.flight]
+        loss = (chosen - target).square().mean()
         gradients = torch.autograd.grad(loss, self.parameters())
         norm = torch.stack([gradient.norm() for gradient in gradients]).norm()
         scale = (MAX_GRADIENT_NORM / norm).clamp(max=1.0)
@@ -175,37 +175,42 @@ class QNetworks:
         self.updates += 1
         if self.updates % settings.target_every == 0:
             self.copy_to_targets()
-        mean = (chosen.detach() * valid).sum() / valid.sum() / chosen[0, 0].numel()
         return {"loss": float(loss.detach()), "gradient_norm": float(norm),
-                "mean_value": float(mean)}
+                "mean_value": float(chosen.detach().mean())}
 
     def reward(self, flights: Flights) -> np.ndarray:
         """Return the (E, T) float32 rewards that are learned from; a subclass may shape them."""
         return flights.collected.sum(axis=2) / np.float32(self.settings.reward_scale)
 
     def mix(self, values: Tensor, state: Tensor, modules: dict[str, nn.Module]) -> Tensor:
-        """Return the values that are learned: (T, E) Q_tot of (T, E, U) values of actions."""
-        return modules["mixer"](values, state)
+        """Return the values that are learned: (N, 1) Q_tot of (N, U) values of actions."""
+        return modules["mixer"](values, state).unsqueeze(-1)
 
     def copy_to_targets(self) -> None:
         """Copy the online networks to the target networks."""
         for name, module in self.modules.items():
             self.targets[name].load_state_dict(module.state_dict())
 
-    def _tensors(self, flights: Flights, mission: Mission) -> tuple[Tensor, ...]:
-        """Return features (T, E, …), actions (T, E, U), reward and validity (T, E) of a batch."""
-        count, slots = flights.action.shape[:2]
-        flat = Frame(*(array.swapaxes(0, 1).reshape(count * slots, *array.shape[2:])
-                       for array in flights.frames))
-        state = global_state(mission, flat) if self.mixes else np.zeros((count * slots, 0), "f4")
-        observation, mask, state = (
-            torch.from_numpy(array).to(self.device).unflatten(0, (slots, count))
-            for array in (*observe(mission, flat), state))
-        action = torch.from_numpy(flights.action.swapaxes(0, 1).astype(np.int64))
-        reward = self.reward(flights).T
-        valid = (np.arange(slots)[:, None] < flights.length[None]).astype(np.float32)
-        return (observation, mask, state, action.to(self.device),
-                *(torch.from_numpy(array).to(self.device) for array in (reward, valid)))
+    def _batch(self, flights: Flights, mission: Mission) -> Batch:
+        """Return flights as the networks take them."""
+        order = np.argsort(-flights.length, kind="stable")
+        slots = np.arange(flights.length.max())
+        valid = slots[:, None] < flights.length[order]
+        slot, place = np.nonzero(valid)
+        flight, action = order[place], flights.action.astype(np.int64)
+        frame = Frame(*(array[flight, slot] for array in flights.frames))
+        state = global_state(mission, frame) if self.mixes else np.zeros((len(slot), 0), "f4")
+        last_action = np.where(slot[:, None] > 0, action[flight, slot - 1], -1)
+        reward = self.reward(flights)[order[:, None], slots].T
+
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(array).to(self.device)
+
+        observation, mask = observe(mission, frame)
+        return Batch(tensor(observation), tensor(mask), tensor(state),
+                     tensor(action[flight, slot]), tensor(last_action), tensor(reward[..., None]),
+                     tensor(valid.astype(np.float32)[..., None]), tensor(slot), tensor(place),
+                     valid.sum(axis=1))
 
     def weights(self) -> dict[str, np.ndarray]:
         """Return copies of the weights that are averaged over replicas.
@@ -252,9 +257,9 @@ def td_lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: flo
     """Return TD(λ) returns: G_t = r_t + γ ((1 - λ) V_{t+1} + λ G_{t+1}), backwards.
 
     Args:
-        reward: (T, E) or (T, E, 1)
-        best: (T, E) or (T, E, U) value of the best action in each slot.
-        valid: as `reward`; 0 behind the end of a flight, where nothing is worth anything.
+        reward: (T, E, 1)
+        best: (T, E, 1) or (T, E, U) value of the best action in each slot.
+        valid: (T, E, 1), 0 behind the end of a flight, where nothing is worth anything.
         discount: γ.
         td_lambda: λ.
 
@@ -293,7 +298,7 @@ class AgentPolicy:
         self._mission = mission
         self._memory = None
         self._last = np.full((flights, mission.uavs), -1, dtype=np.int64)
-        self._slot = 0
+        self._sizes, self._slot = np.array([flights]), 0
         if self._exploration is not None:
             self._exploration.start(flights, mission.uavs)
 
@@ -302,9 +307,9 @@ class AgentPolicy:
         """See `marl.flights.Policy`."""
         observation, mask = observe(self._mission, frame)
         values, self._memory = self._agent(
-            torch.from_numpy(observation).to(self._device)[None],
-            torch.from_numpy(self._last).to(self._device)[None], self._memory)
-        action = np.where(mask, values[0].cpu().numpy(), -np.inf).argmax(axis=-1)
+            torch.from_numpy(observation).to(self._device),
+            torch.from_numpy(self._last).to(self._device), self._sizes, self._memory)
+        action = np.where(mask, values.cpu().numpy(), -np.inf).argmax(axis=-1)
         if self._exploration is not None:
             action = self._exploration.change(action, mask)
         if self._guide is not None:
@@ -571,11 +576,6 @@ class IndependentNetworks(QNetworks):
     @override
     def mix(self, values: Tensor, state: Tensor, modules: dict[str, nn.Module]) -> Tensor:
         return values
-
-    @override
-    def _tensors(self, flights: Flights, mission: Mission) -> tuple[Tensor, ...]:
-        *features, reward, valid = super()._tensors(flights, mission)
-        return *features, reward.unsqueeze(-1), valid.unsqueeze(-1)  # for all UAVs alike
 
 
 class IQL(QMIX):

@@ -29,6 +29,7 @@ LEARNERS: dict[str, Any] = {
     "iql": "marl.qmix:IQL",
     "greedy": "marl.heuristics:Greedy",
     "heuristic": "marl.heuristics:Heuristic",
+    "policy": "marl.policy:Pretrained",
     "planner": "marl.planner:Planner",
     "belief": "marl.replanning:BeliefPlanner",
     "random": "marl.heuristics:Random",

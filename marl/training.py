@@ -1,8 +1,10 @@
-"""What training needs besides networks: exploration, and a memory of whole flights."""
+"""What training needs besides networks: exploration, memory of whole flights, and batches of it."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from marl.checkpoint import Within, require
 from marl.environment import ACTION_COUNT, Frame, empty_frame
@@ -120,3 +122,41 @@ class Replay:
 def _arrays(flights: Flights) -> dict[str, np.ndarray]:
     return flights.frames._asdict() | {"action": flights.action, "collected": flights.collected,
                                        "length": flights.length}
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """E flights to learn from, without padding: packed as by `torch.nn.utils.rnn.PackedSequence`.
+
+    First all flights in their first slot, then those that still fly in the second, and so on; the
+    longest come first. N is the sum of their lengths, T the longest, U the number of UAVs.
+
+    Attributes:
+        observation: (N, U, observation_size)
+        mask: (N, U, 6) bool feasible actions.
+        state: (N, state_size)
+        action: (N, U) int64.
+        last_action: (N, U) int64, of the slot before; -1 in the first one.
+        reward: (T, E, 1), not packed.
+        valid: (T, E, 1), 0 behind the end of a flight.
+        slot: (N,) of each row.
+        flight: (N,) likewise.
+        sizes: (T,) int64 flights that reach each slot, on the CPU.
+    """
+
+    observation: Tensor
+    mask: Tensor
+    state: Tensor
+    action: Tensor
+    last_action: Tensor
+    reward: Tensor
+    valid: Tensor
+    slot: Tensor
+    flight: Tensor
+    sizes: np.ndarray
+
+    def unpacked(self, values: Tensor) -> Tensor:
+        """Return (N, …) values as (T, E, …), 0 behind the end of a flight."""
+        padded = values.new_zeros(*self.valid.shape[:2], *values.shape[1:])
+        padded[self.slot, self.flight] = values
+        return padded

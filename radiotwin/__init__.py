@@ -43,19 +43,21 @@ if TYPE_CHECKING:
     from radiotwin.twin.compare import Comparison, compare_models, score_map, split_flights
     from radiotwin.twin.locate import locate_devices, position_errors
     from radiotwin.twin.point_gains import export_ns3
+    from radiotwin.twin.regressor import TwinRegressor
 
 __version__: str  # found when it is asked for, as all names
 
 __all__ = [  # noqa: F822 - names that __getattr__ finds
     "BadInput", "Comparison", "CoverageSettings", "Loop", "MapDifference", "Measurements",
     "RadioMap", "Residuals", "RunFailed", "Scene", "SelectionCriteria", "SolverSettings", "Twin",
-    "__version__", "build_preset", "build_scene", "cache_content", "choose_quality", "clear_cache",
-    "close_loop", "compare_held_out", "compare_models", "corrected_twin", "diagnose", "export_map",
-    "export_ns3", "export_scene", "fit_twin", "fly_survey", "import_measurements", "in_scene_frame",
-    "keep_pieces", "list_paths", "locate_devices", "make_report", "position_errors",
-    "predict_coverage", "read_measurements", "read_points", "read_run", "read_truth", "residuals",
-    "run_demo", "score_map", "segmented_truth", "split_flights", "trace_map", "trace_points",
-    "write_closeloop_folder", "write_comparison_folder", "write_corrected_scene", "write_report"]
+    "TwinRegressor", "__version__", "build_preset", "build_scene", "cache_content",
+    "choose_quality", "clear_cache", "close_loop", "compare_held_out", "compare_models",
+    "corrected_twin", "diagnose", "export_map", "export_ns3", "export_scene", "fit_twin",
+    "fly_survey", "import_measurements", "in_scene_frame", "keep_pieces", "list_paths",
+    "locate_devices", "make_report", "position_errors", "predict_coverage", "read_measurements",
+    "read_points", "read_run", "read_truth", "residuals", "run_demo", "score_map",
+    "segmented_truth", "split_flights", "trace_map", "trace_points", "write_closeloop_folder",
+    "write_comparison_folder", "write_corrected_scene", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

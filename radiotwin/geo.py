@@ -39,6 +39,7 @@ _OPENS_FILES = re.compile(r"PARAMETERFILE|EXTENSION|GRIDS|INIT\s*=|PROJ\s*=|\bPR
                           re.IGNORECASE)
 GroundHeight = Callable[[np.ndarray, np.ndarray], np.ndarray]
 FRAME_FILE = "frame.toml"
+ORIGIN_DECIMALS = 7  # of degrees: 1 cm
 SAME_DEG, SAME_ALTITUDE_M = 1e-9, 1e-3  # of one place, after rounding: 0.1 mm on the ground
 
 
@@ -167,6 +168,34 @@ def between_frames(position_m: np.ndarray, one: Origin, other: Origin) -> np.nda
         one, *moved_m[known, :2].T)))
     moved_m[:, 2] += _rise_m(one, other)
     return moved_m
+
+
+def middle_of(places: pd.DataFrame) -> Origin:
+    """Return the median of the columns latitude and longitude [degrees], of which some are known.
+
+    >>> middle_of(pd.DataFrame({"latitude": [10.0, 12.0], "longitude": [179.0, -179.0]}))
+    Origin(latitude_deg=11.0, longitude_deg=-180.0, altitude_m=0.0)
+    """
+    first = places["longitude"].dropna().iloc[0]
+    east = (places["longitude"] - first + 180) % 360 - 180  # so that the date line does no harm
+    longitude = (first + east.median() + 180) % 360 - 180
+    return Origin(latitude_deg=round(float(places["latitude"].median()), ORIGIN_DECIMALS),
+                  longitude_deg=round(float(longitude), ORIGIN_DECIMALS))
+
+
+def with_places(table: pd.DataFrame, position_m: np.ndarray,
+                origin: Origin | None) -> pd.DataFrame:
+    """Return a table with columns x_m, y_m, z_m of (n, 3) [m].
+
+    With an origin it has latitude_deg and longitude_deg, too.
+    """
+    table = table.assign(**dict(zip(("x_m", "y_m", "z_m"), position_m.T)))
+    if origin is None:
+        return table
+    longitude_deg, latitude_deg = to_geographic(origin, *position_m[:, :2].T)
+    unknown = ~np.isfinite(position_m[:, :2]).all(axis=1)
+    return table.assign(latitude_deg=np.where(unknown, np.nan, latitude_deg),
+                        longitude_deg=np.where(unknown, np.nan, longitude_deg))
 
 
 def _rise_m(one: Origin, other: Origin) -> float:

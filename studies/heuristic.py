@@ -8,7 +8,7 @@ Cross-entropy method: weights are drawn around a mean, and the best of them give
 import numpy as np
 
 from marl.flights import Policy, evaluate
-from marl.heuristics import HeuristicPolicy, WeighedPolicy
+from marl.heuristics import HeuristicPolicy
 from marl.mission import Mission
 from studies.generated import generated_mission
 
@@ -37,7 +37,8 @@ def main() -> None:
                        for mission in missions])
 
     def worth(weights: np.ndarray, which: slice) -> float:
-        shares = [share(WeighedPolicy(weights), mission) for mission in missions[which]]
+        shares = [share(HeuristicPolicy("heuristic", rng, weights), mission)
+                  for mission in missions[which]]
         return float(np.mean(np.array(shares) / greedy[which]))
 
     rng, mean, spread = np.random.default_rng(0), MEAN, SPREAD

@@ -50,7 +50,7 @@ def documented(tmp_path_factory):
     """The names that all snippets of docs/python.md leave, run one after another in an empty folder, and the folder."""
     folder, text = tmp_path_factory.mktemp("documented"), (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
     snippets = re.findall(r"```py.*?\n(.*?)```", text, re.DOTALL)
-    assert len(snippets) == text.count("```") / 2 == 7
+    assert len(snippets) == text.count("```") / 2 == 8
     matplotlib.use("Agg")
     names, printed = {}, io.StringIO()
     with quickened(), contextlib.chdir(folder), contextlib.redirect_stdout(printed):

@@ -27,7 +27,7 @@ from radiotwin.errors import BadInput
 from radiotwin.runtime.console import notice, print_rows, result, say
 
 if TYPE_CHECKING:
-    from radiotwin.twin import TwinDevice
+    from radiotwin.twin import Twin, TwinDevice
     from radiotwin.twin.compare import Comparison
 
 
@@ -36,8 +36,9 @@ def fit(
     scene: SceneOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the twin.")] = Path("twin"),
     model: Annotated[str, typer.Option(
-        help="segmented_nn, segmented_log_distance, log_distance, regression_kriging, or raytrace: "
-             "paths over the 3D map, also to find devices in narrow streets; takes minutes. "
+        help="segmented_nn, segmented_log_distance, log_distance, regression_kriging; auto: the "
+             "one of these with the least held-out error. Or raytrace: paths over the 3D map, also "
+             "to find devices in narrow streets; takes minutes. "
              "path_kriging: the same over a map that may be wrong. Or a "
              "published law, which needs no anchor: tr36777_uma, tr36777_umi, al_hourani_urban "
              "(_suburban, _dense_urban, _high_rise), p1411, cost231_wi (_metropolitan).")
@@ -67,15 +68,32 @@ def fit(
     data = in_frame_of(world, data, shift)
     earlier = Twin.load(start) if start else None
     with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
-        twin = fit_twin(data, world, model=model, seed=seed, start=earlier,
-                        allow_indoor=allow_indoor, executor=executor)
+        twin = fit_twin(data, world, model, seed=seed, start=earlier, allow_indoor=allow_indoor,
+                        executor=executor, compare=True)
     notice(pieces.progress)
     twin.save(out)
-    print_rows(f"Twin {out} ({model})",
-               {"device": "left", "role": "left", "x [m]": "right", "y [m]": "right",
-                "90 % radius [m]": "right", "note": "left"},
-               [[d.device, d.role, d.x_m, d.y_m, d.credible_radius_m, _note(d)]
-                for d in twin.devices])
+    _print_twin(twin, f"Twin {out} ({twin.channel.name})")
+
+
+def _print_twin(twin: "Twin", title: str) -> None:
+    from radiotwin.twin.selection import HeldOut
+
+    table, columns = twin.positions, {"device": "left", "role": "left", "x [m]": "right",
+                                      "y [m]": "right", "90 % radius [m]": "right"}
+    cells = [table[name] for name in ("device", "role", "x_m", "y_m", "radius_m")]
+    if twin.origin is not None:
+        columns |= {"latitude": "right", "longitude": "right"}
+        cells += [table[name].map("{:.6f}".format) for name in ("latitude_deg", "longitude_deg")]
+    notes = [_note(each) for each in twin.devices]
+    print_rows(title, columns | {"note": "left"}, [list(row) for row in zip(*cells, notes)])
+    law = twin.params
+    if len(law):
+        print_rows("Law of the channel, with 90 % intervals",
+                   {"links": "left", "parameter": "left", "value": "right", "low": "right",
+                    "high": "right", "unit": "left"}, law.to_numpy(dtype=object).tolist())
+    held_out = HeldOut.kept(twin.provenance)
+    if held_out is not None:
+        say(held_out.sentence(twin.channel.name))
 
 
 def _note(device: "TwinDevice") -> str:
@@ -225,6 +243,7 @@ def close_loop(
         write_corrected_scene,
     )
     from radiotwin.closeloop.run import close_loop as run
+    from radiotwin.closeloop.run import expected_cpu_s
     from radiotwin.links.measurements import read_measurements
     from radiotwin.report import (
         check_closeloop_folder,
@@ -246,11 +265,14 @@ def close_loop(
         check_corrected_target(write_scene, world, out)
     if base == "raytrace":
         notice(f"the twin will follow paths, {NOT_BY_PATHS}")
+    minutes = expected_cpu_s(len(data), world is not None) / 60
+    notice(f"{len(data):,} links: usually {minutes / 2:.1f} to {2 * minutes:.1f} min of processor "
+           "time, more where other work runs")
     inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
     # Two workers are no faster than the threads of one process: they are for who asks for them.
     some = "1" if workers == AUTO and cluster is None else workers
     with keep_pieces() as pieces, open_executor(some, cluster, notice) as executor, \
-            progress("closing the loop", total=None) as advance:
+            progress("closing the loop", total=None, lines=True) as advance:
         loop = run(data, world, base, seed,
                    lambda text: advance(1, "; ".join(filter(None, [text, pieces.progress]))),
                    hold_out, executor=executor)

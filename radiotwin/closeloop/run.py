@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from radiotwin.closeloop.crossfit import (
     BASES,
@@ -26,7 +28,7 @@ from radiotwin.closeloop.crossfit import (
     training_parts,
 )
 from radiotwin.closeloop.predict.predictor import CombinedPrediction, combined_prediction
-from radiotwin.closeloop.scan import Anomaly, scan
+from radiotwin.closeloop.scan import scan
 from radiotwin.closeloop.scan_limits import Seen, seen_from
 from radiotwin.closeloop.search.anomaly_causes import add_causes_of_anomalies
 from radiotwin.closeloop.search.causes import add_causes
@@ -51,12 +53,15 @@ from radiotwin.effects.registry import catalogue
 from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, prepare_links
+from radiotwin.links.alignment import as_measurements
 from radiotwin.links.checks import stand_anchors
-from radiotwin.links.evidence import thin_links
+from radiotwin.links.evidence import MAX_LINKS, SAMPLE_LINKS, thin_links
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
+
+FIXED_CPU_S, LINKS_A_CPU_S, LINKS_A_CPU_S_ON_MAP = 45.0, 220.0, 120.0  # see `expected_cpu_s`
 
 
 @dataclass(eq=False, repr=False)
@@ -114,9 +119,39 @@ class Loop(Summarised):
         return significant(self.dependences_after, self.criteria)
 
     @property
-    def anomalies(self) -> tuple[Anomaly, ...]:
-        """Groups of links that stand out in the held-out residual of `before`, with causes."""
-        return self.found.anomalies
+    def anomalies(self) -> pd.DataFrame:
+        """Groups of links that stand out in the held-out residual of `before`.
+
+        Columns: `family`, its `devices, receivers, flights`, `sight` (line of sight), `statistic`,
+        its `size, low, high, unit`, `probability`, number of `links`, and `causes`: the probability
+        of each.
+        """
+        rows = [{"family": each.family,
+                 **{f"{end}s": ", ".join(each.members.get(end, ()))
+                    for end in ("device", "receiver", "flight")},
+                 "sight": each.sight, "statistic": each.statistic, "size": each.size.value,
+                 "low": each.size.low, "high": each.size.high, "unit": each.size.unit,
+                 "probability": each.probability, "links": int(each.rows.sum()),
+                 "causes": dict(each.causes)} for each in self.found.anomalies]
+        return pd.DataFrame(rows, columns=[
+            "family", "devices", "receivers", "flights", "sight", "statistic", "size", "low",
+            "high", "unit", "probability", "links", "causes"])
+
+    @property
+    def effects(self) -> pd.DataFrame:
+        """Effects that were found: a row for each of their parameters, with its 90 % interval.
+
+        Columns: `effect`, its `rank` and `probability`, and `parameter, value, low, high, unit,
+        determined`; see `Parameter.record`.
+        """
+        probability = {trial.name: trial.probability for trial in self.found.log.kept}
+        rows = [{"effect": each.name, "rank": rank, "probability": probability.get(each.name),
+                 "parameter": name, **parameter.record()}
+                for rank, (each, parameters) in enumerate(
+                    zip(self.after.whole.effects, self.parameters, strict=True), start=1)
+                for name, parameter in parameters.items()]
+        return pd.DataFrame(rows, columns=["effect", "rank", "probability", "parameter", "value",
+                                           "low", "high", "unit", "determined"])
 
     @property
     def verdict(self) -> str:
@@ -127,10 +162,10 @@ class Loop(Summarised):
         """
         if any(each.is_cause and not each.is_declared for each in self.after.whole.effects):
             return "effect"
-        if any(each.probability >= MIN_SURE for each in self.anomalies):
+        if any(each.probability >= MIN_SURE for each in self.found.anomalies):
             return "located"
         verdict = verdict_without_effect(self.found.steps, self.criteria)
-        return "undecided" if self.anomalies else verdict
+        return "undecided" if self.found.anomalies else verdict
 
     @property
     def _summary(self) -> Summary:
@@ -161,7 +196,7 @@ class Loop(Summarised):
     @cached_property
     def seen_from(self) -> list[Seen]:
         """Sizes from which groups of each family would have been said, where none stands out."""
-        return [] if self.anomalies else seen_from(self.before)
+        return [] if self.found.anomalies else seen_from(self.before)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:
@@ -175,15 +210,16 @@ class Loop(Summarised):
                 for number in range(len(self.after.whole.effects))]
 
 
-def close_loop(measurements: Measurements, scene: Scene | None = None, base: str = "auto",
+def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
+               scene: Scene | Path | str | None = None, base: str = "auto",
                seed: int = 0, on_progress: Callable[[str], None] = lambda _: None,
                hold_out: str = "auto", criteria: SelectionCriteria | None = None,
                executor: Executor | None = None) -> Loop:
     """Find what a base model lacks.
 
     Args:
-        measurements: links.
-        scene: 3D map and radio; None: every link counts as one with line of sight.
+        measurements: links; of a file or a data frame, too.
+        scene: 3D map and radio, or their folder; None: every link counts as one with line of sight.
         base: one of `BASES`, or `auto`: the one with the least held-out error. Paths are then
             followed only if they make that of a few links smaller.
         seed: of folds, fits and permutations.
@@ -200,6 +236,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     """
     if base not in (*BASES, "auto"):
         raise BadInput(f"base {base!r} is unknown; allowed are auto, {', '.join(BASES)}")
+    scene = None if scene is None else Scene.of(scene)
+    measurements = as_measurements(measurements, scene)
     if scene is None and base == "raytrace":
         raise BadInput("base 'raytrace' follows paths over a 3D map; give --scene, or take the "
                        "base log-distance")
@@ -231,6 +269,16 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
                    [partial(add_trends, variables=left), add_shadowing] if left else [], inputs)
     return Loop(fitted.name, links, folds, declared.model, explained, found, criteria, before,
                 after, seed, noise_floor_db(all_links, criteria), measurements.origin)
+
+
+def expected_cpu_s(links: int, has_map: bool) -> float:
+    """Return about how much processor time `close_loop` takes for so many links [s].
+
+    Of 41 recorded runs with 5,000 to 106,000 links 40 took half to twice as long
+    (`docs/results/real.json`, `injected.json`, `campus.json`).
+    """
+    used = links if links <= MAX_LINKS else SAMPLE_LINKS
+    return FIXED_CPU_S + used / (LINKS_A_CPU_S_ON_MAP if has_map else LINKS_A_CPU_S)
 
 
 def fit_base(links: Links, scene: Scene | None, folds: Folds, base: str = "auto", seed: int = 0,

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -83,7 +84,7 @@ class Coverage:
     areas: tuple[Area, ...] = ()
 
 
-def predict_coverage(source: Twin | RadioMap | str, scene: Scene,
+def predict_coverage(source: Twin | RadioMap | str, scene: Scene | Path | str,
                      transmitters: Sequence[Transmitter] | None = None,
                      settings: CoverageSettings | None = None, areas: Sequence[Area] = (),
                      devices: list[str] | None = None) -> Coverage:
@@ -105,7 +106,7 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene,
         BadInput: an impossible setting, a transmit power that is not known, or a source that does
             not know a transmitter.
     """
-    settings = settings or CoverageSettings()
+    scene, settings = Scene.of(scene), settings or CoverageSettings()
     settings.check()
     chosen = _transmitters(source, scene, transmitters, devices, settings)
     grid, gains = _prepare(source, scene, chosen, settings)

@@ -13,7 +13,7 @@ import pandas as pd
 
 from radiotwin.display import count, some
 from radiotwin.errors import BadInput
-from radiotwin.geo import ALLOWED, reference_system
+from radiotwin.geo import ALLOWED, middle_of, reference_system
 from radiotwin.importing.read_source import Expected, read_source
 from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings
 from radiotwin.importing.source import Source, Tally, are_few
@@ -25,7 +25,6 @@ from radiotwin.links.measurements import DEVICE_OPTIONAL
 from radiotwin.links.site_table import SiteTable, is_site_table, local_positions, read_site_table
 
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
-ORIGIN_DECIMALS = 7  # of a computed origin [degrees]: 1 cm
 NAMED = ("receiver", "device")
 SINCE, UNTIL = "since_s", "until_s"
 """Columns of a table of devices: from when until when a device was there [s]; NaN = always."""
@@ -60,11 +59,7 @@ def find_origin(declared: Origin | None, receivers: pd.DataFrame,
         return None
     of_receivers = "latitude" in receivers and receivers["latitude"].notna().any()
     known = receivers if of_receivers else devices
-    first = known["longitude"].dropna().iloc[0]
-    east = (known["longitude"] - first + 180) % 360 - 180  # so that the date line does no harm
-    longitude = (first + east.median() + 180) % 360 - 180
-    return Origin(latitude_deg=round(float(known["latitude"].median()), ORIGIN_DECIMALS),
-                  longitude_deg=round(float(longitude), ORIGIN_DECIMALS))
+    return middle_of(known)
 
 
 def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:

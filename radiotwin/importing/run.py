@@ -26,13 +26,8 @@ from radiotwin.io.files import atomic_folder, require_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
 from radiotwin.links.cell_limits import FAR_M
-from radiotwin.links.measurements import (
-    OPTIONAL,
-    REQUIRED,
-    Measurements,
-    read_antenna_files,
-    read_measurements,
-)
+from radiotwin.links.link_table import OPTIONAL, REQUIRED
+from radiotwin.links.measurements import Measurements, read_antenna_files, read_measurements
 
 SCHEMA = "radiotwin.import/2"
 UNITS = {"_m": "m", "_deg": "°", "_s": "s", "_dbm": "dBm", "_db": "dB"}

@@ -1,9 +1,12 @@
 """Measurements in the frame of a scene: converted where both are known, checked where not."""
 
+import os
 import warnings
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from scipy.ndimage import gaussian_filter
 
 from radiotwin.errors import BadInput
@@ -25,7 +28,7 @@ MIN_CONTRAST = 5.0  # standard deviations, from which a translation is proposed
 CLEAR = 2.0  # from which receivers keep clear of buildings
 
 
-def in_scene_frame(measurements: Measurements, scene: Scene,
+def in_scene_frame(measurements: Measurements, scene: Scene | Path | str,
                    shift_m: tuple[float, float] | None = None) -> Measurements:
     """Return measurements in the frame of a scene.
 
@@ -47,6 +50,7 @@ def in_scene_frame(measurements: Measurements, scene: Scene,
             that makes them fit best. Or the given translation is impossible, or heights are given
             twice, see `Measurements.on_ground`.
     """
+    scene = Scene.of(scene)
     there = scene.config.origin
     related = shift_m is not None or (measurements.origin is not None and there is not None)
     measurements = in_known_frame(measurements, there, "the scene")
@@ -64,6 +68,28 @@ def in_scene_frame(measurements: Measurements, scene: Scene,
     elif shift_m is not None and any(shift_m):
         _refuse_off_map(measurements, scene, shift_m)
     return measurements
+
+
+def as_measurements(given: Measurements | pd.DataFrame | Path | str,
+                    scene: Scene | None) -> Measurements:
+    """Return measurements, also of a file or a data frame, in the frame of a scene.
+
+    Those of a file or a data frame are checked against it, as commands do. `Measurements` are
+    converted where both say where on the earth they lie.
+
+    Raises:
+        BadInput: they are none of these, as of their reader, or as of `in_scene_frame`.
+    """
+    if isinstance(given, Measurements):
+        return in_known_frame(given, None if scene is None else scene.config.origin, "the scene")
+    if isinstance(given, str | os.PathLike):
+        given = Measurements.load(Path(given))
+    elif isinstance(given, pd.DataFrame):
+        given = Measurements(given)
+    else:
+        raise BadInput(f"measurements are needed, not {type(given).__name__}; pass "
+                       "rt.Measurements, a data frame of links, or the path of measurements.csv")
+    return given.on_ground(None) if scene is None else in_scene_frame(given, scene)
 
 
 def in_known_frame(measurements: Measurements, there: Origin | None, what: str) -> Measurements:

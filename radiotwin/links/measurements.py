@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,19 +38,28 @@ from radiotwin.geo import (
 )
 from radiotwin.io.budgets import DOCUMENT_BYTES
 from radiotwin.io.cells import (
-    as_numbers,
     check_suffix,
     column_names,
     read_cells,
-    refuse,
     require_pyarrow,
     shown,
     write_csv,
 )
 from radiotwin.io.files import atomic_path
-from radiotwin.io.forms import MAX_POSITION_M, Origin, name_fault
+from radiotwin.io.forms import MAX_POSITION_M, Origin, as_origin
 from radiotwin.io.inputs import is_within, read_bytes, require_within
-from radiotwin.links.cell_limits import LEVELS, READS, refuse_limits
+from radiotwin.links.cell_limits import LEVELS, READS
+from radiotwin.links.link_table import (
+    DEVICE_POSITION,
+    FRAME,
+    OPTIONAL,
+    RECEIVER_POSITION,
+    REQUIRED,
+    is_table_of_links,
+    links_of_frame,
+    read_links,
+    require_level,
+)
 from radiotwin.links.site_table import read_site_table, unused_columns
 from radiotwin.links.view import links_dataset, links_table, of_device, plot_links
 from radiotwin.scene.antennas import Pattern, parse_pattern
@@ -61,96 +70,69 @@ if TYPE_CHECKING:
 
     from radiotwin.scene import Scene
 
-_TEXT = {"flight", "receiver", "device"}
-# Columns of the two files, as in docs/conventions.md.
-REQUIRED = ["flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device"]
-OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality", "receiver_above_ground_m"]
 DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
 # What is declared of a device's radio, besides its antenna.
 RADIO = ["tx_power_dbm", "eirp_dbm", "cable_loss_db", "frequency_hz", "azimuth_deg", "tilt_deg"]
 DEVICE_OPTIONAL = [*RADIO, "above_ground_m", READS]
 ROLES = ("anchor", "unknown")
-_RECEIVER_POSITION = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
 _DEVICE_POSITION = ["x_m", "y_m", "z_m"]
 MAX_APART_M = 1e6  # between an anchor and the receivers' middle: no radio link is so long
-_MAY_BE_EMPTY = {"receiver_z_m", *LEVELS, *OPTIONAL}
-
-
-def read_columns(path: Path, required: list[str], optional: list[str],
-                 may_be_empty: set[str]) -> pd.DataFrame:
-    """Read the columns of a table, names as texts and all others as numbers, NaN where empty.
-
-    Raises:
-        BadInput: names file, row and column of the first value that cannot be used.
-    """
-    table = read_cells(path, required, optional)
-    for name in table.columns:
-        if name in _TEXT:
-            table[name] = _names(path, name, table[name])
-        else:
-            cells = table[name]
-            table[name] = _numbers(path, name, cells, name in may_be_empty)
-            refuse_limits(partial(refuse, path, name, cells), name, table[name].to_numpy())
-    return table
-
-
-def _names(path: Path, name: str, column: pd.Series) -> pd.Series:
-    """Return the names in a column without spaces around them."""
-    try:
-        codes, known = pd.factorize(column)
-    except TypeError:
-        raise BadInput(f"{path}: column {name} holds lists or records; it needs one name in each "
-                       "row") from None
-    # A column of whole numbers of which some are missing is one of floating ones
-    texts = [str(int(each) if isinstance(each, float) and each.is_integer() else each).strip()
-             for each in known.tolist()]
-    names = pd.Series(np.array([*texts, ""], dtype=object)[codes], column.index, dtype=str)
-    for text in dict.fromkeys([*texts, ""]):
-        if fault := name_fault(text):
-            refuse(path, name, names, names == text, fault)
-    return names
-
-
-def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd.Series:
-    """Convert the cells of a column, NaN where empty."""
-    needed = "every row needs one: fill it in, or leave the row out"
-    if column.dtype.kind in "fiu":
-        numbers, empty = column.astype(float), column.isna()
-    else:
-        text = column.fillna("").astype(str).str.strip()
-        empty = text == ""
-        numbers = pd.Series(as_numbers(text), index=column.index)
-        named_nan = numbers.isna() & ~empty
-        named_nan[named_nan] = text[named_nan].str.lower().isin(["nan", "na", "none"])
-        refuse(path, name, column, numbers.isna() & ~empty & ~named_nan, "is not a number")
-        remedy = "leave the cell empty where there is no value" if may_be_empty else needed
-        refuse(path, name, column, named_nan, f"is not a number; {remedy}")
-    remedy = "; leave the cell empty where nothing was detected" if name in LEVELS else ""
-    refuse(path, name, column, np.isinf(numbers), f"is not finite{remedy}")
-    if not may_be_empty:
-        refuse(path, name, column, empty, f"is empty; {needed}")
-    return numbers
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measurements(Summarised):
     """Levels of links between devices and receivers.
 
+    Data frames of other layouts are converted: `Measurements(frame)`, or `Measurements(frame,
+    devices, origin)`. Each row of `frame` needs `gain_db` or `rssi_dbm`, a `device` and a position
+    of the receiver, such as `latitude, longitude, height_m`; `flight` and `receiver` may be left
+    out. `devices` needs the device and, of those with a known position, that. Without it, positions
+    are those of columns `device_x_m, device_y_m, device_z_m`, or are to be found.
+
     Attributes:
         table: one row per link, columns as in `measurements.csv`; NaN level = not detected.
         devices: one row per device, columns as in `devices.csv`; NaN x, y where unknown.
-        origin: of the local frame of both; None where it is not known.
+        origin: of the local frame of both, or its latitude and longitude; None where it is not
+            known. Then the middle of latitudes and longitudes becomes the origin.
         antenna_files: content of the devices' antenna files, by their names in `devices`.
         notes: on columns of the files that are not used, and values that are probably not meant.
         files: names of both tables, for messages.
     """
 
     table: pd.DataFrame
-    devices: pd.DataFrame
+    devices: pd.DataFrame = None  # type: ignore[assignment]  # filled in below
     origin: Origin | None = None
     antenna_files: Mapping[str, bytes] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     files: tuple[str, str] = ("measurements", "devices")
+
+    def __post_init__(self) -> None:
+        for what, rows in (("links", self.table), ("devices", self.devices)):
+            if not isinstance(rows, pd.DataFrame) and (rows is not None or what == "links"):
+                raise BadInput(f"Measurements are made of a data frame of {what}, not of "
+                               f"{type(rows).__name__}; Measurements.load(path) reads a file")
+        origin, notes = as_origin(self.origin), self.notes
+        if not is_table_of_links(self.table):
+            table, origin, more = links_of_frame(self.table, origin)
+            self._fill(table=table, origin=origin, notes=(*notes, *more))
+        require_level(FRAME, self.table)
+        if self.devices is None:
+            self._fill(devices=_devices_of_links(self.table))
+        elif not {*DEVICE_REQUIRED} <= set(self.devices):
+            devices, more = _devices(FRAME + " of devices", self.devices.reset_index(drop=True),
+                                     origin, origin, "row {}".format)
+            self._fill(devices=devices, notes=(*self.notes, *more))
+        if self.origin is not origin:
+            self._fill(origin=origin)
+        undeclared = self.device_index < 0
+        if undeclared.any():
+            raise BadInput(f"device {self.table['device'][undeclared].iloc[0]!r} has links and is "
+                           f"not among the devices ({some(self.devices['device'])}); add it "
+                           "there, without a position if that is to be found")
+
+    def _fill(self, **values: object) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     @property
     def level_column(self) -> str:
@@ -165,7 +147,7 @@ class Measurements(Summarised):
     @property
     def receiver_m(self) -> np.ndarray:
         """Receiver positions [m], (n, 3)."""
-        return self.table[_RECEIVER_POSITION].to_numpy(dtype=float)
+        return self.table[RECEIVER_POSITION].to_numpy(dtype=float)
 
     @cached_property
     def device_index(self) -> np.ndarray:
@@ -201,9 +183,16 @@ class Measurements(Summarised):
         """Return a selection of the links, with all devices.
 
         Args:
-            mask: (n,) bool.
+            mask: (n,) bool, such as `measurements.table["flight"] == "f1"`.
+
+        Raises:
+            BadInput: it is no such mask.
         """
-        return replace(self, table=self.table[np.asarray(mask)].reset_index(drop=True))
+        mask = np.asarray(mask)
+        if mask.dtype != bool or mask.shape != (len(self),):
+            raise BadInput(f"select takes a mask of {len(self)} true or false, one for each link, "
+                           'such as measurements.table["flight"] == "f1"')
+        return replace(self, table=self.table[mask].reset_index(drop=True))
 
     def moved(self, position_m: Callable[[np.ndarray], np.ndarray],
               origin: Origin | None) -> "Measurements":
@@ -214,7 +203,7 @@ class Measurements(Summarised):
             origin: of that frame.
         """
         return replace(
-            self, table=moved_positions(self.table, _RECEIVER_POSITION, position_m),
+            self, table=moved_positions(self.table, RECEIVER_POSITION, position_m),
             devices=moved_positions(self.devices, _DEVICE_POSITION, position_m), origin=origin)
 
     def on_ground(self, ground_height_m: GroundHeight | None) -> "Measurements":
@@ -223,7 +212,7 @@ class Measurements(Summarised):
             return self
         table, devices = (above_datum(rows, name, position, ground_height_m)
                           for rows, name, position in (
-                              (self.table, self.files[0], _RECEIVER_POSITION),
+                              (self.table, self.files[0], RECEIVER_POSITION),
                               (self.devices, self.files[1], _DEVICE_POSITION)))
         return replace(self, table=table, devices=devices)
 
@@ -398,12 +387,12 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise BadInput(f"the path of a table is needed, not {type(path).__name__}; Measurements("
+                       "frame) takes a data frame")
     path = Path(path)
-    table = read_columns(path, REQUIRED, OPTIONAL + LEVELS, _MAY_BE_EMPTY)
-    levels = [name for name in LEVELS if name in table]
-    if len(levels) != 1:
-        raise BadInput(f"{path}: needs exactly one of the columns {' and '.join(LEVELS)}, it "
-                       f"has {'both' if levels else 'neither'}")
+    table = read_links(path)
+    require_level(path, table)
     named = devices_path is not None
     devices_path = Path(devices_path) if devices_path else path.parent / "devices.csv"
     if not os.path.exists(devices_path):
@@ -447,8 +436,22 @@ def read_devices(path: Path | str) -> pd.DataFrame:
 def _read_devices(path: Path, origin: Origin | None,
                   own: Origin | None) -> tuple[pd.DataFrame, tuple[str, ...]]:
     """Return devices in the frame about an origin, and notes; `own` is that of the table's x, y."""
-    sites = read_site_table(path, read_cells(path), lambda row: f"row {row + 2}", "device",
-                            [*DEVICE_OPTIONAL, "antenna", "role"])
+    return _devices(path, read_cells(path), origin, own, lambda row: f"row {row + 2}")
+
+
+def _devices_of_links(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the devices of a table of links, where its columns say that they are."""
+    first = table.drop_duplicates("device").reset_index(drop=True)
+    position_m = first.reindex(columns=DEVICE_POSITION).astype(float).to_numpy()
+    placed = np.isfinite(position_m[:, :2]).all(axis=1)
+    return pd.DataFrame({"device": first["device"], **dict(zip(_DEVICE_POSITION, position_m.T)),
+                         "role": np.where(placed, *ROLES)})
+
+
+def _devices(path: Path | str, cells: pd.DataFrame, origin: Origin | None, own: Origin | None,
+             where: Callable[[int], str]) -> tuple[pd.DataFrame, tuple[str, ...]]:
+    """Return the devices in cells of a table of sites; see `_read_devices`."""
+    sites = read_site_table(path, cells, where, "device", [*DEVICE_OPTIONAL, "antenna", "role"])
     names, values = sites.names, sites.values
     sites.refuse("device", names.duplicated(),
                  "occurs twice; every device needs one row, and a name of its own")

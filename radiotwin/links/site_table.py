@@ -442,8 +442,14 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
              crs: bool) -> np.ndarray:
     """Return the numbers (k,) of a quantity in its unit; NaN where empty."""
     name = table.columns[quantity]
-    text = as_text(table.cells[name])
-    numbers = as_numbers(text)
+    cells = table.cells[name]
+    if cells.dtype.kind in "fiu":
+        cells = cells.astype(float)
+        text = pd.Series(np.where(cells.isna(), "", "a number"), cells.index)
+        numbers = cells.to_numpy()
+    else:
+        text = as_text(cells)
+        numbers = as_numbers(text)
     if quantity in LIMITS_DEG:
         for i in np.flatnonzero(np.isnan(numbers) & (text != "")):
             numbers[i] = degrees(text.iloc[i], quantity)

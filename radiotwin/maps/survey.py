@@ -7,6 +7,8 @@ be able to reach its terminal. A flight pattern takes the grid of an altitude, t
 battery and a source of random numbers, and returns one cell (row, column) per slot.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 from scipy.constants import speed_of_light
@@ -87,7 +89,7 @@ LOS_LAW = LogDistanceLine(-30.0, 2.5, 2**0.5)
 NLOS_LAW = LogDistanceLine(-35.0, 3.04, 5**0.5)
 
 
-def segmented_truth(scene: Scene) -> RadioMap:
+def segmented_truth(scene: Scene | Path | str) -> RadioMap:
     """Return mean gain and shadowing of the segmented law over a lattice, through the antennas.
 
     The mean is given below sensitivity, too: a survey draws the shadowing before it decides what is
@@ -99,6 +101,7 @@ def segmented_truth(scene: Scene) -> RadioMap:
     Returns:
         A map with `sigma_db`.
     """
+    scene = Scene.of(scene)
     receiver_m = scene.lattice.positions_m
     gain_db, sigma_db, los = [], [], []
     for device_m, antenna in zip(scene.device_m, scene.device_antennas):
@@ -240,7 +243,7 @@ def random_walk(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Ge
 PATTERNS = {"random-waypoint": random_waypoint, "lawnmower": lawnmower, "random-walk": random_walk}
 
 
-def fly_survey(scene: Scene, truth: RadioMap | str = "traced", *, flights: int = 5,
+def fly_survey(scene: Scene | Path | str, truth: RadioMap | str = "traced", *, flights: int = 5,
                pattern: str = "random-waypoint", seed: int = 0, noise_db: float | None = None
                ) -> Measurements:
     """Fly and measure.
@@ -262,6 +265,7 @@ def fly_survey(scene: Scene, truth: RadioMap | str = "traced", *, flights: int =
         BadInput: An unknown pattern, no flight, no UAV, more rows than a table may have, a map of
             another scene, or one with gains that physics does not allow.
     """
+    scene = Scene.of(scene)
     if isinstance(truth, str):
         truth = read_truth(scene, truth)
     if noise_db is None:

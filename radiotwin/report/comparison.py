@@ -18,6 +18,7 @@ from radiotwin.errors import BadInput
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import Real, Record, Whole, read_record, validated
+from radiotwin.links.alignment import as_measurements
 from radiotwin.links.measurements import Measurements
 from radiotwin.maps.file import is_zarr
 from radiotwin.maps.radiomap import RadioMap
@@ -92,7 +93,8 @@ class ComparisonRecord(Record):
         return scores
 
 
-def compare_held_out(measurements: Measurements, scene: Scene, truth: RadioMap | None = None, *,
+def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
+                     scene: Scene | Path | str, truth: RadioMap | None = None, *,
                      held_out: int = 1, raytrace: bool = False, also: Sequence[Path | str] = (),
                      seed: int = 0, executor: Executor | None = None) -> Comparison:
     """Compare all channel models on the last flights, which none of them is fitted to.
@@ -100,8 +102,8 @@ def compare_held_out(measurements: Measurements, scene: Scene, truth: RadioMap |
     Published laws that hold at the scene's frequency are among them, fitted to nothing.
 
     Args:
-        measurements: of several flights.
-        scene: where they were flown.
+        measurements: of several flights; of a file or a data frame, too.
+        scene: where they were flown, or its folder.
         truth: the whole map to judge on, too; None: there is none.
         held_out: number of the last flights.
         raytrace: compare the model `raytrace`, too; takes minutes.
@@ -113,7 +115,8 @@ def compare_held_out(measurements: Measurements, scene: Scene, truth: RadioMap |
         BadInput: too few flights, neither a twin's folder nor a radio map, a map without a truth,
             or what `compare_models` refuses.
     """
-    train, test = split_flights(measurements, held_out)
+    scene = Scene.of(scene)
+    train, test = split_flights(as_measurements(measurements, scene), held_out)
     twins, maps = _judge_also([Path(path) for path in also], truth, test.flights)
     models = (*DEFAULT_MODELS, *published_models(scene.config.radio.frequency_hz),
               *["raytrace"] * raytrace)

@@ -137,7 +137,7 @@ def check_map_target(path: Path | str, scene: Scene) -> None:
     check_target(path)
 
 
-def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
+def export_map(source: RadioMap | Twin, scene: Scene | Path | str, path: Path | str, *,
                devices: Sequence[str] | None = None, altitudes_m: Sequence[float] | None = None,
                name: str = "the radio map",
                tell: Callable[[str], None] | None = None) -> RadioMap | MapStream:
@@ -160,7 +160,7 @@ def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
     Raises:
         BadInput: as `check_map_target`, a map of another place, or no such device or altitude.
     """
-    path = Path(path)
+    path, scene = Path(path), Scene.of(scene)
     check_map_target(path, scene)
     formats = FORMATS
     if isinstance(source, RadioMap):

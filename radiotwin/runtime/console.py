@@ -5,6 +5,7 @@ Names come from strangers' files: what a terminal would obey is shown as an esca
 
 import logging
 import re
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -182,7 +183,11 @@ def progress(description: str, total: float | None, lines: bool = False,
         return
     console = PrintableConsole(stderr=True)
     if lines and not silent and not console.is_terminal:
-        yield _Lines(description, total)
+        printed = _Lines(description, total)
+        try:
+            yield printed
+        finally:
+            printed.over.set()
         return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
                TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
@@ -198,16 +203,23 @@ def progress(description: str, total: float | None, lines: bool = False,
 
 
 class _Lines:
-    """Progress in a file: a line every ten seconds."""
+    """Progress in a file: a line every ten seconds, also while nothing advances.
+
+    Attributes:
+        over: set where the work ends.
+    """
 
     def __init__(self, description: str, total: float | None) -> None:
         self._text, self._total, self._done = description, total, 0.0
-        self._started = self._printed = time.monotonic()
+        self._started = time.monotonic()
+        self.over = threading.Event()
+        threading.Thread(target=self._print, daemon=True).start()
 
     def __call__(self, n: float = 1, description: str | None = None) -> None:
         self._text, self._done = description or self._text, self._done + n
-        now = time.monotonic()
-        if now - self._printed >= LINE_S:
-            self._printed = now
+
+    def _print(self) -> None:
+        while not self.over.wait(LINE_S):
             of = "" if self._total is None else f" of {self._total:,.0f}"
-            notice(f"{self._text} ({self._done:,.0f}{of}, {now - self._started:.0f} s)")
+            after_s = time.monotonic() - self._started
+            notice(f"{self._text} ({self._done:,.0f}{of}, {after_s:.0f} s)")

@@ -12,9 +12,10 @@ import pandas as pd
 
 from radiotwin.display import Summarised, Summary, count, geo_data_frame, some
 from radiotwin.errors import BadInput
-from radiotwin.geo import origin_attributes
+from radiotwin.geo import origin_attributes, with_places
 from radiotwin.io.budgets import SHAPES
 from radiotwin.io.files import atomic_folder
+from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import is_within, open_input, read_bytes, require_within
 from radiotwin.scene.antennas import Antenna, Pattern, read_pattern
 from radiotwin.scene.citymap import GROUND_M, CityMap, shape_height_sds_m
@@ -71,6 +72,20 @@ class Scene(Summarised):
         scene._check_devices()
         _ = scene.device_antennas, scene.uav_antenna  # report a broken file before any work
         return scene
+
+    @classmethod
+    def of(cls, given: "Scene | Path | str") -> "Scene":
+        """Return a scene as it is, or the one in a folder.
+
+        Raises:
+            BadInput: It is neither, or as `load`.
+        """
+        if isinstance(given, Scene):
+            return given
+        if isinstance(given, str | os.PathLike):
+            return cls.load(given)
+        raise BadInput(f"a scene is needed, not {type(given).__name__}; pass the path of its "
+                       "folder, or what Scene.load(folder) returns")
 
     def save(self, folder: Path | str) -> None:
         """Write a copy of the scene folder, with the configuration of this object.
@@ -154,9 +169,7 @@ class Scene(Summarised):
         if layer not in LAYERS:
             raise BadInput(f"layer {layer!r} is unknown; allowed are {', '.join(LAYERS)}")
         if layer == "devices":
-            rows = [(each.device, each.role, each.x_m, each.y_m, each.z_m)
-                    for each in self.config.devices]
-            table = pd.DataFrame(rows, columns=["device", "role", "x_m", "y_m", "z_m"])
+            table = self.devices[["device", "role", "x_m", "y_m", "z_m"]]
             return geo_data_frame(table, self.config.origin, position_m=self.device_m)
         terrain = self.config.terrain
         found, outlines = [], []
@@ -217,6 +230,18 @@ class Scene(Summarised):
         scene = Scene(self.folder, self.config.model_copy(update={"devices": devices}))
         scene.__dict__["city"] = self.city
         return scene
+
+    @property
+    def origin(self) -> Origin | None:
+        """Of its local frame; None where that is not known."""
+        return self.config.origin
+
+    @property
+    def devices(self) -> pd.DataFrame:
+        """Declared devices: `device, role, x_m, y_m, z_m`; with an origin their place, too."""
+        named = [(each.device, each.role) for each in self.config.devices]
+        return with_places(pd.DataFrame(named, columns=["device", "role"]), self.device_m,
+                           self.origin)
 
     @property
     def xml_path(self) -> Path:

@@ -167,7 +167,7 @@ def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
     return scene.folder / f"{name}.nc"
 
 
-def trace_map(scene: Scene, settings: SolverSettings | None = None,
+def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
               out_path: Path | str | None = None, devices: list[str] | None = None,
               executor: Executor | None = None) -> RadioMap:
     """Trace the radio map of a scene's lattice and write it.
@@ -193,6 +193,7 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
             be written.
         RunFailed: No usable libLLVM, or gains that physics does not allow. Nothing is written then.
     """
+    scene = Scene.of(scene)
     settings = with_radius(scene, settings or SolverSettings.of_quality())
     if out_path is None:
         out_path = require_within(scene.folder, truth_path(scene, devices), str(scene.folder))

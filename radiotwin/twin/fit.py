@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.links import join_links, prepare_links
+from radiotwin.links.alignment import as_measurements
 from radiotwin.links.checks import (
     COPIED,
     copied_rows,
@@ -19,11 +22,14 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.propagation.laws import channel_named
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.path_kriging import PathKriging
+from radiotwin.propagation.laws.published import PublishedLaw
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
-from radiotwin.twin.fit_links import fit_links
+from radiotwin.twin.fit_links import NO_ANCHOR, anchors_links, fit_links
 from radiotwin.twin.fit_paths import fit_along_paths, fit_over_wrong_map
+from radiotwin.twin.law import LAW, law_parameters
 from radiotwin.twin.localize import LocalizeSettings
+from radiotwin.twin.selection import AUTO, CHEAP, HELD_OUT, HeldOut
 from radiotwin.twin.shadowing import MAP_ERRORS, MapErrors
 from radiotwin.twin.twin import Twin
 
@@ -35,23 +41,26 @@ HEIGHT_NEEDED = ("with a 3D map every position needs one. Fill it in, in metres 
                  "of the scene (about 1.5 for a phone in the hand)")
 
 
-def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn",
-             seed: int = 0, start: Twin | None = None, allow_indoor: bool = False,
-             executor: Executor | None = None) -> Twin:
+def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scene | Path | str,
+             model: str = "segmented_nn", *, seed: int = 0, start: Twin | None = None,
+             allow_indoor: bool = False, executor: Executor | None = None,
+             compare: bool = False) -> Twin:
     """Learn the channel from the anchors' links, then locate the unknown devices with it.
 
     A published law (`radiotwin.propagation.laws.published`) is taken as it stands and needs no
     anchor.
 
     Args:
-        measurements: links to anchors and unknown devices.
-        scene: its map and extent, and the receivers' sensitivity.
+        measurements: links to anchors and unknown devices; of a file or a data frame, too.
+        scene: its map and extent, and the receivers' sensitivity; or its folder.
         model: name of a channel model (`radiotwin.propagation.laws.channel_models`); `raytrace`
             stands for `image_paths`, which follows paths over the 3D map, and `path_kriging` allows
-            for errors of that.
+            for errors of that. `auto` is the cheap one with the least held-out error.
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
         allow_indoor: whether unknown devices may be inside buildings.
+        compare: whether the twin's provenance says how the cheap models compare on links that are
+            held out, see `HeldOut`; so it does with the model `auto`.
         executor: where a model that follows paths searches for devices, inside `keep_pieces`;
             None: in this process.
 
@@ -66,12 +75,16 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
             model, devices that may be indoors with one that follows paths, or an earlier twin in
             another frame.
     """
+    scene = Scene.of(scene)
+    measurements = as_measurements(measurements, scene)
     flights = measurements.flights
     measurements = _thinned(_usable(measurements), seed)
     if start is not None:
         start.require_frame(scene)
         start.warn_of_another_scene(scene, scene.content_hash())
-    channel = channel_named(model)
+    channel = channel_named(CHEAP[0] if model == AUTO else model)
+    if not (measurements.is_anchor.any() or issubclass(channel, PublishedLaw)):
+        raise BadInput(NO_ANCHOR)
     along_paths = channel in (ImagePaths, PathKriging)
     if along_paths and allow_indoor:
         raise BadInput(f"model {model} follows paths outside buildings only; take another model "
@@ -85,6 +98,13 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     if links.has_boresights:
         warnings.warn("azimuth_deg and tilt_deg are used by close-loop alone where no column "
                       "antenna names the file of a pattern", stacklevel=2)
+    held_out = None
+    if compare or model == AUTO:
+        of_anchors = np.isin(links.device, sorted(links.anchors))
+        geometry, level_db, limit_db = anchors_links(links)
+        held_out = HeldOut.of(geometry, links.flight[of_anchors], level_db, limit_db, seed)
+        if model == AUTO:
+            channel = channel_named(CHEAP[1] if held_out is None else held_out.best)
     if along_paths:
         fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
         twin = fit(links, scene, seed, start, executor)
@@ -94,7 +114,10 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     twin.provenance.update(flights=flights, seed=seed)
     if not along_paths:  # which would be followed once more
         twin.provenance[MAP_ERRORS] = asdict(MapErrors.of(twin, links, seed))
-    return twin
+        twin.provenance[LAW] = law_parameters(twin.channel, *anchors_links(links), seed)
+    if held_out is not None:
+        twin.provenance[HELD_OUT] = held_out.record
+    return replace(twin, scene=scene)
 
 
 def _usable(measurements: Measurements) -> Measurements:

@@ -21,6 +21,10 @@ from radiotwin.twin.localize import LawError, LocalizeSettings, TwinDevice, loca
 from radiotwin.twin.model.model import FittedModel
 from radiotwin.twin.twin import Twin, measured_heights
 
+NO_ANCHOR = ("no anchor: every device has the role unknown, and a channel is learned from devices "
+             "whose positions are known; give at least one device x_m, y_m and the role anchor in "
+             "devices.csv (in Python, Measurements(frame, devices)), or take a published law, such "
+             "as tr36777_uma, which is not learned")
 MAX_POWER_APART_DB = 3.0  # between declared and fitted powers; more hints at a loss
 
 
@@ -39,8 +43,8 @@ def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int
     Raises:
         BadInput: as of `fit_twin`.
     """
-    is_anchor = np.isin(np.arange(len(links.device_m)), sorted(links.anchors))
-    anchors_m = np.where(is_anchor[:, None], links.device_m, np.nan)
+    anchors_m = _anchors_m(links)
+    is_anchor = np.isfinite(anchors_m).all(axis=1)
     if issubclass(channel, PublishedLaw):
         fitted: ChannelModel = _published(links, anchors_m, scene, channel)
     else:
@@ -61,6 +65,19 @@ def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int
         for note in fitted.outside(_known_links(links, reliable_m(devices))[0]):
             warnings.warn(note, stacklevel=3)
     return make_twin(links, scene, fitted, devices)
+
+
+def anchors_links(links: Links) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
+    """Return the m links of the anchors, their levels (m,) and limits (m,) as a channel has them.
+
+    What is declared of the devices is taken off both [dB].
+    """
+    return _known_links(links, _anchors_m(links))
+
+
+def _anchors_m(links: Links) -> np.ndarray:
+    is_anchor = np.isin(np.arange(len(links.device_m)), sorted(links.anchors))
+    return np.where(is_anchor[:, None], links.device_m, np.nan)
 
 
 def fit_known(links: Links, channel: type[ChannelModel], seed: int) -> Twin:
@@ -93,10 +110,7 @@ def _fit_channel(links: Links, device_m: np.ndarray, channel: type[ChannelModel]
                  seed: int) -> ChannelModel:
     """Fit to the links of all devices whose position in `device_m` (k, 3) is known."""
     if not links.anchors:
-        raise BadInput("no anchor: every device has the role unknown, and a channel is learned "
-                       "from devices whose positions are known; give at least one device x_m, y_m "
-                       "and the role anchor in devices.csv, or take a published law, such as "
-                       "tr36777_uma, which is not learned")
+        raise BadInput(NO_ANCHOR)
     geometry, level_db, limit_db = _known_links(links, device_m)
     if not len(geometry):
         raise BadInput("no link to an anchor: none of the devices with role anchor was measured; "

@@ -14,7 +14,7 @@ from radiotwin.inference.student import sd_of_scale
 from radiotwin.io.cells import listed, read_cells
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, link_geometry, prepare_links
-from radiotwin.links.alignment import in_known_frame
+from radiotwin.links.alignment import as_measurements, in_known_frame
 from radiotwin.links.declared import as_learnt
 from radiotwin.links.measurements import Measurements
 from radiotwin.links.site_table import read_site_table
@@ -47,15 +47,15 @@ def check_can_locate(twin: Twin, scene: Scene | None) -> None:
     twin.require_map(scene)
 
 
-def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None = None
-                   ) -> tuple[pd.DataFrame, list[str]]:
+def locate_devices(measurements: Measurements | pd.DataFrame | Path | str, twin: Twin,
+                   scene: Scene | Path | str | None = None) -> tuple[pd.DataFrame, list[str]]:
     """Locate the devices of role unknown.
 
     Args:
         measurements: their links, and others; converted into the twin's frame where both say where
             on the earth they lie.
         twin: made by `fit` or `close-loop`.
-        scene: the 3D map, if the twin was made with one.
+        scene: the 3D map, or its folder, if the twin was made with one; None: the twin's own.
 
     Returns:
         a row a device: `device, x_m, y_m, radius_m` (of 90 % of the probability), `links`, and
@@ -65,8 +65,12 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
         BadInput: a twin that cannot locate, no unknown device, links of another quantity than the
             twin's, or nothing that can be used.
     """
+    if scene is None:
+        scene = twin.scene if twin.channel.uses_map else None
+    else:
+        scene = Scene.of(scene)
     check_can_locate(twin, scene)
-    measurements = in_known_frame(measurements, twin.origin, "the twin")
+    measurements = in_known_frame(as_measurements(measurements, scene), twin.origin, "the twin")
     unknown = measurements.select(~measurements.is_anchor[measurements.device_index])
     unknown = replace(unknown, devices=unknown.devices[~unknown.is_anchor].reset_index(drop=True))
     if unknown.table.empty:

@@ -47,7 +47,7 @@ CHANNEL_FILE = "channel.safetensors"
 _Decibels = Annotated[float, Field(ge=-MAX_DB, le=MAX_DB)]
 _SdDb = Annotated[float, Field(ge=1e-9, le=MAX_SD_DB)]
 _Scalar = str | int | float | bool | None
-_Json = _Scalar | list[_Scalar] | dict[str, _Scalar]
+_Json = _Scalar | list[_Scalar] | dict[str, _Scalar] | list[dict[str, _Scalar]]
 TWIN_FILE = "twin.json"
 TWIN_FILES = {TWIN_FILE, CHANNEL_FILE, "report.html"}  # the last is what `radiotwin report` makes
 
@@ -140,6 +140,17 @@ class _MapErrors(_Strict):
     devices: Annotated[int, Field(ge=0)]
 
 
+class _LawParameter(_Strict):
+    """A row of `radiotwin.twin.law.COLUMNS`."""
+
+    links: Literal["all", "LoS", "NLoS"]
+    parameter: Annotated[str, Field(max_length=40)]
+    value: Real
+    low: Real | None
+    high: Real | None
+    unit: Annotated[str, Field(max_length=10)]
+
+
 class _Provenance(BaseModel):
     """Fields of the provenance that are read; the others are only kept."""
 
@@ -150,6 +161,8 @@ class _Provenance(BaseModel):
     origin: Origin | None = None
     receiver_heights_m: Annotated[list[Real], Field(min_length=2, max_length=2)] | None = None
     map_errors: _MapErrors | None = None
+    held_out: dict[str, str | Real] | None = None
+    law: Annotated[list[_LawParameter], Field(max_length=10)] | None = None
 
 
 class TwinRecord(_Strict):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import warnings
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import pandas as pd
+from scipy.stats import t as student_t
 
 import radiotwin
 from radiotwin.display import (
@@ -26,12 +27,15 @@ from radiotwin.display import (
 )
 from radiotwin.effects.base import Effect
 from radiotwin.errors import BadInput
-from radiotwin.geo import is_same_frame, place
+from radiotwin.geo import is_same_frame, place, with_places
+from radiotwin.inference.student import sd_of_scale
 from radiotwin.io.files import atomic_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.inputs import read_bytes, read_text, require_within
+from radiotwin.links.alignment import in_known_frame
 from radiotwin.links.declared import NOTHING, Declared
 from radiotwin.links.links import Columns, Ends, Links, Prediction, World
+from radiotwin.links.measurements import Measurements
 from radiotwin.maps.file import POWERS, MapStream
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.laws import ChannelModel
@@ -40,9 +44,11 @@ from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.plot import MARKS, draw_outlines
+from radiotwin.twin.law import LAW, law_frame, parameters_of
 from radiotwin.twin.localize import TwinDevice
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 from radiotwin.twin.model.model import FittedModel
+from radiotwin.twin.places import Places
 from radiotwin.twin.store import (
     CHANNEL_FILE,
     TWIN_FILE,
@@ -111,6 +117,7 @@ class Twin(Summarised):
         provenance: measurements, scene, seed and version that made it.
         declared: of the devices' powers, cables, antennas and carriers; what of it is in the levels
             was taken off them before anything was learnt, and is put back where they are predicted.
+        scene: that is taken where none is given; not saved with the twin.
     """
 
     fitted: FittedModel
@@ -119,6 +126,32 @@ class Twin(Summarised):
     limit_db: float | None
     provenance: dict = field(default_factory=dict)
     declared: Declared = NOTHING
+    scene: Scene | None = None
+
+    @property
+    def params(self) -> pd.DataFrame:
+        """Fitted law: `links` (LoS, NLoS or all), `parameter, value, low, high, unit`.
+
+        The interval holds 90 %; it is empty where it is not known, such as after `close-loop`.
+        There is no row where the channel has no log-distance law.
+        """
+        rows = self.provenance.get(LAW)
+        if rows is None:
+            sd_db = self.fitted.scale_db * sd_of_scale(self.fitted.dof)
+            rows = parameters_of(self.channel, self.fitted.level_coefficients, sd_db)
+        return law_frame(rows, self.level)
+
+    @property
+    def positions(self) -> pd.DataFrame:
+        """Where the devices are: `device, role, located, radius_m`, and their place.
+
+        `radius_m` holds 90 % of the probability. The place is `x_m, y_m, z_m`; with an origin also
+        `latitude_deg, longitude_deg`.
+        """
+        rows = [(each.device, each.role, each.located, each.credible_radius_m)
+                for each in self.devices]
+        table = pd.DataFrame(rows, columns=["device", "role", "located", "radius_m"])
+        return with_places(table, self.device_m, self.origin)
 
     @property
     def channel(self) -> ChannelModel:
@@ -166,50 +199,126 @@ class Twin(Summarised):
             names.append(SHADOWING)
         return self.channel.name + (f" with {', '.join(names)}" if names else "")
 
-    def links(self, receiver_m: np.ndarray, device: np.ndarray, scene: Scene) -> Links:
+    def links(self, receiver_m: np.ndarray, device: np.ndarray, scene: Scene | None = None
+              ) -> Links:
         """Return links that nobody measured: receiver, flight and time unset.
 
         Args:
             receiver_m: (n, 3) positions of the receivers [m].
             device: (n,) row of each link's device in `devices`.
-            scene: the 3D map and the radio.
+            scene: the 3D map and the radio; None: the twin's own, if it has one.
+
+        Raises:
+            BadInput: they are no such arrays.
         """
+        receiver_m, device = np.asarray(receiver_m), np.asarray(device)
+        if receiver_m.ndim != 2 or receiver_m.shape[1] != 3 or device.shape != receiver_m.shape[:1]:
+            raise BadInput(f"links need positions (n, 3) in metres and n devices, not arrays of "
+                           f"the shapes {receiver_m.shape} and {device.shape}")
+        if device.dtype.kind not in "iu" or len(device) and not (
+                0 <= device.min() <= device.max() < len(self)):
+            raise BadInput(f"the devices of links are rows of twin.devices, 0 to {len(self) - 1}; "
+                           "twin.predict takes their names")
+        scene = scene or self.scene
         anchors = frozenset(i for i, each in enumerate(self.devices) if each.role == "anchor")
         return Links(
             columns=Columns.unmeasured(receiver_m, device, self.limit_db),
             ends=Ends(device_names=[each.device for each in self.devices],
                       device_m=np.nan_to_num(self.device_m), anchors=anchors,
                       declared=self.declared),
-            world=World(frequency_hz=scene.config.radio.frequency_hz, city=scene.city,
+            world=World(frequency_hz=np.nan if scene is None else scene.config.radio.frequency_hz,
+                        city=None if scene is None else scene.city,
                         is_gain=self.level == "gain_db"))
 
-    def predict(self, links: Links) -> Prediction:
-        """Return the levels that are expected of links.
+    @overload
+    def predict(self, places: Links) -> Prediction: ...
+
+    @overload
+    def predict(self, places: Measurements | pd.DataFrame | np.ndarray | None = None, *,
+                scene: Scene | Path | str | None = None, interval: float = 0.9,
+                **columns: Any) -> pd.DataFrame: ...
+
+    def predict(self, places: Links | Measurements | pd.DataFrame | np.ndarray | None = None, *,
+                scene: Scene | Path | str | None = None, interval: float = 0.9,
+                **columns: Any) -> Prediction | pd.DataFrame:
+        """Return the levels that are expected at places, or of links.
 
         Args:
-            links: n links, with the twin's devices; measured ones with the twin's receivers, or
-                `Twin.links`, whose receivers are faultless.
+            places: a data frame with the columns below, or an array (n, 3) of x, y, z [m]; or
+                measurements, whose receivers are taken for faultless. Or `Links` with the twin's
+                devices; measured ones with the twin's receivers.
+            scene: the 3D map; None: the one that the twin was fitted in or loaded with.
+            interval: probability that a level is between `low_db` and `high_db`, where the device
+                is where the twin has it.
+            columns: numbers or arrays: `latitude, longitude` [degrees] or `x_m, y_m`; `height_m`
+                above the scene's datum, or `above_ground_m`; and `device`, a name. Without names,
+                every device at each place.
 
         Returns:
-            of n links.
+            of places a data frame, in the order and with the index of theirs: `device, x_m, y_m,
+            z_m`, `mean_db`, `sd_db`, `low_db`, `high_db` [dB or dBm], `detection_probability`; NaN
+            of a device that the twin has nowhere. Of links a `Prediction`.
+
+        Raises:
+            BadInput: what cannot be used, and what to pass.
         """
+        if isinstance(places, Links):
+            return self._predict(places)
+        if not 0 < interval < 1:
+            raise BadInput(f"interval = {interval:g} is no probability between 0 and 1; 0.9 holds "
+                           "nine levels in ten")
+        world = self._world(scene)
+        self.require_map(world)
+        if isinstance(places, Measurements):
+            places = in_known_frame(places, self.origin, "the twin").table
+        origin = self.origin or (None if world is None else world.origin)
+        names = [each.device for each in self.devices]
+        found = Places.read(places, columns, names, origin, None if world is None else world.city)
+        known = np.isfinite(self.device_m).all(axis=1)[found.device]
+        values = np.full((3, len(known)), np.nan)
+        if known.any():
+            predicted = self._predict(self.links(found.receiver_m[known], found.device[known],
+                                                 world))
+            values[:, known] = (predicted.mean_db, predicted.sd_db,
+                                predicted.detection_probability)
+        mean_db, sd_db, detected = values
+        dof = self.fitted.dof
+        reach_db = student_t.ppf((1 + interval) / 2, dof) * sd_db / sd_of_scale(dof)
+        x_m, y_m, z_m = found.receiver_m.T
+        return pd.DataFrame({
+            "device": np.array(names)[found.device],
+            "x_m": x_m, "y_m": y_m, "z_m": z_m, "mean_db": mean_db, "sd_db": sd_db,
+            "low_db": mean_db - reach_db, "high_db": mean_db + reach_db,
+            "detection_probability": detected}, index=found.index)
+
+    def _world(self, scene: Scene | Path | str | None) -> Scene | None:
+        return self.scene if scene is None else Scene.of(scene)
+
+    def _predict(self, links: Links) -> Prediction:
         size = CHUNK if self.fitted.is_channel_alone else CHUNK_WITH_EFFECTS
         chunks = [links] if len(links) <= size else [
             links.select(slice(start, start + size)) for start in range(0, len(links), size)]
         return Prediction.concatenate([self.fitted.predict(chunk) for chunk in chunks])
 
-    def radio_map(self, scene: Scene) -> RadioMap:
+    def radio_map(self, scene: Scene | Path | str | None = None) -> RadioMap:
         """Return mean and standard deviation of the level over a scene's lattice.
 
         For all devices that have a position, at faultless receivers. The mean is given below
         sensitivity, too; attribute `gain_limit_db` says where detection ends, by the readings where
         these have shown it.
 
+        Args:
+            scene: None: the one that the twin was fitted in or loaded with.
+
         Raises:
             BadInput: the twin was fitted without a 3D map or in another frame, or predicts what no
                 link has.
         """
-        return RadioMap.collect(self.map_stream(scene))
+        world = self._world(scene)
+        if world is None:
+            raise BadInput("a map is over the lattice of a scene; pass one, radio_map(scene), or "
+                           "load the twin with it, Twin.load(folder, scene)")
+        return RadioMap.collect(self.map_stream(world))
 
     def map_stream(self, scene: Scene) -> MapStream:
         """Return the map of `radio_map`, made block by block when it is written.
@@ -228,7 +337,7 @@ class Twin(Summarised):
         def make(device: str, lattice: Lattice) -> dict[str, np.ndarray]:
             receiver_m = lattice.positions_m
             links = self.links(receiver_m, np.full(len(receiver_m), rows[device]), scene)
-            predicted = self.predict(links)
+            predicted = self._predict(links)
             values = {"gain_db": predicted.mean_db - power_dbm[rows[device]], "los": links.los,
                       "sigma_db": predicted.sd_db}
             return {name: value.reshape(lattice.shape) for name, value in values.items()}
@@ -263,8 +372,12 @@ class Twin(Summarised):
             (temporary / TWIN_FILE).write_text(record, encoding="utf-8")
 
     @classmethod
-    def load(cls, folder: Path | str) -> Twin:
+    def load(cls, folder: Path | str, scene: Scene | Path | str | None = None) -> Twin:
         """Read a twin's folder.
+
+        Args:
+            folder: as `save` writes it.
+            scene: that its predictions need, if it was learnt in one.
 
         Raises:
             BadInput: not a twin's folder, a damaged one, or effects that are not installed.
@@ -276,9 +389,10 @@ class Twin(Summarised):
                            "makes one")
         record, channel = (require_within(folder, folder / name, str(folder))
                            for name in (TWIN_FILE, CHANNEL_FILE))
-        return cls.decode(read_text(record, "twin"), read_bytes(channel, "channel model"), path)
+        twin = cls.decode(read_text(record, "twin"), read_bytes(channel, "channel model"), path)
+        return replace(twin, scene=None if scene is None else Scene.of(scene))
 
-    def plot(self, ax: Axes | None = None, *, scene: Scene | None = None,
+    def plot(self, ax: Axes | None = None, *, scene: Scene | Path | str | None = None,
              geographic: bool | None = None) -> Axes:
         """Draw where the devices are; circles hold 90 % of the probability.
 
@@ -293,8 +407,9 @@ class Twin(Summarised):
         Raises:
             BadInput: longitude and latitude are wanted and the origin is not known.
         """
-        origin = self.origin if scene is None else self.origin or scene.config.origin
-        return plot_positions(self.devices, ax, origin, scene, geographic)
+        world = None if scene is None else Scene.of(scene)
+        origin = self.origin if world is None else self.origin or world.origin
+        return plot_positions(self.devices, ax, origin, world, geographic)
 
     def to_geodataframe(self) -> GeoDataFrame:
         """Return a row for each device, with a point in metres of the local frame.
@@ -416,7 +531,7 @@ class Twin(Summarised):
         if with_map and scene is None:
             raise BadInput(f"the twin was made with a 3D map (scene "
                            f"{self.provenance.get('scene', 'unknown')}), and none is given; give "
-                           "it with --scene")
+                           "it with --scene, in Python as scene=")
         if scene is not None and not with_map:
             raise BadInput(f"the twin was made without a 3D map, and cannot use that of "
                            f"{scene.folder}: locate devices without --scene, or run close-loop "

@@ -54,7 +54,7 @@ def test_a_weak_device_is_named_with_its_loss():
     (effect,) = named(loop)
     assert effect.name == "device_gain_offset" and effect.params.members == [2]
     assert loop.parameters[loop.after.whole.effects.index(effect)]["offset_db[d2]"].value == pytest.approx(-6, abs=0.7)
-    (anomaly,) = [each for each in loop.anomalies if each.probability >= 0.9]
+    (anomaly,) = [each for each in loop.found.anomalies if each.probability >= 0.9]
     assert anomaly.members == {"device": ("d2",)} and anomaly.causes["device_gain_offset"] > 0.5
     assert sum(anomaly.causes.values()) == pytest.approx(1)
 
@@ -73,7 +73,7 @@ def test_a_device_that_was_moved_is_found_where_it_went():
     assert effect.name == "device_moved" and effect.params.device == 4
     assert effect.params.flights == ["f3", "f4"]
     assert np.array(effect.params.move_m) == pytest.approx([70, -40], abs=8)
-    assert all(each.causes["device_moved"] > 0.5 for each in loop.anomalies if each.probability >= 0.9)
+    assert all(each.causes["device_moved"] > 0.5 for each in loop.found.anomalies if each.probability >= 0.9)
 
 
 @pytest.mark.slow
@@ -84,4 +84,4 @@ def test_two_faults_are_told_apart():
 
 def test_nothing_is_named_where_nothing_stands_out():
     loop = rt.close_loop(campaign(5), base="log-distance")
-    assert named(loop) == [] and not any(each.causes for each in loop.anomalies)
+    assert named(loop) == [] and not any(each.causes for each in loop.found.anomalies)

@@ -93,7 +93,7 @@ def test_positions_of_unknown_devices_come_from_measurements_only(small_scene, r
     assert np.isnan(location_errors_m(small_scene, Known.anchors(small_scene))).all()
 
 
-@pytest.mark.parametrize("algorithm, guide", [("qmix", "planner"), ("iql", "none"), ("planner", "none"), ("belief", "none"),
+@pytest.mark.parametrize("algorithm, guide", [("qmix", "planner"), ("iql", "none"), ("planner", "none"), ("belief", "none"), ("policy", "none"),
                                               ("greedy", "none")])
 def test_a_stopped_run_ends_as_an_unbroken_one(small_scene, tmp_path, algorithm, guide):
     run = run_settings(algorithm=algorithm, guide=guide, twin="log-distance", seed=1).model_copy(update={

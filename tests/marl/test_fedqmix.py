@@ -63,7 +63,7 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(unbroken):
     assert [line.split()[:2] for line in lines] == [["fedqmix", "NN"], ["qmix", "log-distance"], ["qmix", "the"],
                                                     ["planner", "NN"], ["heuristic", "2"], ["greedy", "2"], ["random", "0"]]
     # Trained in the truth, every episode is a real one, and so are three looks at the policy.
-    assert lines[2].split()[3] == str(80 + 3 * 64)
+    assert lines[2].split()[3:8] == ["0", "+", "80", "+", str(3 * 64)]
     for name in ("config.json", "metrics.csv", "checkpoint.safetensors", "comparison.csv", "curve.png", "trajectories.png",
                  "flight.gif", "flights.csv", "twin/twin.json", "compare/truth/metrics.csv"):
         assert (folder / name).is_file(), name
@@ -132,7 +132,7 @@ def flat(value):
     ("--episodes 0", ["--episodes 0", "≥ 1"]),
     ("--compare true", ["--compare true", "none|twins|truth"]),
     ("--twin magic", ["--twin magic", "nn|log-distance|kriging|raytrace|path-kriging|truth"]),
-    ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|heuristic|planner|belief|random"]),
+    ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|heuristic|policy|planner|belief|random"]),
     ("--fly-again true", ["No such option: --fly-again"]),
     ("--batch 64 --replay 32", ["replay 32", "64"]),
     ("--guide planner --algorithm greedy", ["guide planner", "greedy does not learn"]),

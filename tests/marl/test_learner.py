@@ -65,7 +65,7 @@ def test_a_learner_may_shape_its_reward(city_mission):
 
     flights = evaluate(city_mission, HeuristicPolicy("random", np.random.default_rng(0)), 3, np.random.default_rng(1))
     settings = LearnerSettings(hidden=4, mixing_width=4)
-    usual, half = (made(settings, city_mission, 0)._tensors(flights, city_mission)[4] for made in (QNetworks, Half))
+    usual, half = (made(settings, city_mission, 0)._batch(flights, city_mission).reward for made in (QNetworks, Half))
     assert usual.sum() * settings.reward_scale == pytest.approx(flights.collected.sum(), rel=1e-4)
     np.testing.assert_allclose(half, usual / 2)
 
@@ -117,7 +117,7 @@ def test_only_what_learns_can_be_guided(best_of_many):
 
 def test_an_unknown_learner_is_refused_as_every_other_choice():
     with pytest.raises(BadInput, match=r"--algorithm best-of-many: Input should be 'fedqmix', .* or 'random'; allowed: "
-                                       r"fedqmix\|qmix\|iql\|greedy\|heuristic\|planner\|belief\|random"):
+                                       r"fedqmix\|qmix\|iql\|greedy\|heuristic\|policy\|planner\|belief\|random"):
         settings_of({"algorithm": "best-of-many"})
 
 

@@ -36,7 +36,8 @@ def test_the_agent_matches_its_equations_in_double_precision(slow):
     rng = np.random.default_rng(0)
     seen, last = rng.normal(size=(6, 2, 3, 11)).astype(np.float32), rng.integers(0, 6, (6, 2, 3))
     last[0] = -1
-    values, _ = agent(torch.from_numpy(seen), torch.from_numpy(last))
+    values, _ = agent(torch.from_numpy(seen).flatten(0, 1), torch.from_numpy(last).flatten(0, 1), np.full(6, 2))
+    values = values.unflatten(0, (6, 2))
     for flight in range(2):
         expected = slow.agent_values(weights(agent), seen[:, flight], last[:, flight])
         np.testing.assert_allclose(values[:, flight].detach().numpy(), expected, atol=1e-5)
@@ -45,10 +46,10 @@ def test_the_agent_matches_its_equations_in_double_precision(slow):
 def test_the_agent_walks_slot_by_slot_as_over_the_whole_flight():
     agent = Agent(5, 2, 8, seeded())
     seen, last = torch.randn(7, 3, 2, 5), torch.randint(0, 6, (7, 3, 2))
-    whole, _ = agent(seen, last)
+    whole, _ = agent(seen.flatten(0, 1), last.flatten(0, 1), np.full(7, 3))
     memory, steps = None, []
     for slot in range(7):
-        values, memory = agent(seen[slot:slot + 1], last[slot:slot + 1], memory)
+        values, memory = agent(seen[slot], last[slot], np.array([3]), memory)
         steps.append(values)
     torch.testing.assert_close(torch.cat(steps), whole)
 
@@ -105,7 +106,8 @@ def test_lambda_returns_are_the_weighted_sum_of_n_step_returns(seed, discount, t
     lengths = rng.integers(1, 8, 3)
     reward, best = rng.normal(size=(7, 3)), rng.normal(size=(7, 3))
     valid = (np.arange(7)[:, None] < lengths).astype(float)
-    got = td_lambda_targets(*(torch.from_numpy(array) for array in (reward, best, valid)), discount, td_lambda).numpy()
+    got = td_lambda_targets(*(torch.from_numpy(array)[..., None] for array in (reward, best, valid)), discount,
+                            td_lambda)[..., 0].numpy()
     for e, length in enumerate(lengths):
         for t in range(length):
             returns = []
@@ -205,7 +207,7 @@ def test_flights_of_an_earlier_twin_are_seen_with_the_positions_known_now(tiny):
     mission, flights = tiny(0), flown(tiny(0))
     moved = mission._replace(known_m=mission.known_m + 10.0)
     learner = QNetworks(SETTINGS, mission, 0)
-    before, after = (learner._tensors(flights, each)[0] for each in (mission, moved))
+    before, after = (learner._batch(flights, each).observation for each in (mission, moved))
     assert isinstance(flights, Flights) and not torch.equal(before, after)
     assert torch.equal(before[..., 0], after[..., 0])  # the SNR is what it was
 

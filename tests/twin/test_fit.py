@@ -122,8 +122,8 @@ def test_blanks_far_above_the_limit_of_detection_are_warned_of(small_scene, flow
 
 def test_of_too_many_links_some_of_each_device_are_drawn(monkeypatch):
     device = np.repeat(["a", "b", "c"], [10, 600, 390])
-    table = pd.DataFrame({"device": device, "row": np.arange(1000)})
-    data = Measurements(table, pd.DataFrame({"device": ["a", "b", "c", "never"]}))
+    table = pd.DataFrame({"device": device, "row": np.arange(1000), "x_m": 0.0, "y_m": 0.0, "gain_db": -80.0})
+    data = Measurements(table, pd.DataFrame({"device": ["a", "b", "c", "never"], "x_m": 0.0, "y_m": 0.0}))
     assert fit._thinned(data, 0) is data
     assert fit.MAX_LINKS > 106_455  # no data set that results were recorded of is thinned
     monkeypatch.setattr(fit, "MAX_LINKS", 210)

@@ -38,7 +38,7 @@ def measured(share, length_m, seed):
         level_db = gain_db[number, 0, 0, 0] + sigma_db[number, 0, 0, 0] * unit
         tables.append(pd.DataFrame({"receiver_x_m": x_m, "receiver_y_m": y_m, "receiver_z_m": 50.0, "device": name,
                                     "gain_db": np.where(level_db < LIMIT_DB, np.nan, level_db)}))
-    return radio_map, Measurements(pd.concat(tables, ignore_index=True), pd.DataFrame({"device": ["b", "c", "a"]}))
+    return radio_map, Measurements(pd.concat(tables, ignore_index=True), pd.DataFrame({"device": ["b", "c", "a"], "x_m": 0.0, "y_m": 0.0}))
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -42,7 +42,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     if scene is not None:
         provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}
     # Devices whose position is too uncertain to be learnt from, too: a map with them is better.
-    return replace(model.twin, provenance=provenance, fitted=fitted)
+    return replace(model.twin, provenance=provenance, fitted=fitted, scene=scene)
 
 
 def _sd_db(residual_db: np.ndarray) -> float:

@@ -127,7 +127,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
         "anomalies": [_anomaly(each) | {"same_over": same_over(each, loop.before)}
-                      for each in loop.anomalies],
+                      for each in loop.found.anomalies],
         "posterior": [_step(each) for each in loop.found.steps],
         "detectable": [vars(each) for each in agreeing(
             loop.detectable, {each["name"] for each in effects}, loop.found.steps)],
@@ -297,14 +297,14 @@ def explained_anomalies(loop: Loop) -> list[list[int]]:
     off the residuals of a group that scatters.
     """
     whole, found = loop.after.whole, []
-    if not loop.anomalies:
+    if not loop.found.anomalies:
         return [[] for _ in whole.effects]
     residual_db = whole.links.level_db - loop.before.held_out_mean_db
     for number, effect in enumerate(whole.effects):
         change_db = whole.readings().mean_db - whole.without(number).readings().mean_db
         scatters = whole.model.terms[number].random_effect_sd_db
         shares = [_explained_share(each, residual_db, change_db, scatters)
-                  for each in loop.anomalies]
+                  for each in loop.found.anomalies]
         found.append([index for index, share in enumerate(shares)
                       if share >= AS_LARGE and effect.is_cause and not effect.is_declared])
     return found

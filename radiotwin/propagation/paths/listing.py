@@ -169,7 +169,7 @@ def _joined(parts: list[Rays]) -> Rays:
     return Rays(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
-def list_paths(scene: Scene, points_m: np.ndarray, out_path: Path | str | None = None,
+def list_paths(scene: Scene | Path | str, points_m: np.ndarray, out_path: Path | str | None = None,
                devices: list[str] | None = None, velocity_m_s: ArrayLike | None = None,
                bandwidth_hz: float | None = None) -> xr.Dataset:
     """Follow the paths from a scene's devices to points, and describe each link by them.
@@ -196,7 +196,7 @@ def list_paths(scene: Scene, points_m: np.ndarray, out_path: Path | str | None =
         BadInput: an unknown device, points of another shape, a bandwidth or velocity that is none,
             more paths than the budget, or an output that cannot be written.
     """
-    points_m = np.asarray(points_m, dtype=float)
+    scene, points_m = Scene.of(scene), np.asarray(points_m, dtype=float)
     velocity = None if velocity_m_s is None else np.asarray(velocity_m_s, dtype=float)
     _check(points_m, velocity, bandwidth_hz, out_path)
     index = device_indices(scene, devices)

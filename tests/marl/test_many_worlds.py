@@ -1,0 +1,48 @@
+"""Flights side by side, each in a world of its own: the same as one environment for each."""
+
+import numpy as np
+import pytest
+
+from marl.environment import Environment, ManyWorlds, observe
+from studies.generated import generated_mission, redrawn
+
+
+@pytest.fixture(scope="module")
+def city():
+    return generated_mission(3, devices=8, side_m=(400.0, 300.0))
+
+
+def test_many_worlds_are_as_many_environments(city):
+    rng = np.random.default_rng(0)
+    missions = [redrawn(city, rng) for _ in range(5)]
+    calm = [each._replace(sigma_db=np.zeros_like(each.sigma_db)) for each in missions]
+    worlds = ManyWorlds([calm[0], *calm[:4]], 5, rng)
+    worlds.put(0, calm[4])
+    alone = [Environment(each, 1, rng) for each in (calm[4], *calm[:4])]
+    for each in alone:
+        each.reset()
+    for _ in range(max(each.longest for each in calm)):
+        action = np.full((5, 5), 5)
+        for world, each in enumerate(alone):
+            _, mask = observe(each.mission, each.frame)
+            chance = rng.random(mask[0].shape) * mask[0]
+            action[world, :each.mission.uavs] = chance.argmax(axis=1)
+        together = worlds.step(action)
+        for world, each in enumerate(alone):
+            uavs = each.mission.uavs
+            np.testing.assert_array_equal(together[world, :uavs], each.step(action[world:world + 1, :uavs])[0])
+            np.testing.assert_array_equal(worlds.battery[world, :uavs], each.frame.battery[0])
+            assert not together[world, uavs:].any() and not worlds.battery[world, uavs:].any()
+            for one, other in zip(worlds.frames[world], each.frame):
+                np.testing.assert_array_equal(one, other)
+    assert not worlds.battery.any()
+
+
+def test_one_of_many_worlds_draws_the_shadowing_of_an_environment(city):
+    draws = [np.random.default_rng(7) for _ in range(2)]
+    worlds, alone = ManyWorlds([city], city.uavs, draws[0]), Environment(city, 1, draws[1])
+    alone.reset()
+    hover = np.zeros((1, city.uavs), np.int64)
+    for _ in range(4):
+        np.testing.assert_array_equal(worlds.step(hover), alone.step(hover))
+        np.testing.assert_array_equal(worlds.frames[0].snr_db, alone.frame.snr_db)
