@@ -209,11 +209,11 @@ def count(number: int, noun: str) -> str:
     return f"{number:,} {noun}" + "s" * (number != 1)
 
 
-def some(names: Iterable[str], most: int = 5) -> str:
+def some(names: Iterable[object], most: int = 5) -> str:
     """Return the first names of a list, and how many there are."""
-    names = [str(name) for name in names]
-    more = f", … ({len(names):,} in all)" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    texts = [str(name) for name in names]
+    more = f", … ({len(texts):,} in all)" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + more
 
 
 def span(low: float, high: float, unit: str) -> str:
