@@ -79,20 +79,19 @@ class SlotBySlot(Agent):
     """The agent, walked slot by slot with encoder and head in the loop, as in PyMARL."""
 
     @override
-    def forward(self, observation: torch.Tensor, last_action: torch.Tensor,
+    def forward(self, observation: torch.Tensor, last_action: torch.Tensor, sizes: np.ndarray,
                 memory: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-        slots, flights = observation.shape[:2]
         one_hot = nn.functional.one_hot(last_action.clamp(min=0), ACTION_COUNT)
-        own = torch.eye(self.uavs).expand(slots, flights, -1, -1)
+        own = torch.eye(self.uavs).expand(len(observation), -1, -1)
         one_hot = (one_hot * (last_action >= 0).unsqueeze(-1)).float()
-        inputs = torch.cat([observation, one_hot, own], -1)
-        inputs = inputs.reshape(slots, flights * self.uavs, -1)
-        remembered, values = inputs.new_zeros(flights * self.uavs, self.hidden), []
-        for slot in range(slots):
-            encoded = torch.relu(self.encoder(inputs[slot]))
-            remembered = torch.gru_cell(encoded, remembered, *self.memory.parameters())
+        inputs = torch.cat([observation, one_hot, own], -1).flatten(0, 1)
+        remembered, values = inputs.new_zeros(int(sizes[0]) * self.uavs, self.hidden), []
+        for rows in inputs.split((self.uavs * sizes).tolist()):
+            encoded = torch.relu(self.encoder(rows))
+            remembered = torch.gru_cell(encoded, remembered[:len(rows)],
+                                        *self.memory.parameters())
             values.append(self.head(remembered))
-        return torch.stack(values).reshape(slots, flights, self.uavs, ACTION_COUNT), remembered
+        return torch.cat(values).unflatten(0, (-1, self.uavs)), remembered
 
 
 def _update(rng: np.random.Generator, scene: Scene, settings: dict) -> dict[str, float]:

@@ -266,16 +266,21 @@ def close_loop(
     if base == "raytrace":
         notice(f"the twin will follow paths, {NOT_BY_PATHS}")
     minutes = expected_cpu_s(len(data), world is not None) / 60
-    notice(f"{len(data):,} links: usually {minutes / 2:.1f} to {2 * minutes:.1f} min of processor "
-           "time, more where other work runs")
+    expected = (f"{len(data):,} links: usually {minutes / 2:.1f} to {2 * minutes:.1f} min of "
+                "processor time, more where other work runs")
     inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
     # Two workers are no faster than the threads of one process: they are for who asks for them.
     some = "1" if workers == AUTO and cluster is None else workers
     with keep_pieces() as pieces, open_executor(some, cluster, notice) as executor, \
             progress("closing the loop", total=None, lines=True) as advance:
-        loop = run(data, world, base, seed,
-                   lambda text: advance(1, "; ".join(filter(None, [text, pieces.progress]))),
-                   hold_out, executor=executor)
+        def show(text: str) -> None:
+            nonlocal expected
+            if expected:  # said once the data have been accepted
+                notice(expected)
+                expected = ""
+            advance(1, "; ".join(filter(None, [text, pieces.progress])))
+
+        loop = run(data, world, base, seed, show, hold_out, executor=executor)
         advance(1, "other models, and the combination of all")
         report = write_closeloop_folder(loop, world, out, inputs=inputs,
                                         title=f"Close-loop report of {measurements.name}")

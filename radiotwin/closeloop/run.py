@@ -247,6 +247,7 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
         all_links = stand_anchors(all_links, scene, refuse=base != LogDistanceBase.name)
     links = limits_to_explain(thin_links(all_links, seed))
     folds = make_folds(links, seed, hold_out)
+    on_progress("fitting the base")
     links, fitted, model = fit_base(links, scene, folds, base, seed, on_progress)
     effects = tuple(effect() for effect in catalogue()
                     if not (effect.in_paths and model.whole.channel.follows_paths))
