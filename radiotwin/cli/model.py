@@ -242,8 +242,8 @@ def close_loop(
         check_corrected_target,
         write_corrected_scene,
     )
+    from radiotwin.closeloop.run import BASE_FITTED, expected_cpu_s
     from radiotwin.closeloop.run import close_loop as run
-    from radiotwin.closeloop.run import expected_cpu_s
     from radiotwin.links.measurements import read_measurements
     from radiotwin.report import (
         check_closeloop_folder,
@@ -274,10 +274,8 @@ def close_loop(
     with keep_pieces() as pieces, open_executor(some, cluster, notice) as executor, \
             progress("closing the loop", total=None, lines=True) as advance:
         def show(text: str) -> None:
-            nonlocal expected
-            if expected:  # said once the data have been accepted
+            if text == BASE_FITTED:
                 notice(expected)
-                expected = ""
             advance(1, "; ".join(filter(None, [text, pieces.progress])))
 
         loop = run(data, world, base, seed, show, hold_out, executor=executor)

@@ -61,6 +61,7 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 
+BASE_FITTED = "looking at the residual"  # what is done once the data have been accepted
 FIXED_CPU_S, LINKS_A_CPU_S, LINKS_A_CPU_S_ON_MAP = 45.0, 220.0, 120.0  # see `expected_cpu_s`
 
 
@@ -247,14 +248,13 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
         all_links = stand_anchors(all_links, scene, refuse=base != LogDistanceBase.name)
     links = limits_to_explain(thin_links(all_links, seed))
     folds = make_folds(links, seed, hold_out)
-    on_progress("fitting the base")
     links, fitted, model = fit_base(links, scene, folds, base, seed, on_progress)
     effects = tuple(effect() for effect in catalogue()
                     if not (effect.in_paths and model.whole.channel.follows_paths))
     inputs = SearchInputs(links, fitted, folds, effects, criteria, seed,
                           executor or Executor(), on_progress)
     declared = search(SearchState(model), [add_declared], inputs)
-    on_progress("looking at the residual")
+    on_progress(BASE_FITTED)
     declared = replace(declared, anomalies=tuple(scan(declared.model)))
     before = after = dependences(declared.model, seed)
     found = search(declared, [add_causes_of_anomalies, add_faults, add_changes, add_causes,

@@ -144,11 +144,11 @@ class _LawParameter(_Strict):
     """A row of `radiotwin.twin.law.COLUMNS`."""
 
     links: Literal["all", "LoS", "NLoS"]
-    parameter: Annotated[str, Field(max_length=40)]
+    parameter: str
     value: Real
     low: Real | None
     high: Real | None
-    unit: Annotated[str, Field(max_length=10)]
+    unit: str
 
 
 class _Provenance(BaseModel):

@@ -45,11 +45,11 @@ def test_a_file_and_a_table_of_devices_are_enough(run, tmp_path):
     shown = run("report result", tmp_path)
     assert shown.returncode == 0 and "no scene" in shown.stdout, shown.stderr
     whole = (tmp_path / "result" / "report.html").read_text()
-    assert "receiver_gain_offset" in whole and not re.search(r'<[^>]*(?:src|href)="(?!data:)', whole)
+    assert "Receiver gain offset" in whole and not re.search(r'<[^>]*(?:src|href)="(?!data:)', whole)
     reasons = {candidate["name"]: candidate["reason"] for candidate in report["candidates"]}
     assert "heading" in reasons["body_shadowing"] and "frequency" in reasons["missing_obstacle"]
     page = (tmp_path / "result" / "closeloop.html").read_text()
-    assert page.count("data:image/png;base64,") == 5 and "receiver_gain_offset" in page
+    assert page.count("data:image/png;base64,") == 5 and "Receiver gain offset" in page
     assert not re.search(r'(?:src|href)="(?!data:)', page)  # nothing from a network
 
 

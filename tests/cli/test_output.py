@@ -141,7 +141,7 @@ def test_planning_has_the_same_options(small_scene, tmp_path):
     done = run_planning(arguments, tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["tables"][0]["rows"]
-    assert [row["method"] for row in rows] == ["random", "planner", "heuristic", "greedy"]
+    assert [row["method"] for row in rows] == ["random", "planner", "heuristic", "greedy", "clairvoyant"]
 
 
 @pytest.mark.parametrize("given", [None, "2"])

@@ -116,8 +116,8 @@ def test_without_exploration_the_feasible_action_of_greatest_value_is_flown(city
         frames = type(flights.frames)(*(array[e] for array in flights.frames))
         observation, mask = observe(city_mission, frames)
         last = np.concatenate([np.full((1, city_mission.uavs), -1), flights.action[e, :-1]]).astype(np.int64)
-        values, _ = agent(torch.from_numpy(observation)[:, None], torch.from_numpy(last)[:, None])
-        best = np.where(mask, values[:, 0].detach().numpy(), -np.inf).argmax(-1)
+        values, _ = agent(torch.from_numpy(observation), torch.from_numpy(last), np.ones(len(last), dtype=np.int64))
+        best = np.where(mask, values.detach().numpy(), -np.inf).argmax(-1)
         np.testing.assert_array_equal(flights.action[e, :flights.length[e]], best[:flights.length[e]])
 
 
