@@ -112,7 +112,8 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
 
 
 def _cards(report: dict) -> list[tuple[str, str]]:
-    before, after = (number(report["error"][when].get("rmse_db")) for when in ("before", "after"))
+    error = report["error"]
+    before, after = number(error["before"].get("rmse_db")), number(words.rmse_after_db(error))
     unchanged = before == after and not report["effects"]
     cards = [("verdict", words.verdict(report)),
              ("RMSE, before and after", (before if unchanged else f"{before} → {after}") + " dB")]

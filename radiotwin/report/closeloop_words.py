@@ -237,13 +237,18 @@ def _side_by_side(found: dict) -> str:
             f"{first} {both}")
 
 
+def rmse_after_db(error: dict) -> float:
+    """Return the RMSE after [dB], of the links that the RMSE before is of."""
+    return (error.get("after_same_links") or error["after"]).get("rmse_db")
+
+
 def _effect(report: dict) -> str:
     error = report["error"]
     without_cause = interpolations()
     explained = [each["heldout_rmse_db"] for each in report["candidates"]
                  if each["kept"] and each["name"] not in without_cause]
     interpolated = _has_interpolation(report)
-    after = explained[-1] if explained and interpolated else error["after"]["rmse_db"]
+    after = explained[-1] if explained and interpolated else rmse_after_db(error)
     found = causes(report)
     it = "it" if len(found) == 1 else "them"  # one kind may have been found twice
     known = [each["probability"] for each in found if each.get("probability") is not None]

@@ -108,6 +108,9 @@ def make_report(loop: Loop) -> dict[str, Any]:
     links = loop.after.links
     error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),
                              "noise_floor_db": loop.noise_floor_db}
+    both = np.isfinite(loop.before.on_map[0]) & np.isfinite(links.level_db)
+    if error["before"]["n"] != error["after"]["n"]:  # a device could be located only afterwards
+        error["after_same_links"] = scores(loop.after, both)
     if loop.after.reads_quality:
         error["after_with_quality"] = _scores(links.level_db, loop.after.held_out_mean_db,
                                               loop.after.held_out_nll)

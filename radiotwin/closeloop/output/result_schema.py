@@ -36,6 +36,7 @@ class ErrorRecord(BothRecord):
 
     combined: ScoresRecord | None = None
     map: ScoresRecord | None = None
+    after_same_links: ScoresRecord | None = None  # of those that `before` has errors of
     after_with_quality: ScoresRecord | None = None
     noise_floor_db: Real | None
     by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)
