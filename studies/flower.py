@@ -87,7 +87,7 @@ def _parties(folder: Path, seed: int, flights: int) -> list[Party]:
                           pattern="random-waypoint", seed=1000 + seed)
     path = folder / "survey" / "measurements.csv"
     path.parent.mkdir()
-    measured.write(path)
+    measured.save(path)
     return [Party(each, folder / "parties" / str(index), index, "traced",
                   path if index == MEASURED else None) for index, each in enumerate(scenes)]
 

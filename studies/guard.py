@@ -137,7 +137,7 @@ def write_inputs(inputs: Path) -> None:
         folder = inputs / name.replace(":", "-")
         hidden = foreign_case(name) if name in FOREIGN else case(
             name.split(":")[0], int(name.split(":")[1]))
-        thinned(hidden.measurements, 1 if name in FOREIGN else THIN).write(
+        thinned(hidden.measurements, 1 if name in FOREIGN else THIN).save(
             folder / "measurements.csv")
         shutil.copytree(hidden.scene.folder, folder / "scene", dirs_exist_ok=True)
     shutil.copytree(ROOT / "examples" / "campaign", inputs / "campaign")
@@ -145,7 +145,7 @@ def write_inputs(inputs: Path) -> None:
     scene = Scene.load(inputs / "rbm" / "scene")
     survey = fly_survey(scene, RadioMap.load(ROOT / "scenes" / "rbm" / "truth.nc"), flights=3,
                         pattern="random-waypoint", seed=0)
-    survey.write(inputs / "rbm" / "measurements.csv")
+    survey.save(inputs / "rbm" / "measurements.csv")
     if (DATA / "powder_frs").is_dir():
         write_powder(inputs / "powder")
     if (DATA / "duke_cbrs" / "map.osm").is_file():
@@ -192,7 +192,7 @@ def write_campus(inputs: Path) -> None:
         (DATA / "duke_cbrs" / "raw.csv.gz").read_bytes()))
     with campus() as (measurements, scene):
         table = one_in_each_cell(measurements.table, CELL_M, ("device",), seed=0)
-        replace(measurements, table=table).write(inputs / "campus" / "measurements.csv")
+        replace(measurements, table=table).save(inputs / "campus" / "measurements.csv")
         shutil.copytree(scene.folder, inputs / "campus" / "scene")
 
 

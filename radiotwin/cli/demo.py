@@ -46,7 +46,7 @@ def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed:
     write_picture(truth, scene, folder / "truth.png")
     on_progress(f"3 flying {FLIGHTS} flights of {len(scene.config.uavs)} UAVs")
     measurements = fly_survey(scene, truth, flights=FLIGHTS, pattern="random-waypoint", seed=seed)
-    measurements.write(folder / "survey" / "measurements.csv.gz")
+    measurements.save(folder / "survey" / "measurements.csv.gz")
     on_progress(f"4 learning four channel models from {FLIGHTS - HELD_OUT} flights, and finding "
                 "the unknown devices")
     train, test = split_flights(measurements, HELD_OUT)

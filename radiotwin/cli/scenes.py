@@ -469,7 +469,7 @@ def survey(
     keep_others(out, force, "flight", "receiver", "receiver_x_m", "device", "gain_db")
     measurements = fly_survey(scene, read_truth(scene, truth), flights=flights, pattern=pattern,
                               seed=seed, noise_db=noise_db)
-    measurements.write(out)
+    measurements.save(out)
     missed = int(measurements.table["gain_db"].isna().sum())
     say(f"wrote {out}: {len(measurements.flights)} flights, {len(measurements.table)} links to "
         f"{len(measurements.devices)} devices ({int(measurements.is_anchor.sum())} anchors), "

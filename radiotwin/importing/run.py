@@ -242,7 +242,7 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
     used = settings.model_copy(update={"origin": positioned.origin,
                                        "format": settings.format or logs.format})
     with atomic_folder(out) as folder:
-        measurements.write(folder / ("measurements.csv.gz" if compress else "measurements.csv"))
+        measurements.save(folder / ("measurements.csv.gz" if compress else "measurements.csv"))
         write_settings(used, folder / "import.toml", out)
         text = json.dumps(report, indent=1, ensure_ascii=False)
         (folder / "import.json").write_text(text + "\n", "utf-8")

@@ -276,8 +276,6 @@ class Measurements(Summarised):
             else:
                 write_csv(self.table, links)
 
-    write = save  # the name of version 0.1
-
     def plot(self, device: str | None = None, ax: "Axes | None" = None, *,
              scene: "Scene | None" = None, geographic: bool | None = None) -> "Axes":
         """Draw the levels of a device's links at the end that moves.

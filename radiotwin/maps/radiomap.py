@@ -371,8 +371,6 @@ class RadioMap(OverDevices):
         write_parts(self.header, {name: self.dataset[name].dtype for name in self.variables},
                     self.blocks(), path)
 
-    write = save  # the name of version 0.1
-
     def require_of(self, scene: Scene) -> None:
         """Raise BadInput unless the map was made for a scene as it is now, with all its devices."""
         known = set(self.devices)

@@ -215,7 +215,7 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
     if finished is not None:
         placed = finished.placed(scene.config.origin)  # the origin does not change the gains
         if placed.dataset.attrs != finished.dataset.attrs:
-            placed.write(out_path)
+            placed.save(out_path)
         return placed
     executor = executor or Executor()
     raw_db = solve_lattice(scene, settings, store, index, executor)
@@ -260,7 +260,7 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
                   **library_versions(), "radiotwin_version": version("radiotwin")}
     radio_map = RadioMap.build(names, scene.lattice, gain_db, los, attributes=attributes)
     radio_map = radio_map.placed(scene.config.origin)
-    radio_map.write(out_path)
+    radio_map.save(out_path)
     return radio_map
 
 

@@ -87,7 +87,7 @@ def test_all_links_nlos(run, here):
     from radiotwin.scene import Scene
     scene = Scene.load(here / "scene")
     seen = scene.city.line_of_sight(scene.device_m[measurements.device_index], measurements.receiver_m)
-    measurements.select(~seen).write(here / "measurements.csv")
+    measurements.select(~seen).save(here / "measurements.csv")
     refuse(run, FIT, here, "all links NLoS", "log_distance")
 
 

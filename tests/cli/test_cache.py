@@ -49,7 +49,7 @@ def test_without_a_cache_it_is_empty(run, own_cache, tmp_path):
 @pytest.fixture
 def flown(small_scene, tmp_path):
     fly_survey(small_scene, segmented_truth(small_scene), flights=2, pattern="random-waypoint", seed=0,
-               noise_db=0.0).write(tmp_path / "m.csv")
+               noise_db=0.0).save(tmp_path / "m.csv")
     return tmp_path / "m.csv"
 
 

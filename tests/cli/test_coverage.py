@@ -116,7 +116,7 @@ def test_a_mistake_is_one_message_and_nothing_is_written(run, town, tmp_path, wh
     (tmp_path / "plain.csv").write_text("device,x_m,y_m,z_m\nmast,0,0,40\n")
     lattice = Scene.load(town / "scene").lattice
     RadioMap.build(["d"], lattice, np.zeros((1, lattice.positions_m.shape[0])) - 90,
-                   np.ones((1, lattice.positions_m.shape[0]))).write(tmp_path / "map.nc")
+                   np.ones((1, lattice.positions_m.shape[0]))).save(tmp_path / "map.nc")
     feature = {"type": "Feature", "properties": {"name": "far"}}
     for name, geometry in (("points", {"type": "Point", "coordinates": [8, 47]}),
                            ("metres", {"type": "Polygon", "coordinates": [[[5e5, 6e6], [6e5, 6e6], [6e5, 7e6], [5e5, 6e6]]]}),

@@ -24,8 +24,8 @@ def folder(run, tmp_path_factory):
         result = run(line, cwd=folder)
         assert result.returncode == 0, result.stderr
     here = read_measurements(folder / "here" / "measurements.csv")
-    here.in_frame(ELSEWHERE).write(folder / "there" / "measurements.csv")
-    here.in_frame(ELSEWHERE).write(folder / "nowhere" / "measurements.csv")
+    here.in_frame(ELSEWHERE).save(folder / "there" / "measurements.csv")
+    here.in_frame(ELSEWHERE).save(folder / "nowhere" / "measurements.csv")
     (folder / "nowhere" / "frame.toml").unlink()
     return folder
 

@@ -53,7 +53,7 @@ def inputs(small_scene, tmp_path_factory, run):
     origin = "[origin]\nlatitude_deg = 47.5\nlongitude_deg = 8.7\n[mission]"
     toml.write_text(toml.read_text().replace("[mission]", origin))
     truth = segmented_truth(small_scene)
-    fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).write(folder / "m.csv")
+    fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).save(folder / "m.csv")
     assert run("fit m.csv --scene scene --model log_distance -o twin", folder).returncode == 0
     (folder / "import.toml").write_text(IMPORT)
     stored = Path(__file__).parents[1] / "twin" / "stored"

@@ -21,7 +21,7 @@ def folder(small_scene, tmp_path):
     lattice = small_scene.lattice
     gain_db = -60 - np.arange(2 * np.prod(lattice.shape)) / 100
     radio_map = RadioMap.build(["d0", "d1"], lattice, gain_db, gain_db > -70, attributes={"source": "test"})
-    radio_map.write(tmp_path / "map.nc")
+    radio_map.save(tmp_path / "map.nc")
     return tmp_path
 
 
@@ -65,7 +65,7 @@ def test_a_map_of_another_scene_is_warned_of_and_one_of_another_place_is_refused
             ("another", 47.5, 0, "was made for another scene than scene"),
             ("another", 40.0, 2, "latitude_deg is 40, that of scene is 47.5")):
         radio_map.dataset.attrs |= {"scene_hash": hash_, "origin_latitude_deg": latitude_deg}
-        radio_map.write(folder / "other.nc")
+        radio_map.save(folder / "other.nc")
         result = run("map other.nc --scene scene -o other.tif", cwd=folder)
         assert result.returncode == status and arguments in " ".join(result.stderr.split()), result.stderr
         assert bool(result.stderr.strip()) == bool(arguments) and (folder / "other.tif").exists() == (status == 0)

@@ -59,7 +59,7 @@ def measured():
 
 
 def test_a_table_keeps_its_origin(measured, tmp_path):
-    measured.write(tmp_path / "m" / "measurements.csv")
+    measured.save(tmp_path / "m" / "measurements.csv")
     again = read_measurements(tmp_path / "m" / "measurements.csv")
     assert again.origin == HERE and again.select([True, False]).origin == HERE
     moved = again.in_frame(THERE)
@@ -70,18 +70,18 @@ def test_a_table_keeps_its_origin(measured, tmp_path):
 
 
 def test_devices_of_another_folder_are_converted(measured, tmp_path):
-    measured.write(tmp_path / "here" / "measurements.csv")
-    measured.in_frame(THERE).write(tmp_path / "there" / "measurements.csv")
+    measured.save(tmp_path / "here" / "measurements.csv")
+    measured.in_frame(THERE).save(tmp_path / "there" / "measurements.csv")
     both = read_measurements(tmp_path / "here" / "measurements.csv", tmp_path / "there" / "devices.csv")
     np.testing.assert_allclose(both.device_m, measured.device_m, atol=1e-5)
 
 
 def test_a_folder_is_of_one_frame(measured, tmp_path):
-    measured.write(tmp_path / "measurements.csv")
-    measured.write(tmp_path / "more.csv")
+    measured.save(tmp_path / "measurements.csv")
+    measured.save(tmp_path / "more.csv")
     for other in (measured.in_frame(THERE), Measurements(measured.table, measured.devices)):
         with pytest.raises(BadInput, match="choose another output folder"):
-            other.write(tmp_path / "other.csv")
+            other.save(tmp_path / "other.csv")
     assert not (tmp_path / "other.csv").exists()
 
 
@@ -99,7 +99,7 @@ def test_a_bad_frame_is_refused(tmp_path, what):
 
 
 def test_a_frame_that_leads_out_of_its_folder_is_refused(tmp_path, measured):
-    measured.write(tmp_path / "secret" / "measurements.csv")
+    measured.save(tmp_path / "secret" / "measurements.csv")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / FRAME_FILE).symlink_to(tmp_path / "secret" / FRAME_FILE)
     with pytest.raises(BadInput, match="out of its folder"):

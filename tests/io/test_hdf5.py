@@ -19,7 +19,7 @@ LATTICE = Lattice.over(0, 40, 0, 20, 20, [50, 60])
 @pytest.fixture
 def path(tmp_path):
     gain_db = -np.arange(24, dtype=float).reshape(2, 2, 2, 3)
-    RadioMap.build(["a", "b"], LATTICE, gain_db, gain_db > -10).write(tmp_path / "map.nc")
+    RadioMap.build(["a", "b"], LATTICE, gain_db, gain_db > -10).save(tmp_path / "map.nc")
     return tmp_path / "map.nc"
 
 

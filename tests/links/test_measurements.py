@@ -41,7 +41,7 @@ def test_written_and_read_again_is_the_same(write, tmp_path, suffix):
         pytest.importorskip("pyarrow")
     measurements = read_measurements(write(HEADER + ROWS))
     path = tmp_path / "again" / f"m{suffix}"
-    measurements.write(path)
+    measurements.save(path)
     again = read_measurements(path)
     np.testing.assert_array_equal(again.level_db, measurements.level_db)
     np.testing.assert_array_equal(again.receiver_m, measurements.receiver_m)
@@ -188,7 +188,7 @@ def test_a_missing_table_of_devices_says_what_it_needs(write):
 def test_links_do_not_take_the_name_of_the_devices(write, tmp_path):
     measurements = read_measurements(write(HEADER + ROWS))
     with pytest.raises(BadInput, match="give the links another name"):
-        measurements.write(tmp_path / "new" / "devices.csv")
+        measurements.save(tmp_path / "new" / "devices.csv")
     assert not (tmp_path / "new").exists()
 
 
@@ -199,10 +199,10 @@ def test_a_table_of_other_devices_is_not_overwritten(write, tmp_path, other):
     devices = tmp_path / "out" / "devices.csv"
     devices.write_text(other)
     with pytest.raises(BadInput, match="is not overwritten"):
-        measurements.write(tmp_path / "out" / "m.csv")
+        measurements.save(tmp_path / "out" / "m.csv")
     assert devices.read_text() == other and list((tmp_path / "out").iterdir()) == [devices]
     devices.write_text("device,x_m,y_m,z_m,role\nb,,,9,unknown\na,1,2,3,anchor\n")
-    measurements.write(tmp_path / "out" / "m.csv")
+    measurements.save(tmp_path / "out" / "m.csv")
     assert read_measurements(tmp_path / "out" / "m.csv").devices.equals(measurements.devices)
 
 
@@ -241,7 +241,7 @@ def test_names_of_any_other_kind_survive(write, tmp_path):
     measurements = read_measurements(write(HEADER + rows, devices.replace("'=x", "''=x")))
     assert list(measurements.devices["device"]) == names[1:]
     for suffix in (".csv", ".csv.gz"):
-        measurements.write(tmp_path / "again" / f"m{suffix}")
+        measurements.save(tmp_path / "again" / f"m{suffix}")
         again = read_measurements(tmp_path / "again" / f"m{suffix}")
         assert again.table.equals(measurements.table) and again.devices.equals(measurements.devices)
 

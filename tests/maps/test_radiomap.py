@@ -20,7 +20,7 @@ def example() -> RadioMap:
 
 
 def test_a_map_comes_back_from_its_file_as_it_was(tmp_path):
-    example().write(tmp_path / "map.nc")
+    example().save(tmp_path / "map.nc")
     again = RadioMap.load(tmp_path / "map.nc")
     xr.testing.assert_identical(again.dataset, example().dataset)
     assert again.devices == ["a", "b"]
@@ -29,7 +29,7 @@ def test_a_map_comes_back_from_its_file_as_it_was(tmp_path):
 
 
 def test_a_map_whose_name_is_in_capitals(tmp_path):
-    example().write(tmp_path / "MAP.NC")
+    example().save(tmp_path / "MAP.NC")
     with open_model(tmp_path / "MAP.NC") as radio_map:
         assert radio_map.devices == ["a", "b"]
 
@@ -42,7 +42,7 @@ def test_values_lie_where_the_lattice_says():
 
 
 def test_units_are_in_the_file(tmp_path):
-    example().write(tmp_path / "map.nc")
+    example().save(tmp_path / "map.nc")
     with xr.open_dataset(tmp_path / "map.nc", engine="h5netcdf") as dataset:
         assert dataset["gain_db"].attrs["units"] == "dB" and dataset["x"].attrs["units"] == "m"
 
@@ -50,7 +50,7 @@ def test_units_are_in_the_file(tmp_path):
 def test_what_is_not_a_radio_map_is_bad_input(tmp_path):
     with pytest.raises(BadInput, match="does not exist"):
         RadioMap.load(tmp_path / "no.nc")
-    example().write(tmp_path / "map.nc")
+    example().save(tmp_path / "map.nc")
     data = (tmp_path / "map.nc").read_bytes()
     (tmp_path / "half.nc").write_bytes(data[: len(data) // 2])
     with pytest.raises(BadInput, match="not a readable NetCDF-4 file"):
@@ -98,7 +98,7 @@ def test_a_part_that_is_not_as_it_must_be_is_named(tmp_path, change, message):
 
 def test_one_position_is_a_map_too(tmp_path):
     one = Lattice.over(0, 10, 0, 10, 20, [50])
-    RadioMap.build(["a"], one, np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1))).write(tmp_path / "map.nc")
+    RadioMap.build(["a"], one, np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1))).save(tmp_path / "map.nc")
     assert RadioMap.load(tmp_path / "map.nc").lattice.shape == (1, 1, 1)
 
 

@@ -127,7 +127,7 @@ def test_a_party_that_missed_rounds_goes_on(shared, parties):
 def test_a_party_with_measurements_flies_nothing(small_scene, shared, tmp_path):
     truth = segmented_truth(small_scene)
     path = tmp_path / "measurements.csv"
-    fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=3).write(path)
+    fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=3).save(path)
     party = Party(small_scene.folder, tmp_path / "out", 0, "segmented", path)
     client = Client(shared.run, shared.learner, party)
     weights, episodes = client.train(1, initial_weights(shared))

@@ -24,9 +24,9 @@ def run_folder(small_scene, tmp_path_factory):
     truth = segmented_truth(scene)
     dataset = truth.dataset.copy(deep=True)
     dataset["gain_db"] = dataset["gain_db"].where(dataset["gain_db"] > -100.0)
-    RadioMap(dataset).write(folder / "scene" / "truth.nc")
+    RadioMap(dataset).save(folder / "scene" / "truth.nc")
     measurements = fly_survey(scene, truth, flights=2, pattern="random-waypoint", seed=0, noise_db=0.0)
-    measurements.write(folder / "survey" / "measurements.csv.gz")
+    measurements.save(folder / "survey" / "measurements.csv.gz")
     fit_twin(measurements, scene, model="log_distance", seed=0).save(folder / "twin")
     return folder
 

@@ -77,7 +77,7 @@ def hostile(run_folder, server, tmp_path_factory):
     truth = RadioMap.load(folder / "scene" / "truth.nc")
     names = [name + in_names for name in truth.devices]
     hostile = RadioMap(truth.dataset.assign_coords(device=np.array(names, dtype=object)).assign_attrs(source=attack))
-    hostile.write(folder / "map.nc")
+    hostile.save(folder / "map.nc")
     (folder / "map.nc").rename(folder / f"{attack.replace('/', '')[:200]}.nc")
     for name in ("survey/measurements.csv.gz", "survey/devices.csv"):
         table = pd.read_csv(folder / name)

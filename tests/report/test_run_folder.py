@@ -46,7 +46,7 @@ def test_a_rejected_truth_is_not_shown_by_another_way_nor_maps_over_other_lattic
     path.write_text(path.read_text().replace("tx_power_dbm = 0.0", "tx_power_dbm = 3.0"))
     truth = RadioMap.load(folder / "truth.nc")
     smaller = RadioMap(truth.dataset.isel(x=slice(1, None)))
-    smaller.write(folder / "part.nc")
+    smaller.save(folder / "part.nc")
     run = read_run(folder)
     assert not run.maps and [note.split(" is not shown")[0] for note in run.notes] == [
         str(folder / "truth.nc"), str(folder / "part.nc")]

@@ -60,7 +60,7 @@ def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(run, tmp
     hidden = data.devices.copy()
     hidden.loc[4, ["x_m", "y_m"]] = np.nan
     hidden.loc[4, "role"] = "unknown"
-    Measurements(data.table, hidden).write(tmp_path / "flight" / "measurements.csv")
+    Measurements(data.table, hidden).save(tmp_path / "flight" / "measurements.csv")
     data.devices.to_csv(tmp_path / "truth.csv", index=False)
     done = run("close-loop flight/measurements.csv -o loop", tmp_path)
     assert done.returncode == 0, done.stderr
@@ -78,7 +78,7 @@ def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(run, tmp
     ("anchor", "loop/twin", "role unknown"), ("unknown", "nowhere", "not a twin")])
 def test_bad_input_is_one_message(run, tmp_path, open_ground, role, twin, message, monkeypatch, quick_report):
     data = open_ground.measured(open_ground.fly(13))
-    data.write(tmp_path / "flight" / "measurements.csv")
+    data.save(tmp_path / "flight" / "measurements.csv")
     if role == "anchor":
         monkeypatch.setattr("radiotwin.closeloop.run.catalogue", list)  # whatever the loop would find
         loop = close_loop(data, base="log-distance")
@@ -91,15 +91,15 @@ def test_bad_input_is_one_message(run, tmp_path, open_ground, role, twin, messag
 @pytest.mark.parametrize("model", ["segmented_log_distance", "regression_kriging", "raytrace"])
 def test_a_twin_of_fit_locates_a_device_that_it_has_not_seen(run, tmp_path, small_scene, model):
     truth = segmented_truth(small_scene)
-    fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).write(tmp_path / "all" / "measurements.csv")
+    fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).save(tmp_path / "all" / "measurements.csv")
     data = read_measurements(tmp_path / "all" / "measurements.csv")
     anchors = np.flatnonzero(data.is_anchor)
     lost = data.devices["device"][anchors[-1]]
-    data.select(data.table["device"].to_numpy() != lost).write(tmp_path / "known" / "measurements.csv")
+    data.select(data.table["device"].to_numpy() != lost).save(tmp_path / "known" / "measurements.csv")
     hidden = data.devices.copy()
     hidden.loc[anchors[-1], ["x_m", "y_m"]] = np.nan
     hidden.loc[anchors[-1], "role"] = "unknown"
-    Measurements(data.select(data.table["device"].to_numpy() == lost).table, hidden).write(tmp_path / "new" / "measurements.csv")
+    Measurements(data.select(data.table["device"].to_numpy() == lost).table, hidden).save(tmp_path / "new" / "measurements.csv")
     done = run(f"fit known/measurements.csv --scene {small_scene.folder} --model {model} -o twin", tmp_path)
     assert done.returncode == 0, done.stderr
     done = run(f"locate new/measurements.csv --scene {small_scene.folder} --twin twin -o located.csv", tmp_path)

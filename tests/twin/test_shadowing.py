@@ -64,7 +64,7 @@ def test_the_correlation_of_an_interpolating_twin_is_that_of_its_own_field(small
         assert "shadowing_share" not in radio_map.dataset.attrs
         if model == "regression_kriging":
             twin.channel.field.share, twin.channel.field.length_m = 0.7, 70.0
-            with_shadowing(radio_map, twin, measurements, -120.0, 0).write(tmp_path / "map.nc")
+            with_shadowing(radio_map, twin, measurements, -120.0, 0).save(tmp_path / "map.nc")
             attributes = RadioMap.load(tmp_path / "map.nc").dataset.attrs
             assert (attributes["shadowing_share"], attributes["shadowing_length_m"]) == (0.7, 70.0)
 

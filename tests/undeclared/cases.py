@@ -131,7 +131,7 @@ def _devices(where: World) -> pd.DataFrame:
 def write(family: str, seed: int, folder: Path) -> None:
     """Write what a user would have of a case: `measurements.csv`, `devices.csv` and the folder `scene`."""
     one = case(family, seed)
-    one.measurements.write(folder / "measurements.csv")
+    one.measurements.save(folder / "measurements.csv")
     shutil.copytree(one.scene.folder, folder / "scene", dirs_exist_ok=True)
 
 

@@ -212,7 +212,7 @@ def test_cases_differ_and_noise_is_drawn_for_each():
 
 def test_a_case_can_be_written_and_read(tmp_path):
     before = case("device_position_error", 0).measurements
-    before.write(tmp_path / "measurements.csv.gz")
+    before.save(tmp_path / "measurements.csv.gz")
     after = read_measurements(tmp_path / "measurements.csv.gz")
     np.testing.assert_allclose(after.level_db, before.level_db)
 

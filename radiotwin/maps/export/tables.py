@@ -32,7 +32,7 @@ def write_dataset(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
     """Write NetCDF-4 or Zarr after the CF conventions, with the scene's origin."""
     placed = radio_map.placed(scene.config.origin)
     if isinstance(placed, RadioMap):
-        placed.write(path)
+        placed.save(path)
         return
     dtypes = {name: np.dtype(bool if name == "los" else np.float32) for name in placed.variables}
     write_parts(placed.header, dtypes, placed.blocks(), path)

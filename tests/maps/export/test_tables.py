@@ -27,7 +27,7 @@ def test_netcdf_follows_the_conventions(radio_map, scene, tmp_path):
     again = RadioMap.load(path)
     assert again.dataset.attrs["origin_latitude_deg"] == 47.5 and set(again.dataset.data_vars) == {
         "gain_db", "los", "sigma_db"}
-    again.write(tmp_path / "again.nc")
+    again.save(tmp_path / "again.nc")
     xr.testing.assert_identical(RadioMap.load(tmp_path / "again.nc").dataset, again.dataset)
 
 

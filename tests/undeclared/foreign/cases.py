@@ -207,7 +207,7 @@ def _change_db(at: Scenario, found: list[Hidden]) -> np.ndarray:
 def write(name: str, folder: Path) -> None:
     """Write what a user would have of a case: `measurements.csv`, `devices.csv` and the folder `scene`."""
     one = foreign_case(name)
-    one.measurements.write(folder / "measurements.csv")
+    one.measurements.save(folder / "measurements.csv")
     shutil.copytree(one.scene.folder, folder / "scene", dirs_exist_ok=True)
 
 
