@@ -20,25 +20,25 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Family, Readings, codes_of, families_of, units_of
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.effects.params import QUANTILE_90, Parameter
-from radiotwin.inference.curves import Curves, curves, curves_together
+from radiotwin.inference.curves import Curves, combine_curves, compare_curves
 from radiotwin.inference.gaussian import robust_sd
 from radiotwin.inference.groups import (
     HUBER,
     MAX_SCALES,
     TINY,
-    Apart,
     Groups,
-    Nested,
+    LastingErrors,
+    PeerComparison,
     Units,
-    apart,
-    less_ends,
+    combine_parts,
+    compare_with_peers,
     levels,
     log_scatters,
     means,
+    median_polish,
     medians,
-    polished,
-    together,
-    without_shared,
+    subtract_end_levels,
+    subtract_unit_errors,
 )
 from radiotwin.links.sites import never_part
 
@@ -108,7 +108,7 @@ class Compared:
     family: Family
     statistic: str
     sight: str
-    distance: Apart | Curves
+    distance: PeerComparison | Curves
     log_odds: np.ndarray
 
     @property
@@ -180,7 +180,7 @@ class _Class:
         is_los: whether the class is that with line of sight.
         scale_db: of its residuals.
         units: of the n values.
-        nested: of those in `rows`.
+        lasting: estimator of the error of lasting units, over `rows`.
         taken_off: values less the levels of ends that were asked for, kept.
     """
 
@@ -190,7 +190,7 @@ class _Class:
     is_los: bool
     scale_db: float
     units: Units
-    nested: Nested
+    lasting: LastingErrors
     taken_off: dict[tuple[int, ...], np.ndarray] = field(default_factory=dict)
 
     def of(self, family: Family, groups: Groups) -> np.ndarray:
@@ -198,20 +198,20 @@ class _Class:
         key = tuple(id(end) for end in family.ends)
         if key not in self.taken_off:
             values, ends = self.values.copy(), [end[self.rows] for end in family.ends]
-            take_off = _centred if self.statistic == "blanks" else polished
+            take_off = _centred if self.statistic == "blanks" else median_polish
             values[self.rows] = take_off(values[self.rows], ends)
             self.taken_off[key] = values
         values = self.taken_off[key]
         if not family.is_crossing or self.statistic != "level":
             return values
         values = values.copy()
-        values[groups.row] = without_shared(values[groups.row], groups.group,
-                                            self.units.lasting[groups.row])
+        values[groups.row] = subtract_unit_errors(values[groups.row], groups.group,
+                                                  self.units.lasting[groups.row])
         return values
 
-    def compare(self, family: Family) -> Apart | Curves | None:
+    def compare(self, family: Family) -> PeerComparison | Curves | None:
         """Return how far a family's groups are from their peers; None if too few are judged."""
-        groups = family.groups.among(self.rows)
+        groups = family.groups.restrict_to(self.rows)
         if not len(groups.row):
             return None
         values = self.of(family, groups)
@@ -219,33 +219,34 @@ class _Class:
         if self.statistic == "level":
             # A level gives way to outliers; so much of a unit's error as it follows counts.
             own, limit_db = own - np.median(own), HUBER * scale_db
-            followed_db = self.nested.error(np.clip(own, -limit_db, limit_db))
+            followed_db = self.lasting.sd(np.clip(own, -limit_db, limit_db))
             lasting_db = followed_db / float((np.abs(own) < limit_db).mean())
             is_bin = family.curve is not None
             found = levels(values, groups, lasting_db, LEAST_SCALE_DB, is_bin)
             if family.curve is not None:
                 usual_db = (LOS_CURVE_SHARE if self.is_los else NLOS_CURVE_SHARE) * scale_db
-                return curves(found, family.curve, usual_db, "los" if self.is_los else "nlos")
+                part = "los" if self.is_los else "nlos"
+                return compare_curves(found, family.curve, usual_db, part)
             prior = SPREAD_DB.get(family.name, PAIR_SPREAD_DB)
             prior = float(np.hypot(prior, (LOS_SHARE if self.is_los else NLOS_SHARE) * scale_db))
         elif self.statistic == "blanks":
-            found = means(values, groups, self.nested.error(own))
+            found = means(values, groups, self.lasting.sd(own))
             prior = LOS_BLANKS_SPREAD if self.is_los else NLOS_BLANKS_SPREAD
             prior *= 1 if family.name in ENDS else 2
         else:
             size = np.minimum(np.abs(own) / scale_db, MAX_SCALES)
             # What an instrument adds is another at each reading.
             lasting_sd = None if self.statistic == "noise" else \
-                self.nested.error(size / max(size.mean(), TINY))
+                self.lasting.sd(size / max(size.mean(), TINY))
             found = log_scatters(values, groups, lasting_sd, scale_db)
             prior = NOISE_SPREAD if self.statistic == "noise" else SCATTER_SPREAD
             prior *= 1 if family.name in ENDS else 1.5
         if np.isfinite(found.value).sum() < 2:
             return None
         if family.pairs:
-            found = less_ends(found, family.pairs)
+            found = subtract_end_levels(found, family.pairs)
         heavy = self.statistic == "level" and not self.is_los
-        return apart(found, prior, NLOS_DOF if heavy else LOS_DOF)
+        return compare_with_peers(found, prior, NLOS_DOF if heavy else LOS_DOF)
 
 
 def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _Class]]:
@@ -264,7 +265,7 @@ def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _Class]]:
         for name, each in values.items():
             rows = of_class & np.isfinite(each)
             found[name][sight] = _Class(each, rows, "level" if name == "base" else name, is_los,
-                                        scale_db, units, Nested(units, rows))
+                                        scale_db, units, LastingErrors(units, rows))
     return found
 
 
@@ -276,7 +277,7 @@ def compare(readings: Readings, families: list[Family], units: Units) -> list[Co
         for statistic in family.statistics:
             is_base = family.name in BASE_ERRORS and statistic == "level"
             of = "base" if is_base else "level" if statistic == "curve" else statistic
-            parts: dict[str, Apart | Curves] = {}
+            parts: dict[str, PeerComparison | Curves] = {}
             for name, each in classes[of].items():
                 part = each.compare(family)
                 if part is not None:
@@ -299,10 +300,10 @@ def compare(readings: Readings, families: list[Family], units: Units) -> list[Co
     return found
 
 
-def _together(parts: list[Apart | Curves]) -> Apart | Curves:
-    of_groups = [each for each in parts if isinstance(each, Apart)]
+def _together(parts: list[PeerComparison | Curves]) -> PeerComparison | Curves:
+    of_groups = [each for each in parts if isinstance(each, PeerComparison)]
     of_curves = [each for each in parts if isinstance(each, Curves)]
-    return together(of_groups) if of_groups else curves_together(of_curves)
+    return combine_parts(of_groups) if of_groups else combine_curves(of_curves)
 
 
 def _usual_errors(readings: Readings) -> np.ndarray:

@@ -15,7 +15,7 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.families import Readings, families_of, units_of
 from radiotwin.closeloop.scan import UNITS, Compared, compare, moved
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
-from radiotwin.inference.groups import Apart, Units
+from radiotwin.inference.groups import PeerComparison, Units
 
 STATISTICS = ("level", "scatter")
 FIRST, STEP = 3.0, 1.25  # errors of a typical group; each size that is tried over the one before
@@ -52,7 +52,7 @@ def seen_from(model: CrossFit) -> list[Seen]:
                 for each in families_of(readings, units)]
     sharpest: dict[tuple[str, str], tuple[Compared, int, float]] = {}
     for each in compare(readings, families, units):
-        if isinstance(each.distance, Apart):
+        if isinstance(each.distance, PeerComparison):
             key, (group, total) = (each.family.name, each.statistic), _typical(each.distance)
             if key not in sharpest or total < sharpest[key][2]:
                 sharpest[key] = each, group, total
@@ -65,7 +65,7 @@ def seen_from(model: CrossFit) -> list[Seen]:
     return found
 
 
-def _typical(distance: Apart) -> tuple[int, float]:
+def _typical(distance: PeerComparison) -> tuple[int, float]:
     """Return the group whose error and spread together are the median, and what they are."""
     judged = np.isfinite(distance.size)
     total = np.where(judged, np.hypot(distance.error, distance.spread), np.inf)

@@ -1,1 +1,1 @@
-"""Censored robust regression, folds, evidence, intervals: mathematics that knows no radio."""
+"""Statistics without radio: censored robust regression, folds, evidence, interval widths."""

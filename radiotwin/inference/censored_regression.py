@@ -1,13 +1,13 @@
-"""Regression of levels of which some were not detected, robust against outliers.
+"""Fit a robust Tobit regression: levels with outliers, some below the limit of detection.
 
-Errors follow a Student-t distribution with `dof` degrees of freedom and a scale for each group of
-rows (Lange, Little and Taylor 1989, 'Robust statistical modeling using the t distribution', JASA
-84); blanks are censored (`radiotwin.inference.student`). Solved by Newton steps on the exact
-likelihood: a few EM steps would leave a bias of a decibel.
+Errors follow a Student-t distribution with `dof` degrees of freedom and one scale per group of rows
+(Lange, Little and Taylor 1989, 'Robust statistical modeling using the t distribution', JASA 84);
+blanks are censored (`radiotwin.inference.student`). Newton steps maximise the exact likelihood: a
+few EM steps would leave a bias of a decibel.
 
-Errors arise mostly before the instrument. So where its response is not linear (a noise floor,
-saturation), errors pass through it, too: mean and scale of the reading are those over all levels
-that may arrive (Gauss-Hermite quadrature), and far below a floor all readings are alike.
+Most errors arise before the receiver. Where its response is not linear (a noise floor, saturation),
+they pass through that response: mean and scale of a reading are taken over the distribution of the
+arriving level (Gauss-Hermite quadrature), so that far below a floor all readings are alike.
 """
 
 from collections.abc import Callable
@@ -20,21 +20,21 @@ from radiotwin.inference import student
 from radiotwin.inference.student import NO_LOSSES, Losses
 
 MIN_SCALE_DB = 0.05
-FIRST_SCALE_DB = 5.0  # where the search for the error scales begins
+FIRST_SCALE_DB = 5.0  # initial error scale
 MAX_ITERATIONS = 40
-TOLERANCE = 1e-3  # of the objective, at which the search ends [nats]
-MIN_STEP = 1e-3  # share of a Newton step, below which none is taken
-MAX_GROWTH = float(np.log(2.0))  # of a scale's logarithm in one step
-NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(7)  # over the levels that may arrive
-MAX_DENSITY = 0.2  # share of entries that are not zero, up to which a design is kept sparse
-OWN_SHARE = 0.5  # of the error scale: the instrument's own noise where it passes nothing on
+TOLERANCE = 1e-3  # improvement of the objective at which the iteration stops [nats]
+MIN_STEP = 1e-3  # smallest fraction of a Newton step that is tried
+MAX_GROWTH = float(np.log(2.0))  # largest change of log(scale) in one step
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(7)  # quadrature over the arriving level
+MAX_DENSITY = 0.2  # share of non-zero entries up to which a design matrix is stored as sparse
+INSTRUMENT_SHARE = 0.5  # receiver noise over the error scale, where the response is flat
 
 Response = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""Mean level (n,) [dB] -> what becomes of it (n,) [dB], and the slope of that (n,)."""
+"""Map the level (n,) before to the level (n,) behind [dB], with the slope (n,) of the map."""
 
 
 def design(blocks: list[np.ndarray], n: int) -> np.ndarray | csr_array:
-    """Return columns (n, …) side by side; sparse where most is zero."""
+    """Stack columns (n, …) side by side into a design matrix; sparse if most entries are zero."""
     columns = np.hstack([np.zeros((n, 0)), *blocks])
     sparse = np.count_nonzero(columns) < MAX_DENSITY * columns.size
     return csr_array(columns) if sparse else columns
@@ -42,24 +42,25 @@ def design(blocks: list[np.ndarray], n: int) -> np.ndarray | csr_array:
 
 @dataclass(frozen=True, eq=False)
 class CensoredRegression:
-    """n levels to be explained: mean = receiver(paths(law) + gains).
+    """Data and model of a regression of n levels: mean = receiver(paths(law) + gains).
 
     Attributes:
-        level_db: (n,) NaN = not detected.
-        limit_db: (n,) below which nothing is detected; -inf where a blank says nothing.
-        law_db: (n,) part of the law's mean that is given [dB].
-        law_columns: (n, p0) design of the law's part that is fitted.
-        paths: response between law and gains; None = none.
-        gain_db: (n,) gains that are given [dB].
-        gain_columns: (n, p1) design of the gains that are fitted, see `design`.
+        level_db: (n,) measured levels [dB]; NaN = not detected.
+        limit_db: (n,) limits of detection [dB]; -inf if unknown: then a blank carries no
+            information.
+        law_db: (n,) fixed part of the channel law's mean [dB].
+        law_columns: (n, p0) design matrix of the fitted part of the channel law.
+        paths: response applied between law and gains; None = identity.
+        gain_db: (n,) fixed gains [dB].
+        gain_columns: (n, p1) design matrix of the fitted gains, see `design`.
         prior_sd_db: (p0 + p1,) prior standard deviation of each coefficient around zero;
-            inf = free.
-        group: (n,) index of the error scale.
-        receiver: response to the level that arrives; None = none.
+            inf = flat prior.
+        group: (n,) index of the error scale of each row.
+        receiver: response of the receiver to the arriving level; None = identity.
         dof: degrees of freedom of the errors.
-        losses: of links, whatever their level.
-        random_effect_sd_db: (n,), or one for all, standard deviation of what nothing was learnt of,
-            beside the error scale [dB].
+        losses: blanks and drops that do not depend on the level.
+        random_effect_sd_db: (n,) or scalar, standard deviation of random effects, added in
+            quadrature to the error scale [dB].
     """
 
     level_db: np.ndarray
@@ -77,9 +78,11 @@ class CensoredRegression:
     random_effect_sd_db: np.ndarray | float = 0.0
 
     def arriving(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """Return the mean level before the receiver (n,) [dB] by coefficients (p0 + p1,).
+        """Compute the mean level before the receiver from coefficients (p0 + p1,).
 
-        And its slope in the law (n,); None where that is one.
+        Returns:
+            (n,) mean level [dB], and its derivative (n,) with respect to the channel law's level;
+            None if that is 1 everywhere.
         """
         split, slope = self.law_columns.shape[1], None
         level_db = self.law_db + self.law_columns @ coefficients[:split]
@@ -88,50 +91,51 @@ class CensoredRegression:
         return level_db + self.gain_db + self.gain_columns @ coefficients[split:], slope
 
     def linearise(self, coefficients: np.ndarray, scale_db: np.ndarray) -> "Linearisation":
-        """Return mean and scale of the readings with their derivatives.
+        """Compute mean and scale of the readings with their derivatives.
 
-        By coefficients (p0 + p1,) and error scales (groups,) [dB].
+        Args:
+            coefficients: (p0 + p1,).
+            scale_db: (groups,) error scales [dB].
         """
         arriving_db, law_slope = self.arriving(coefficients)
         scale = np.hypot(scale_db[self.group], self.random_effect_sd_db)
         if self.receiver is None:
             return Linearisation(arriving_db, scale, law_slope, np.ones(1), np.zeros(1), np.ones(1))
-        mean, square, slope, both = np.zeros((4, len(arriving_db)))
+        mean, square, slope, cross = np.zeros((4, len(arriving_db)))
         for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum(), strict=True):
-            level_db, passed = self.receiver(arriving_db + node * scale)
-            moved = level_db - arriving_db  # or squares of large levels would be subtracted
-            mean += weight * moved
-            square += weight * moved**2
-            slope += weight * passed
-            both += weight * moved * (passed - 1)
+            level_db, node_slope = self.receiver(arriving_db + node * scale)
+            change = level_db - arriving_db  # small: squares of the levels would cancel
+            mean += weight * change
+            square += weight * change**2
+            slope += weight * node_slope
+            cross += weight * change * (node_slope - 1)
         variance = np.maximum(square - mean**2, 0.0)
-        own = (OWN_SHARE * scale_db[self.group]) ** 2
-        share = 1 - own / scale**2  # so that what passes unchanged keeps its scale
-        total = own + share * variance
-        growth = share * (both - mean * (slope - 1)) / total
+        instrument = (INSTRUMENT_SHARE * scale_db[self.group]) ** 2
+        share = 1 - instrument / scale**2  # a linear response keeps the scale
+        total = instrument + share * variance
+        growth = share * (cross - mean * (slope - 1)) / total
         return Linearisation(arriving_db + mean, np.sqrt(total), law_slope, slope, growth,
                              variance / total)
 
     def predict(self, result: "FitResult") -> "Linearisation":
-        """Return mean and scale of the readings by a fit, before the limit of detection."""
+        """Compute mean and scale of the uncensored readings from a fit [dB]."""
         return self.linearise(result.coefficients, result.scale_db)
 
     def nll(self, result: "FitResult") -> np.ndarray:
-        """Return the negative log-likelihood (n,) of each level by a fit [nats]."""
+        """Compute the negative log-likelihood (n,) of each level under a fit [nats]."""
         predicted = self.predict(result)
         return self.nll_at(predicted.mean_db, predicted.scale_db)
 
     def nll_at(self, mean_db: np.ndarray, scale_db: np.ndarray) -> np.ndarray:
-        """Return the negative log-likelihood (n,) around any mean and scale (n,) [nats]."""
+        """Compute the negative log-likelihood (n,) of the levels for mean and scale (n,) [nats]."""
         return student.censored_nll(self.level_db, self.limit_db, mean_db, scale_db, self.dof,
                                     self.losses)
 
     def residual_db(self, result: "FitResult") -> np.ndarray:
-        """Return measured minus predicted levels (n,) [dB].
+        """Compute measured minus predicted levels (n,) [dB], also for blanks.
 
-        What a level has probably dropped by is added. Of a blank: the least change of the mean
-        after which it is as likely detected as not, 0 where it already is less likely, times the
-        probability that it is blank for its level and did not drop out.
+        The expected drop of a level is added back. The residual of a blank is min(limit - mean, 0),
+        times the probability that it is blank because of its level and was not lost.
         """
         predicted = self.predict(result)
         mean, blank = predicted.mean_db, np.isnan(self.level_db)
@@ -147,14 +151,15 @@ class CensoredRegression:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Mean and scale of n readings, and how they change with the level that arrives.
+    """Mean and scale of n readings, and their derivatives with respect to the arriving level.
 
     Attributes:
         mean_db, scale_db: (n,) of the reading [dB].
-        law_slope: (n,) of the arriving level in the law; None where it is one.
-        slope: (n,), or one for all, of the mean in the arriving level.
-        growth: (n,), or one for all, of log(scale) in it [1/dB].
-        passed: (n,), or one for all, share of scale_db² that has come through the receiver.
+        law_slope: (n,) derivative of the arriving level with respect to the channel law's level;
+            None if it is 1 everywhere.
+        slope: (n,) or (1,), d mean / d arriving level.
+        growth: (n,) or (1,), d log(scale) / d arriving level [1/dB].
+        passed: (n,) or (1,), share of scale_db² that passed through the receiver.
     """
 
     mean_db: np.ndarray
@@ -167,7 +172,7 @@ class Linearisation:
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """Coefficients (p,), error scales (groups,) [dB], and the negative log-posterior [nats]."""
+    """Fitted coefficients (p,), error scales (groups,) [dB], and negative log-posterior [nats]."""
 
     coefficients: np.ndarray
     scale_db: np.ndarray
@@ -175,12 +180,12 @@ class FitResult:
 
 
 def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResult:
-    """Return the maximum of the posterior.
+    """Maximise the posterior of coefficients and error scales by damped Newton steps.
 
     Args:
         problem: n levels and p coefficients.
-        start: an earlier fit; it may have fewer coefficients, the others then start at 0 and come
-            last.
+        start: an earlier fit to start from; the coefficients that it lacks are the last ones and
+            start at 0.
     """
     p, groups = len(problem.prior_sd_db), int(problem.group.max()) + 1
     if start is not None and len(start.coefficients) <= p and len(start.scale_db) >= groups:
@@ -192,18 +197,19 @@ def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResul
     predicted = problem.linearise(beta, scale_db)
     objective = _objective(problem, predicted, beta, precision)
     for _ in range(MAX_ITERATIONS):
-        slope, hessian, growth, grown_nats = _slope_and_hessian(problem, predicted, precision)
+        slope, hessian, growth, scale_gain_nats = _slope_and_hessian(problem, predicted, precision)
         slope = slope - precision * beta
         step = np.linalg.solve(hessian, slope)
-        if 0.5 * slope @ step + grown_nats < TOLERANCE:
+        if 0.5 * slope @ step + scale_gain_nats < TOLERANCE:
             break
         size, before = 1.0, objective
         while size > MIN_STEP:
-            there = beta + size * step, np.maximum(scale_db * np.exp(size * growth), MIN_SCALE_DB)
-            reached = problem.linearise(*there)
-            tried = _objective(problem, reached, there[0], precision)
+            new_beta = beta + size * step
+            new_scale_db = np.maximum(scale_db * np.exp(size * growth), MIN_SCALE_DB)
+            reached = problem.linearise(new_beta, new_scale_db)
+            tried = _objective(problem, reached, new_beta, precision)
             if tried <= objective + 1e-9:
-                (beta, scale_db), predicted, objective = there, reached, tried
+                beta, scale_db, predicted, objective = new_beta, new_scale_db, reached, tried
                 break
             size *= 0.5
         if before - objective < TOLERANCE:
@@ -212,21 +218,19 @@ def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResul
 
 
 def _least_squares(problem: CensoredRegression) -> np.ndarray:
+    """Compute start coefficients (p,) by ridge regression on the detected levels."""
     seen = np.isfinite(problem.level_db)
     first_scale_db = np.full(int(problem.group.max()) + 1, FIRST_SCALE_DB)
     predicted = problem.linearise(np.zeros(len(problem.prior_sd_db)), first_scale_db)
-    pull = np.where(seen, predicted.slope * (problem.level_db - predicted.mean_db), 0.0)
-    slope, squares = _moments(problem, predicted, pull, np.where(seen, predicted.slope**2, 0.0))
+    score = np.where(seen, predicted.slope * (problem.level_db - predicted.mean_db), 0.0)
+    slope, squares = _moments(problem, predicted, score, np.where(seen, predicted.slope**2, 0.0))
     ridge = np.diag(np.square(FIRST_SCALE_DB / problem.prior_sd_db) + 1e-6)
     return np.linalg.solve(squares + ridge, slope)
 
 
-def _moments(problem: CensoredRegression, predicted: Linearisation, pull: np.ndarray,
+def _moments(problem: CensoredRegression, predicted: Linearisation, score: np.ndarray,
              weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return X' pull (p,) and X' diag(weight) X (p, p).
-
-    X is the derivative of the arriving level in the coefficients.
-    """
+    """Compute X' score (p,) and X' diag(weight) X (p, p), X = d arriving level / d coefficients."""
     law, gains = problem.law_columns, problem.gain_columns
     if predicted.law_slope is not None:
         law = law * predicted.law_slope[:, None]
@@ -235,29 +239,30 @@ def _moments(problem: CensoredRegression, predicted: Linearisation, pull: np.nda
     squares = gains.T @ (gains * weight[:, None])
     if issparse(squares):
         squares = squares.toarray()
-    return (np.concatenate([law.T @ pull, gains.T @ pull]),
+    return (np.concatenate([law.T @ score, gains.T @ score]),
             np.block([[law.T @ weighted, between.T], [between, squares]]))
 
 
 def _objective(problem: CensoredRegression, predicted: Linearisation, beta: np.ndarray,
                precision: np.ndarray) -> float:
+    """Compute the negative log-posterior [nats]."""
     value = problem.nll_at(predicted.mean_db, predicted.scale_db).sum()
     return float(value + 0.5 * np.sum(precision * beta**2))
 
 
 def _slope_and_hessian(problem: CensoredRegression, predicted: Linearisation,
                        precision: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return how the posterior changes with the coefficients and the scales.
+    """Compute the derivatives of the log-posterior for one Newton step.
 
     Returns:
-        the log-likelihood's slope (p,), the posterior's curvature (p, p); a step towards the best
-        scales (groups,) [logarithm], for which rows count little of which the receiver passes
-        little on; and about what that step gains [nats].
+        (p,) gradient of the log-likelihood in the coefficients, (p, p) negative Hessian of the
+        log-posterior, (groups,) step of the log scales, in which a row counts by the share of its
+        error that passes the receiver, and the approximate gain of that step [nats].
     """
     slope, curvature, scale_slope = student.derivatives(
         problem.level_db, problem.limit_db, predicted.mean_db, predicted.scale_db, problem.dof,
         problem.losses)
-    # Of the logarithm of a scale, a link's Fisher information (Lange et al. 1989).
+    # Fisher information of one row about log(scale) (Lange et al. 1989).
     growth, information = predicted.growth, 2 * problem.dof / (problem.dof + 3)
     toward, hessian = _moments(problem, predicted, slope * predicted.slope + scale_slope * growth,
                                curvature * predicted.slope**2 + information * growth**2)

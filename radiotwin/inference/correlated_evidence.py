@@ -1,10 +1,10 @@
-"""Evidence for a cause beside errors that are allowed to be correlated.
+"""Compute the evidence for a cause against residuals with spatially correlated model error.
 
-A base lacks more than noise: walls stand elsewhere than on the map, materials differ. Such a rest
-is a Gaussian field over positions, unknown to the catalogue, and it explains part of whatever has a
-position. So a cause is judged by how much likelier the data are with it *beside* that field, whose
-strength is fitted anew each time (Kennedy and O'Hagan 2001, 'Bayesian calibration of computer
-models', J. R. Stat. Soc. B 63; Brynjarsdóttir and O'Hagan 2014, Inverse Problems 30).
+A channel model lacks more than noise: walls are off on the map, materials differ. This model error
+is a Gaussian field over positions and could explain part of any cause that has a position. So a
+cause is judged by the marginal likelihood with it *and* that field, whose strength is fitted each
+time (Kennedy and O'Hagan 2001, 'Bayesian calibration of computer models', J. R. Stat. Soc. B 63;
+Brynjarsdóttir and O'Hagan 2014, Inverse Problems 30).
 
 Residuals z = columns · b + field + noise, with b ~ N(0, prior²), a field of exponential correlation
 (Gudmundson 1991) for each series and white noise. In the eigenbasis of a series' correlation matrix
@@ -21,42 +21,42 @@ from scipy.linalg import cho_factor, cho_solve, eigh
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-MAX_POINTS = 400  # of a part of a series: its matrix is decomposed
-MAX_ROWS = 8000  # of all series
-MIN_POINTS = 3  # of a part that says anything
-# Of correlation [m]: shadowing decorrelates within 10 to 50 m (3GPP TR 38.901, Table 7.5-6). Longer
-# ones would explain whatever an antenna or a wrong position does to a device's levels.
+MAX_POINTS = 400  # points in a part of a series, the size of a matrix to decompose
+MAX_ROWS = 8000  # rows of all series together
+MIN_POINTS = 3  # points in a part; smaller parts are left out
+# Correlation lengths [m]: shadowing decorrelates within 10 to 50 m (3GPP TR 38.901, Table 7.5-6).
+# Longer ones would explain the effect of an antenna or a wrong position on a device's levels.
 LENGTHS_M = (5.0, 12.0, 30.0)
-# Along a weak field the likelihood is flat: no slope may be left that adds up to a nat.
+# With a weak field the likelihood is nearly flat: a remaining slope must not add up to a nat.
 PRECISION = {"maxfun": 60, "ftol": 1e-8, "gtol": 0.001}
-START = np.array([0.0, -1.0])  # logarithms: noise variance, field over noise
+START = np.array([0.0, -1.0])  # log(noise variance), log(field variance / noise variance)
 BOUNDS = np.array([[-6.0, -7.0], [6.0, 7.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Columns (n, q), and prior standard deviations (q,) of their coefficients."""
+    """Regression columns (n, q), and prior standard deviations (q,) of their coefficients."""
 
     values: np.ndarray
     prior_sd: np.ndarray
 
     def beside(self, other: Columns) -> Columns:
-        """Return both, side by side."""
+        """Stack the columns of both side by side."""
         return Columns(np.hstack([self.values, other.values]),
                        np.concatenate([self.prior_sd, other.prior_sd]))
 
 
 @dataclass(frozen=True, eq=False)
 class CorrelatedEvidence:
-    """Marginal likelihoods of residuals beside a correlated rest.
+    """Marginal likelihood of residuals with a correlated model error.
 
     Attributes:
         rows: (m,) rows that are used, part after part.
-        parts: where each part of a series is among them: links near each other; what is further
-            away counts as not correlated.
-        bases: of each part the eigenvectors of its correlation matrix.
-        spectrum: (m,) the eigenvalues.
-        length_m: of the correlation.
+        parts: slice of `rows` of each part of a series: links near each other; different parts
+            count as not correlated.
+        bases: eigenvectors of the correlation matrix of each part.
+        spectrum: (m,) eigenvalues of all parts.
+        length_m: correlation length [m].
     """
 
     rows: np.ndarray
@@ -68,21 +68,25 @@ class CorrelatedEvidence:
     @classmethod
     def fit(cls, series: np.ndarray, position_m: np.ndarray, z: np.ndarray, nuisance: Columns,
             seed: int) -> Self:
-        """Choose the length of the correlation at which residuals are likeliest.
+        """Choose the correlation length of highest marginal likelihood.
 
-        Rows (n,) have the label of the field that they belong to, a position [m], and a residual,
-        NaN if it is of no use. Where there are many, some are drawn.
+        Args:
+            series: (n,) label of the field that each row belongs to.
+            position_m: (n, 3) positions [m].
+            z: (n,) standardised residuals; NaN: not used.
+            nuisance: columns fitted in every likelihood.
+            seed: of the random draw, if there are more than `MAX_ROWS` rows.
         """
         rng = np.random.default_rng(seed)
         chosen = []
         known = np.flatnonzero(np.isfinite(z))
         labels, member = np.unique(series[known], return_inverse=True)
-        most = max(MAX_ROWS // max(len(labels), 1), MIN_POINTS)
+        max_rows = max(MAX_ROWS // max(len(labels), 1), MIN_POINTS)
         for number in rng.permutation(len(labels))[:MAX_ROWS // MIN_POINTS]:
-            mine = known[member == number]
-            if len(mine) > most:
-                mine = np.sort(rng.choice(mine, most, replace=False))
-            chosen += [part for part in _near_each_other(mine, position_m)
+            rows = known[member == number]
+            if len(rows) > max_rows:
+                rows = np.sort(rng.choice(rows, max_rows, replace=False))
+            chosen += [part for part in _split_by_position(rows, position_m)
                        if len(part) >= MIN_POINTS]
         tried = [cls._decomposed(chosen, position_m, length_m) for length_m in LENGTHS_M]
         return max(tried, key=lambda each: each.log_evidence(z, nuisance))
@@ -90,6 +94,7 @@ class CorrelatedEvidence:
     @classmethod
     def _decomposed(cls, chosen: list[np.ndarray], position_m: np.ndarray,
                     length_m: float) -> Self:
+        """Decompose the exponential correlation matrix of each part (rows) into eigenvectors."""
         ends = np.cumsum([0, *(len(rows) for rows in chosen)])
         parts = [slice(a, b) for a, b in zip(ends, ends[1:], strict=False)]
         bases, spectra = [], [np.zeros(0)]
@@ -102,19 +107,19 @@ class CorrelatedEvidence:
         return cls(rows, parts, bases, np.concatenate(spectra), length_m)
 
     def rotated(self, values: np.ndarray) -> np.ndarray:
-        """Return values (n, …) in the eigenbasis (m, …)."""
-        mine = values[self.rows]
-        return np.concatenate([basis.T @ mine[part] for part, basis in
-                               zip(self.parts, self.bases, strict=True)]) if self.parts else mine
+        """Transform values (n, …) of all rows into the eigenbasis (m, …)."""
+        used = values[self.rows]
+        return np.concatenate([basis.T @ used[part] for part, basis in
+                               zip(self.parts, self.bases, strict=True)]) if self.parts else used
 
     def log_evidence(self, z: np.ndarray, columns: Columns) -> float:
-        """Return the log marginal likelihood of residuals (n,) at the best variances [nats]."""
+        """Compute the log marginal likelihood of residuals (n,), variances fitted [nats]."""
         return self.of_rotated(self.rotated(z), self.rotated(columns.values), columns.prior_sd)[0]
 
     def coefficients(self, z: np.ndarray, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
-        """Return the coefficients (q,) of columns at the best variances, and their errors (q,).
+        """Compute posterior mean (q,) and standard deviation (q,) of the columns' coefficients.
 
-        An error is the standard deviation that a coefficient has after the data.
+        Noise and field variances are fitted to the residuals z (n,).
         """
         rotated, values = self.rotated(z), self.rotated(columns.values)
         theta = self.of_rotated(rotated, values, columns.prior_sd)[1]
@@ -124,11 +129,21 @@ class CorrelatedEvidence:
 
     def of_rotated(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
                    start: np.ndarray = START) -> tuple[float, np.ndarray]:
-        """Return the same of rotated values (m,), (m, q), and the two variances' logarithms."""
+        """Maximise the log marginal likelihood of rotated residuals over both variances.
+
+        Args:
+            z: (m,) rotated residuals.
+            columns: (m, q) rotated columns.
+            prior_sd: (q,) prior standard deviations of their coefficients.
+            start: (2,) initial logarithms of the variances, see `START`.
+
+        Returns:
+            log marginal likelihood [nats], and the best (2,) logarithms of the variances.
+        """
         if not len(z):
             return 0.0, START
 
-        # In units in which the likelihood is about as curved along either variance.
+        # Scaled so that the likelihood has about the same curvature along both variances.
         share = 1.0 - 1.0 / (1.0 + np.exp(start[1]) * self.spectrum)
         unit = 1.0 / np.sqrt(0.5 * np.array([len(z), max(float(share @ share), 1.0)]))
 
@@ -142,9 +157,10 @@ class CorrelatedEvidence:
 
     def at(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
            theta: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the log marginal likelihood of rotated values at given variances [nats].
+        """Compute the log marginal likelihood of rotated residuals for log variances theta (2,).
 
-        And its derivatives (2,) by the logarithms of the variances.
+        Returns:
+            log marginal likelihood [nats], and its gradient (2,) in theta.
         """
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
         share = 1.0 - np.exp(theta[0]) / variance  # of the field
@@ -162,17 +178,24 @@ class CorrelatedEvidence:
             left = z - columns @ best
             weighted *= np.sqrt(share)
             of_field = weighted @ weighted.T
-            freedom = np.array([np.trace(cho_solve(factor, each)) for each in (inner, of_field)])
+            freedom = np.array([np.trace(cho_solve(factor, squares))
+                                for squares in (inner, of_field)])
         excess = 1.0 - left * left / variance
         slope = np.array([excess.sum(), share @ excess]) - freedom
         return -0.5 * float(value) - 0.5 * len(z) * np.log(2 * np.pi), -0.5 * slope
 
     def information(self, pattern: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
                     theta: np.ndarray) -> float:
-        """Return how sharply the data would show a pattern of unit size [1/size²].
+        """Compute the Fisher information about the size of a pattern [1/size²].
 
-        Twice the expected log-likelihood ratio of the pattern beside columns that are fitted, too;
-        both are rotated. Others as of `at`.
+        Twice the expected log-likelihood ratio of the pattern at size 1, with the columns fitted as
+        well.
+
+        Args:
+            pattern: (m,) rotated pattern of unit size.
+            columns: (m, q) rotated columns.
+            prior_sd: (q,) prior standard deviations of their coefficients.
+            theta: (2,) logarithms of the variances.
         """
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
         weighted = columns.T / variance
@@ -182,12 +205,12 @@ class CorrelatedEvidence:
         return max(float(left), 0.0)
 
 
-def _near_each_other(rows: np.ndarray, position_m: np.ndarray) -> list[np.ndarray]:
-    """Return rows in parts of at most `MAX_POINTS`, halved across the longest side (k-d tree)."""
+def _split_by_position(rows: np.ndarray, position_m: np.ndarray) -> list[np.ndarray]:
+    """Split rows into parts of at most `MAX_POINTS`, halved across the longest side (k-d tree)."""
     if len(rows) <= MAX_POINTS:
         return [rows]
-    mine_m = position_m[rows]
-    order = np.argsort(mine_m[:, np.ptp(mine_m, axis=0).argmax()], kind="stable")
+    rows_m = position_m[rows]
+    order = np.argsort(rows_m[:, np.ptp(rows_m, axis=0).argmax()], kind="stable")
     half = len(rows) // 2
-    return [part for each in (order[:half], order[half:])
-            for part in _near_each_other(rows[np.sort(each)], position_m)]
+    return [part for side in (order[:half], order[half:])
+            for part in _split_by_position(rows[np.sort(side)], position_m)]

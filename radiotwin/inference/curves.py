@@ -1,11 +1,10 @@
-"""Groups of values that change along a variable more than their peers do.
+"""Find curves that vary along a variable (time, direction) more than their peers do.
 
-A curve is a group whose bins along a variable (time, direction) have levels of their own. How much
-it changes is the standard deviation of these levels beyond their errors. Errors of a model let all
-curves change a little; a curve stands out if it changes more than its peers. Its evidence is the
-marginal likelihood over that standard deviation, on a grid, as in a random-effects model (Searle,
-Casella, McCulloch 1992, Variance components): a cycle that no single bin shows is seen in all bins
-together.
+A curve is a group that is cut into bins along the variable. It varies by the standard deviation of
+the bins' levels beyond their errors. Model errors let all curves vary a little; a curve stands out
+if it varies more than its peers. The evidence is the marginal likelihood over that standard
+deviation, on a grid, as in a random-effects model (Searle, Casella, McCulloch 1992, Variance
+components): all bins together show a cycle that no single bin shows.
 """
 
 from __future__ import annotations
@@ -21,27 +20,26 @@ from scipy.stats import t as student_t
 from radiotwin.inference.gaussian import MAD_SD
 from radiotwin.inference.groups import Statistic
 
-SD_GRID = np.geomspace(0.05, 40.0, 64)  # dB
+SD_GRID = np.geomspace(0.05, 40.0, 64)  # standard deviations of the bins of a curve [dB]
 LOG_GRID = np.log(SD_GRID)
 MIN_BINS = 4
-BIN_DOF = 5.0  # of a bin's level: single bins may be far off
-LEAST_ERROR = 0.5  # of what errors say, where bins are closer together
-PEERS_LOG_SD = 0.4  # by which peers' standard deviations differ
-PRIOR_LOG_SD = 0.7  # of what they have in common
-OUTLIER_SHARE = 0.1  # of peers that stand out themselves
-OUTLIER_LOG_SD = 0.8  # of the standard deviation of a curve that stands out
+BIN_DOF = 5.0  # degrees of freedom of a bin's level: single bins may be far off
+LEAST_ERROR = 0.5  # least factor on the errors, if bins scatter less than their errors
+PEERS_LOG_SD = 0.4  # sd of log(standard deviation) between peers
+PRIOR_LOG_SD = 0.7  # sd of the prior of their common log(standard deviation)
+OUTLIER_SHARE = 0.1  # share of peers that may stand out themselves
+OUTLIER_LOG_SD = 0.8  # sd of log(standard deviation) of curves that stand out
 
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """How much p curves of k bins change.
+    """Variation of p curves with k bins in all.
 
     Attributes:
-        log_likelihood: (p, grid) of each standard deviation of `SD_GRID`; 0 of one that is not
-            judged.
+        log_likelihood: (p, grid) of each standard deviation in `SD_GRID`; 0 if not judged.
         log_null: (p,) log likelihood as one of its peers.
-        judged: (p,) bool.
-        bins: level of each bin less that of its curve (k,), with its error, by part of the data.
+        judged: (p,) bool, whether the curve has enough bins.
+        bins: part of the data -> level of each bin minus the median of its curve (k,), with errors.
     """
 
     log_likelihood: np.ndarray
@@ -50,11 +48,11 @@ class Curves:
     bins: Mapping[str, Statistic]
 
     def log_odds(self, usual_sd: float, prior_odds: float) -> np.ndarray:
-        """Return the log odds (p,) that a curve changes more than its peers; NaN = not judged.
+        """Compute the log odds (p,) that a curve varies more than its peers; NaN = not judged.
 
         Args:
-            usual_sd: of the bins of a curve that stands out, its median.
-            prior_odds: that one of all curves stands out, shared among those that are judged.
+            usual_sd: median standard deviation of the bins of a curve that stands out.
+            prior_odds: prior odds that one of all curves stands out, divided among the judged ones.
         """
         log_prior = _log_normal(np.log(usual_sd), OUTLIER_LOG_SD)
         odds = logsumexp(self.log_likelihood + log_prior, axis=1) - self.log_null
@@ -62,7 +60,7 @@ class Curves:
         return np.where(self.judged, odds, np.nan)
 
     def sd(self, quantile: float) -> np.ndarray:
-        """Return a quantile (p,) of the standard deviation of each curve's bins."""
+        """Compute a posterior quantile (p,) of the standard deviation of each curve's bins."""
         weight = np.exp(self.log_likelihood - self.log_likelihood.max(axis=1, keepdims=True))
         share = np.cumsum(weight, axis=1)
         share /= share[:, -1:]
@@ -74,24 +72,24 @@ class Curves:
         return np.where(self.judged, self.sd(0.5), np.nan)
 
     def fitted(self, curve: int, part: str) -> np.ndarray:
-        """Return the levels (k,) of a curve's bins in one part of the data, shrunk by their errors.
+        """Shrink the levels (k,) of all bins in one part of the data towards 0 by their errors.
 
         Args:
-            curve: whose standard deviation is taken.
-            part: of the data. A bin that is not judged is 0.
+            curve: index of the curve whose standard deviation sets the shrinkage.
+            part: name of the part of the data; bins without a level are 0.
         """
         bins, variance = self.bins[part], float(self.sd(0.5)[curve]) ** 2
         shrunk = bins.value * variance / (variance + bins.error**2)
         return np.where(np.isfinite(shrunk), shrunk, 0.0)
 
 
-def curves(found: Statistic, curve: np.ndarray, prior_sd: float, part: str) -> Curves:
-    """Return how much curves change, beside their peers.
+def compare_curves(found: Statistic, curve: np.ndarray, prior_sd: float, part: str) -> Curves:
+    """Estimate how much each curve varies, and its likelihood as one of its peers.
 
     Args:
-        found: level of each of k bins.
-        curve: (k,) number of the curve that a bin is of.
-        prior_sd: standard deviation of the bins of a curve that does not stand out.
+        found: levels of k bins.
+        curve: (k,) index of each bin's curve.
+        prior_sd: prior standard deviation of the bins of a curve that does not stand out.
         part: name of this part of the data.
     """
     count = int(curve.max()) + 1
@@ -115,8 +113,8 @@ def curves(found: Statistic, curve: np.ndarray, prior_sd: float, part: str) -> C
                   {part: Statistic(deviation, error)})
 
 
-def curves_together(parts: list[Curves]) -> Curves:
-    """Return the same curves in several parts of the data, whose bins change as much."""
+def combine_curves(parts: list[Curves]) -> Curves:
+    """Combine the same curves in several parts of the data: one standard deviation for all."""
     return Curves(sum((each.log_likelihood for each in parts), np.zeros(1)),
                   sum((each.log_null for each in parts), np.zeros(1)),
                   np.any([each.judged for each in parts], axis=0),
@@ -124,19 +122,19 @@ def curves_together(parts: list[Curves]) -> Curves:
 
 
 def _log_normal(middle: float | np.ndarray, log_sd: float) -> np.ndarray:
-    """Return log probabilities (…, grid) of a log-normal standard deviation with a middle (…)."""
+    """Compute log probabilities (…, grid) of a log-normal standard deviation of log median (…)."""
     density = norm.logpdf(LOG_GRID, np.expand_dims(middle, -1), log_sd)
     return density - logsumexp(density, axis=-1, keepdims=True)
 
 
-OF_PEERS = _log_normal(LOG_GRID, PEERS_LOG_SD)  # (grid, grid) by what they have in common
+OF_PEERS = _log_normal(LOG_GRID, PEERS_LOG_SD)  # (grid, grid), row: common standard deviation
 
 
 def _log_null(log_likelihood: np.ndarray, judged: np.ndarray, prior_sd: float) -> np.ndarray:
-    """Return the log likelihood (p,) of each curve as one of the others.
+    """Compute the log likelihood (p,) of each curve as one of its peers, leave-one-out.
 
-    What peers have in common is inferred from the prior and all others, some of which may stand
-    out themselves.
+    The common standard deviation of the peers follows from the prior and all other curves, of which
+    some may stand out themselves.
     """
     given = logsumexp(log_likelihood[:, None] + OF_PEERS, axis=2)
     anywhere = logsumexp(log_likelihood - np.log(len(SD_GRID)), axis=1)

@@ -1,13 +1,12 @@
-"""Whether values depend on a variable: permutations that keep together what is alike."""
+"""Test whether values depend on a variable, by permutations that keep series correlated."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-BINS = 10  # that a continuous variable is cut into
+BINS = 10  # quantile bins of a continuous variable
 PERMUTATIONS = 2500
-MIN_STRONGER = 20  # permutations that are stronger than what was observed, to stop early
-MIN_LEVELS = 2  # of a label
+MIN_STRONGER = 20  # permutations beyond the observed statistic, at which the test stops
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,21 +23,23 @@ class Series:
 
     @classmethod
     def sort(cls, series: np.ndarray, position: np.ndarray) -> "Series":
-        """Return the series of labels (n,), each in order of a position (n,)."""
+        """Group rows by series label (n,) and sort each series by position (n,)."""
         order = np.lexsort((np.arange(len(series)), position, series))
         return cls(order, np.flatnonzero(np.r_[True, np.diff(series[order]) > 0, True]))
 
 
 def levels_of(values: np.ndarray) -> np.ndarray | None:
-    """Return the bin (n,) of each value; None where there is nothing to compare.
+    """Bin a variable: integer labels as they are, other values by quantiles.
 
     Args:
-        values: (n,) integers are labels; of others NaN, where they are few, is a bin of its own.
+        values: (n,) labels or values; NaN is one more bin.
+
+    Returns:
+        (n,) bin from 0; None if there are too few bins, too many labels, or most values are NaN.
     """
     if values.dtype.kind in "iu":
         level = np.unique(values, return_inverse=True)[1]
-        enough = level.max() + 1 >= MIN_LEVELS and level.max() < len(level) // 5
-        return level if enough else None
+        return level if 1 <= level.max() < len(level) // 5 else None
     if np.isfinite(values).mean() < 0.5 or np.nanstd(values) < 1e-9:
         return None
     edges = np.unique(np.nanquantile(values, np.linspace(0, 1, BINS + 1)[1:-1]))
@@ -49,11 +50,14 @@ def levels_of(values: np.ndarray) -> np.ndarray | None:
 
 def permutation_p_value(level: np.ndarray, z: np.ndarray, series: Series,
                         rng: np.random.Generator) -> float:
-    """Return the p-value of the values' squares between bins (n,).
+    """Test by permutation whether the means of values z (n,) differ between bins `level` (n,).
 
-    Where the bin changes within most series, each is rotated by a random number of places, so that
-    neighbours stay neighbours; else whole series swap their means. (`scipy.stats.permutation_test`
-    knows neither.) Sequential (Besag and Clifford 1991, 'Sequential Monte Carlo p-values').
+    If the bin changes within most series, each series is rotated by a random shift, which keeps
+    neighbours together; else the series exchange their means. (`scipy.stats.permutation_test`
+    does neither.) Sequential (Besag and Clifford 1991, 'Sequential Monte Carlo p-values').
+
+    Returns:
+        p-value, above 0.
     """
     level, z, count = level[series.order], z[series.order], np.maximum(np.bincount(level), 1)
     observed = _between(level, z, count)
@@ -66,25 +70,25 @@ def permutation_p_value(level: np.ndarray, z: np.ndarray, series: Series,
 
 
 def holm(p_values: np.ndarray) -> np.ndarray:
-    """Return p-values corrected for their number, in the given ascending order (Holm 1979)."""
+    """Correct ascending p-values for multiple tests (Holm 1979)."""
     factor = len(p_values) - np.arange(len(p_values))
     return np.maximum.accumulate(np.minimum(p_values * factor, 1.0))
 
 
 def _between(level: np.ndarray, z: np.ndarray, count: np.ndarray) -> float:
-    """Return the sum of squares between the bins of `count` values."""
+    """Compute the sum of squares between bins of z (n,); `count` (bins,) values are in each."""
     return float((np.bincount(level, weights=z) ** 2 / count).sum())
 
 
 def _changes_within(level: np.ndarray, starts: np.ndarray) -> bool:
-    """Return whether the bin, in the order of the series, changes within most of them."""
+    """Check whether the bin changes within more than half of the series."""
     changed = np.r_[0, np.diff(level) != 0]
     changes = np.add.reduceat(changed, starts[:-1]) - changed[starts[:-1]]
     return bool(np.mean(changes > 0) > 0.5)
 
 
 def _rotated(z: np.ndarray, starts: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the values, in the order of the series, each of which is rotated."""
+    """Rotate the values of each series by a random shift."""
     length = np.diff(starts)
     shift = (rng.random(len(length)) * length).astype(int)
     return np.concatenate([part for start, end, by in zip(
@@ -93,7 +97,7 @@ def _rotated(z: np.ndarray, starts: np.ndarray, rng: np.random.Generator) -> np.
 
 
 def _swapped(z: np.ndarray, starts: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the values with the series' means elsewhere; what is around them stays."""
+    """Exchange the means of the series at random; deviations from the means stay."""
     length = np.diff(starts)
     means = np.add.reduceat(z, starts[:-1]) / length
     return z + np.repeat(rng.permutation(means) - means, length)

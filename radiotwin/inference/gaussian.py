@@ -1,6 +1,7 @@
-"""Levels with Gaussian errors, some below the limit of detection (left-censored, the Tobit model).
+"""Gaussian Tobit model: likelihood of left-censored levels, and the log-distance line fitted by it.
 
-Their likelihood, and the log-distance line of highest likelihood.
+The torch form stays beside the NumPy one: it takes log(sd), whose gradient training needs, and
+masks the branch that is not taken.
 """
 
 from __future__ import annotations
@@ -15,38 +16,37 @@ from scipy.special import log_ndtr
 if TYPE_CHECKING:
     import torch
 
-MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
+MAD_SD = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
 Limit = float | np.ndarray | None
-"""Level below which nothing is detected [dB], for all links or each (n,); None or -inf: unknown."""
-MIN_SD_DB, MAX_SD_DB = 0.1, 100.0  # of a fitted standard deviation: far outside what is measured
-EXPONENT_PRIOR = 3.0, 2.0  # mean, standard deviation: it decides where distances hardly differ
+"""Limit of detection [dB], scalar or (n,); None or -inf: unknown."""
+MIN_SD_DB, MAX_SD_DB = 0.1, 100.0  # bounds of a fitted standard deviation, far outside real ones
+EXPONENT_PRIOR = 3.0, 2.0  # mean and sd; decides only where all distances are nearly equal
 
 
 def robust_sd(values: np.ndarray) -> float:
-    """Return the standard deviation of normal values (n,) among which there may be outliers."""
+    """Estimate the standard deviation of values (n,) from their median absolute deviation."""
     return MAD_SD * float(np.median(np.abs(values - np.median(values))))
 
 
 def limits_of(limit_db: Limit, n: int) -> np.ndarray:
-    """Return the limit of each of n links [dB]; -inf where it is unknown."""
+    """Broadcast a limit of detection to n links [dB]; -inf if unknown."""
     return np.broadcast_to(np.asarray(-np.inf if limit_db is None else limit_db, float), n)
 
 
 def gaussian_nll(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
                  limit_db: Limit) -> np.ndarray:
-    """Return the negative log-likelihood of each level [nats].
+    """Compute the negative log-likelihood of each level under the Gaussian Tobit model.
 
-    The arguments broadcast against each other. A level that was not detected counts as
-    P(level < limit): -log Phi((limit - mean) / sd) (Tobin 1958, 'Estimation of relationships for
-    limited dependent variables').
+    The arguments broadcast against each other. A blank contributes -log P(level < limit) =
+    -log Phi((limit - mean) / sd) (Tobin 1958, 'Estimation of relationships for limited dependent
+    variables').
 
     Args:
         level_db: measured [dB]; NaN: not detected.
         mean_db: expected [dB].
         sd_db: standard deviation [dB].
-        limit_db: limit of detection [dB]; None: what was not detected counts 0, as it does where
-            the limit is -inf.
+        limit_db: limit of detection [dB]; None or -inf: unknown, a blank contributes 0.
 
     Returns:
         [nats], of the broadcast shape.
@@ -63,42 +63,44 @@ def gaussian_nll(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
 
 def mean_if_detected(mean_db: np.ndarray, sd_db: np.ndarray,
                      limit_db: np.ndarray | float) -> np.ndarray:
-    """Return the mean of a level given that it lies above the limit [dB]; the arguments broadcast.
+    """Compute the mean of a level given that it is above the limit [dB]; the arguments broadcast.
 
-    Compare measured levels with this: near the limit only the strong ones were detected, whose mean
-    lies above the mean of all. mean + sd * phi(a) / Phi(-a), a = (limit - mean) / sd, of the
-    truncated normal distribution (Johnson, Kotz and Balakrishnan 1994, section 13.10.1). At a limit
-    of -inf everything is detected.
+    Compare measured levels with this mean: near the limit only the strong links were detected.
+    Truncated normal: mean + sd * phi(a) / Phi(-a), a = (limit - mean) / sd (Johnson, Kotz and
+    Balakrishnan 1994, section 13.10.1). A limit of -inf means that every link is detected.
     """
-    below = (limit_db - mean_db) / sd_db
-    return mean_db + sd_db * np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(-below))
+    return mean_db + sd_db * _mills_ratio((mean_db - limit_db) / sd_db)
+
+
+def _mills_ratio(z: np.ndarray) -> np.ndarray:
+    """Compute phi(z) / Phi(z) of the standard normal distribution without underflow."""
+    return np.exp(-0.5 * z**2 - HALF_LOG_2PI - log_ndtr(z))
 
 
 def standardised(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
                  limit_db: Limit) -> np.ndarray:
-    """Return the standardised residual (level - mean) / sd of each link.
+    """Compute the standardised residual (level - mean) / sd of each link; all are (n,).
 
-    A link that was not detected, and whose limit is known, gets its conditional mean below the
-    limit, -phi(a) / Phi(a), a = (limit - mean) / sd, as in `mean_if_detected`. All are (n,) [dB].
+    A blank with a known limit gets the conditional mean of a residual below the limit,
+    -phi(a) / Phi(a), a = (limit - mean) / sd.
     """
     residual = (level_db - mean_db) / sd_db
     missing = np.isnan(residual)
     if missing.any():
         limits_db = limits_of(limit_db, len(level_db))
-        below = (limits_db[missing] - mean_db[missing]) / sd_db[missing]
-        residual[missing] = -np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(below))
+        residual[missing] = -_mills_ratio((limits_db[missing] - mean_db[missing]) / sd_db[missing])
     return residual
 
 
 def gaussian_nll_torch(level: torch.Tensor, mean: torch.Tensor, log_sd: torch.Tensor,
                        censored: torch.Tensor) -> torch.Tensor:
-    """Return `gaussian_nll` in torch, differentiable in mean and log_sd; everything broadcasts.
+    """Compute `gaussian_nll` in torch, differentiable in mean and log_sd; everything broadcasts.
 
     Args:
-        level: measured; where `censored`, the limit of detection instead.
-        mean: expected, in the unit of `level`.
+        level: measured level; the limit of detection where `censored`.
+        mean: expected level, in the unit of `level`.
         log_sd: natural logarithm of the standard deviation.
-        censored: bool, what was not detected.
+        censored: bool, True if not detected.
 
     Returns:
         [nats], of the broadcast shape.
@@ -114,7 +116,7 @@ def gaussian_nll_torch(level: torch.Tensor, mean: torch.Tensor, log_sd: torch.Te
 
 @dataclass(frozen=True)
 class LogDistanceLine:
-    """gain = intercept - 10 * exponent * log10(d / 1 m) + N(0, sd^2), the log-distance law.
+    """Log-distance law: gain = intercept - 10 * exponent * log10(d / 1 m) + N(0, sd^2).
 
     Attributes:
         intercept_db: mean gain at 1 m [dB].
@@ -127,13 +129,13 @@ class LogDistanceLine:
     sd_db: float
 
     def mean_db(self, log_distance: np.ndarray) -> np.ndarray:
-        """Return the mean gain [dB] at log10(d / 1 m), any shape."""
+        """Compute the mean gain [dB] at log10(d / 1 m), any shape."""
         return self.intercept_db - 10.0 * self.exponent * log_distance
 
 
 def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
              limit_db: Limit) -> LogDistanceLine:
-    """Return the line of highest likelihood, with a weak prior on the exponent.
+    """Fit the log-distance line by Tobit maximum likelihood, with a weak prior on the exponent.
 
     The Tobit likelihood has one maximum only (Olsen 1978, 'Note on the uniqueness of the maximum
     likelihood estimator for the Tobit model', Econometrica 46), so the least-squares line through
@@ -141,12 +143,12 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
 
     Args:
         log_distance: (n,) log10(d / 1 m).
-        level_db: (n,) [dB], at least two of them detected; NaN: below the limit.
-        limit_db: limit of detection [dB]; unknown only for levels that were detected.
+        level_db: (n,) measured levels [dB], at least two of them detected; NaN: not detected.
+        limit_db: limit of detection [dB]; it must be known for every blank.
     """
     detected = ~np.isnan(level_db)
     x, y = log_distance[detected], level_db[detected]
-    # Centred and scaled: L-BFGS wants parameters of about one size.
+    # Centred and scaled, as L-BFGS needs parameters of similar size.
     x_mid, x_scale, y_mid = x.mean(), max(float(x.std()), 1e-3), y.mean()
     u, v = (x - x_mid) / x_scale, y - y_mid
     u_below = (log_distance[~detected] - x_mid) / x_scale
@@ -157,13 +159,11 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
         level, slope, log_sd = theta
         h = np.exp(-log_sd)
         z, z_below = h * (v - level - slope * u), h * (limit - level - slope * u_below)
-        log_phi = log_ndtr(z_below)
-        ratio = np.exp(-0.5 * z_below**2 - HALF_LOG_2PI - log_phi)
-        pull = (slope + prior_loss) / prior_sd
-        value = 0.5 * z @ z + len(z) * log_sd - log_phi.sum() + 0.5 * pull**2
+        ratio, z_prior = _mills_ratio(z_below), (slope + prior_loss) / prior_sd
+        value = 0.5 * z @ z + len(z) * log_sd - log_ndtr(z_below).sum() + 0.5 * z_prior**2
         gradient = [
             h * (ratio.sum() - z.sum()),
-            h * (ratio @ u_below - z @ u) + pull / prior_sd,
+            h * (ratio @ u_below - z @ u) + z_prior / prior_sd,
             len(z) - z @ z + ratio @ z_below,
         ]
         return value / len(level_db), np.array(gradient) / len(level_db)
@@ -181,10 +181,15 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
 
 def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.ndarray,
                limit_db: Limit, prior_db: float, prior_sd_db: float) -> LogDistanceLine:
-    """Return the line, moved up or down to few or no levels: a maximum a posteriori shift.
+    """Shift a line up or down to fit few or no levels: maximum a posteriori of the intercept.
 
-    Levels are as of `fit_line`; without a limit those that were not detected count nothing. The
-    shift's prior is normal, of mean `prior_db` and standard deviation `prior_sd_db`.
+    Args:
+        line: log-distance line of other links.
+        log_distance: (n,) log10(d / 1 m).
+        level_db: (n,) measured levels [dB]; NaN: not detected.
+        limit_db: limit of detection [dB]; a blank contributes nothing if it is unknown.
+        prior_db: mean of the shift's normal prior [dB].
+        prior_sd_db: standard deviation of that prior [dB].
     """
 
     def objective(shift_db: float) -> float:
@@ -199,10 +204,15 @@ def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.nda
 
 
 def fit_sd_db(level_db: np.ndarray, mean_db: np.ndarray, limit_db: Limit) -> float:
-    """Return the standard deviation of highest likelihood around given means (n,) [dB].
+    """Fit the standard deviation of levels about given means by Tobit maximum likelihood.
 
-    It is between MIN_SD_DB and MAX_SD_DB. Levels are as of `fit_line`; without a limit those that
-    were not detected count nothing.
+    Args:
+        level_db: (n,) measured levels [dB]; NaN: not detected.
+        mean_db: (n,) means [dB].
+        limit_db: limit of detection [dB]; a blank contributes nothing if it is unknown.
+
+    Returns:
+        standard deviation [dB], from MIN_SD_DB to MAX_SD_DB.
     """
 
     def objective(log_sd: float) -> float:

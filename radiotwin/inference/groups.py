@@ -1,11 +1,11 @@
-"""Groups of values that stand out from their peers.
+"""Find groups of values that stand out from their peers: statistics, errors, two-groups odds.
 
-A group is any set of values, and groups may overlap. Each has a statistic with a standard error, in
-which values of one unit (neighbours, which err alike) count as one. Its peers are the other groups
-of the same kind. Their own spread is estimated robustly, and with few peers it is shrunk to a
-prior. Whether a group is one of its peers is judged by two hypotheses (Efron 2008,
-'Microarrays, empirical Bayes and the two-groups model', Statist. Sci. 23): it is as far from them
-as Student's t with that spread allows, or it may be anywhere.
+A group is any set of values, and groups may overlap. Each has a statistic (level, log scatter,
+share) with a cluster-robust standard error: values of one unit (neighbours, with correlated errors)
+count as one. Its peers are the other groups of the same kind. The spread between peers is estimated
+robustly and, with few peers, shrunk to a prior. Two hypotheses are compared (Efron 2008,
+'Microarrays, empirical Bayes and the two-groups model', Statist. Sci. 23): the group is as far from
+its peers as Student's t with that spread allows, or it may be anywhere.
 """
 
 from __future__ import annotations
@@ -17,26 +17,27 @@ from scipy.stats import t as student_t
 
 from radiotwin.inference.gaussian import MAD_SD, robust_sd
 
-LEAST = 12, 4, 3.0  # values, passing and lasting units of a group, to be judged
-BIN_LEAST = 5, 2, 1.0  # of a bin of a curve
-HUBER = 1.345  # scales, beyond which a value pulls no further (95 % efficient for normal errors)
-MAX_SCALES = 6.0  # a single value counts as this far away at most
-LEAVE_OUT = 64  # groups up to which each is left out of its own peers
-PEER_WEIGHT = 4.0  # peers that the prior spread counts as
-PRIOR_DOF = 60.0  # of that prior
-MIN_ALIKE = 3  # values of a unit, to tell how much units differ
-OUTLIER_DOF = 2.0  # of sizes of what stands out: heavy tails
+LEAST = 12, 4, 3.0  # least number of values, passing and lasting units of a group that is judged
+BIN_LEAST = 5, 2, 1.0  # the same for a bin of a curve
+HUBER = 1.345  # clip of Huber's estimate [scales]: 95 % efficient for normal errors
+MAX_SCALES = 6.0  # clip of a single deviation [scales]
+LEAVE_OUT = 64  # number of groups up to which peers are taken leave-one-out
+PEER_WEIGHT = 4.0  # prior spread counts as so many peers
+PRIOR_DOF = 60.0  # degrees of freedom of the prior spread
+MIN_ALIKE = 3  # passing units in a lasting one, to estimate the spread between lasting units
+OUTLIER_DOF = 2.0  # heavy tails of the size of a group that stands out
 POLISH_ROUNDS, SHARED_ROUNDS = 3, 10
+MEDIAN_VARIANCE = 1.57  # of a median over that of a mean, normal values: pi / 2
 TINY = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Units:
-    """Which of n values err alike.
+    """Labels of n values that share errors.
 
     Attributes:
-        passing: unit (n,) of values whose errors are alike at one time.
-        lasting: unit (n,) of values whose errors are alike at all times; there are few large ones.
+        passing: (n,) label of values with correlated errors at one time.
+        lasting: (n,) label of values with correlated errors at all times; few and large.
     """
 
     passing: np.ndarray
@@ -45,14 +46,14 @@ class Units:
 
 @dataclass(frozen=True, eq=False)
 class Groups:
-    """Members of groups, which may overlap.
+    """Memberships of values in groups, which may overlap.
 
     Attributes:
-        row: (m,) value of each membership.
-        group: (m,) group of each membership.
+        row: (m,) index of the value of each membership.
+        group: (m,) index of its group.
         count: number of groups k.
-        passing, lasting: (m,) number of each membership's pair of group and unit.
-        of_passing, of_lasting: group of each such pair.
+        passing, lasting: (m,) number of its pair of group and unit.
+        of_passing, of_lasting: (pairs,) group of each pair.
     """
 
     row: np.ndarray
@@ -65,64 +66,66 @@ class Groups:
 
     @classmethod
     def of_members(cls, row: np.ndarray, group: np.ndarray, count: int, units: Units) -> Groups:
-        """Return groups (m,) of rows (m,), some of which may be in several."""
+        """Build groups from memberships: rows (m,) and their groups (m,)."""
         return cls(row, group, count, *_pairs(group, units.passing[row]),
                    *_pairs(group, units.lasting[row]))
 
     @classmethod
     def of_labels(cls, label: np.ndarray, units: Units) -> Groups:
-        """Return the groups of equal labels (n,); negative labels are in none."""
+        """Build one group per label (n,); values of a negative label are in no group."""
         row = np.flatnonzero(label >= 0)
         return cls.of_members(row, label[row], int(label.max(initial=-1)) + 1, units)
 
-    def among(self, rows: np.ndarray) -> Groups:
-        """Return the groups with members from a mask (n,) only."""
+    def restrict_to(self, rows: np.ndarray) -> Groups:
+        """Keep only the members in a mask (n,)."""
         kept = rows[self.row]
         return replace(self, row=self.row[kept], group=self.group[kept],
                        passing=self.passing[kept], lasting=self.lasting[kept])
 
     def members(self, group: int, n: int) -> np.ndarray:
-        """Return the mask (n,) of a group's members."""
+        """Build the mask (n,) of a group's members."""
         rows = np.zeros(n, dtype=bool)
         rows[self.row[self.group == group]] = True
         return rows
 
 
-class Nested:
-    """Passing units within lasting ones, of some rows: how much of their errors lasts."""
+class LastingErrors:
+    """Estimator of the error that lasts, from passing units nested in lasting ones."""
 
     def __init__(self, units: Units, rows: np.ndarray) -> None:
+        """Prepare the estimate for some rows (r,), a mask or indices."""
         lasting = np.unique(units.lasting[rows], return_inverse=True)[1].ravel()
         self._part, self._of_part = _pairs(lasting, units.passing[rows])
         self._size = np.bincount(self._part)
         self._parts = np.bincount(self._of_part)
         self._several = self._parts >= MIN_ALIKE
 
-    def error(self, values: np.ndarray) -> float:
-        """Return the standard deviation of lasting units, of the rows' values (r,).
+    def sd(self, values: np.ndarray) -> float:
+        """Estimate the standard deviation between lasting units of values (r,).
 
-        Analysis of variance: the part that lasts is what the units' means differ by beyond what
-        their passing parts explain. Robust, as groups that stand out must not hide themselves.
+        Analysis of variance: variance of the means of lasting units, less the part that the scatter
+        of their passing units explains. By medians, so that a group that stands out does not
+        inflate it.
         """
         several, parts = self._several, self._parts
         if several.sum() < LEAST[1]:
             return 0.0
         mean = np.bincount(self._part, values) / self._size
         middle = np.bincount(self._of_part, mean) / parts
-        own = several[self._of_part]
-        freedom = np.sqrt(1 - 1 / parts[self._of_part[own]])
-        within = MAD_SD * np.median(np.abs(mean - middle[self._of_part])[own] / freedom)
+        used = several[self._of_part]
+        freedom = np.sqrt(1 - 1 / parts[self._of_part[used]])
+        within = MAD_SD * np.median(np.abs(mean - middle[self._of_part])[used] / freedom)
         between = robust_sd(middle[several]) ** 2 - within**2 * np.mean(1 / parts[several])
         return float(np.sqrt(np.maximum(between, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Statistic:
-    """A statistic of each of k groups; NaN where a group is too small.
+    """A statistic of k groups; NaN if a group is too small.
 
     Attributes:
-        value: (k,).
-        error: (k,) its standard error, units counted once.
+        value: (k,) estimate.
+        error: (k,) cluster-robust standard error.
     """
 
     value: np.ndarray
@@ -130,10 +133,10 @@ class Statistic:
 
 
 def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """Return the median (count,) of the values (m,) of each group (m,); NaN of an empty one.
+    """Compute the median (count,) of values (m,) by group (m,); NaN for an empty group.
 
-    Exact to the span of the values over 2³²: group and value are sorted as one integer, which is
-    ten times as fast as sorting by both.
+    Exact to the span of the values over 2³²: group and value are sorted as one integer, ten times
+    as fast as a sort by both.
     """
     found = np.full(count, np.nan)
     if not len(values):
@@ -144,23 +147,23 @@ def medians(values: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     key.sort()
     begin = np.searchsorted(key, np.arange(count + 1, dtype=np.int64) << 32)
     size = np.diff(begin)
-    some = size > 0
+    filled = size > 0
     low, high = begin[:-1] + (size - 1) // 2, begin[:-1] + size // 2
-    middle = (key[low[some]] & (2**32 - 1)) + (key[high[some]] & (2**32 - 1))
-    found[some] = least + 0.5 * step * middle
+    middle = (key[low[filled]] & (2**32 - 1)) + (key[high[filled]] & (2**32 - 1))
+    found[filled] = least + 0.5 * step * middle
     return found
 
 
 def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
            least_scale: float, is_bin: bool = False) -> Statistic:
-    """Return the level of each group: Huber's estimate, one step from the median.
+    """Estimate the level of each group: Huber's M-estimate, one step from the median.
 
     Args:
         values: (n,) without NaN among the members.
-        groups: of them.
-        lasting_sd: standard deviation of lasting units.
-        least_scale: of a group's values, such as the step that they are rounded to.
-        is_bin: whether groups are bins of curves, which may be small, as they are judged together.
+        groups: k groups of them.
+        lasting_sd: standard deviation between lasting units, see `LastingErrors`.
+        least_scale: lower bound of the scale of a group's values, e.g. their rounding step.
+        is_bin: whether the groups are bins of curves, which may be small.
     """
     x, group, count = values[groups.row], groups.group, groups.count
     middle = medians(x, group, count)
@@ -168,62 +171,63 @@ def levels(values: np.ndarray, groups: Groups, lasting_sd: float,
     deviation = (x - middle[group]) / scale[group]
     inside = np.maximum(np.bincount(group, np.abs(deviation) < HUBER, count), 1.0)
     value = middle + scale * np.bincount(group, np.clip(deviation, -HUBER, HUBER), count) / inside
-    pull = np.clip((x - value[group]) / scale[group], -HUBER, HUBER)
-    return _judged(value, scale / inside, pull, groups, lasting_sd, is_bin)
+    influence = np.clip((x - value[group]) / scale[group], -HUBER, HUBER)
+    return _with_error(value, scale / inside, influence, groups, lasting_sd, is_bin)
 
 
 def log_scatters(values: np.ndarray, groups: Groups, lasting_sd: float | None,
                  scale: float) -> Statistic:
-    """Return the logarithm of each group's mean absolute deviation from its own median.
+    """Estimate the log scatter of each group: log of the mean absolute deviation from its median.
 
     Args:
         values: (n,) without NaN among the members.
-        groups: of them.
-        lasting_sd: as of `levels`, of the logarithm; None: values are independent.
-        scale: usual one, of which a value counts `MAX_SCALES` at most.
+        groups: k groups of them.
+        lasting_sd: standard deviation between lasting units, of the logarithm; None: values are
+            independent.
+        scale: usual scatter, the unit of the deviations, which are clipped at `MAX_SCALES`.
     """
     x, group, count = values[groups.row], groups.group, groups.count
     middle = medians(x, group, count)
     size = np.minimum(np.abs(x - middle[group]) / scale, MAX_SCALES)
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.maximum(np.bincount(group, size, count) / number, 1e-3)
-    return _judged(np.log(mean), 1 / (number * mean), size - mean[group], groups, lasting_sd)
+    return _with_error(np.log(mean), 1 / (number * mean), size - mean[group], groups, lasting_sd)
 
 
 def means(values: np.ndarray, groups: Groups, lasting_sd: float) -> Statistic:
-    """Return the mean of each group, such as a share; arguments as of `levels`.
+    """Estimate the mean of each group, e.g. its share of blanks; arguments as in `levels`.
 
-    Values are taken as at least as uncertain as if they were independent, with the variance of
-    their group, or of all values where that is larger.
+    The error is at least that of independent values, with the variance of the group or of all
+    values, whichever is larger.
     """
     x, group, count = values[groups.row], groups.group, groups.count
     number = np.maximum(np.bincount(group, minlength=count), 1)
     mean = np.bincount(group, x, count) / number
-    found = _judged(mean, 1 / number, x - mean[group], groups, lasting_sd)
+    found = _with_error(mean, 1 / number, x - mean[group], groups, lasting_sd)
     variance = np.bincount(group, (x - mean[group]) ** 2, count) / number
     least = np.sqrt(np.maximum(variance, np.var(x)) / number)
     return replace(found, error=np.maximum(found.error, least))
 
 
-def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Groups,
-            lasting_sd: float | None, is_bin: bool = False) -> Statistic:
-    """Return a statistic with its error.
+def _with_error(value: np.ndarray, step: np.ndarray, influence: np.ndarray, groups: Groups,
+                lasting_sd: float | None, is_bin: bool = False) -> Statistic:
+    """Add the standard error to a statistic (k,), and blank groups that are too small.
 
-    That of passing units is a sandwich, whose influences are `pull` (m,) times `step`. What lasts
-    in lasting units is added. Without it each value is a unit. Bins have few units, so that
-    their sandwich is shrunk to what all groups have.
+    Sandwich over passing units, with the influence (m,) times `step` (k,) of each member, plus the
+    error of lasting units in quadrature. `lasting_sd` None: values are independent. The sandwich of
+    bins, which have few units, is shrunk to the mean ratio over all bins.
     """
     count = groups.count
     number = np.bincount(groups.group, minlength=count)
     filled = np.bincount(groups.passing, minlength=len(groups.of_passing)) > 0
     several = np.bincount(groups.of_passing, filled, count)
-    pulls = np.bincount(groups.passing, pull, len(groups.of_passing))
-    squares = np.bincount(groups.of_passing, pulls**2, count)
+    unit_influence = np.bincount(groups.passing, influence, len(groups.of_passing))
+    squares = np.bincount(groups.of_passing, unit_influence**2, count)
     sandwich = step * np.sqrt(squares * several / np.maximum(several - 1, 1))
     share = np.bincount(groups.lasting, minlength=len(groups.of_lasting)).astype(float)
     effective = np.maximum(
         number**2 / np.maximum(np.bincount(groups.of_lasting, share**2, count), 1), 1.0)
-    independent = step * np.sqrt(np.bincount(groups.group, pull**2, count))
+    independent = step * np.sqrt(np.bincount(groups.group, influence**2, count))
     least = BIN_LEAST if is_bin else LEAST
     enough = (number >= least[0]) & (several >= least[1]) & (effective >= least[2])
     if is_bin and enough.any():
@@ -237,20 +241,20 @@ def _judged(value: np.ndarray, step: np.ndarray, pull: np.ndarray, groups: Group
 
 
 def _pairs(group: np.ndarray, unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pair (m,) of each group (m,) and unit (m,), and the group of each pair."""
+    """Assign a number to each pair (m,) of group and unit, and list the group of each number."""
     size = np.int64(unit.max(initial=0) + 1)
     pairs, pair = np.unique(group * size + unit, return_inverse=True)
     return pair.ravel(), pairs // size
 
 
 @dataclass(frozen=True, eq=False)
-class Apart:
-    """How far k groups are from their peers.
+class PeerComparison:
+    """Distance of k groups from their peers.
 
     Attributes:
-        size: (k,) distance from the peers' centre; NaN where a group is not judged.
-        error: (k,) its standard error, the centre's included.
-        spread: (k,) standard deviation of the peers themselves.
+        size: (k,) distance from the centre of the peers; NaN if a group is not judged.
+        error: (k,) its standard error, including that of the centre.
+        spread: (k,) standard deviation between the peers.
         dof: (k,) degrees of freedom of the spread.
     """
 
@@ -261,15 +265,15 @@ class Apart:
 
     @property
     def score(self) -> np.ndarray:
-        """(k,) distance over error and spread together."""
+        """(k,) distance over the root of error² + spread²."""
         return self.size / np.hypot(self.error, self.spread)
 
     def log_odds(self, outlier_sd: float, prior_odds: float) -> np.ndarray:
-        """Return the log odds (k,) that a group is not one of its peers; NaN = not judged.
+        """Compute the log odds (k,) that a group differs from its peers; NaN = not judged.
 
         Args:
-            outlier_sd: scale of the sizes of what stands out, Student's t around 0.
-            prior_odds: that one group of all k stands out, shared among those that are judged.
+            outlier_sd: scale of the Student t of the size of a group that differs.
+            prior_odds: prior odds that one of all groups differs, divided among the judged groups.
         """
         total, judged = np.hypot(self.error, self.spread), np.isfinite(self.size)
         like_peers = student_t.logpdf(self.size, self.dof, scale=total)
@@ -277,43 +281,44 @@ class Apart:
         return anywhere - like_peers + np.log(prior_odds / max(judged.sum(), 1))
 
 
-def apart(found: Statistic, prior_spread: float, dof: float) -> Apart:
-    """Return how far each group is from its peers, whose spread is shrunk to a prior.
+def compare_with_peers(found: Statistic, prior_spread: float, dof: float) -> PeerComparison:
+    """Compare each group with its peers, leave-one-out, the spread of peers shrunk to a prior.
 
     Args:
-        found: statistic of each group.
-        prior_spread: standard deviation of peers.
-        dof: degrees of freedom of peers' distribution, Student's t.
+        found: statistic of k groups.
+        prior_spread: prior standard deviation between peers.
+        dof: degrees of freedom of the Student t between peers.
     """
     value, error = found.value, found.error
     size, total = np.full(len(value), np.nan), np.full(len(value), np.nan)
     spread, tails = total.copy(), total.copy()
     judged = np.flatnonzero(np.isfinite(value))
     if len(judged) < 2:
-        return Apart(size, total, spread, tails)
-    own, squares = value[judged], error[judged] ** 2
+        return PeerComparison(size, total, spread, tails)
+    values, squares = value[judged], error[judged] ** 2
     if len(judged) <= LEAVE_OUT:
         others = ~np.eye(len(judged), dtype=bool)
-        own_peers = np.broadcast_to(own, others.shape)[others].reshape(len(judged), -1)
-        of_peers = np.broadcast_to(squares, others.shape)[others].reshape(len(judged), -1)
+        peer_values = np.broadcast_to(values, others.shape)[others].reshape(len(judged), -1)
+        peer_squares = np.broadcast_to(squares, others.shape)[others].reshape(len(judged), -1)
     else:
-        own_peers, of_peers = own[None], squares[None]
-    peers = own_peers.shape[1]
-    centre = np.median(own_peers, axis=1)
-    noise = np.maximum(np.median(of_peers, axis=1), TINY)
-    seen = (MAD_SD * np.median(np.abs(own_peers - centre[:, None]), axis=1)) ** 2
-    # Peers may be closer together than their errors say, which are of the worst case.
+        peer_values, peer_squares = values[None], squares[None]
+    peers = peer_values.shape[1]
+    centre = np.median(peer_values, axis=1)
+    noise = np.maximum(np.median(peer_squares, axis=1), TINY)
+    seen = (MAD_SD * np.median(np.abs(peer_values - centre[:, None]), axis=1)) ** 2
+    # Errors are of the worst case: peers may be closer together than their errors.
     weight = peers - 1.0
     usual = (weight * seen + PEER_WEIGHT * (prior_spread**2 + noise)) / (weight + PEER_WEIGHT)
-    size[judged] = own - centre
-    total[judged] = np.sqrt(squares * np.minimum(usual / noise, 1.0) + 1.57 / peers * usual)
+    size[judged] = values - centre
+    total[judged] = np.sqrt(squares * np.minimum(usual / noise, 1.0)
+                            + MEDIAN_VARIANCE / peers * usual)
     spread[judged] = np.sqrt(np.maximum(usual - noise, 0.0))
     tails[judged] = 1 / (1 / (weight + PRIOR_DOF) + 1 / dof)  # the spread is not known exactly
-    return Apart(size, total, spread, tails)
+    return PeerComparison(size, total, spread, tails)
 
 
-def together(parts: list[Apart]) -> Apart:
-    """Return distances of the same groups in several parts of the data, weighted by precision."""
+def combine_parts(parts: list[PeerComparison]) -> PeerComparison:
+    """Average comparisons of the same groups in several parts of the data, by inverse variance."""
     if len(parts) == 1:
         return parts[0]
     sizes = np.array([each.size for each in parts])
@@ -330,13 +335,13 @@ def together(parts: list[Apart]) -> Apart:
         return np.where(missing, np.nan, summed)
 
     size = np.where(missing, np.nan, np.sum(share * np.where(known, sizes, 0.0), axis=0))
-    return Apart(size, joined([each.error for each in parts], 2),
-                 joined([each.spread for each in parts], 2),
-                 joined([each.dof for each in parts], 1))
+    return PeerComparison(size, joined([each.error for each in parts], 2),
+                          joined([each.spread for each in parts], 2),
+                          joined([each.dof for each in parts], 1))
 
 
-def polished(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
-    """Return values (n,) less the medians of each label's groups in turn: a median polish."""
+def median_polish(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
+    """Subtract from values (n,) the medians of the groups of each labelling (n,) in turn."""
     left = values.copy()
     for _ in range(POLISH_ROUNDS):
         for label in labels:
@@ -344,36 +349,37 @@ def polished(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
     return left
 
 
-def less_ends(found: Statistic, ends: tuple[np.ndarray, ...]) -> Statistic:
-    """Return a statistic of k pairs less the levels of both ends (k,).
+def subtract_end_levels(found: Statistic, ends: tuple[np.ndarray, ...]) -> Statistic:
+    """Subtract from a statistic of k pairs the levels of both ends, given by labels (k,).
 
-    These have families of their own. An end's level is the median of its pairs and a zero: of two
-    pairs of which one is off, the end is not; where both are, it is.
+    The level of an end is the median of its pairs and one zero: an end with two pairs has a level
+    only if both are off.
     """
     judged = np.isfinite(found.value)
     value, error = found.value.copy(), found.error.copy()
-    own = [np.unique(end[judged], return_inverse=True)[1].ravel() for end in ends]
+    labels = [np.unique(end[judged], return_inverse=True)[1].ravel() for end in ends]
     left = value[judged] - np.median(value[judged])
     for _ in range(POLISH_ROUNDS):
-        for end in own:
+        for end in labels:
             count = int(end.max()) + 1
             left = left - medians(np.append(left, np.zeros(count)),
                                   np.append(end, np.arange(count)), count)[end]
     value[judged] = left
-    error[judged] *= np.sqrt(1 + sum(1.57 / (np.bincount(end)[end] + 1) for end in own))
+    error[judged] *= np.sqrt(1 + sum(MEDIAN_VARIANCE / (np.bincount(end)[end] + 1)
+                                     for end in labels))
     return Statistic(value, error)
 
 
-def without_shared(values: np.ndarray, label: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Return values (n,) less what several groups share in a unit.
+def subtract_unit_errors(values: np.ndarray, label: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Subtract from values (n,) the error that groups share in a unit, such as a place.
 
-    A unit that several groups have been to shows how far they differ where all else is equal. Its
-    own error is estimated beside the groups' levels, by medians in turn, and shrunk to 0.
+    Two-way fit by medians, levels of groups plus errors of units; the error of a unit is shrunk to
+    0, fully if only one group was in it.
 
     Args:
-        values: n values.
-        label: group (n,) of each.
-        unit: (n,) within which errors last.
+        values: (n,).
+        label: (n,) group.
+        unit: (n,) lasting unit, see `Units`.
     """
     cell_of, of_group = _pairs(label, unit)
     size = np.int64(unit.max(initial=0) + 1)

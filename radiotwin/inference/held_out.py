@@ -1,9 +1,9 @@
-"""Held-out data: groups, and weights of predictions.
+"""Cross-validation: deal groups to folds, and stack predictions by held-out errors.
 
-Weights are those of a convex combination: not negative, with the sum one (Breiman 1996, 'Stacked
-regressions', Machine Learning 24; van der Laan, Polley and Hubbard 2007, 'Super learner',
-Statistical Applications in Genetics and Molecular Biology 6). They may pass from one set to another
-with a share that each prediction has.
+Stacking weights are not negative and sum to one (Breiman 1996, 'Stacked regressions', Machine
+Learning 24; van der Laan, Polley and Hubbard 2007, 'Super learner', Statistical Applications in
+Genetics and Molecular Biology 6). There are two sets of weights, and each row blends them linearly
+by its share of the second.
 """
 
 from __future__ import annotations
@@ -11,14 +11,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import nnls
 
-TOGETHER = 1e4  # weight of the condition that weights sum to one, relative to the errors
+SUM_WEIGHT = 1e4  # weight of the equation "weights sum to one", relative to the errors
 
 
 def deal_groups(group: np.ndarray, max_folds: int, rng: np.random.Generator) -> np.ndarray:
-    """Deal groups to folds of about equal size.
+    """Deal groups to folds of about equal size, largest group first, each to the smallest fold.
 
-    The largest group comes first, and each goes to the fold that is smallest so far, as in
-    scikit-learn's `GroupKFold`; groups of equal size come in random order.
+    As scikit-learn's `GroupKFold`, but groups of equal size come in random order.
 
     Args:
         group: (n,) label of the group.
@@ -38,16 +37,16 @@ def deal_groups(group: np.ndarray, max_folds: int, rng: np.random.Generator) -> 
 
 
 def convex_weights(error: np.ndarray, share: np.ndarray, pull: float) -> np.ndarray:
-    """Return the weights with the least squares, pulled towards the best single prediction.
+    """Fit convex stacking weights by least squares, shrunk towards the best single prediction.
 
-    Minimises sum((error @ w)^2) / m + pull * |w - best|^2 summed over both sets, with the mean
-    square m of the best single prediction's error: another single one must have a mean square
-    lower by 4 `pull` to be taken instead, if the share is the same for all.
+    Minimises mean((error @ w)^2) / m + pull * |w - best|^2, summed over both sets of weights, where
+    m is the mean square error of the best single prediction. With equal shares, another prediction
+    must have a mean square error lower by 4 `pull` m to be taken instead.
 
     Args:
         error: (n, k) measured minus predicted, of k predictions.
-        share: (n,) in 0..1, of the second set of weights.
-        pull: as above.
+        share: (n,) in 0..1, share of the second set of weights.
+        pull: strength of the shrinkage.
 
     Returns:
         (2, k) weights: the first set (share 0) and the second (share 1).
@@ -59,15 +58,15 @@ def convex_weights(error: np.ndarray, share: np.ndarray, pull: float) -> np.ndar
     columns /= np.sqrt(n * max(float(square[best]), 1e-12))
     upper = np.linalg.qr(columns, mode="r")
     wanted = np.tile(np.arange(k) == best, 2).astype(float)
-    sums = TOGETHER * np.kron(np.eye(2), np.ones(k))
+    sums = SUM_WEIGHT * np.kron(np.eye(2), np.ones(k))
     weights, _ = nnls(np.vstack([upper, np.sqrt(pull) * np.eye(2 * k), sums]),
                       np.concatenate([np.zeros(len(upper)), np.sqrt(pull) * wanted,
-                                      np.full(2, TOGETHER)]))
+                                      np.full(2, SUM_WEIGHT)]))
     weights = weights.reshape(2, k)
     return weights / weights.sum(axis=1, keepdims=True)
 
 
 def combine(predictions: np.ndarray, share: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the combination (n,) of predictions (n, k) with shares (n,) and weights (2, k)."""
-    of_each = (1 - share)[:, None] * weights[0] + share[:, None] * weights[1]
-    return (of_each * predictions).sum(axis=1)
+    """Combine predictions (n, k) by two sets of weights (2, k), blended by shares (n,)."""
+    blended = (1 - share)[:, None] * weights[0] + share[:, None] * weights[1]
+    return (blended * predictions).sum(axis=1)

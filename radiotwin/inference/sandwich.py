@@ -1,13 +1,13 @@
-"""Covariance of estimates from rows that err alike in clusters.
+"""Compute cluster-robust covariances of estimates whose rows have correlated errors.
 
 The sandwich A⁻¹ M A⁻¹ (Liang and Zeger 1986, 'Longitudinal data analysis using generalized linear
-models', Biometrika 73): A is the information of all rows, M the sum of the squares of the clusters'
-scores. With few clusters instead: the fit, linearised, without each (the jackknife CV3 of
-MacKinnon, Nielsen and Webb 2023, 'Fast and reliable jackknife and bootstrap methods for
-cluster-robust inference', Journal of Applied Econometrics 38). A prior counts as one more
-observation, in both. How many clusters a parameter hangs on
-decides the quantile of Student's t (Carter, Schnepel and Steigerwald 2017, 'Asymptotic behavior of
-a t-test robust to cluster heterogeneity', Review of Economics and Statistics 99).
+models', Biometrika 73): A is the information of all rows, M the sum of squares of the clusters'
+scores. With few clusters, the linearised leave-one-cluster-out jackknife instead (CV3 of MacKinnon,
+Nielsen and Webb 2023, 'Fast and reliable jackknife and bootstrap methods for cluster-robust
+inference', Journal of Applied Econometrics 38). In both a prior counts as one more observation. The
+effective number of clusters of a parameter sets the degrees of freedom of its Student t quantile
+(Carter, Schnepel and Steigerwald 2017, 'Asymptotic behavior of a t-test robust to cluster
+heterogeneity', Review of Economics and Statistics 99).
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ import numpy as np
 from scipy.sparse import csr_array, issparse
 from scipy.stats import norm, t
 
-MIN_CLUSTERS = 1.5  # effective ones, below which a way to cluster says nothing of a parameter
-MAX_LEFT_OUT = 50  # clusters, up to which the fit without each is looked at
-MAX_WIDTH = 3.0  # of an interval without some data, over that with all: a wider one is the prior's
+MIN_CLUSTERS = 1.5  # effective clusters below which a clustering is ignored for a parameter
+MAX_LEFT_OUT = 50  # clusters up to which the jackknife replaces the sandwich
+MAX_WIDTH = 3.0  # interval without a cluster over that with all; if wider, the prior decides it
 QUANTILE = 0.95  # upper end of a 90 % interval
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """How n rows and a prior bear on q parameters, at their best fit.
+    """Scores and information of n rows and a prior about q parameters, at the best fit.
 
     Attributes:
-        score: (n, q) slope of each row's log-likelihood.
-        root: (m, q) whose square root' root is the information of the rows; m = k n, and row i of
-            it belongs to row i modulo n.
-        precision: (q,) of the prior as the fit has taken it.
-        prior_score_variance: (q,) variance of the prior's own score.
+        score: (n, q) gradient of each row's log-likelihood.
+        root: (m, q) with root' root = information of the rows; m = k n, and row i belongs to data
+            row i modulo n.
+        precision: (q,) precision of the prior in the fit.
+        prior_score_variance: (q,) variance of the prior's score.
     """
 
     score: np.ndarray | csr_array
@@ -47,64 +47,67 @@ class Scores:
         return np.linalg.inv(_dense(self.root.T @ self.root) + np.diag(self.precision + 1e-12))
 
     def covariances(self, clusterings: list[np.ndarray]) -> list[np.ndarray]:
-        """Return covariances (q, q) whose 1.645 standard deviations are the end of 90 % intervals.
+        """Compute covariances (q, q), each scaled so that ±1.645 sd is a 90 % interval.
 
-        First that of independent rows, then of each clustering, with its t quantile. The interval
-        of a parameter, or of a sum or difference of some, is the widest of them. What hangs on too
-        few clusters has the standard deviation of independent rows.
+        The first is that of independent rows, then one per clustering, widened by Student's t. The
+        interval of a parameter, or of a contrast, is the widest of them. A parameter with too few
+        effective clusters keeps the standard deviation of independent rows.
 
         Args:
-            clusterings: (n,) integer labels of rows that err alike, such as places, or flights.
+            clusterings: (n,) integer labels of rows with correlated errors, e.g. places, flights.
         """
         bread, information = self.bread, _dense(self.root.T @ self.root)
-        alone = bread @ (information + np.diag(self.prior_score_variance)) @ bread
-        found = [alone]
+        independent = bread @ (information + np.diag(self.prior_score_variance)) @ bread
+        found = [independent]
         for label in clusterings:
-            own = np.unique(label, return_inverse=True)[1].ravel()
-            count = own.max() + 1
+            cluster = np.unique(label, return_inverse=True)[1].ravel()
+            count = cluster.max() + 1
             if count < 2:
                 continue
-            clustered = self._clustered(bread, own, count)
+            clustered = self._clustered(bread, cluster, count)
             clustered += bread @ np.diag(self.prior_score_variance) @ bread
-            clusters = self._effective_clusters(bread, own, count)
-            widening = t.ppf(QUANTILE, np.maximum(clusters - 1, 1.0)) / norm.ppf(QUANTILE)
-            own_sd = np.sqrt(np.maximum(np.diag(clustered), 1e-300))
-            sd = np.where(clusters >= MIN_CLUSTERS, own_sd * widening, np.sqrt(np.diag(alone)))
-            found.append(clustered * np.outer(sd / own_sd, sd / own_sd))
+            effective = self._effective_clusters(bread, cluster, count)
+            widening = t.ppf(QUANTILE, np.maximum(effective - 1, 1.0)) / norm.ppf(QUANTILE)
+            clustered_sd = np.sqrt(np.maximum(np.diag(clustered), 1e-300))
+            sd = np.where(effective >= MIN_CLUSTERS, clustered_sd * widening,
+                          np.sqrt(np.diag(independent)))
+            found.append(clustered * np.outer(sd / clustered_sd, sd / clustered_sd))
         return found
 
-    def _clustered(self, bread: np.ndarray, own: np.ndarray, count: int) -> np.ndarray:
-        """Return the covariance (q, q) by clusters (n,) that err by themselves.
+    def _clustered(self, bread: np.ndarray, cluster: np.ndarray, count: int) -> np.ndarray:
+        """Compute the covariance (q, q) for clusters (n,) with independent errors.
 
-        Few clusters bend the fit towards themselves: then by how far it moves without each. Without
-        the only cluster that determines a parameter it moves to the prior, which does not count.
+        Few clusters pull the fit towards themselves: then by the jackknife. A cluster without which
+        a parameter is left to the prior does not count for it.
         """
-        sums = _by_cluster(self.score, own, count)
+        sums = _sum_by_cluster(self.score, cluster, count)
         if count > MAX_LEFT_OUT:
             return count / (count - 1) * bread @ (sums.T @ sums) @ bread
-        every = _dense(self.root.T @ self.root) + np.diag(self.precision + 1e-12)
-        rows = np.tile(own, self.root.shape[0] // len(own))
+        information = _dense(self.root.T @ self.root) + np.diag(self.precision + 1e-12)
+        rows = np.tile(cluster, self.root.shape[0] // len(cluster))
         moves = np.empty_like(sums)
         for number in range(count):
-            mine = self.root[np.flatnonzero(rows == number)]
-            without = np.linalg.inv(every - _dense(mine.T @ mine))
-            determined = np.diag(without) <= MAX_WIDTH**2 * np.diag(bread)
-            moves[number] = np.where(determined, without @ sums[number], 0.0)
+            root = self.root[np.flatnonzero(rows == number)]
+            bread_without = np.linalg.inv(information - _dense(root.T @ root))
+            determined = np.diag(bread_without) <= MAX_WIDTH**2 * np.diag(bread)
+            moves[number] = np.where(determined, bread_without @ sums[number], 0.0)
         return (count - 1) / count * moves.T @ moves
 
-    def _effective_clusters(self, bread: np.ndarray, own: np.ndarray, count: int) -> np.ndarray:
-        """Return (q,) number of equal clusters that would bear on a parameter as these do."""
+    def _effective_clusters(self, bread: np.ndarray, cluster: np.ndarray, count: int) -> np.ndarray:
+        """Compute the effective number of clusters (q,) of each parameter: (Σ s)² / Σ s²."""
         influence = self.root @ bread
-        times = influence.shape[0] // len(own)
-        share = _by_cluster(influence**2, np.tile(own, times), count)
+        times = influence.shape[0] // len(cluster)
+        share = _sum_by_cluster(influence**2, np.tile(cluster, times), count)
         return share.sum(axis=0)**2 / np.maximum((share**2).sum(axis=0), 1e-300)
 
 
-def _by_cluster(rows: np.ndarray | csr_array, own: np.ndarray, count: int) -> np.ndarray:
-    """Return the sums (count, q) of rows (n, q) by their cluster (n,)."""
-    members = csr_array((np.ones(len(own)), (own, np.arange(len(own)))), shape=(count, len(own)))
+def _sum_by_cluster(rows: np.ndarray | csr_array, cluster: np.ndarray, count: int) -> np.ndarray:
+    """Sum rows (n, q) by their cluster (n,) into (count, q)."""
+    n = len(cluster)
+    members = csr_array((np.ones(n), (cluster, np.arange(n))), shape=(count, n))
     return _dense(members @ rows)
 
 
 def _dense(matrix: np.ndarray | csr_array) -> np.ndarray:
+    """Convert a sparse or dense matrix to a dense array."""
     return matrix.toarray() if issparse(matrix) else np.asarray(matrix)  # type: ignore[union-attr]

@@ -134,13 +134,6 @@ def test_derivatives_are_those_of_the_likelihood_also_where_links_are_lost(share
     np.testing.assert_allclose(scale_slope, (narrower - wider) / (2 * step), atol=1e-5)
 
 
-def test_the_likelihood_of_a_link_that_may_drop_out_is_that_of_either():
-    given = replace(problem(np.array([-80.0, np.nan, np.nan]), np.ones((3, 1)), -90.0),
-                    losses=Losses(blank=np.array([0.1, 0.1, 0.0])))
-    found = given.nll_at(np.full(3, -84.0), np.full(3, 4.0))
-    below = student.cdf(-6 / 4, 5)
-    np.testing.assert_allclose(found, -np.log([0.9 * student.pdf(1, 5) / 4, 0.1 + 0.9 * below, below]))
-
 
 def test_the_likelihood_of_a_level_that_may_have_dropped_is_that_of_a_mixture():
     given = replace(problem(np.array([-80.0, -99.0, np.nan]), np.ones((3, 1)), -110.0),

@@ -12,6 +12,10 @@ from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
 NOTHING = Columns(np.zeros((240, 0)), np.zeros(0))
 
 
+def gain_nats(evidence, z, values, prior_sd):
+    return evidence.log_evidence(z, Columns(values, np.array([prior_sd]))) - evidence.log_evidence(z, NOTHING)
+
+
 def field(rng, sd, length_m, series=2, points=120, side_m=400.0):
     """Return series, positions and a field of exponential correlation plus white noise of sd 1."""
     label, position_m = np.repeat(np.arange(series), points), rng.uniform(0, side_m, (series * points, 3)) * [1, 1, 0]
@@ -59,9 +63,8 @@ def test_a_smooth_rest_is_no_evidence_for_a_smooth_pattern(seed):
     """Counted link by link it would be: hundreds of nats for a ramp that is not there."""
     rng = np.random.default_rng(seed)
     label, position_m, z = field(rng, 3.0, 30.0)
-    ramp = Columns((position_m[:, :1] - 200) / 200, np.array([3.0]))
     evidence = CorrelatedEvidence.fit(label, position_m, z, NOTHING, 0)
-    assert evidence.log_evidence(z, ramp) - evidence.log_evidence(z, NOTHING) < 3.0
+    assert gain_nats(evidence, z, (position_m[:, :1] - 200) / 200, 3.0) < 3.0
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -70,9 +73,7 @@ def test_a_pattern_that_no_field_has_is_evidence(seed):
     label, position_m, z = field(rng, 3.0, 150.0)
     pattern = rng.normal(size=(240, 1))
     evidence = CorrelatedEvidence.fit(label, position_m, z, NOTHING, 0)
-    z = z + pattern[:, 0]
-    gain = evidence.log_evidence(z, Columns(pattern, np.array([3.0]))) - evidence.log_evidence(z, NOTHING)
-    assert gain > 20
+    assert gain_nats(evidence, z + pattern[:, 0], pattern, 3.0) > 20
 
 
 def test_information_is_twice_the_expected_log_likelihood_ratio():
@@ -109,9 +110,7 @@ def test_a_series_in_parts_is_worth_nearly_what_it_is_in_one(monkeypatch):
         label, position_m, z = field(rng, 1.0, 20.0)
         pattern = rng.normal(size=(240, 1))
         evidence = CorrelatedEvidence.fit(label, position_m, z + 0.5 * pattern[:, 0], NOTHING, 0)
-        own = Columns(pattern, np.ones(1))
-        found.append(evidence.log_evidence(z + 0.5 * pattern[:, 0], own)
-                     - evidence.log_evidence(z + 0.5 * pattern[:, 0], NOTHING))
+        found.append(gain_nats(evidence, z + 0.5 * pattern[:, 0], pattern, 1.0))
     assert found[0] > 5 and found[1] == pytest.approx(found[0], rel=0.2)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.inference.curves import curves, curves_together
+from radiotwin.inference.curves import combine_curves, compare_curves
 from radiotwin.inference.groups import Statistic
 
 BINS, ERROR_DB, PRIOR_DB, ODDS = 16, 0.4, 0.1, 0.03
@@ -22,7 +22,7 @@ def drawn(rng, count, moves_db):
 def test_a_cycle_that_no_bin_shows_is_seen_in_all_together(count):
     rng, found, sizes = np.random.default_rng(0), [], []
     for _ in range(60):
-        curve = curves(*drawn(rng, count, 2.5), PRIOR_DB, "all")
+        curve = compare_curves(*drawn(rng, count, 2.5), PRIOR_DB, "all")
         found.append(curve.log_odds(3.0, ODDS))
         sizes.append(curve.size[0])
     found = np.array(found)
@@ -34,7 +34,7 @@ def test_a_cycle_that_no_bin_shows_is_seen_in_all_together(count):
 def test_curves_that_all_move_alike_are_peers():
     rng = np.random.default_rng(1)
     curve = np.repeat(np.arange(6), BINS)
-    most = [np.nanmax(curves(Statistic(rng.normal(size=len(curve)), np.full(len(curve), 0.2)), curve,
+    most = [np.nanmax(compare_curves(Statistic(rng.normal(size=len(curve)), np.full(len(curve), 0.2)), curve,
                              PRIOR_DB, "all").log_odds(3.0, ODDS)) for _ in range(60)]
     assert np.mean(np.array(most) > 0) < 0.05
 
@@ -42,7 +42,7 @@ def test_curves_that_all_move_alike_are_peers():
 def test_an_interval_of_the_size_holds_the_truth():
     rng, held = np.random.default_rng(2), []
     for _ in range(200):
-        found = curves(*drawn(rng, 4, 1.5), PRIOR_DB, "all")
+        found = compare_curves(*drawn(rng, 4, 1.5), PRIOR_DB, "all")
         held.append(found.sd(0.05)[0] <= 1.5 <= found.sd(0.95)[0])
     assert np.mean(held) > 0.85
 
@@ -50,15 +50,15 @@ def test_an_interval_of_the_size_holds_the_truth():
 def test_two_parts_of_the_data_say_more_than_one():
     rng, more = np.random.default_rng(3), []
     for _ in range(40):
-        parts = [curves(*drawn(rng, 4, 1.0), PRIOR_DB, name) for name in ("one", "two")]
-        both = curves_together(parts)
+        parts = [compare_curves(*drawn(rng, 4, 1.0), PRIOR_DB, name) for name in ("one", "two")]
+        both = combine_curves(parts)
         more.append(both.log_odds(3.0, ODDS)[0] > parts[0].log_odds(3.0, ODDS)[0])
         assert set(both.bins) == {"one", "two"}
     assert np.mean(more) > 0.9
 
 
 def test_the_levels_of_a_curve_are_pulled_towards_its_middle_by_their_errors():
-    found = curves(*drawn(np.random.default_rng(4), 3, 3.0), PRIOR_DB, "all")
+    found = compare_curves(*drawn(np.random.default_rng(4), 3, 3.0), PRIOR_DB, "all")
     bins, fitted_db = found.bins["all"].value[:BINS], found.fitted(0, "all")[:BINS]
     assert np.corrcoef(bins, fitted_db)[0, 1] > 0.999
     assert 0.8 < np.std(fitted_db) / np.std(bins) < 1.0
@@ -66,5 +66,5 @@ def test_the_levels_of_a_curve_are_pulled_towards_its_middle_by_their_errors():
 
 def test_a_curve_of_few_bins_is_not_judged():
     curve = np.repeat([0, 1], [3, BINS])
-    found = curves(Statistic(np.zeros(len(curve)), np.ones(len(curve))), curve, PRIOR_DB, "all")
+    found = compare_curves(Statistic(np.zeros(len(curve)), np.ones(len(curve))), curve, PRIOR_DB, "all")
     assert np.isnan(found.size[0]) and np.isnan(found.log_odds(3.0, ODDS)[0]) and found.size[1] < 2.0

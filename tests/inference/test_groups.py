@@ -8,13 +8,13 @@ from radiotwin.inference.groups import (
     Groups,
     Statistic,
     Units,
-    apart,
+    combine_parts,
+    compare_with_peers,
     levels,
     log_scatters,
+    median_polish,
     medians,
-    polished,
-    together,
-    without_shared,
+    subtract_unit_errors,
 )
 
 
@@ -52,21 +52,21 @@ def test_scores_of_peers_are_as_large_as_chance_makes_them():
     rng, scores = np.random.default_rng(3), []
     for _ in range(400):
         spread, error = 0.4, np.full(9, 0.3)
-        found = apart(Statistic(rng.normal(scale=np.hypot(spread, error)), error), spread, 40.0)
+        found = compare_with_peers(Statistic(rng.normal(scale=np.hypot(spread, error)), error), spread, 40.0)
         scores.append(found.score)
     assert np.std(scores) == pytest.approx(1.0, abs=0.2)
 
 
 def test_one_that_is_off_does_not_widen_the_spread_that_it_is_judged_by():
     value = np.array([0.1, -0.2, 0.0, 0.2, -0.1, -6.0, 0.1, 0.05])
-    found = apart(Statistic(value, np.full(8, 0.1)), 0.3, 40.0)
+    found = compare_with_peers(Statistic(value, np.full(8, 0.1)), 0.3, 40.0)
     assert found.spread[5] < 0.35 and found.size[5] == pytest.approx(-6.05, abs=0.1)
     log_odds = found.log_odds(5.0, 0.1)
     assert log_odds[5] > 10 and (np.delete(log_odds, 5) < -2).all()
 
 
-def test_log_odds_are_those_of_the_two_densities():
-    found = apart(Statistic(np.array([0.0, 1.0, 0.5, 0.4]), np.full(4, 0.2)), 0.5, np.inf)
+def test_log_odds_compare_the_density_of_peers_with_that_of_outliers():
+    found = compare_with_peers(Statistic(np.array([0.0, 1.0, 0.5, 0.4]), np.full(4, 0.2)), 0.5, np.inf)
     total = np.hypot(found.error, found.spread)
     expected = (stats.t(2, scale=np.hypot(total, 5)).logpdf(found.size)
                 - stats.t(62, scale=total).logpdf(found.size) + np.log(0.1 / 4))
@@ -75,9 +75,9 @@ def test_log_odds_are_those_of_the_two_densities():
 
 def test_two_parts_of_the_data_are_weighted_by_precision():
     error = np.array([0.2, 0.2, 0.2])
-    sure = apart(Statistic(np.array([0.0, 0.0, 3.0]), error), 0.1, 40.0)
-    vague = apart(Statistic(np.array([0.0, np.nan, -3.0]), 20 * error), 0.1, 40.0)
-    both = together([sure, vague])
+    sure = compare_with_peers(Statistic(np.array([0.0, 0.0, 3.0]), error), 0.1, 40.0)
+    vague = compare_with_peers(Statistic(np.array([0.0, np.nan, -3.0]), 20 * error), 0.1, 40.0)
+    both = combine_parts([sure, vague])
     assert both.size[2] == pytest.approx(sure.size[2], abs=0.1) and both.error[2] <= sure.error[2]
     assert both.size[1] == sure.size[1]
 
@@ -85,7 +85,7 @@ def test_two_parts_of_the_data_are_weighted_by_precision():
 def test_a_polish_takes_off_both_ends_and_leaves_their_pair():
     one, other = (each.ravel() for each in np.mgrid[:5, :6])
     pair_db = np.where((one == 2) & (other == 3), 4.0, 0.0)
-    left = polished(3.0 * one - 2.0 * other + pair_db, [one, other])
+    left = median_polish(3.0 * one - 2.0 * other + pair_db, [one, other])
     assert left == pytest.approx(pair_db, abs=1e-6)
 
 
@@ -94,7 +94,7 @@ def test_what_groups_share_in_a_unit_does_not_count_as_theirs():
     unit = np.tile(np.arange(40), 3)
     label = np.repeat(np.arange(3), 40)
     values = 5 * rng.normal(size=40)[unit] + np.array([0.0, 0.0, 2.0])[label]
-    left = without_shared(values, label, unit)
+    left = subtract_unit_errors(values, label, unit)
     levels_db = [np.median(left[label == each]) for each in range(3)]
     assert levels_db[2] - levels_db[0] == pytest.approx(2.0, abs=0.3)
     assert np.std(left[label == 0]) < 0.5 * np.std(values[label == 0])
