@@ -13,7 +13,8 @@ from radiotwin.coverage.output import Legend, drawn_rasters, file_stem, legend_o
 from radiotwin.report.labels import new_figure, plain, save
 from radiotwin.report.map_figures import HeightGrid
 from radiotwin.scene import Scene
-from radiotwin.scene.plot import height_grid
+from radiotwin.scene.plot import draw_streets, height_grid
+from radiotwin.scene.streets import CREDIT
 
 BUILDING_M = 2.0  # lowest height that is drawn
 OUTLINE_CELLS = 800  # along the longer side
@@ -53,6 +54,7 @@ def _coverage_figure(coverage: Coverage, scene: Scene, name: str, heights: Heigh
     ax.imshow(np.ma.masked_less(classes, 0), origin="lower", extent=bounds_m,
               cmap=ListedColormap(legend.colours), vmin=-0.5, vmax=len(legend.colours) - 0.5,
               interpolation="nearest")
+    draw_streets(ax, scene)
     height_m, over = heights
     building = height_m > BUILDING_M
     indoors = coverage.settings.indoor_loss_db is not None
@@ -153,10 +155,10 @@ def _caption(coverage: Coverage, scene: Scene) -> str:
              f"bandwidth {facts['bandwidth_hz'] / 1e6:g} MHz, noise {facts['noise_dbm']:.1f} dBm "
              f"(noise figure {facts['noise_figure_db']:.1f} dB)"]
     credit = _attribution(scene)
-    return "\n".join([lines[0], lines[1] + (f"; buildings {credit}" if credit else "")])
+    return "\n".join([lines[0], lines[1] + (f"; map {credit}" if credit else "")])
 
 
 def _attribution(scene: Scene) -> str:
     """Return the credit that the map a scene was built from asks for; empty if none is known."""
     source = scene.config.provenance.get("source", "").lower()
-    return "© OpenStreetMap contributors (ODbL)" if source.endswith(OSM_SUFFIXES) else ""
+    return CREDIT if source.endswith(OSM_SUFFIXES) else ""

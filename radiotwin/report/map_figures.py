@@ -36,7 +36,7 @@ from radiotwin.report.labels import (
     shorten,
 )
 from radiotwin.scene import Scene
-from radiotwin.scene.plot import draw_vegetation, height_grid
+from radiotwin.scene.plot import draw_streets, draw_vegetation, height_grid
 from radiotwin.twin import TwinDevice
 from radiotwin.twin.compare import comparable_db
 
@@ -107,7 +107,8 @@ def _radio_map_figure(radio_map: RadioMap, scene: Scene, devices: Sequence[TwinD
         if number >= len(names):
             ax.set_axis_off()
             continue
-        image = _draw_map(ax, level_db[number], radio_map, heights, GAIN_COLOURS, *colour_range)
+        image = _draw_map(ax, level_db[number], radio_map, scene, heights, GAIN_COLOURS,
+                          *colour_range)
         _mark_device(ax, position_m.get(names[number]), 8)
         if names[number] in found:
             _mark_twin_device(ax, found[names[number]])
@@ -144,7 +145,7 @@ def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene
     heights = height_grid(scene, OUTLINE_CELLS)
     true_db = truth.gain_db[truth.devices.index(device), 0]
     colour_range = level_range_db(true_db)
-    gain_image = _draw_map(axes[0, 0], true_db, truth, heights, GAIN_COLOURS, *colour_range)
+    gain_image = _draw_map(axes[0, 0], true_db, truth, scene, heights, GAIN_COLOURS, *colour_range)
     axes[0, 0].set_title("truth")
     axes[1, 0].set_axis_off()
     axes[1, 0].text(
@@ -154,10 +155,11 @@ def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene
     for column, (name, radio_map) in enumerate(models.items(), start=1):
         model_db = comparable_db(radio_map, truth)[radio_map.devices.index(device), 0]
         error_db = model_db - true_db
-        _draw_map(axes[0, column], model_db, radio_map, heights, GAIN_COLOURS, *colour_range)
+        _draw_map(axes[0, column], model_db, radio_map, scene, heights, GAIN_COLOURS,
+                  *colour_range)
         axes[0, column].set_title(plain(MODELS.get(name, name)))
-        error_image = _draw_map(axes[1, column], error_db, truth, heights, DIFFERENCE_COLOURS,
-                                -ERROR_RANGE_DB, ERROR_RANGE_DB)
+        error_image = _draw_map(axes[1, column], error_db, truth, scene, heights,
+                                DIFFERENCE_COLOURS, -ERROR_RANGE_DB, ERROR_RANGE_DB)
         axes[1, column].set_title(f"difference, RMSE {np.sqrt(np.nanmean(error_db**2)):.1f} dB",
                                   fontsize=10)
     for ax in (*axes[0], *axes[1, 1:]):
@@ -180,9 +182,9 @@ def true_positions_m(scene: Scene) -> dict[str, np.ndarray]:
     return dict(zip([device.device for device in scene.config.devices], scene.device_m))
 
 
-def _draw_map(ax: Axes, level_db: np.ndarray, radio_map: RadioMap, heights: HeightGrid,
-              colours: str, low_db: float, high_db: float) -> AxesImage:
-    """Draw (ny, nx) levels over the lattice of a map, with the outlines of the buildings."""
+def _draw_map(ax: Axes, level_db: np.ndarray, radio_map: RadioMap, scene: Scene,
+              heights: HeightGrid, colours: str, low_db: float, high_db: float) -> AxesImage:
+    """Draw (ny, nx) levels over the lattice of a map, with streets and outlines of buildings."""
     lattice = radio_map.lattice
     half_m = lattice.step_m / 2
     extent = (lattice.x_m[0] - half_m, lattice.x_m[-1] + half_m,
@@ -192,6 +194,7 @@ def _draw_map(ax: Axes, level_db: np.ndarray, radio_map: RadioMap, heights: Heig
     height_m, bounds = heights
     ax.contour(height_m > BUILDING_M, levels=[0.5], origin="lower", extent=bounds, colors="black",
                linewidths=0.4, alpha=0.5)
+    draw_streets(ax, scene)
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]", aspect="equal")
     ax.autoscale(False)  # a mark outside must not make the map smaller
     return image
@@ -272,6 +275,7 @@ class MapBackground:
         """Draw buildings, the ends that do not move, and axes in metres."""
         x_min, x_max, y_min, y_max = self.bounds
         if self._scene is not None:
+            draw_streets(ax, self._scene)
             draw_vegetation(ax, self._scene)
         if self._height_m is not None:
             building = self._height_m > BUILDING_M

@@ -296,6 +296,16 @@ def city_mesh(scene: Scene) -> tuple[dict, str]:
         f"The city has {keep.sum():,} triangles and is drawn as blocks of {cell_m:.1f} m.")
 
 
+def street_layer(scene: Scene | None) -> dict | None:
+    """Return the streets of a scene as (n, 2, 3) ends of straight lines [m], on the ground."""
+    if scene is None or not scene.streets_m:
+        return None
+    ends_m = np.concatenate([np.stack([line_m[:-1], line_m[1:]], axis=1)
+                             for line_m in scene.streets_m])
+    ground_m = scene.city.ground_height_m(ends_m[..., 0], ends_m[..., 1])
+    return pack_m(np.concatenate([ends_m, ground_m[..., None]], axis=-1))
+
+
 def blocks(height_m: np.ndarray, x_m: float, y_m: float,
            cell_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Build roofs over the cells of a grid, and walls where neighbours differ in height.
@@ -378,7 +388,8 @@ def _viewer_data(run: Run) -> dict[str, Any]:
     if len(devices) > MAX_DEVICES:
         run.notes.append(f"Of {len(devices):,} devices the first {MAX_DEVICES:,} are drawn.")
     return {"scales": scales, "bounds": bounds_m(run), "top_m": max(heights_m, default=1.0),
-            "city": city, "maps": maps, "links": link_layer(run), "devices": devices[:MAX_DEVICES],
+            "city": city, "streets": street_layer(run.scene), "maps": maps,
+            "links": link_layer(run), "devices": devices[:MAX_DEVICES],
             "flights": flight_layer(run), "found": found_layer(run)}
 
 

@@ -59,6 +59,7 @@ from radiotwin.scene.placement import (
 )
 from radiotwin.scene.plot import draw_preview
 from radiotwin.scene.scene import Scene
+from radiotwin.scene.streets import write_streets
 from radiotwin.scene.vegetation import VegetationConfig
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "fixed": "green"}
@@ -344,6 +345,7 @@ class Declared:
         facts: More lines for the report.
         vegetation: Volumes of it.
         terrain: Ground that is not flat; None: it is, at z = 0.
+        streets_m: (n, 2) corners of each street [m].
     """
 
     source: str
@@ -354,6 +356,7 @@ class Declared:
     facts: tuple[tuple[str, str], ...] = ()
     vegetation: Sequence[VegetationConfig] = ()
     terrain: TerrainConfig | None = None
+    streets_m: Sequence[np.ndarray] = ()
 
 
 def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, options: BuildOptions,
@@ -375,7 +378,7 @@ def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, optio
     city.problems.extend(material_problems)
     config, built_fraction, tallest_m, tallest = _plan(city, declared, options)
     if not check_only:
-        write_scene(out_folder, shapes, config, buildings)
+        write_scene(out_folder, shapes, config, buildings, declared.streets_m)
     return BuildReport(
         declared.source, None if check_only else out_folder, config.radio.frequency_hz, len(shapes),
         sum(len(shape.mesh.faces) for shape in shapes), config.extent.bounds, tallest_m, tallest,
@@ -386,14 +389,17 @@ def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, optio
 
 
 def write_scene(folder: Path, shapes: list[CityShape], config: SceneConfig,
-                buildings: pd.DataFrame | None = None) -> None:
-    """Write a scene folder with its preview, and `buildings.csv` if there is such a table."""
+                buildings: pd.DataFrame | None = None,
+                streets_m: Sequence[np.ndarray] = ()) -> None:
+    """Write a scene folder with its preview, and the tables of buildings and streets it has."""
     with atomic_folder(folder) as temporary:
         write_city(temporary, shapes)
         write_config(config, temporary / "scene.toml")
         keep_declarations(folder, temporary)
         if buildings is not None:
             write_csv(buildings, temporary / "buildings.csv")
+        if config.origin is not None and len(streets_m):
+            write_streets(streets_m, config.origin, temporary)
         draw_preview(Scene.load(temporary), temporary / "preview.png")
 
 

@@ -38,13 +38,14 @@ from radiotwin.scene.meshes import RawMesh, load_shapes
 from radiotwin.scene.mitsuba_xml import DeclaredCity, read_mitsuba_xml
 from radiotwin.scene.models import UP_AXES
 from radiotwin.scene.ply import write_ply
+from radiotwin.scene.streets import STREETS
 
 if TYPE_CHECKING:
     import trimesh
 
 EARLIER = "scene.toml.old"  # the declarations that a new scene replaced
 SCENE_FILES = frozenset({"scene.toml", EARLIER, "city.xml", "meshes", "preview.png",
-                         "buildings.csv"})
+                         "buildings.csv", STREETS})
 MAP_SUFFIXES = ".osm, .osm.pbf, .geojson, .gpkg, .parquet, .shp, .zip, .json, .jsonl, .gml"
 
 

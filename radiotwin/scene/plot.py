@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 Bounds = tuple[float, float, float, float]
 GROUND_COLOUR = "#eef0ee"
 VEGETATION_COLOUR = "#7fb069"
+STREET_COLOUR = "#9aa3ab"
 BUILDING_M = 2.0  # lowest height that is outlined
 MIN_HEIGHT_M = 0.5  # of what is drawn as a building
 PLOT_CELLS = 400  # along the longer side of a plot
@@ -74,6 +75,7 @@ def plot_scene(scene: Scene, ax: Axes | None, geographic: bool | None) -> Axes:
     drawn = draw_cells(ax, frame, x_m, y_m, np.ma.masked_less(height_m, MIN_HEIGHT_M),
                        cmap=colormaps["YlGnBu"], vmin=0, vmax=top_m)
     add_colour_bar(ax, drawn, "height [m]", "max" if height_m.max() > top_m else "neither")
+    draw_streets(ax, scene, frame)
     draw_vegetation(ax, scene, frame)
     draw_devices(ax, scene, frame)
     frame.prepare(ax)
@@ -103,6 +105,15 @@ def draw_vegetation(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None
         axes.add_patch(PathPatch(Path.make_compound_path(*rings), facecolor=VEGETATION_COLOUR,
                                  edgecolor="none", alpha=0.45, zorder=1.5,
                                  label="" if number else "vegetation"))
+
+
+def draw_streets(axes: Axes, scene: Scene, frame: PlotFrame = METRES, zorder: float = 1.4) -> None:
+    """Draw the streets as thin grey lines."""
+    from matplotlib.collections import LineCollection
+
+    axes.add_collection(
+        LineCollection([np.column_stack(frame.at(*line_m.T)) for line_m in scene.streets_m],
+                       colors=STREET_COLOUR, linewidths=0.7, zorder=zorder), autolim=False)
 
 
 def draw_devices(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None:
@@ -148,6 +159,7 @@ def draw_preview(scene: Scene, path: Path | str) -> None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     image = draw_heights(axes, height_m, bounds)
+    draw_streets(axes, scene)
     draw_vegetation(axes, scene)
     on_terrain = scene.city.terrain is not None
     if on_terrain:

@@ -28,6 +28,7 @@ from radiotwin.scene.config import (
 )
 from radiotwin.scene.folder import SCENE_FILES, check_target, mesh_paths, read_city, write_city
 from radiotwin.scene.lattice import Lattice
+from radiotwin.scene.streets import STREETS, read_streets
 from radiotwin.scene.vegetation import Vegetation
 
 if TYPE_CHECKING:
@@ -70,7 +71,8 @@ class Scene(Summarised):
             require_within(folder, folder / name, str(folder))
         scene = cls(folder, read_config(folder / "scene.toml"))._on_ground()
         scene._check_devices()
-        _ = scene.device_antennas, scene.uav_antenna  # report a broken file before any work
+        # Report a broken file before any work.
+        _ = scene.device_antennas, scene.uav_antenna, scene.streets_m
         return scene
 
     @classmethod
@@ -107,10 +109,8 @@ class Scene(Summarised):
             write_city(temporary, read_city(self.xml_path))
             self.copy_antennas(temporary)
             write_config(self.config, temporary / "scene.toml")
-            table = self.folder / "buildings.csv"
-            if table.is_file():
-                require_within(self.folder, table, str(self.folder))
-                (temporary / table.name).write_bytes(read_bytes(table, "file of a scene"))
+            for name in ("buildings.csv", STREETS):
+                self.copy(name, temporary)
 
     def plot(self, ax: "Axes | None" = None, *, geographic: bool | None = None) -> "Axes":
         """Draw buildings, vegetation, devices and the UAVs' starts from above.
@@ -273,6 +273,11 @@ class Scene(Summarised):
         return float(self.city.ground_height_m(x_m, y_m)) + declared_m
 
     @cached_property
+    def streets_m(self) -> list[np.ndarray]:
+        """(n, 2) x and y of each street, for pictures [m]."""
+        return read_streets(self.folder, self.config.origin)
+
+    @cached_property
     def device_m(self) -> np.ndarray:
         """(k, 3) true positions of the declared devices [m]."""
         positions = [(device.x_m, device.y_m, device.z_m) for device in self.config.devices]
@@ -322,6 +327,16 @@ class Scene(Summarised):
             data = read_bytes(self._antenna_path(name), "antenna pattern")
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(data)
+
+    def copy(self, name: str, folder: Path) -> None:
+        """Copy a table of the scene folder into another one, where there is such a table.
+
+        Raises:
+            BadInput: A file outside the scene folder, or one that cannot be read.
+        """
+        if (self.folder / name).is_file():
+            path = require_within(self.folder, self.folder / name, str(self.folder))
+            (folder / name).write_bytes(read_bytes(path, "file of a scene"))
 
     def _antenna_path(self, name: str) -> Path:
         return require_within(self.folder, self.folder / name, str(self.folder / "scene.toml"))

@@ -27,6 +27,7 @@ from radiotwin.scene.config import DeviceConfig, SceneConfig, write_config
 from radiotwin.scene.folder import SCENE_FILES, CityShape, check_target, read_city, write_city
 from radiotwin.scene.materials import itu_material, safe_name, traceable, unique_name
 from radiotwin.scene.plot import draw_preview
+from radiotwin.scene.streets import STREETS
 
 ANTENNAS = "antennas"
 AZIMUTH_DEG, ELEVATION_DEG = np.arange(0.0, 360.0, 5.0), np.arange(-90.0, 91.0, 2.0)
@@ -213,6 +214,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
         if table is not None:
             write_csv(table, temporary / "buildings.csv")
         scene.copy_antennas(temporary)
+        scene.copy(STREETS, temporary)
         for file, antenna in antennas.items():
             _write_antenna(antenna, temporary / file)
         write_config(config.model_copy(update={"provenance": provenance}), temporary / "scene.toml")

@@ -37,7 +37,7 @@ const CELLS = {
       vec4 colour = texture2D(cells, cell);
       gl_FragColor = vec4(colour.rgb, 0.72 * colour.a);
     }`};
-const GROUND = [0.945, 0.953, 0.957];
+const GROUND = [0.945, 0.953, 0.957], STREET = 0.66;
 const DARK = window.matchMedia("(prefers-color-scheme: dark)");
 const DOT_PIXELS = 6;
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
@@ -66,6 +66,7 @@ class Stage {
     this.coloured = coloured();
     this.city = data.city ? this.addCity(data.city) : new THREE.Object3D();
     this.addGround();
+    if (data.streets) this.addStreets(data.streets);
     this.slice = this.addSlice();
     this.dots = new THREE.Points(new THREE.BufferGeometry(), coloured());
     this.dots.frustumCulled = this.dots.visible = false;
@@ -116,6 +117,13 @@ class Stage {
     const ground = new THREE.Mesh(plane, this.coloured);
     ground.position.set((x0 + x1) / 2, (y0 + y1) / 2, -0.3);
     this.scene.add(ground);
+  }
+
+  addStreets(ends) {
+    const geometry = new THREE.BufferGeometry(), count = ends.length / 3;
+    geometry.addAttribute("position", new THREE.BufferAttribute(ends, 3));
+    geometry.addAttribute("color", new THREE.BufferAttribute(new Float32Array(3 * count).fill(STREET), 3));
+    this.scene.add(new THREE.LineSegments(geometry, this.coloured));
   }
 
   addSlice() {

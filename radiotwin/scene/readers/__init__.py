@@ -13,7 +13,7 @@ from radiotwin.scene.materials import STANDARD, MaterialTable, read_material_tab
 from radiotwin.scene.presets import build_preset_scene
 from radiotwin.scene.readers.build import MapOptions, build_scene_from_map, map_name, map_suffix
 from radiotwin.scene.readers.heights import HeightColumn, declared_column
-from radiotwin.scene.readers.osm import download_osm
+from radiotwin.scene.readers.overpass import download_osm
 
 PRESET = "preset:"
 _OPTION = {"default_height_m": "height-default", "materials": "material"}

@@ -74,6 +74,7 @@ from radiotwin.scene.readers.solids import (
 from radiotwin.scene.readers.systems import check_declared_system
 from radiotwin.scene.readers.terrain import Ground, make_ground, stand_on
 from radiotwin.scene.readers.vegetation import make_vegetation, vegetation_fact
+from radiotwin.scene.streets import cut_streets
 from radiotwin.scene.surfaces import Surfaces
 from radiotwin.scene.vegetation import VegetationConfig
 
@@ -264,12 +265,13 @@ def build_scene_from_map(
     vegetation, unusable = make_vegetation(found.vegetation, origin,
                                            _enclosing(around.bounds, extent.bounds))
     city.problems.extend(unusable)
+    streets_m = cut_streets(found.streets, origin, _enclosing(around.bounds, extent.bounds))
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
                         _facts(table["building"].nunique(), len(set(shape_of.values())), counts,
                                origin, map_options, vegetation, shells, ground)
                         + _not_used(found, features, map_options), vegetation,
-                        ground.config)
+                        ground.config, streets_m)
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
 

@@ -111,6 +111,7 @@ class MapFile:
         plan_m: unit of its east and north [m].
         columns: of its tables, also those of other things than buildings.
         layers: that hold no areas.
+        streets: (n, 2) longitudes and latitudes of each street [degrees].
     """
 
     features: list[Feature]
@@ -120,6 +121,7 @@ class MapFile:
     plan_m: float = 1.0
     columns: set[str] = field(default_factory=set)
     layers: tuple[str, ...] = ()
+    streets: list[np.ndarray] = field(default_factory=list)
 
 
 def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:

@@ -1,35 +1,30 @@
-"""OpenStreetMap: areas of buildings and vegetation, from files and from the Overpass API [1].
+"""OpenStreetMap: areas of buildings and vegetation, and streets, from files.
 
-A closed way is an area, and so is a relation of type multipolygon whose ways form closed rings [2];
+A closed way is an area, and so is a relation of type multipolygon whose ways form closed rings [1];
 rings of role `inner` are courtyards. Where a ring has no role, those within an odd number of others
 are. `.osm` files are the XML of OpenStreetMap's API, of Overpass and of JOSM; the first two also
-answer in JSON [4]. `.osm.pbf` files are read with libosmium [3] in several passes that keep only
+answer in JSON [3]. `.osm.pbf` files are read with libosmium [2] in several passes that keep only
 what is needed, so that an extract of a whole region needs little memory.
 
-[1] https://wiki.openstreetmap.org/wiki/Overpass_API
-[2] https://wiki.openstreetmap.org/wiki/Relation:multipolygon
-[3] https://osmcode.org/pyosmium
-[4] https://wiki.openstreetmap.org/wiki/OSM_JSON
+[1] https://wiki.openstreetmap.org/wiki/Relation:multipolygon
+[2] https://osmcode.org/pyosmium
+[3] https://wiki.openstreetmap.org/wiki/OSM_JSON
 """
 
-import http.client
 import math
-import time
-import urllib.parse
-import urllib.request
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import Any, Literal
 
+import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.errors import BadInput, RunFailed, optional_package
-from radiotwin.io.budgets import FEATURES, FILE_BYTES, OUTLINE_CORNERS, VERTICES
-from radiotwin.io.files import atomic_file
+from radiotwin.errors import BadInput, optional_package
+from radiotwin.io.budgets import FEATURES, OUTLINE_CORNERS, VERTICES
 from radiotwin.io.inputs import check_input, parse_elements
 from radiotwin.scene.checks import warning
 from radiotwin.scene.readers.features import (
@@ -50,13 +45,13 @@ NO_VEGETATION = "area(s) of vegetation are incomplete, not closed or too intrica
 _MADE_UP = -(2**60)  # ids of nodes that have none
 _PLACE_NODES = 1000  # that say where something lies: many relations may name one long way
 MIN_RING_NODES = 4  # a triangle, with the first node again at the end
+STREETS = ("motorway", "trunk", "primary", "secondary", "tertiary", "unclassified", "residential",
+           "living_street", "pedestrian", "motorway_link", "trunk_link", "primary_link",
+           "secondary_link", "tertiary_link")  # values of highway that pictures show
+MAX_STREET_NODES = 1_000_000  # of an .osm.pbf file, in 200 MB; with more it is read without streets
 _IDS_PER_BLOCK = 100  # elements: 40 kB of the filter for each that is looked for
 REMARKED = ("Overpass added a remark to its answer, as where it ran out of time or memory: "
             "buildings may be missing; ask for a smaller area, or more time ([timeout:600])")
-SERVER = "https://overpass-api.de/api/interpreter"
-TIMEOUT_S = 180  # [s], the default of Overpass itself
-MAX_DOWNLOAD_S = 1800.0  # [s], chosen: some 100 MB on a slow line
-MAX_AREA_KM2 = 100.0  # [km²], chosen so that one request does not burden a public server
 
 
 @dataclass
@@ -162,7 +157,16 @@ def assemble(elements: OsmElements) -> MapFile:
     left_out.sort(key=lambda one: one.reason != INCOMPLETE)
     vegetation, unusable = _vegetation(elements)
     return MapFile(ways + relations, left_out + unusable, vegetation=vegetation,
-                   problems=[warning(REMARKED)] if elements.remarked else [])
+                   problems=[warning(REMARKED)] if elements.remarked else [],
+                   streets=_streets(elements))
+
+
+def _streets(elements: OsmElements) -> list[np.ndarray]:
+    """Return the (n, 2) longitudes and latitudes of each street [degrees], for pictures."""
+    lines = ([elements.positions[node] for node in way.nodes if node in elements.positions]
+             for way in elements.ways.values()
+             if way.tags.get("highway") in STREETS and way.tags.get("area") != "yes")
+    return [np.array(line) for line in lines if len(line) > 1]
 
 
 def _place(element: Way | Relation, elements: OsmElements) -> BaseGeometry:
@@ -472,7 +476,7 @@ def _tags(element: Mapping) -> dict[str, str]:
 
 
 def read_osm_pbf(path: Path) -> OsmElements:
-    """Read buildings and vegetation, their ways and their nodes, of an `.osm.pbf` file.
+    """Read buildings, vegetation and streets, their ways and nodes, of an `.osm.pbf` file.
 
     Raises:
         BadInput: pyosmium is not installed, no such file, or not a PBF file.
@@ -509,6 +513,9 @@ def read_osm_pbf(path: Path) -> OsmElements:
         missing = member_ids - elements.ways.keys()
         if missing:
             _add_ways(elements, selected(kinds.WAY, missing))
+        elements.ways |= _street_ways(
+            matching(kinds.WAY, filters.TagFilter(*(("highway", kind) for kind in STREETS))),
+            elements.ways)
         nodes = {node for way in elements.ways.values() for node in way.nodes}
         if nodes:
             for node in selected(kinds.NODE, nodes):
@@ -530,6 +537,20 @@ def _add_ways(elements: OsmElements, ways: Iterable[Any]) -> None:
     FEATURES.check(len(elements.ways), "the map")
 
 
+def _street_ways(ways: Iterable[Any], known: Mapping[int, Way]) -> dict[int, Way]:
+    """Return the streets that are not known, none where they have too many nodes."""
+    found: dict[int, Way] = {}
+    nodes = 0
+    for way in ways:
+        if way.id in known:
+            continue
+        nodes += len(way.nodes)
+        if nodes > MAX_STREET_NODES:
+            return {}
+        found[way.id] = Way([node.ref for node in way.nodes], dict(way.tags))
+    return found
+
+
 def _drop_other_relations(elements: OsmElements) -> None:
     """Keep vegetation, and buildings that are so themselves or, as in old maps, by their ways."""
     for number, relation in list(elements.relations.items()):
@@ -537,62 +558,3 @@ def _drop_other_relations(elements: OsmElements) -> None:
                 key in relation.tags for key in BUILDING_KEYS) and not any(
                 way in elements.ways for way, role in relation.members if role != "inner"):
             del elements.relations[number]
-
-
-def download_osm(
-    path: Path, bbox_deg: tuple[float, float, float, float], server: str = SERVER
-) -> None:
-    """Download the buildings and the vegetation of an area to an `.osm` file that does not exist.
-
-    Args:
-        path: `.osm` file.
-        bbox_deg: south, west, north, east [degrees].
-        server: address of an Overpass interpreter.
-
-    Raises:
-        BadInput: the file exists, is not called `.osm`, or the area is too large.
-        RunFailed: no network, or the server refuses.
-    """
-    from pyproj import Geod
-
-    if path.suffix.lower() != ".osm":
-        raise BadInput(f"--overpass writes {path}, which is not called .osm; choose such a name")
-    if path.exists():
-        raise BadInput(f"{path} exists already; leave --overpass out to build from it, or choose "
-                       "another name")
-    south, west, north, east = bbox_deg
-    area_m2, _ = Geod(ellps="WGS84").polygon_area_perimeter(
-        [west, east, east, west], [south, south, north, north])
-    if abs(area_m2) > MAX_AREA_KM2 * 1e6:
-        raise BadInput(f"--overpass: {abs(area_m2) / 1e6:.0f} km² are too much for a public "
-                       f"server, {MAX_AREA_KM2:g} km² are allowed; make --bbox smaller, or "
-                       "download an extract (.osm.pbf)")
-    box = ",".join(f"{value:.7f}" for value in bbox_deg)
-    wanted = [*(f'["{key}"]' for key in BUILDING_KEYS),
-              *(f'["{key}"="{value}"]' for key, value in TAGS)]
-    selectors = "".join(f"{kind}{each}({box});" for kind in ("way", "relation") for each in wanted)
-    query = f"[out:xml][timeout:{TIMEOUT_S}];({selectors});(._;>;);out body;"
-    request = urllib.request.Request(
-        server, urllib.parse.urlencode({"data": query}).encode(),
-        {"User-Agent": "radiotwin (https://pypi.org/project/radiotwin)"})
-    try:
-        with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer, \
-                atomic_file(path) as file:
-            _copy(answer, file, path)
-    except (OSError, http.client.HTTPException) as error:
-        reason = getattr(error, "reason", error)
-        raise RunFailed(f"--overpass needs a network, and {server} did not answer ({reason}); try "
-                        "again later, or download an extract and give the file") from None
-
-
-def _copy(answer: Any, file: IO[bytes], path: Path) -> None:
-    """Copy an answer that ends in time, is not too large, and is complete."""
-    read, deadline = 0, time.monotonic() + MAX_DOWNLOAD_S
-    while part := answer.read1(2**16):
-        read += len(part)
-        FILE_BYTES.check(read, f"{path}, as the server sends it")
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"its answer has not ended after {MAX_DOWNLOAD_S:g} s")
-        file.write(part)
-    if getattr(answer, "length", None):  # bytes that were announced and did not come
-        raise ConnectionError("its answer was cut off")

@@ -12,8 +12,7 @@ import shapely
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.io.budgets import CROSSINGS, OUTLINE_CORNERS, OVERLAPS, TOUCHING_CORNERS
 from radiotwin.scene.materials import Names, unique_name
-from radiotwin.scene.readers import build_scene_from_map
-from radiotwin.scene.readers import osm as overpass
+from radiotwin.scene.readers import build_scene_from_map, overpass
 from radiotwin.scene.readers.gis_files import _other_tags, read_geopackage
 from radiotwin.scene.readers.osm import stitch
 

@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 import pytest
 
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.scene.readers.osm import download_osm
+from radiotwin.scene.readers.overpass import download_osm
 
 BOX = (47.5, 8.7, 47.51, 8.72)
 
