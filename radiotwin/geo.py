@@ -1,4 +1,4 @@
-"""Where on the earth things are: WGS84, reference systems by their names, and local frames.
+"""Geographic coordinates: WGS84, coordinate reference systems by name, and the local frame.
 
 The local frame, x east and y north [m], is the azimuthal equidistant projection of the WGS84
 ellipsoid about an origin; heights are left as they are. Distance and bearing from the origin are
@@ -6,9 +6,9 @@ exact, and the ground stays at one z, as on a flat city map; in a tangent plane 
 the ground 10 km away would lie 8 m below zero. `frame.toml` beside tables of positions holds the
 origin of their frame.
 
-The name of a reference system comes from a stranger. In PROJ's own language, in its JSON, or in WKT
-with grids, it can open any file, and a pipe for ever: only an authority with its code, a title of
-PROJ's database, and WKT without grids are used.
+The name of a reference system may come from a stranger's file. PROJ's own language, its JSON, and
+WKT with grids can make PROJ open any file, or wait at a pipe for ever. So only AUTHORITY:CODE, a
+title of PROJ's database, and WKT without grids are accepted.
 """
 
 import os
@@ -33,14 +33,15 @@ if TYPE_CHECKING:
 ALLOWED = "AUTHORITY:CODE, a title of PROJ's database, or WKT without grids"
 _CODE = re.compile(r"(?:urn:ogc:def:crs:)?([A-Za-z]+):(?:[\d.]*:)?(\w+)")
 _TITLE = re.compile(r"[\w .,()/'-]+")
-# What can hold the name of a file in WKT: parameters that are files, PROJ's strings in extensions,
-# and names of methods and geoid models that PROJ takes for its own language ("PROJ-based …").
+# Parts of WKT that can name a file: parameters that are files, PROJ strings in extensions, and
+# names of methods and geoid models that PROJ reads as its own language ("PROJ-based …").
 _OPENS_FILES = re.compile(r"PARAMETERFILE|EXTENSION|GRIDS|INIT\s*=|PROJ\s*=|\bPROJ[\s-]",
                           re.IGNORECASE)
 GroundHeight = Callable[[np.ndarray, np.ndarray], np.ndarray]
 FRAME_FILE = "frame.toml"
 ORIGIN_DECIMALS = 7  # of degrees: 1 cm
-SAME_DEG, SAME_ALTITUDE_M = 1e-9, 1e-3  # of one place, after rounding: 0.1 mm on the ground
+# Largest difference of two origins that are the same but for rounding; 1e-9 degrees are 0.1 mm
+SAME_DEG, SAME_ALTITUDE_M = 1e-9, 1e-3
 
 
 def local_crs(origin: Origin) -> str:
@@ -50,7 +51,7 @@ def local_crs(origin: Origin) -> str:
 
 
 def origin_attributes(origin: Origin | None) -> dict[str, Any]:
-    """Return an origin as attributes of a data set: `origin_latitude_deg` and so on."""
+    """Return an origin as attributes of a NetCDF data set: `origin_latitude_deg` and so on."""
     return {} if origin is None else {
         f"origin_{name}": value for name, value in origin.model_dump().items()}
 
@@ -59,7 +60,7 @@ def to_local(origin: Origin, longitude_deg: ArrayLike,
              latitude_deg: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Convert longitude and latitude [degrees] to x and y of the local frame [m].
 
-    They are not finite where the projection is undefined.
+    Where the projection is undefined, x and y are infinite or NaN.
     """
     longitude_deg, latitude_deg = np.asarray(longitude_deg, float), np.asarray(latitude_deg, float)
     return _projection(origin)(longitude_deg, latitude_deg)
@@ -77,10 +78,10 @@ def _projection(origin: Origin) -> "Proj":
 
 
 def reference_system(name: str) -> "CRS":
-    """Return a system by `AUTHORITY:CODE`, URN, title of PROJ's database, or WKT.
+    """Look up a coordinate reference system by `AUTHORITY:CODE`, URN, title of PROJ's, or WKT.
 
     Raises:
-        pyproj.exceptions.CRSError: it is not known, or a name that could open a file.
+        pyproj.exceptions.CRSError: the name is unknown, or of a form that could open a file.
     """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
@@ -112,10 +113,10 @@ class FrameRecord(Table):
 
 
 def read_frame(folder: Path) -> Origin | None:
-    """Return the origin of the frame of a folder's tables; None where `frame.toml` is absent.
+    """Read the origin of the tables in a folder from its `frame.toml`; None if it has none.
 
     Raises:
-        BadInput: it cannot be read, it leads out of its folder, or a value is not allowed.
+        BadInput: the file cannot be read, is a link out of the folder, or has an impossible value.
     """
     path = folder / FRAME_FILE
     if not os.path.lexists(path):
@@ -133,61 +134,68 @@ def read_frame(folder: Path) -> Origin | None:
 
 
 def write_frame(origin: Origin, path: Path) -> None:
-    """Write `frame.toml`."""
+    """Write the origin of a local frame to a file `frame.toml`."""
     record = FrameRecord(origin=origin, crs=local_crs(origin))
     with path.open("wb") as file:
         tomli_w.dump(record.model_dump(by_alias=True), file)
 
 
-def place(origin: Origin) -> str:
-    """Return an origin as a message names it.
+def origin_text(origin: Origin) -> str:
+    """Format latitude and longitude of an origin for a message.
 
-    >>> place(Origin(latitude_deg=36.0001, longitude_deg=-78.93575))
+    >>> origin_text(Origin(latitude_deg=36.0001, longitude_deg=-78.93575))
     '36.0001, -78.93575'
     """
     return f"{origin.latitude_deg:.10g}, {origin.longitude_deg:.10g}"
 
 
 def is_same_frame(one: Origin, other: Origin) -> bool:
-    """Return whether coordinates of the frame about one origin are those of the other."""
+    """Return whether two origins define the same local frame, but for rounding."""
     turn_deg = abs(one.longitude_deg - other.longitude_deg) % 360
     return (abs(one.latitude_deg - other.latitude_deg) <= SAME_DEG
             and min(turn_deg, 360 - turn_deg) <= SAME_DEG
-            and abs(_rise_m(one, other)) <= SAME_ALTITUDE_M)
+            and abs(_datum_difference_m(one, other)) <= SAME_ALTITUDE_M)
 
 
-def between_frames(position_m: np.ndarray, one: Origin, other: Origin) -> np.ndarray:
-    """Convert positions (n, 3) [m] exactly, by way of latitude and longitude; NaN stays.
+def between_frames(position_m: np.ndarray, source: Origin, target: Origin) -> np.ndarray:
+    """Convert positions (n, 3) [m] from one local frame to another, by latitude and longitude.
 
-    Heights count from the ground of a frame. They change only where both frames declare their
-    ground's altitude: one of 0 m, which maps have that know no terrain, declares none.
+    NaN stays NaN. Heights count from the ground datum of a frame. They change only if both origins
+    declare the altitude of their datum; 0 m, as of maps without terrain, counts as not declared.
     """
-    moved_m = np.array(position_m, dtype=float)
-    known = np.isfinite(moved_m[:, :2]).all(axis=1)
-    moved_m[known, :2] = np.column_stack(to_local(other, *to_geographic(
-        one, *moved_m[known, :2].T)))
-    moved_m[:, 2] += _rise_m(one, other)
-    return moved_m
+    target_m = np.array(position_m, dtype=float)
+    known = np.isfinite(target_m[:, :2]).all(axis=1)
+    target_m[known, :2] = np.column_stack(to_local(target, *to_geographic(
+        source, *target_m[known, :2].T)))
+    target_m[:, 2] += _datum_difference_m(source, target)
+    return target_m
 
 
-def middle_of(places: pd.DataFrame) -> Origin:
-    """Return the median of the columns latitude and longitude [degrees], of which some are known.
+def _datum_difference_m(source: Origin, target: Origin) -> float:
+    """Return the height to add to z of one frame to get z of another [m]; 0 if not declared."""
+    if not (source.altitude_m and target.altitude_m):
+        return 0.0
+    return source.altitude_m - target.altitude_m
 
-    >>> middle_of(pd.DataFrame({"latitude": [10.0, 12.0], "longitude": [179.0, -179.0]}))
+
+def median_origin(places: pd.DataFrame) -> Origin:
+    """Return the median of the columns latitude and longitude [degrees]; some rows may be NaN.
+
+    >>> median_origin(pd.DataFrame({"latitude": [10.0, 12.0], "longitude": [179.0, -179.0]}))
     Origin(latitude_deg=11.0, longitude_deg=-180.0, altitude_m=0.0)
     """
     first = places["longitude"].dropna().iloc[0]
-    east = (places["longitude"] - first + 180) % 360 - 180  # so that the date line does no harm
+    east = (places["longitude"] - first + 180) % 360 - 180  # continuous across the date line
     longitude = (first + east.median() + 180) % 360 - 180
     return Origin(latitude_deg=round(float(places["latitude"].median()), ORIGIN_DECIMALS),
                   longitude_deg=round(float(longitude), ORIGIN_DECIMALS))
 
 
-def with_places(table: pd.DataFrame, position_m: np.ndarray,
+def with_coordinates(table: pd.DataFrame, position_m: np.ndarray,
                 origin: Origin | None) -> pd.DataFrame:
-    """Return a table with columns x_m, y_m, z_m of (n, 3) [m].
+    """Add columns x_m, y_m, z_m of positions (n, 3) [m] to a table.
 
-    With an origin it has latitude_deg and longitude_deg, too.
+    If an origin is given, also add latitude_deg and longitude_deg.
     """
     table = table.assign(**dict(zip(("x_m", "y_m", "z_m"), position_m.T)))
     if origin is None:
@@ -198,27 +206,20 @@ def with_places(table: pd.DataFrame, position_m: np.ndarray,
                         longitude_deg=np.where(unknown, np.nan, longitude_deg))
 
 
-def _rise_m(one: Origin, other: Origin) -> float:
-    """Return what to add to heights of one frame for those of the other [m]."""
-    if not (one.altitude_m and other.altitude_m):
-        return 0.0
-    return one.altitude_m - other.altitude_m
-
-
-def above_datum(table: pd.DataFrame, what: str, position: list[str],
-                ground_height_m: GroundHeight | None) -> pd.DataFrame:
-    """Return a table with the heights that it gives above the ground above the datum.
+def with_datum_heights(table: pd.DataFrame, what: str, position: list[str],
+                       ground_height_m: GroundHeight | None) -> pd.DataFrame:
+    """Convert heights above the ground to heights above the datum (z), and drop their column.
 
     Args:
-        table: with columns of positions, and one named as that of the height, `above_ground_m` for
-            `z_m`; a row has one of both heights, or none.
-        what: it holds, for messages.
-        position: its columns of x, y and z.
-        ground_height_m: returns the heights (n,) of the ground at x and y (n,) [m]; None: it is at
-            z = 0.
+        table: columns x, y and z, and one named like z with `above_ground_m` in the place of `z_m`;
+            a row has one of the two heights, or none.
+        what: contents of the table, for messages.
+        position: names of the columns x, y and z.
+        ground_height_m: function of x and y (n,) that returns the height (n,) of the ground [m];
+            None: flat ground at z = 0.
 
     Raises:
-        BadInput: a row has both heights, or one above the ground of an unknown position.
+        BadInput: a row has both heights, or a height above the ground without x and y.
     """
     column = position[2].replace("z_m", "above_ground_m")
     if column not in table:
@@ -240,8 +241,8 @@ def above_datum(table: pd.DataFrame, what: str, position: list[str],
                                                                       z_m)})
 
 
-def moved_positions(table: pd.DataFrame, columns: list[str],
+def map_positions(table: pd.DataFrame, columns: list[str],
                     position_m: Callable[[np.ndarray], np.ndarray]) -> pd.DataFrame:
-    """Return a table with its columns of positions converted by a function of (n, 3) [m]."""
-    moved_m = position_m(table[columns].to_numpy(dtype=float))
-    return table.assign(**dict(zip(columns, moved_m.T)))
+    """Apply a function of positions (n, 3) [m] to the columns of a table that hold x, y and z."""
+    mapped_m = position_m(table[columns].to_numpy(dtype=float))
+    return table.assign(**dict(zip(columns, mapped_m.T)))

@@ -13,7 +13,7 @@ import pandas as pd
 
 from radiotwin.display import count, some
 from radiotwin.errors import BadInput
-from radiotwin.geo import ALLOWED, middle_of, reference_system
+from radiotwin.geo import ALLOWED, median_origin, reference_system
 from radiotwin.importing.read_source import Expected, read_source
 from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings
 from radiotwin.importing.source import Source, Tally, are_few
@@ -59,7 +59,7 @@ def find_origin(declared: Origin | None, receivers: pd.DataFrame,
         return None
     of_receivers = "latitude" in receivers and receivers["latitude"].notna().any()
     known = receivers if of_receivers else devices
-    return middle_of(known)
+    return median_origin(known)
 
 
 def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:

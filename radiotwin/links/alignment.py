@@ -10,7 +10,7 @@ import pandas as pd
 from scipy.ndimage import gaussian_filter
 
 from radiotwin.errors import BadInput
-from radiotwin.geo import is_same_frame, place
+from radiotwin.geo import is_same_frame, origin_text
 from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.checks import SURE, chance_inside, map_corners_m, outside_map
 from radiotwin.links.measurements import Measurements
@@ -105,8 +105,9 @@ def in_known_frame(measurements: Measurements, there: Origin | None, what: str) 
         return measurements
     converted = measurements.in_frame(there)
     moved_m = np.nanmedian(converted.receiver_m - measurements.receiver_m, axis=0)
-    warnings.warn(f"the measurements are in the frame about {place(here)}, {what} in that about "
-                  f"{place(there)}: positions are converted (moved by {moved_m[0]:+.1f} m east, "
+    warnings.warn(f"the measurements are in the frame about {origin_text(here)}, {what} in that "
+                  f"about {origin_text(there)}: positions are converted (moved by "
+                  f"{moved_m[0]:+.1f} m east, "
                   f"{moved_m[1]:+.1f} m north)", stacklevel=3)
     return converted
 

@@ -12,7 +12,7 @@ import pandas as pd
 
 from radiotwin.display import some
 from radiotwin.errors import BadInput
-from radiotwin.geo import is_same_frame, place
+from radiotwin.geo import is_same_frame, origin_text
 from radiotwin.io.texts import percent
 from radiotwin.links.links import Links
 from radiotwin.links.measurements import MAX_APART_M, Measurements
@@ -124,8 +124,8 @@ def require_one_frame(measurements: Measurements, scene: Scene | None) -> None:
     """
     here, there = measurements.origin, None if scene is None else scene.config.origin
     if here is not None and there is not None and not is_same_frame(here, there):
-        raise BadInput(f"the measurements are in the frame about {place(here)}, the scene is in "
-                       f"that about {place(there)}; convert them with "
+        raise BadInput(f"the measurements are in the frame about {origin_text(here)}, the scene is "
+                       f"in that about {origin_text(there)}; convert them with "
                        "radiotwin.links.alignment.in_scene_frame")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.geo import middle_of
+from radiotwin.geo import median_origin
 from radiotwin.io.cells import as_numbers, listed, read_cells, refuse
 from radiotwin.io.forms import Origin, name_fault
 from radiotwin.links.cell_limits import LEVELS, refuse_limits
@@ -72,7 +72,7 @@ def links_of_frame(frame: pd.DataFrame, origin: Origin | None
     if not {*RECEIVER_POSITION} <= set(table):
         sites = receivers_of_frame(table)
         if "latitude" in sites.values and "x" not in sites.values and origin is None:
-            origin = middle_of(sites.values)
+            origin = median_origin(sites.values)
         position_m = sites.local_m(origin, None, "the measurements")
         table = table.drop(columns=list(sites.columns.values()), errors="ignore").assign(
             **dict(zip(RECEIVER_POSITION, position_m.T)))

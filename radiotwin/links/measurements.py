@@ -28,12 +28,12 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import (
     FRAME_FILE,
     GroundHeight,
-    above_datum,
     between_frames,
     is_same_frame,
-    moved_positions,
-    place,
+    map_positions,
+    origin_text,
     read_frame,
+    with_datum_heights,
     write_frame,
 )
 from radiotwin.io.budgets import DOCUMENT_BYTES
@@ -203,14 +203,14 @@ class Measurements(Summarised):
             origin: of that frame.
         """
         return replace(
-            self, table=moved_positions(self.table, RECEIVER_POSITION, position_m),
-            devices=moved_positions(self.devices, _DEVICE_POSITION, position_m), origin=origin)
+            self, table=map_positions(self.table, RECEIVER_POSITION, position_m),
+            devices=map_positions(self.devices, _DEVICE_POSITION, position_m), origin=origin)
 
     def on_ground(self, ground_height_m: GroundHeight | None) -> "Measurements":
-        """Return the same links with all heights above the datum; see `above_datum`."""
+        """Return the same links with all heights above the datum; see `with_datum_heights`."""
         if "receiver_above_ground_m" not in self.table and "above_ground_m" not in self.devices:
             return self
-        table, devices = (above_datum(rows, name, position, ground_height_m)
+        table, devices = (with_datum_heights(rows, name, position, ground_height_m)
                           for rows, name, position in (
                               (self.table, self.files[0], RECEIVER_POSITION),
                               (self.devices, self.files[1], _DEVICE_POSITION)))
@@ -346,15 +346,15 @@ class Measurements(Summarised):
                 ("receivers", some(receivers)), ("devices", some(self.devices["device"])),
                 ("of these", count(anchors, "anchor")), (self.level_column, levels),
                 ("not detected", missed),
-                ("origin", "not known" if self.origin is None else place(self.origin))))
+                ("origin", "not known" if self.origin is None else origin_text(self.origin))))
 
     def _check_frame(self, folder: Path) -> None:
         """Refuse a folder whose tables are in another frame."""
         there = read_frame(folder)
         if there is not None and (self.origin is None or not is_same_frame(there, self.origin)):
             raise BadInput(f"{folder / FRAME_FILE} says that tables of this folder are in the "
-                           f"frame about {place(there)}, and these are "
-                           + (f"about {place(self.origin)}" if self.origin else
+                           f"frame about {origin_text(there)}, and these are "
+                           + (f"about {origin_text(self.origin)}" if self.origin else
                               "in one of unknown origin") + "; choose another output folder")
 
     def _check_replaceable(self, path: Path) -> None:

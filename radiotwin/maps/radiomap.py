@@ -37,7 +37,7 @@ from radiotwin.display import (
     span,
 )
 from radiotwin.errors import BadInput
-from radiotwin.geo import is_same_frame, origin_attributes, place
+from radiotwin.geo import is_same_frame, origin_attributes, origin_text
 from radiotwin.io.forms import Origin
 from radiotwin.maps.file import (
     ATTRIBUTES,
@@ -224,8 +224,8 @@ class MapDifference(OverDevices):
         origin, other = (origin_of({str(name): value for name, value in each.attrs.items()})
                          for each in (first, second))
         if origin is not None and other is not None and not is_same_frame(origin, other):
-            raise BadInput(f"the maps are in different frames, about {place(origin)} and about "
-                           f"{place(other)}; make both for the same scene")
+            raise BadInput(f"the maps are in different frames, about {origin_text(origin)} and "
+                           f"about {origin_text(other)}; make both for the same scene")
         order = [names[1].index(name) for name in names[0]]
         difference = first["gain_db"].values - second["gain_db"].values[order]
         attributes = origin_attributes(origin or other) | {

@@ -1,4 +1,4 @@
-"""Measured antenna patterns: read from MSI Planet (.msi, .pln) and CSV, oriented, evaluated."""
+"""Measured antenna patterns: reading MSI Planet (.msi, .pln) and CSV files, gain along a ray."""
 
 import io
 import re
@@ -13,13 +13,15 @@ from radiotwin.errors import BadInput
 from radiotwin.io.budgets import COLUMNS, DOCUMENT_BYTES
 from radiotwin.io.inputs import read_bytes
 
-EVEN_SHARE = 0.01  # of their mean, by which the steps of even azimuths may differ: files round them
+# Steps between azimuths that differ by less than this share of their mean count as equal: files
+# round azimuths.
+EVEN_SHARE = 0.01
 MAX_GAIN_DBI = 60.0  # [dBi], about that of a dish of 20 m at 5 GHz; more is taken for an error
-ROUNDED_DB = 0.1  # [dB], by which rows of one direction may differ: files hold a decimal or more
-AZIMUTH_DEG = np.arange(0.0, 360.0)  # grid of the patterns between two cuts
+ROUNDED_DB = 0.1  # [dB], allowed difference of rows of one direction: files hold one decimal
+AZIMUTH_DEG = np.arange(0.0, 360.0)  # grid of the patterns that are interpolated from two cuts
 ELEVATION_DEG = np.arange(-90.0, 91.0)
 _COLUMNS = {"azimuth_deg": (-360, 360), "elevation_deg": (-90, 90),
-            "gain_dbi": (-200, MAX_GAIN_DBI)}  # of a CSV file, with the range of their values
+            "gain_dbi": (-200, MAX_GAIN_DBI)}  # of a CSV file, with the range of allowed values
 _TOLERANCE_DB = ROUNDED_DB + 1e-9  # decimals are no exact binary numbers
 _GAIN = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*(dbd|dbi)?", re.IGNORECASE)
 
@@ -62,13 +64,13 @@ class Pattern:
     def heading_mean(self) -> "Pattern":
         """Average the power over all azimuths, for an antenna on a carrier that turns.
 
-        Evenly spaced azimuths count alike. Others stand for unequal shares of a turn: then the mean
-        is that of the interpolated pattern.
+        Evenly spaced azimuths have equal weight. Otherwise the interpolated pattern is averaged.
         """
         gaps_deg = np.diff(self.azimuth_deg, append=self.azimuth_deg[0] + 360)
         power = 10 ** (self.gain_dbi / 10)
         if np.ptp(gaps_deg) > EVEN_SHARE * gaps_deg.mean():
-            # Between two azimuths a line in dB, whose power has the logarithmic mean of its ends
+            # Between two azimuths the gain is linear in dB: its mean power is the logarithmic mean
+            # of the powers at both ends
             rise = np.diff(self.gain_dbi, append=self.gain_dbi[:, :1]) * np.log(10) / 10
             level = np.abs(rise) < 1e-9
             power = power * np.where(level, 1.0, np.expm1(rise) / np.where(level, 1.0, rise))
@@ -77,9 +79,9 @@ class Pattern:
 
 
 def _bracket(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the grid value below each value, and the fraction of the step above.
+    """Return the index of the grid value below each value, and the value's fraction of that step.
 
-    Beyond the ends of the grid the fraction is that of the end.
+    Values beyond the grid are clipped to its ends.
     """
     index = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
     held = np.clip(values, grid[0], grid[-1])
@@ -88,7 +90,7 @@ def _bracket(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @dataclass(frozen=True, eq=False)
 class Antenna:
-    """A pattern and its orientation.
+    """An antenna pattern with its orientation.
 
     Attributes:
         pattern: gain in the antenna's own frame.
@@ -101,7 +103,7 @@ class Antenna:
     tilt_deg: float = 0.0
 
     def gain_dbi(self, rays: np.ndarray) -> np.ndarray:
-        """Return the gain (...,) [dBi] along rays (..., 3) east, north, up, longer than 0."""
+        """Return the gain (...,) [dBi] along rays (..., 3): east, north, up, of any length."""
         azimuth, tilt = np.radians([self.azimuth_deg, self.tilt_deg])
         ahead = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
         right = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])
@@ -116,14 +118,14 @@ class Antenna:
 def read_pattern(path: Path | str) -> Pattern:
     """Read an antenna pattern.
 
-    `.msi`, `.pln`: GAIN in dBd unless it says dBi, and the cuts HORIZONTAL and VERTICAL of 360
+    `.msi`, `.pln`: GAIN in dBd unless dBi is written, and the cuts HORIZONTAL and VERTICAL of 360
     attenuations [dB] each. Angles of the vertical cut count downwards from the horizon, as
     manufacturers give downtilts; directions between the cuts are interpolated (see
     `between_cuts`).
     `.csv`: columns azimuth_deg (clockwise from the boresight), elevation_deg (up) and gain_dbi, on
     a full grid.
-    Of rows of one direction, such as 0 and 360 degrees, the first counts; they may differ by
-    `ROUNDED_DB`.
+    If several rows have one direction, such as 0 and 360 degrees, the first is used; they may
+    differ by `ROUNDED_DB`.
 
     Args:
         path: file to read.
@@ -140,11 +142,11 @@ def read_pattern(path: Path | str) -> Pattern:
 
 
 def parse_pattern(path: Path, text: bytes) -> Pattern:
-    """Return the antenna pattern of a file's content, see `read_pattern`.
+    """Parse the content of an antenna file, see `read_pattern`.
 
     Args:
-        path: of the file, whose suffix tells the format.
-        text: its content.
+        path: name of the file; its suffix is the format.
+        text: content of the file.
 
     Raises:
         BadInput: as `read_pattern`.
@@ -185,6 +187,7 @@ def between_cuts(horizontal_db: np.ndarray, vertical_db: np.ndarray) -> np.ndarr
 
 
 def _read_msi(path: Path, text: bytes) -> Pattern:
+    """Parse an MSI Planet file: GAIN and two cuts."""
     gain_dbi: float | None = None
     cuts: dict[str, dict[float, float]] = {"HORIZONTAL": {}, "VERTICAL": {}}
     cut: dict[float, float] | None = None
@@ -225,19 +228,19 @@ def _read_msi(path: Path, text: bytes) -> Pattern:
 
 def _contradiction(path: Path, row: int, direction: str, known_db: float,
                    given_db: float) -> BadInput:
+    """Return the error that two rows of one direction have different gains."""
     return BadInput(f"{path}, row {row}: {direction} has {given_db:g} dB, an earlier row of this "
                     f"direction {known_db:g} dB; rows of one direction (0 and 360 degrees are one) "
                     f"may differ by {ROUNDED_DB:g} dB, remove the wrong one")
 
 
 def _resample(cut: dict[float, float]) -> np.ndarray:
-    """Return a cut at every whole degree (360,)."""
-    angles = np.array(sorted(cut))
-    values = np.array([cut[angle] for angle in angles])
-    return np.interp(AZIMUTH_DEG, angles, values, period=360)
+    """Interpolate a cut (angle [degrees] -> gain [dB]) at every whole degree, (360,)."""
+    return np.interp(AZIMUTH_DEG, list(cut), list(cut.values()), period=360)
 
 
 def _read_csv(path: Path, text: bytes) -> Pattern:
+    """Parse a CSV file with a gain for every pair of azimuth and elevation of a grid."""
     COLUMNS.check(text.partition(b"\n")[0].count(b",") + 1, path)
     try:
         table = pd.read_csv(io.BytesIO(text), skipinitialspace=True, encoding="utf-8-sig",
@@ -245,8 +248,7 @@ def _read_csv(path: Path, text: bytes) -> Pattern:
     except (ValueError, OSError) as error:
         raise BadInput(f"{path} cannot be read as CSV: {error}") from None
     columns = list(_COLUMNS)
-    missing = [name for name in columns if name not in table]
-    if missing:
+    if missing := [name for name in columns if name not in table]:
         raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {columns}, it has "
                        f"{list(table.columns)}")
     numbers = table[columns].apply(pd.to_numeric, errors="coerce")

@@ -45,7 +45,7 @@ from radiotwin.scene.folder import (
     write_city,
 )
 from radiotwin.scene.importer import ImportedCity, import_city
-from radiotwin.scene.materials import constants, settle
+from radiotwin.scene.materials import Names, constants, traceable_materials
 from radiotwin.scene.placement import (
     BuiltGrid,
     building_bounds,
@@ -407,7 +407,8 @@ def _city_shapes(city: ImportedCity, frequency_hz: float
                  ) -> tuple[list[CityShape], list[Problem]]:
     assert city.surfaces is not None  # without an error among the problems
     materials = [material for material in city.materials if material is not None]
-    written, problems = settle(materials, frequency_hz, {name.lower() for name in city.names})
+    taken = Names(name.lower() for name in city.names)
+    written, problems = traceable_materials(materials, frequency_hz, taken)
     shapes = [CityShape(name, trimesh.Trimesh(vertices, faces, process=False), written[material])
               for name, material, (vertices, faces)
               in zip(city.names, materials, city.surfaces.meshes())]

@@ -1,4 +1,4 @@
-"""Findings about a city, and the checks of its geometry: axis, units, ground, open meshes."""
+"""Checks of a city's geometry (up axis, units, ground, open meshes), and `Problem`s they report."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,10 +9,10 @@ import numpy as np
 from radiotwin.scene.surfaces import Surfaces
 
 Severity = Literal["error", "warning", "fixed"]
-# No city has a median above it (San Francisco's centre 11 m, Munich's 16 m), but 60 feet are six
-# storeys. Low-rise cities in feet stay below and are not noticed.
-MAX_MEDIAN_M = 60.0  # of heights
-HIGH_M = 10.0  # above z = 0: the lowest point of a city that is not raised on purpose is lower
+# Median building height [m] above which the unit is doubted: no city reaches it (San Francisco's
+# centre 11 m, Munich 16 m), but a city of six storeys has 60 feet. Lower cities in feet pass.
+MAX_MEDIAN_M = 60.0
+HIGH_M = 10.0  # [m]: if a city without ground lies higher than this, its z may be elevations
 _TO_Z_UP = {  # rotation that makes the axis point up
     "x": np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=float),
     "y": np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=float),
@@ -22,13 +22,13 @@ _TO_Z_UP = {  # rotation that makes the axis point up
 
 @dataclass(frozen=True)
 class Problem:
-    """One finding.
+    """A problem of a city, with its remedy.
 
     Attributes:
         severity: `error`: tracing would fail; `warning`: tracing works, but the result may not be
             the intended one; `fixed`: corrected in the scene that is written.
         shape: Name of the shape or material concerned, or "" for the whole city.
-        message: What was found, and what to do or what was done.
+        message: The problem, and what to do or what was done about it.
     """
 
     severity: Severity
@@ -37,36 +37,37 @@ class Problem:
 
 
 def error(message: str, shape: str = "") -> Problem:
-    """Return a finding that makes tracing fail."""
+    """Return a problem that makes tracing fail."""
     return Problem("error", shape, message)
 
 
 def warning(message: str, shape: str = "") -> Problem:
-    """Return a finding that leaves the scene traceable but may not be intended."""
+    """Return a problem that leaves the scene traceable."""
     return Problem("warning", shape, message)
 
 
 def fixed(message: str, shape: str = "") -> Problem:
-    """Return a finding that has been corrected."""
+    """Return a problem that was corrected."""
     return Problem("fixed", shape, message)
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return `'a', 'b', 'c' and 7 more`: names for a message about many shapes at once."""
+    """Format names for a message: all of up to three, else `'a', 'b', 'c' and 7 more`."""
     text = ", ".join(map(repr, names[:3]))
     return text if len(names) <= 3 else f"{text} and {len(names) - 3} more"
 
 
 def upright(vertices: np.ndarray, up: str) -> np.ndarray:
-    """Return coordinates (v, 3) rotated so that the axis x, y or z becomes z; x stays if it can."""
+    """Rotate coordinates (v, 3) so that the axis `up` (x, y or z) becomes z."""
     return vertices @ _TO_Z_UP[up].T
 
 
 def check_up_axis(surfaces: Surfaces, ground: np.ndarray) -> list[Problem]:
-    """Return an error if there is no ground (f,) with z up, but there is one with another axis up.
+    """Return an error if the axis x or y seems to point up instead of z.
 
-    Without any ground, the city seems to lie on its side if five or more parts are much taller than
-    the whole city is wide in one direction.
+    This is so if no face is ground (`ground`, (f,) bool), but some would be with the other axis up;
+    or if the city has five or more parts and is less than half as wide along that axis as along
+    both others.
     """
     if ground.any():
         return []
@@ -82,7 +83,10 @@ def check_up_axis(surfaces: Surfaces, ground: np.ndarray) -> list[Problem]:
 
 
 def _has_ground_below(surfaces: Surfaces) -> bool:
-    """Return whether ground covers most of the plane below all else; a screen in a room is none."""
+    """Return whether ground covers 80 % of the city's plan and lies at its bottom.
+
+    The latter tells ground from a level surface high up, such as a screen in a room.
+    """
     ground = surfaces.ground_faces()
     size = np.ptp(surfaces.vertices, axis=0)
     covered = np.abs(surfaces.area_vectors[ground, 2]).sum()
@@ -95,9 +99,9 @@ def _has_ground_below(surfaces: Surfaces) -> bool:
 
 
 def check_units(surfaces: Surfaces) -> list[Problem]:
-    """Return warnings if sizes look like feet or kilometres, an error if no unit makes sense."""
+    """Return a warning if sizes look like another unit than metres, an error if none fits."""
     low, high = surfaces.part_bounds()
-    heights = (high - low)[surfaces.wall_share > 0.1, 2]  # of parts that have walls
+    heights = (high - low)[surfaces.wall_share > 0.1, 2]  # of parts with walls
     width = float(np.ptp(surfaces.vertices[:, :2], axis=0).max())
     if width > 100e3:  # wider than any city
         return [error(f"the city is {width / 1000:.4g} km wide if its unit is the metre; a shape "
@@ -121,7 +125,7 @@ def check_units(surfaces: Surfaces) -> list[Problem]:
 
 
 def check_ground(ground: np.ndarray, surfaces: Surfaces) -> list[Problem]:
-    """Return a warning if no face (f,) is ground."""
+    """Return a warning if no face is ground (`ground`, (f,) bool)."""
     if ground.any():
         return []
     lowest_m = surfaces.vertices[:, 2].min()
@@ -133,7 +137,10 @@ def check_ground(ground: np.ndarray, surfaces: Surfaces) -> list[Problem]:
 
 
 def check_closed(surfaces: Surfaces, ground: np.ndarray, names: Sequence[str]) -> list[Problem]:
-    """Return a warning about open meshes beside the ground, and about roofs apart from walls."""
+    """Return warnings about meshes that are not watertight, and roofs that are not joined to walls.
+
+    The ground may be open: `ground`, (f,) bool, are its faces.
+    """
     found = []
     opened = np.zeros(surfaces.shapes, dtype=bool)
     opened[surfaces.shape[surfaces.free_edges[1]]] = True

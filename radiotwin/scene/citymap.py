@@ -1,11 +1,11 @@
-"""The 3D map: line of sight, heights, what lies inside buildings, and maps as they might be.
+"""The 3D map: line of sight, heights, points inside buildings, and maps with random errors.
 
 Rays are cast with Embree [1], which computes in single precision: distances are accurate to about
 1 mm in a city of 10 km, and surfaces closer together than `SKIN_M` count as one.
 
-Surveyed maps have walls off by decimetres to metres, and heights by metres where they were counted
-from storeys (`buildings.csv` says how well each is known). What such errors do to a prediction is
-seen by predicting over several maps with random ones.
+Walls of surveyed maps are off by decimetres to metres, and heights that were counted from storeys
+by metres (`buildings.csv` has the standard deviation of each). Predictions over several maps with
+random errors (`perturbed_map`) show how such errors matter.
 
 [1] Wald et al., "Embree: a kernel framework for efficient CPU ray tracing", ACM TOG 33(4), 2014.
 """
@@ -30,23 +30,24 @@ from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import connected
 from radiotwin.scene.vegetation import Vegetation
 
-ON_SURFACE_M = 1e-3  # closer to a surface an antenna is on it [m]
-SKIN_M = 0.01  # step past a surface before the next is looked for [m]
-GROUND_M = 0.05  # faces this close to z = 0 are the ground [m]
+ON_SURFACE_M = 1e-3  # an antenna closer to a surface is on it [m]
+SKIN_M = 0.01  # a ray starts again this far behind a surface that it crossed [m]
+GROUND_M = 0.05  # flat ground: faces within this distance of z = 0 [m]
 SIGHT_CHUNK = 1 << 16  # lines of sight of one thread at a time
 CHUNK = 1_000_000  # rays per call: bounds the memory of any query to about 100 MB
 DOWN = np.array([0.0, 0.0, -1.0])
 CONCRETE = Material("concrete", itu="concrete")  # of faces whose material is not known
 SAME_CORNER_M = 0.01  # corners closer than this are one [m]
-EARTH_RADIUS_M = 8.5e6  # 4/3 of the Earth's, for refraction (ITU-R P.526-15, Sec. 1)
-FAR_M = 5_000.0  # between ends for which the Earth is round [m]; its bulge is 0.4 m there
-BEND_M = 1_000.0  # pieces that are straight of a line of sight over the round Earth
+EARTH_RADIUS_M = 8.5e6  # effective radius, 4/3 of the true one (ITU-R P.526-15, Sec. 1)
+FAR_M = 5_000.0  # longer links are bent by the Earth's curvature [m]; its bulge is 0.4 m there
+BEND_M = 1_000.0  # length of the straight pieces of a bent line of sight [m]
 HEIGHT_SD_M = 3.0  # of a roof whose accuracy is unknown: one storey
-MIN_HEIGHT_SHARE = 0.2  # of a building's height that is left, whatever the error
-_MAX_SD_M, _MAX_AREA_M2 = 1000.0, 1e9
+MIN_HEIGHT_SHARE = 0.2  # a perturbed building keeps at least this share of its height
+_MAX_SD_M, _MAX_AREA_M2 = 1000.0, 1e9  # allowed in buildings.csv
 
 
 def _embree_scene(triangles: np.ndarray) -> Any:
+    """Return Embree's scene of triangles (n, 3, 3) [m]."""
     try:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -60,9 +61,9 @@ def _embree_scene(triangles: np.ndarray) -> Any:
 
 
 def _distinct(triangles: np.ndarray) -> np.ndarray:
-    """Return the indices of triangles (n, 3, 3) in single precision without their copies.
+    """Return the indices of triangles (n, 3, 3), in single precision, without duplicates.
 
-    Embree looks at all copies of a triangle for every ray that meets one.
+    Embree tests every duplicate of a triangle that a ray meets.
     """
     words = np.ascontiguousarray(triangles).reshape(len(triangles), 9).view(np.uint32)
     return np.flatnonzero(~pd.DataFrame(words).duplicated())
@@ -74,10 +75,10 @@ class CityMap:
     Args:
         vertices: (v, 3) positions [m].
         faces: (f, 3) indices of vertices, counter-clockwise seen from outside.
-        materials: Of the city; by default one, a slab of concrete of `Material`'s thickness.
-        material: (f,) row of `materials` of each face; None: all are of the first.
-        vegetation: Volumes that block no ray; None: there are none.
-        terrain: (f,) bool, faces of a ground that is not flat; None: the ground is flat, at z = 0.
+        materials: Materials of the city; default: concrete.
+        material: (f,) index of each face's material; None: all have the first.
+        vegetation: Volumes of vegetation, which block no ray; None: none.
+        terrain: (f,) bool, faces of ground that is not flat; None: flat ground at z = 0.
         height_sd_m: (f,) standard deviation of the mapped height of the building that each face
             belongs to [m], NaN where unknown; None: unknown for all.
     """
@@ -107,7 +108,7 @@ class CityMap:
         self._top_m = float(self.vertices[:, 2].max()) + 1.0
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle what the map is made of; Embree's scene is made again."""
+        """Pickle the constructor's arguments: Embree's scene cannot be pickled, and is rebuilt."""
         return CityMap, (self.vertices, self.faces, self.materials, self.material, self.vegetation,
                          self.terrain, self.height_sd_m)
 
@@ -115,74 +116,75 @@ class CityMap:
     def from_xml(cls, xml_path: Path | str, vegetation: Vegetation | None = None,
                  terrain: str | None = None,
                  height_sd_m: Mapping[str, float] | None = None) -> CityMap:
-        """Read the meshes that a scene folder's `city.xml` names, and what they are made of.
+        """Read the meshes of a scene folder's `city.xml`, and their materials.
 
         Args:
-            xml_path: The file.
-            vegetation: Of the scene.
-            terrain: Name of the shape that is the ground; None: the ground is flat.
-            height_sd_m: Standard deviation of the height of the building(s) of a shape [m].
+            xml_path: Path of `city.xml`.
+            vegetation: Volumes of vegetation; None: none.
+            terrain: Name of the shape that is the ground; None: flat ground.
+            height_sd_m: Name of a shape -> standard deviation of its height [m]; None: unknown.
 
         Raises:
             BadInput: No such file, malformed XML, a mesh that cannot be read, one outside the
                 folder, or no shape of the ground's name.
         """
-        meshes, found, names = zip(*read_triangles(xml_path))
+        meshes, declared, names = zip(*read_triangles(xml_path))
         if terrain is not None and terrain not in names:
             raise BadInput(f"{xml_path} has no shape {terrain!r}, which scene.toml declares as "
                            "the ground ([terrain] shape); correct the name")
-        of_shape = [material or CONCRETE for material in found]
-        materials = list(dict.fromkeys(of_shape))
+        shape_materials = [material or CONCRETE for material in declared]
+        materials = list(dict.fromkeys(shape_materials))
         starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         faces = [len(mesh.faces) for mesh in meshes]
         return cls(
             np.concatenate([mesh.vertices for mesh in meshes]),
             np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)]),
-            materials, np.repeat([materials.index(each) for each in of_shape], faces), vegetation,
+            materials, np.repeat([materials.index(one) for one in shape_materials], faces),
+            vegetation,
             None if terrain is None else np.repeat([name == terrain for name in names], faces),
             None if height_sd_m is None else np.repeat(
                 [height_sd_m.get(name, np.nan) for name in names], faces))
 
     @cached_property
     def ground_material(self) -> Material:
-        """Material of the ground: that of most of its faces that look up; else concrete."""
+        """Material of most of the ground's upward area; concrete if there is no ground."""
         area_m2 = np.where(self.on_ground & (self._normals[:, 2] > 0), self._normals[:, 2] / 2, 0.0)
         by_material = np.bincount(self.material, weights=area_m2, minlength=len(self.materials))
         return self.materials[int(by_material.argmax())] if by_material.any() else CONCRETE
 
     @cached_property
     def on_ground(self) -> np.ndarray:
-        """(f,) bool: faces of the terrain, or of flat ground, within `GROUND_M` of z = 0."""
+        """(f,) bool: faces of the terrain; without one, faces within `GROUND_M` of z = 0."""
         if self.terrain is not None:
             return self.terrain
         return (np.abs(self.vertices[self.faces][:, :, 2]) < GROUND_M).all(axis=1)
 
     def without(self, faces: np.ndarray) -> CityMap:
-        """Return the map without some faces, (f,) bool."""
-        terrain, height_sd_m = (None if each is None else each[~faces]
-                                for each in (self.terrain, self.height_sd_m))
+        """Return a map without the given faces, (f,) bool."""
+        terrain, height_sd_m = (None if values is None else values[~faces]
+                                for values in (self.terrain, self.height_sd_m))
         return CityMap(self.vertices, self.faces[~faces], self.materials, self.material[~faces],
                        self.vegetation, terrain, height_sd_m)
 
     def with_vertices(self, vertices: np.ndarray) -> CityMap:
-        """Return the map with other positions (v, 3) [m] of its vertices."""
+        """Return a map whose vertices are moved to (v, 3) [m]."""
         return CityMap(vertices, self.faces, self.materials, self.material, self.vegetation,
                        self.terrain, self.height_sd_m)
 
     def state(self) -> tuple[Any, ...]:
-        """Return everything that queries of this map and paths over it depend on."""
-        known = (self.vertices, self.faces, self.materials, self.material, self.vegetation.state())
-        return (*known, self.terrain, self.height_sd_m)
+        """Return everything that queries of this map, and paths over it, depend on, for a hash."""
+        return (self.vertices, self.faces, self.materials, self.material, self.vegetation.state(),
+                self.terrain, self.height_sd_m)
 
     def line_of_sight(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-        """Return whether no surface lies between points.
+        """Return whether links have line of sight: no surface between their ends.
 
-        Two points within one solid see each other. Between points more than `FAR_M` apart the line
-        is bent by the curvature of the Earth, with mean refraction, and flat ground has no end.
+        Two points within one solid see each other. Lines longer than `FAR_M` are bent by the
+        curvature of the Earth, with mean refraction, and flat ground extends without end.
 
         Args:
-            a_m: (n, 3) or broadcastable to it [m].
-            b_m: The other ends, likewise.
+            a_m: (n, 3) one end of each link, or broadcastable to it [m].
+            b_m: (n, 3) other end, likewise [m].
 
         Returns:
             (n,) bool
@@ -194,10 +196,10 @@ class CityMap:
             part = slice(start, start + SIGHT_CHUNK)
             origin = np.ascontiguousarray(a_m[part], dtype=np.float32)
             # Not normalised: a length of 1 then ends the ray at b, which is faster
-            way = np.ascontiguousarray(b_m[part] - a_m[part], dtype=np.float32)
-            los[part] = self._scene.run(origin, way, np.ones(len(way), np.float32),
+            ray = np.ascontiguousarray(b_m[part] - a_m[part], dtype=np.float32)
+            los[part] = self._scene.run(origin, ray, np.ones(len(ray), np.float32),
                                         query="OCCLUDED") == -1
-            far.append(start + np.flatnonzero(way[:, 0] ** 2 + way[:, 1] ** 2 > FAR_M**2))
+            far.append(start + np.flatnonzero(ray[:, 0] ** 2 + ray[:, 1] ** 2 > FAR_M**2))
 
         far: list[np.ndarray] = [np.zeros(0, dtype=int)]
         in_threads(cast, range(0, len(a_m), SIGHT_CHUNK))
@@ -213,7 +215,10 @@ class CityMap:
         return ~self.ground.line_of_sight(a_m, b_m)
 
     def _sight_over_earth(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-        """Return whether lines of sight (n,) over the round Earth are clear, piece by piece."""
+        """Return whether long links (n,) have line of sight over the round Earth.
+
+        The bent line is tested piece by piece; over flat ground also against the horizon.
+        """
         offset_m = b_m - a_m
         length_m = np.hypot(offset_m[:, 0], offset_m[:, 1])
         share = np.linspace(0, 1, 1 + int(np.ceil(length_m.max() / BEND_M)))[:, None, None]
@@ -227,14 +232,14 @@ class CityMap:
         return clear
 
     def height_at(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> np.ndarray:
-        """Return the height of the highest surface above each point of the plane.
+        """Return the height of the highest surface at each point of the plane.
 
         Args:
             x_m: East coordinates, any shape [m].
             y_m: North coordinates, same shape [m].
 
         Returns:
-            Heights of that shape [m]; 0 (the ground datum) where there is nothing.
+            Heights of that shape above the datum [m]; 0 where there is no surface.
         """
         x_m, y_m = np.broadcast_arrays(x_m, y_m)
         above = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, self._top_m)])
@@ -251,14 +256,14 @@ class CityMap:
         return CityMap(self.vertices[used], faces, terrain=np.ones(len(faces), dtype=bool))
 
     def ground_height_m(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> np.ndarray:
-        """Return the height of the ground above the datum.
+        """Return the height of the ground above the datum at each point of the plane.
 
         Args:
             x_m: East coordinates, any shape [m].
             y_m: North coordinates, same shape [m].
 
         Returns:
-            Heights of that shape [m]; off the terrain those of its border, of flat ground 0.
+            Heights of that shape [m]; beyond the terrain, the height of its border; 0 if flat.
         """
         x_m, y_m = np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float))
         if self.terrain is None:
@@ -266,12 +271,13 @@ class CityMap:
         return self._terrain_height_m(x_m.ravel(), y_m.ravel()).reshape(x_m.shape)
 
     def _terrain_height_m(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-        """Return the heights (n,) of the terrain [m]."""
+        """Return the heights (n,) of the terrain at x and y (n,) [m], by rays from above."""
         ground = self.ground
         low_m, high_m = ground.vertices[:, :2].min(axis=0), ground.vertices[:, :2].max(axis=0)
         points_m = np.column_stack([x_m, y_m])
         height_m = np.full(len(points_m), np.nan)
-        # A ray that meets a corner or a side exactly may pass between triangles: a hair beside it
+        # A ray that meets a corner or an edge exactly may pass between triangles: then it is cast
+        # again a little beside
         for aside_m in (0.0, 0.004, 0.03, 0.2):
             left = np.flatnonzero(np.isnan(height_m))
             if not len(left):
@@ -281,7 +287,7 @@ class CityMap:
                         high_m - SKIN_M), np.full(len(left), ground._top_m)])
             far_m = ground.first_hits_towards(above, DOWN)[0]
             height_m[left] = np.where(np.isfinite(far_m), ground._top_m - far_m, np.nan)
-        left = np.flatnonzero(np.isnan(height_m))  # in a hole of a terrain that was made elsewhere
+        left = np.flatnonzero(np.isnan(height_m))  # in a hole: terrain of another program
         if len(left):
             corner = cKDTree(ground.vertices[:, :2]).query(points_m[left])[1]
             height_m[left] = ground.vertices[corner, 2]
@@ -306,10 +312,10 @@ class CityMap:
         return self._depth(np.atleast_2d(np.asarray(points_m, dtype=float))) > 0
 
     def misplaced(self, points_m: np.ndarray) -> np.ndarray:
-        """Return why no antenna can be at points (n, 3) [m], empty where one can, (n,) str.
+        """Return the reason (n,) why no antenna can be at points (n, 3) [m]; "" where one can.
 
-        It is `below the ground`, `inside a building`, or `on a surface`: within `ON_SURFACE_M` of a
-        wall, a roof or the ground, where rays would begin on either side of it.
+        Reasons are `below the ground`, `inside a building`, and `on a surface`: within
+        `ON_SURFACE_M` of a wall, a roof or the ground, where rays could start on either side.
         """
         points_m = np.atleast_2d(np.asarray(points_m, dtype=float))
         inside = self.inside(points_m)
@@ -321,11 +327,11 @@ class CityMap:
                          ["on a surface", "below the ground", "inside a building"], default="")
 
     def metres_inside(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-        """Return the length of each segment that lies within buildings.
+        """Return the length that straight links run inside buildings.
 
         Args:
-            a_m: (n, 3) or broadcastable to it [m].
-            b_m: The other ends, likewise.
+            a_m: (n, 3) one end of each link, or broadcastable to it [m].
+            b_m: (n, 3) other end, likewise [m].
 
         Returns:
             (n,) lengths [m]
@@ -353,7 +359,7 @@ class CityMap:
 
     def _crossings(self, a_m: np.ndarray, b_m: np.ndarray
                    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Yield the 1st, 2nd, … crossing of each segment that has one.
+        """Yield the first crossing of each segment (a, b) with a surface, then the second, etc.
 
         Yields:
             Distances from a [m], +1 for entering or -1 for leaving a solid, indices of segments.
@@ -375,7 +381,7 @@ class CityMap:
 
     def first_hits(self, a_m: np.ndarray, b_m: np.ndarray
                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the first surface on the way from a to b.
+        """Find the first surface between a and b.
 
         Args:
             a_m: (n, 3) starts [m].
@@ -393,12 +399,12 @@ class CityMap:
     def first_hits_towards(self, start_m: np.ndarray, direction: np.ndarray,
                            length_m: np.ndarray | float = np.inf
                            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the first surface in some directions; returns those of `first_hits`.
+        """Find the first surface along rays; returns the same as `first_hits`.
 
         Args:
-            start_m: (n, 3) [m].
-            direction: (n, 3), or one, unit vectors.
-            length_m: (n,), or one, how far to look [m].
+            start_m: (n, 3) starts of the rays [m].
+            direction: (n, 3) unit vectors, or one for all.
+            length_m: (n,) length of the rays [m], or one for all.
         """
         n = len(start_m)
         direction = np.broadcast_to(direction, (n, 3))
@@ -418,7 +424,7 @@ class CityMap:
 
 
 def building_of_vertex(city: CityMap) -> np.ndarray:
-    """Return the building (v,) that each vertex belongs to; -1: only ground.
+    """Return the number (v,) of the building that each vertex belongs to; -1: ground only.
 
     A building is a set of triangles above the ground that are connected by shared corners.
     """
@@ -435,13 +441,19 @@ def building_of_vertex(city: CityMap) -> np.ndarray:
     return (building.reshape(-1) - (~built).any())[index.reshape(-1)]
 
 
-@lru_cache(maxsize=8)  # a map holds what was found for its paths: tens of MB
+@lru_cache(maxsize=8)  # a map also holds its precomputed walls and edges: tens of MB
 def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int) -> CityMap:
-    """Return a map with the walls and roofs of every building moved by normal errors.
+    """Return a map with normal errors of every building's walls and height.
 
     The walls on opposite sides of a building move independently, so that it is shifted and grows or
-    shrinks; its roof keeps its shape. The same seed moves them in the same direction whatever the
-    standard deviations of a wall's position, across it, and of a building's height.
+    shrinks; its roof keeps its shape. The errors of a seed are proportional to the standard
+    deviations.
+
+    Args:
+        city: Map to perturb.
+        wall_sd_m: Standard deviation of a wall's position, across the wall [m].
+        height_sd_m: Standard deviation of a building's height [m].
+        seed: Seed of the errors.
     """
     rng = np.random.default_rng(seed)
     building = building_of_vertex(city)
@@ -467,10 +479,10 @@ def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int
 
 
 def shape_height_sds_m(folder: Path) -> dict[str, float] | None:
-    """Return the standard deviation of the height of each shape [m], as `buildings.csv` has it.
+    """Read the standard deviation of the height of each shape [m] from a folder's `buildings.csv`.
 
-    A shape is a block of buildings that touch: it has their mean, by area. None if the folder has
-    no such table, or one of an earlier version (without the column `height_sd_m`).
+    A shape is a block of buildings that touch: the mean over its buildings is weighted by area.
+    None if the folder has no such table, or the table no column `height_sd_m`.
 
     Raises:
         BadInput: the table cannot be read, lies outside the folder, or has an impossible value.
@@ -483,9 +495,9 @@ def shape_height_sds_m(folder: Path) -> dict[str, float] | None:
     if not {"shape", "area_m2", "height_sd_m"} <= set(table.columns):
         return None
     numbers = {name: as_numbers(table[name]) for name in ("area_m2", "height_sd_m")}
-    for name, most in (("area_m2", _MAX_AREA_M2), ("height_sd_m", _MAX_SD_M)):
-        refuse(path, name, table[name], ~((numbers[name] > 0) & (numbers[name] <= most)),
-               f"is impossible; allowed are numbers above 0, up to {most:g}")
+    for name, highest in (("area_m2", _MAX_AREA_M2), ("height_sd_m", _MAX_SD_M)):
+        refuse(path, name, table[name], ~((numbers[name] > 0) & (numbers[name] <= highest)),
+               f"is impossible; allowed are numbers above 0, up to {highest:g}")
     areas_m2 = pd.Series(numbers["area_m2"]).groupby(table["shape"]).sum()
     sums = pd.Series(numbers["area_m2"] * numbers["height_sd_m"]).groupby(table["shape"]).sum()
     return dict((sums / areas_m2).items())

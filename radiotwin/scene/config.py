@@ -1,4 +1,4 @@
-"""`scene.toml`: the declarations of a scene besides its geometry, checked when it is read."""
+"""`scene.toml`: radio, extent, lattice, devices, UAVs, mission; how it is read and checked."""
 
 import os
 import re
@@ -28,15 +28,15 @@ from radiotwin.scene.vegetation import VegetationConfig
 
 ANTENNA_HEIGHT_M = 1.5  # of a device above the ground [m]: a person, a meter, a low pole
 _MAX_MESSAGES = 10
-# Names become parts of file names: none is hidden, or the folder itself, or the one above.
+# Names become parts of file names: none begins with a dot (hidden files, `.` and `..`).
 Name = Annotated[str, Field(min_length=1, max_length=64,
                             pattern=r"^[A-Za-z0-9_+-][A-Za-z0-9_.+-]*$")]
 Altitude = Annotated[Number, Field(gt=0, le=MAX_COORDINATE_M)]
 Vertical = Literal["geoid", "ellipsoid", "unknown"]
 
 
-def _below(name: str) -> str:
-    """Return the name of a file if it can only mean one below the folder that names it."""
+def _file_below(name: str) -> str:
+    """Return the name of a file; ValueError if it could mean a file outside the scene folder."""
     parts = PurePosixPath(name).parts
     if (not parts or ".." in parts or re.search(r"^/|[\\:]", name) or not name.isprintable()
             or len(name) > 255):
@@ -45,11 +45,11 @@ def _below(name: str) -> str:
     return name
 
 
-FileName = Annotated[str, AfterValidator(_below)]
+FileName = Annotated[str, AfterValidator(_file_below)]
 
 
 class RadioConfig(Table):
-    """One radio for all links; a device's own frequency or power may come with later formats."""
+    """The radio of all links."""
 
     frequency_hz: Number = 2.4e9
     bandwidth_hz: Number = Field(1e6, gt=0, le=450e9)
@@ -75,12 +75,12 @@ class RadioConfig(Table):
 
     @property
     def declares_power(self) -> bool:
-        """Whether the transmit power is another than the default, which nobody may have meant."""
+        """Whether the transmit power differs from the default, which may just have been left."""
         return self.tx_power_dbm != type(self)().tx_power_dbm
 
 
 class Extent(Table):
-    """The part of the plane that UAVs fly over and devices are searched in."""
+    """The rectangle that UAVs fly over and devices are searched in."""
 
     x_min_m: Metres
     x_max_m: Metres
@@ -105,7 +105,7 @@ class LatticeConfig(Table):
     step_m: Number = Field(20.0, ge=1e-6, le=MAX_COORDINATE_M)
     altitudes_m: list[Altitude] = Field(min_length=1)
     above: Literal["datum", "ground"] | None = Field(None, description=(
-        "of the altitudes, the UAVs', too: z = 0 [datum], or the ground below each position"))
+        "reference of all altitudes: z = 0 [datum], or the ground below each position"))
 
     @field_validator("altitudes_m")
     @classmethod
@@ -117,7 +117,7 @@ class LatticeConfig(Table):
 
 
 class DeviceConfig(Table):
-    """True position of a device; a survey reports that of anchors only."""
+    """True position of a device; a survey reports only those of anchors."""
 
     device: Name
     x_m: Metres
@@ -148,7 +148,7 @@ class DeviceConfig(Table):
 
 
 class UavConfig(Table):
-    """A UAV: one altitude, from start to terminal, on `battery` units (move 1, hover 0.5)."""
+    """A UAV: flies at one altitude from start to terminal; a move takes 1 unit, hovering 0.5."""
 
     uav: Name
     altitude_m: Altitude
@@ -161,7 +161,7 @@ class UavConfig(Table):
 
 
 class MissionConfig(Table):
-    """The data-harvesting mission of Chen et al. 2023."""
+    """The data-harvesting mission of Chen et al., GLOBECOM Workshops 2023."""
 
     data_units: Number = Field(16_000.0, gt=0, le=1e15, description="data at each device that "
                                                                      "declares none")
@@ -174,10 +174,10 @@ class TerrainConfig(Table):
 
     Attributes:
         shape: name of the ground's shape in `city.xml`.
-        source: file that the heights are from.
+        source: file of the terrain heights.
         datum_m: height of z = 0 above the zero of `reference` [m].
-        reference: vertical reference of the file's heights.
-        kind: of that reference.
+        reference: name of the vertical reference of the file's heights.
+        kind: kind of that reference: geoid, ellipsoid, or unknown.
     """
 
     shape: str = Field(min_length=1, max_length=200)
@@ -188,7 +188,7 @@ class TerrainConfig(Table):
 
 
 class SceneConfig(Table):
-    """All of `scene.toml`."""
+    """Content of `scene.toml`."""
 
     schema_: Literal["radiotwin.scene/1"] = Field("radiotwin.scene/1", alias="schema")
     name: Name
@@ -210,8 +210,7 @@ class SceneConfig(Table):
     def _consistent(self) -> "SceneConfig":
         for kind, names in (("device", [device.device for device in self.devices]),
                             ("uav", [uav.uav for uav in self.uavs])):
-            double = [name for name, count in Counter(names).items() if count > 1]
-            if double:
+            if double := [name for name, count in Counter(names).items() if count > 1]:
                 raise ValueError(f"{kind} {min(double)!r} is declared twice; every name must "
                                  "be unique")
         if self.crs is not None and (self.origin is None or self.crs != local_crs(self.origin)):
@@ -256,7 +255,7 @@ class SceneConfig(Table):
 
     @property
     def gain_limit_db(self) -> float:
-        """Gain below which a link is not detected [dB]."""
+        """Limit of detection: links with a lower gain are not detected [dB]."""
         return self.radio.sensitivity_dbm - self.radio.tx_power_dbm
 
 
@@ -264,6 +263,7 @@ _UNITS = {"m": "m", "hz": "Hz", "dbm": "dBm", "db": "dB", "deg": "degrees", "s":
 
 
 def _explain(path: Path, error: ValidationError) -> str:
+    """Format pydantic's errors: file, key, value and remedy, a line each."""
     lines = []
     problems = error.errors(include_url=False)
     for problem in problems[:_MAX_MESSAGES]:
@@ -287,11 +287,11 @@ def _explain(path: Path, error: ValidationError) -> str:
 
 
 def parse_config(data: dict[str, Any], path: Path | str) -> SceneConfig:
-    """Check the content of a scene file, nested tables as TOML gives them.
+    """Check the content of `scene.toml`, nested dictionaries as a TOML parser returns them.
 
     Raises:
-        BadInput: An unknown key, an impossible value, or too many of them; names `path`, key, value
-            and what is allowed.
+        BadInput: An unknown key, an impossible value, or too many devices or UAVs; the message has
+            path, key, value and what is allowed.
     """
     for name, budget in (("devices", DEVICES), ("uavs", UAVS)):
         if isinstance(data.get(name), list):
@@ -317,10 +317,10 @@ def read_config(path: Path | str) -> SceneConfig:
 
 
 def write_config(config: SceneConfig, path: Path | str) -> None:
-    """Write `scene.toml` with every number that a later step uses, defaults included.
+    """Write `scene.toml`, defaults included.
 
-    Devices and UAVs become `[[devices]]` and `[[uavs]]` tables, which tomli_w would fold into one
-    array: so another table can be appended by hand.
+    Devices and UAVs become `[[devices]]` and `[[uavs]]` tables, so that more can be appended by
+    hand; tomli_w alone would write each list as one array.
     """
     data = config.model_dump(by_alias=True, exclude_none=True)
     lists = {name: data.pop(name) for name in ("uavs", "devices")}

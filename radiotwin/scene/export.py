@@ -1,4 +1,4 @@
-"""A scene's city for other programs: XML and PLY for Sionna RT and Mitsuba, glTF, OBJ."""
+"""Export of a scene's city: XML and PLY for Sionna RT and Mitsuba, glTF, OBJ."""
 
 from pathlib import Path
 
@@ -25,14 +25,14 @@ _COLOURS = {"concrete": (178, 178, 178), "brick": (170, 90, 70), "wood": (160, 1
 
 
 def export_scene(scene: Scene, out: Path | str) -> None:
-    """Write a scene's city in the form that the name of the output implies.
+    """Write a scene's city in the format of the output's suffix.
 
     A folder: `city.xml` and `meshes/*.ply`, which `sionna.rt.load_scene` loads, and `devices.csv`.
     `NAME.glb` or `NAME.gltf`: glTF 2.0, y up, with everything in one file. `NAME.obj`: z up, with
     its materials in `NAME.mtl`.
 
     Args:
-        scene: The scene.
+        scene: Scene to export.
         out: Folder or file to write.
 
     Raises:
@@ -57,23 +57,19 @@ def export_scene(scene: Scene, out: Path | str) -> None:
 
 
 def _colour(material: Material) -> tuple[int, int, int]:
+    """Return the RGB colour of a material; grey if its ITU type has none."""
     itu = material.itu or material.name.removesuffix("-fixed").removeprefix("own-")
     return _COLOURS.get(itu, (165, 165, 165))
 
 
-def _coloured(shape: CityShape) -> trimesh.Trimesh:
-    mesh = shape.mesh.copy()
-    material = trimesh.visual.material.PBRMaterial(
-        name=shape.material.name, baseColorFactor=[*_colour(shape.material), 255],
-        metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True)
-    mesh.visual = trimesh.visual.TextureVisuals(material=material)
-    return mesh
-
-
 def _write_gltf(shapes: list[CityShape], path: Path) -> None:
+    """Write glTF 2.0 with one coloured mesh per shape, and everything in one file."""
     model = trimesh.Scene()
     for shape in shapes:
-        mesh = _coloured(shape)
+        mesh = shape.mesh.copy()
+        mesh.visual = trimesh.visual.TextureVisuals(material=trimesh.visual.material.PBRMaterial(
+            name=shape.material.name, baseColorFactor=[*_colour(shape.material), 255],
+            metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True))
         mesh.apply_transform(Y_UP)
         model.add_geometry(mesh, node_name=shape.name, geom_name=shape.name)
     if path.suffix.lower() == ".glb":
@@ -88,6 +84,7 @@ def _write_gltf(shapes: list[CityShape], path: Path) -> None:
 
 
 def _sign(tree: dict) -> None:
+    """Enter radiotwin as the generator of a glTF document."""
     tree["asset"]["generator"] = "radiotwin"
 
 
@@ -104,6 +101,6 @@ def _write_obj(shapes: list[CityShape], path: Path) -> None:
                for line in (f"newmtl {name}",
                             "Kd " + " ".join(f"{value / 255:.3f}" for value in rgb), ""))]
     with atomic_path(path) as model, atomic_path(path.with_suffix(".mtl")) as colour_file:
-        # Neither is renamed before both are written
+        # Both are renamed only when both are written
         model.write_text("\n".join(lines) + "\n", encoding="utf-8")
         colour_file.write_text("\n".join(library) + "\n", encoding="utf-8")

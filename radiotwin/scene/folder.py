@@ -1,8 +1,8 @@
-"""The folder of a scene: its city read and written, what may be replaced in it, its source.
+"""The folder of a scene: reading and writing its city, replacing it safely, finding its source.
 
-All that uses a scene's geometry reads `city.xml` and its meshes here, whose author may be unknown.
-The ray tracer loads a copy that is written here from what was read, never the scene's own file: as
-Sionna RT 2.2 loads it, with one binary PLY file for each shape.
+The author of a scene's `city.xml` and meshes may be unknown: everything that uses the geometry
+reads it by this module. The ray tracer loads a copy that is written here from the parsed shapes,
+in the form that Sionna RT 2.2 loads (one binary PLY file per shape), never the scene's own file.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from radiotwin.scene.materials import (
     Names,
     map_materials,
     safe_name,
-    unique_name,
 )
 from radiotwin.scene.meshes import RawMesh, load_shapes
 from radiotwin.scene.mitsuba_xml import DeclaredCity, read_mitsuba_xml
@@ -43,7 +42,7 @@ from radiotwin.scene.streets import STREETS
 if TYPE_CHECKING:
     import trimesh
 
-EARLIER = "scene.toml.old"  # the declarations that a new scene replaced
+EARLIER = "scene.toml.old"  # the scene.toml that a new one replaced
 SCENE_FILES = frozenset({"scene.toml", EARLIER, "city.xml", "meshes", "preview.png",
                          "buildings.csv", STREETS})
 MAP_SUFFIXES = ".osm, .osm.pbf, .geojson, .gpkg, .parquet, .shp, .zip, .json, .jsonl, .gml"
@@ -51,12 +50,12 @@ MAP_SUFFIXES = ".osm, .osm.pbf, .geojson, .gpkg, .parquet, .shp, .zip, .json, .j
 
 @dataclass(frozen=True, eq=False)
 class CityShape:
-    """One surface or body of a city.
+    """One shape of a city: a mesh of one material.
 
     Attributes:
         name: Unique in the city; letters, digits, `_` and `-`.
         mesh: Triangles in the scene's frame [m].
-        material: Shapes that share one have equal `Material` objects.
+        material: Radio material.
     """
 
     name: str
@@ -67,8 +66,8 @@ class CityShape:
 def write_city(folder: Path | str, shapes: Sequence[CityShape]) -> None:
     """Write `city.xml` and `meshes/*.ply` into an existing folder.
 
-    Names of shapes are unique, also among the names of materials (Sionna RT keeps both in one
-    register).
+    A shape's name must differ from those of all shapes and materials: Sionna RT keeps both in one
+    register.
     """
     folder = Path(folder)
     (folder / "meshes").mkdir(exist_ok=True)
@@ -86,6 +85,7 @@ def write_city(folder: Path | str, shapes: Sequence[CityShape]) -> None:
 
 
 def _material_element(material: Material) -> ET.Element:
+    """Return the `<bsdf>` element of a material."""
     # The identifier must not begin with "itu_": Sionna RT rebuilds such a material from its type
     # and thickness and drops its scattering.
     if material.itu is not None:
@@ -105,11 +105,13 @@ def _material_element(material: Material) -> ET.Element:
 
 
 def _add_float(element: ET.Element, name: str, value: float | None) -> None:
+    """Add a `<float>` to an element, with all digits of its value."""
     assert value is not None  # a material outside the ITU table has both constants
     ET.SubElement(element, "float", name=name, value=repr(float(value)))
 
 
 def _shape_element(shape: CityShape) -> ET.Element:
+    """Return the `<shape>` element of a shape, which refers to its mesh file and material."""
     element = ET.Element("shape", type="ply", id=f"mesh-{shape.name}")
     ET.SubElement(element, "string", name="filename", value=f"meshes/{shape.name}.ply")
     # Otherwise Mitsuba smooths the normals of walls that share vertices, and reflections go astray
@@ -119,9 +121,7 @@ def _shape_element(shape: CityShape) -> ET.Element:
 
 
 def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None, str]]:
-    """Read mesh, material and name of every shape of a `city.xml`, in the file's order.
-
-    The material is None if the shape's is not known.
+    """Read mesh, material (None: unknown) and name of every shape of a `city.xml`, in its order.
 
     Raises:
         BadInput: No such file, malformed XML, an element or a mesh that cannot be read, or a file
@@ -136,8 +136,8 @@ def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None,
 def read_city(xml_path: Path | str) -> list[CityShape]:
     """Read the shapes of a `city.xml` with their materials, in the file's order.
 
-    Names that Sionna RT or a file system would not accept are changed; those of a city that
-    `write_city` wrote stay, and writing it again gives the same bytes.
+    Names that Sionna RT or a file system would not accept are replaced. A city that `write_city`
+    wrote keeps its names, and written again has the same bytes.
 
     Raises:
         BadInput: As `read_triangles`; or a shape without a known material.
@@ -150,11 +150,10 @@ def read_city(xml_path: Path | str) -> list[CityShape]:
     if errors:
         raise BadInput("\n".join([f"{xml_path}: not every shape has a usable material:", *errors]))
     taken = Names(RESERVED_NAMES)
-    names = [unique_name(safe_name(shape.name.removeprefix("mesh-")), taken)
+    names = [taken.unique(safe_name(shape.name.removeprefix("mesh-")))
              for shape in declared.shapes]
     used = sorted({material for material in materials if material is not None}, key=repr)
-    unique = {material: replace(material, name=unique_name(material.name, taken))
-              for material in used}
+    unique = {material: replace(material, name=taken.unique(material.name)) for material in used}
     return [CityShape(name, trimesh.Trimesh(mesh.vertices, mesh.faces, process=False),
                       unique[material])
             for name, mesh, material in zip(names, _meshes(Path(xml_path), declared), materials)
@@ -162,7 +161,7 @@ def read_city(xml_path: Path | str) -> list[CityShape]:
 
 
 def mesh_paths(xml_path: Path | str) -> set[Path]:
-    """Return the files of meshes that a scene folder's `city.xml` names.
+    """Return the mesh files that a scene folder's `city.xml` names.
 
     Raises:
         BadInput: No such file, malformed XML, or a mesh outside the folder.
@@ -172,12 +171,14 @@ def mesh_paths(xml_path: Path | str) -> set[Path]:
 
 
 def _declared(xml_path: Path) -> DeclaredCity:
+    """Parse a scene folder's `city.xml`; BadInput if it does not exist."""
     if not os.path.lexists(xml_path):
         raise BadInput(f"{xml_path} does not exist; `radiotwin build-scene` makes a scene folder")
     return read_mitsuba_xml(xml_path, scene_folder=True)
 
 
 def _meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
+    """Load the meshes of a city, and check that they are triangles near the origin."""
     meshes = []
     for shape, mesh in zip(declared.shapes, load_shapes(declared.shapes, xml_path)):
         farthest_m = float(np.abs(mesh.vertices).max(initial=0.0))
@@ -196,7 +197,14 @@ def _meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
 
 def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | None = None,
                  mark: str = "scene.toml") -> None:
-    """Raise BadInput if writing a folder would erase more than the allowed names, or the source."""
+    """Raise BadInput if replacing a folder would erase its source, or files of other names.
+
+    Args:
+        folder: Output folder; fine if it does not exist.
+        allowed: Names of files and folders that may be replaced.
+        source: File that the scene is built from.
+        mark: Name of a file by which a folder is recognised as replaceable.
+    """
     require_folder(folder, allowed, mark)
     if source is not None and is_within(source, folder):
         raise BadInput(f"{source} lies in {folder}, which the new scene would replace; choose "
@@ -204,9 +212,9 @@ def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | N
 
 
 def keep_declarations(folder: Path, new: Path) -> None:
-    """Keep a `scene.toml` that is replaced as `scene.toml.old`, with a warning, if it differs.
+    """Keep a replaced `scene.toml` that differs, as `scene.toml.old`, with a warning.
 
-    It may have been edited. `new` is the folder with the new `scene.toml`.
+    It may have been edited by hand. `new` is the folder with the new `scene.toml`.
     """
     before = folder / "scene.toml"
     if before.is_file() and not filecmp.cmp(before, new / "scene.toml", shallow=False):
@@ -220,18 +228,18 @@ def keep_declarations(folder: Path, new: Path) -> None:
 def published_scene(name: str) -> Path:
     """Return the folder of a published scene, `rbm` or `rdm`.
 
-    The scene in the folder `scenes` of the working directory comes first, then that of the source
-    tree that the package was imported from, then the copy inside an installed package. Where there
-    is none, it is `scenes/NAME`, so that the message of a missing scene names it.
+    It is looked for in `scenes` of the working directory, then of the source tree that the package
+    was imported from, then inside the installed package. If it is nowhere, `scenes/NAME` is
+    returned, so that the message of a missing scene names it.
     """
     package = Path(__file__).parents[1]
-    here = Path("scenes") / name
-    candidates = (here, package.parent / here, package / here)
-    return next((folder for folder in candidates if (folder / "scene.toml").is_file()), here)
+    relative = Path("scenes") / name
+    candidates = (relative, package.parent / relative, package / relative)
+    return next((folder for folder in candidates if (folder / "scene.toml").is_file()), relative)
 
 
 def sionna_scenes() -> dict[str, Path]:
-    """Return the XML files of the scenes in sionna-rt by name, without importing it."""
+    """Return name -> XML file of the scenes that sionna-rt brings, without importing it."""
     spec = find_spec("sionna")
     roots = [] if spec is None else spec.submodule_search_locations or []
     return {path.parent.name: path for root in roots
@@ -240,7 +248,7 @@ def sionna_scenes() -> dict[str, Path]:
 
 
 def find_source(source: Path | str) -> Path:
-    """Return the file of a source: a path, or `sionna:NAME`.
+    """Return the file of a city: a path, or `sionna:NAME` for a scene of sionna-rt.
 
     Raises:
         BadInput: Unknown name (the message lists the known ones), no such file, or neither XML nor
@@ -269,7 +277,7 @@ def find_source(source: Path | str) -> Path:
 
 
 def scene_name(source: Path | str) -> str:
-    """Return the name of a source's scene, in the characters that `scene.toml` allows.
+    """Return a name for the scene of a source, in the characters that `scene.toml` allows.
 
     >>> scene_name("sionna:munich"), scene_name("data/My city.xml")
     ('munich', 'My_city')
@@ -280,5 +288,5 @@ def scene_name(source: Path | str) -> str:
 
 
 def source_text(source: Path | str) -> str:
-    """Return a source for `scene.toml`, with an escape for each byte that is not UTF-8."""
+    """Return a source as text for `scene.toml`; bytes that are not UTF-8 are escaped."""
     return str(source).encode("utf-8", "backslashreplace").decode("utf-8")

@@ -1,9 +1,9 @@
-"""Corrected positions of devices that the map puts inside a building or below the ground.
+"""Corrected positions of devices that lie inside a building or below the ground of the map.
 
-Roofs, walls and the ground of a map are off. A mast on a roof that is mapped too high is inside
-the building, and so is a lamp at a wall that is mapped too far out. Such a device is moved to where
-the smallest of these errors, in its standard deviations, would put the surface: to just above the
-roof or the ground, or to just outside the wall.
+Roofs, walls and ground of a map have errors. A mast on a roof that is mapped too high is inside the
+building in the map, and so is a lamp at a wall that is mapped too far out. Such a device is moved
+just above the roof or the ground, or just outside the wall: whichever needs the smallest error of
+the map, in standard deviations.
 """
 
 from dataclasses import dataclass
@@ -12,24 +12,25 @@ import numpy as np
 
 from radiotwin.scene.citymap import DOWN, HEIGHT_SD_M, CityMap
 
-CLEARANCE_M = 0.5  # of a device from the surface that it is moved out of
+CLEARANCE_M = 0.5  # distance of a moved device from the roof, ground or wall
 WALL_SD_M = 2.0
-"""Of a wall, across it: outlines of OpenStreetMap lie 4 m from those of a survey on average, most
-of it in common with their neighbours, and surveyed ones decimetres (Fan, Zipf, Fu and Neis 2014,
-'Quality assessment for building footprints data on OpenStreetMap', IJGIS 28)."""
+"""Standard deviation of a wall's position, across the wall. Outlines of OpenStreetMap lie 4 m from
+surveyed ones on average, mostly by a shift that neighbours share, and surveyed ones are off by
+decimetres (Fan, Zipf, Fu and Neis 2014, 'Quality assessment for building footprints data on
+OpenStreetMap', IJGIS 28)."""
 GROUND_SD_M = 2.4  # Copernicus DEM: within 4 m at 90 %
-MAX_SDS = 3.0  # errors beyond are not a map's
+MAX_SDS = 3.0  # a larger error is not attributed to the map
 STEP_M, DIRECTIONS = 0.1, 72  # of the search for the nearest wall
 
 
 @dataclass(frozen=True, eq=False)
 class Footing:
-    """The nearest place outside.
+    """A corrected position outdoors.
 
     Attributes:
         point_m: (3,) x, y, z [m].
-        sds: error of the map that explains it, in its standard deviations.
-        move: what was done, in words.
+        sds: error of the map that would explain the device's position, in standard deviations.
+        move: description of the correction, for a message.
     """
 
     point_m: np.ndarray
@@ -38,30 +39,30 @@ class Footing:
 
 
 def footing(city: CityMap, point_m: np.ndarray) -> Footing | None:
-    """Find the likeliest position outdoors of a device (3,) [m] that the map puts indoors.
+    """Find the likeliest position outdoors of a device (3,) [m] that is indoors in the map.
 
     Returns:
-        the position that needs the smallest error of the map, in its standard deviations; None if
-        all need more than `MAX_SDS`.
+        the position that needs the smallest error of the map, in standard deviations; None if all
+        need more than `MAX_SDS`.
     """
-    found = [each for each in (_above(city, point_m, to_ground=True),
-                               _above(city, point_m, to_ground=False), _beside(city, point_m))
-             if each is not None and each.sds <= MAX_SDS]
-    return min(found, key=lambda each: each.sds, default=None)
+    candidates = (_above(city, point_m, to_ground=True), _above(city, point_m, to_ground=False),
+                  _beside(city, point_m))
+    plausible = [one for one in candidates if one is not None and one.sds <= MAX_SDS]
+    return min(plausible, key=lambda one: one.sds, default=None)
 
 
-def standing(city: CityMap, points_m: np.ndarray) -> np.ndarray:
-    """Return positions (n, 3) [m] of devices, the misplaced ones moved as `footing` says."""
-    places_m = points_m.copy()
+def moved_outdoors(city: CityMap, points_m: np.ndarray) -> np.ndarray:
+    """Return positions (n, 3) [m] of devices, with the misplaced ones corrected by `footing`."""
+    corrected_m = points_m.copy()
     for row in np.flatnonzero(city.misplaced(points_m) != ""):
         found = footing(city, points_m[row])
         if found is not None:
-            places_m[row] = found.point_m
-    return places_m
+            corrected_m[row] = found.point_m
+    return corrected_m
 
 
 def _above(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | None:
-    """Return the place just above the ground, or above the roof; None inside a building."""
+    """Return the position just above the ground, or the roof; None if that is lower or indoors."""
     x_m, y_m, z_m = point_m.tolist()
     ground_m = float(city.ground_height_m(x_m, y_m))
     surface_m, sd_m, what = ground_m, GROUND_SD_M, "the ground"
@@ -76,7 +77,7 @@ def _above(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | Non
 
 
 def _roof_m(city: CityMap, x_m: float, y_m: float) -> tuple[float, float]:
-    """Return the height of the roof at a place, and its standard deviation [m]."""
+    """Return the height of the highest surface at x and y, and its standard deviation [m]."""
     above_m = np.array([[x_m, y_m, city.vertices[:, 2].max() + 1.0]])
     distance_m, face, _ = city.first_hits_towards(above_m, DOWN)
     if face[0] < 0:
@@ -86,14 +87,14 @@ def _roof_m(city: CityMap, x_m: float, y_m: float) -> tuple[float, float]:
 
 
 def _beside(city: CityMap, point_m: np.ndarray) -> Footing | None:
-    """Return the place just outside the nearest wall; None where it is too far."""
+    """Return the position just outside the nearest wall; None if that is too far."""
     steps_m = np.arange(0.0, MAX_SDS * WALL_SD_M, STEP_M) + STEP_M
     angle_rad = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
     towards = np.column_stack([np.sin(angle_rad), np.cos(angle_rad), np.zeros(DIRECTIONS)])
     free = np.ones((len(steps_m), DIRECTIONS), dtype=bool)
     for beyond_m in (0.0, CLEARANCE_M):  # the next building may be close
-        places_m = point_m + (steps_m + beyond_m)[:, None, None] * towards
-        free &= ~city.inside(places_m.reshape(-1, 3)).reshape(free.shape)
+        points_m = point_m + (steps_m + beyond_m)[:, None, None] * towards
+        free &= ~city.inside(points_m.reshape(-1, 3)).reshape(free.shape)
     if not free.any():
         return None
     nearest = int(free.any(axis=1).argmax())

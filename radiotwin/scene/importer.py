@@ -1,4 +1,4 @@
-"""Import a city model: clean meshes in the scene's frame, and all problems found on the way."""
+"""Import of a city model: clean meshes in the scene's frame, and the problems of the file."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,6 @@ from radiotwin.scene.materials import (
     map_materials,
     materials_by_name,
     safe_name,
-    unique_name,
 )
 from radiotwin.scene.meshes import MeshBudget, RawMesh, clean, connected, load_shape
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
@@ -27,7 +26,7 @@ from radiotwin.scene.models import UP_AXES, read_model
 from radiotwin.scene.surfaces import FLAT_M, Surfaces
 
 _MAX_DISTANCE_M = 100e3  # from the origin: beyond, float32 rounds positions to 8 mm and more
-_MAX_UNREADABLE = 5  # messages about single shapes, before the rest is summed up
+_MAX_UNREADABLE = 5  # messages about single unreadable shapes; further ones are counted
 
 Box = tuple[float, float, float, float]
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -40,10 +39,10 @@ class ImportedCity:
     Attributes:
         names: Names of the shapes; unique and safe.
         materials: Materials of the shapes; None only together with an error among the problems.
-        surfaces: Meshes of the shapes, or None when no shape could be read.
+        surfaces: Meshes of the shapes; None if no shape could be read.
         ground: (f,) bool, faces of `surfaces` that are ground.
-        problems: In the order found.
-        moved_m: Offset added to the file's coordinates, after scale and axis [m].
+        problems: Problems of the city, in the order found.
+        moved_m: Offset that was added to the file's coordinates, after scale and axis [m].
     """
 
     names: list[str]
@@ -68,15 +67,15 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
             it are kept.
 
     Returns:
-        The city, with the problems found.
+        The city with its problems.
 
     Raises:
         BadInput: The file cannot be read, an override matches nothing, or nothing lies within
             `bbox`.
     """
     source = _read_source(path, overrides)
-    of_format = UP_AXES.get(path.suffix.lower(), "z")
-    loaded = _load_meshes(path, source, scale or 1.0, up or of_format, bbox)
+    usual_up = UP_AXES.get(path.suffix.lower(), "z")
+    loaded = _load_meshes(path, source, scale or 1.0, up or usual_up, bbox)
     materials, problems = source.materials_of(loaded.inside)
     names, name_problems = _safe_names([source.names[index] for index in loaded.inside])
     problems += name_problems + loaded.problems
@@ -92,8 +91,7 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
     names, materials, surfaces, join_problems = _joined(names, materials, surfaces)
     ground = surfaces.ground_faces()
     problems += sense_problems + join_problems
-    # In glTF it is a rule that y is up; of other formats nobody knows.
-    if up is None and of_format == "z":
+    if up is None and usual_up == "z":  # a convention only; in glTF, y is up by its specification
         problems += checks.check_up_axis(surfaces, ground)
     problems += checks.check_units(surfaces) if scale is None else []
     city = ImportedCity(names, materials, surfaces, ground, problems)
@@ -108,12 +106,12 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """Shapes of a file, whatever its format.
+    """The shapes of a file of any format.
 
     Attributes:
-        names: As in the file.
-        load: Reads the shape of an index.
-        materials_of: Finds materials of the shapes of some indices, and problems with them.
+        names: Names of the shapes as in the file.
+        load: Function of a shape's index that reads its mesh.
+        materials_of: Function of indices that finds the shapes' materials, and problems with them.
     """
 
     names: Sequence[str]
@@ -122,6 +120,7 @@ class _Source:
 
 
 def _read_source(path: Path, overrides: Mapping[str, str]) -> _Source:
+    """Open a file by its suffix; BadInput if an override matches none of its materials."""
     if path.suffix.lower() in UP_AXES:
         parts = read_model(path)
         materials_by_name([part.material for part in parts], overrides)
@@ -139,11 +138,12 @@ def _read_source(path: Path, overrides: Mapping[str, str]) -> _Source:
 
 
 def _safe_names(wanted_names: Sequence[str]) -> tuple[list[str], list[Problem]]:
+    """Return unique names that Sionna RT and file systems accept, and the problems fixed."""
     taken = Names(RESERVED_NAMES)
     names, changed, double = [], [], []
     for wanted in wanted_names:
         safe = safe_name(wanted)
-        name = unique_name(safe, taken)
+        name = taken.unique(safe)
         names.append(name)
         if safe != wanted:
             changed.append(f"{wanted} -> {name}")
@@ -162,13 +162,13 @@ def _safe_names(wanted_names: Sequence[str]) -> tuple[list[str], list[Problem]]:
 
 @dataclass
 class _Loaded:
-    """Shapes of a file.
+    """Shapes of a file that were read.
 
     Attributes:
-        inside: Indices of the shapes that reach into the box, or whose place is not known.
-        meshes: Index -> vertices [m] and faces of each that has some.
+        inside: Indices of the shapes that reach into the box, or could not be read.
+        meshes: Index -> vertices [m] and faces, of the shapes inside with faces.
         bounds: (2,) lowest and highest x and y of all shapes [m]; None: nothing was read.
-        problems: With shapes inside.
+        problems: Problems of the shapes inside.
     """
 
     inside: list[int] = field(default_factory=list)
@@ -178,7 +178,7 @@ class _Loaded:
 
 
 def _load_meshes(path: Path, source: _Source, scale: float, up: str, bbox: Box | None) -> _Loaded:
-    """Read the shapes that reach into the box."""
+    """Read the shapes, turn them upright in metres, and keep those that reach into the box."""
     loaded = _Loaded()
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     budget = MeshBudget(path)
@@ -233,7 +233,7 @@ def _load_meshes(path: Path, source: _Source, scale: float, up: str, bbox: Box |
 
 
 def _outward(surfaces: Surfaces, names: Sequence[str]) -> tuple[Surfaces, list[Problem]]:
-    """Give the triangles of each mesh one sense: solids face outwards, sheets upwards."""
+    """Orient the triangles of each mesh: solids face outwards, sheets upwards."""
     problems = []
     mixed = surfaces.inconsistent_shapes()
     if len(mixed):
@@ -264,24 +264,25 @@ def _joined(names: list[str], materials: list[Material | None], surfaces: Surfac
     pairs = pairs[[materials[a] is not None and materials[a] == materials[b] for a, b in pairs]]
     if len(pairs) == 0:
         return names, materials, surfaces, []
-    size = surfaces.shapes
-    building = connected(pairs, size)
-    meshes, whole, first = surfaces.meshes(), [], []
+    building = connected(pairs, surfaces.shapes)
+    meshes, buildings, first = surfaces.meshes(), [], []
     order = np.argsort(building, kind="stable")
     for members in np.split(order, np.cumsum(np.bincount(building))[:-1]):
-        parts = [trimesh.Trimesh(meshes[one][0], meshes[one][1], process=False) for one in members]
-        mesh: Any = trimesh.util.concatenate(parts)
-        whole.append(clean(mesh.vertices, mesh.faces)[:2] if len(members) > 1
-                     else meshes[members[0]])
         first.append(members[0])
-    joined = fixed(f"{size - len(whole)} mesh(es) were joined to others of the same material, "
-                   "roofs to walls, so that the edge between them diffracts")
+        if len(members) == 1:
+            buildings.append(meshes[members[0]])
+            continue
+        mesh: Any = trimesh.util.concatenate(
+            [trimesh.Trimesh(*meshes[index], process=False) for index in members])
+        buildings.append(clean(mesh.vertices, mesh.faces)[:2])
+    joined = fixed(f"{surfaces.shapes - len(buildings)} mesh(es) were joined to others of the same "
+                   "material, roofs to walls, so that the edge between them diffracts")
     return ([names[index] for index in first], [materials[index] for index in first],
-            Surfaces(whole), [joined])
+            Surfaces(buildings), [joined])
 
 
 def _cut(city: ImportedCity, surfaces: Surfaces, bbox: Box) -> ImportedCity:
-    """Keep whole shapes, and single triangles of the ground, whose bounds reach into the box."""
+    """Keep the shapes, and the single triangles of the ground, whose bounds reach into the box."""
     low, high = surfaces.face_bounds()
     overlaps = ((low[:, :2] <= bbox[2:]) & (high[:, :2] >= bbox[:2])).all(axis=1)
     shape_low = np.full((surfaces.shapes, 2), np.inf)
@@ -300,13 +301,14 @@ def _cut(city: ImportedCity, surfaces: Surfaces, bbox: Box) -> ImportedCity:
 
 
 def _nothing_in(bbox: Box, low: np.ndarray, high: np.ndarray) -> BadInput:
+    """Return the error that the box holds no shape of a city with these bounds (2,) [m]."""
     return BadInput(f"the part x {bbox[0]:g} to {bbox[2]:g} m, y {bbox[1]:g} to {bbox[3]:g} m "
                     f"is empty; the city lies in x {low[0]:.0f} to {high[0]:.0f} m, y {low[1]:.0f} "
                     f"to {high[1]:.0f} m")
 
 
 def _move_to_origin(city: ImportedCity) -> ImportedCity:
-    """Move flat ground (or the lowest point of uneven ground) to z = 0, a far city to x = y = 0."""
+    """Move the ground (if uneven, its lowest point) to z = 0, and a far city to x = y = 0."""
     assert city.surfaces is not None  # some shape was read
     vertices, problems = city.surfaces.vertices, list(city.problems)
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2

@@ -1,4 +1,4 @@
-"""The lattice of positions that UAVs fly on and radio maps are made on."""
+"""The lattice: regular positions that UAVs fly on and radio maps are computed at."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from radiotwin.io.budgets import POSITIONS
 
 def check_lattice(x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float, step_m: float,
                   altitudes_m: Sequence[float]) -> None:
-    """Raise BadInput if a lattice, see `Lattice.over`, has more positions than are allowed."""
+    """Raise BadInput if a lattice would have too many positions; arguments as `Lattice.over`."""
     width_m, depth_m = x_max_m - x_min_m, y_max_m - y_min_m
     count = (width_m / step_m + 1) * (depth_m / step_m + 1) * len(altitudes_m)
     if not count <= POSITIONS.limit:
@@ -22,19 +22,19 @@ def check_lattice(x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float
 
 
 def positions(low_m: float, high_m: float, step_m: float) -> int:
-    """Return how many positions a lattice has along an axis of an extent."""
+    """Return the number of lattice positions along one axis, from `low_m` on [m]."""
     return int(np.floor((high_m - low_m) / step_m + 1e-9)) + 1
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Regular positions in the scene's frame.
+    """Positions at regular x, y and altitudes in the scene's frame.
 
     Attributes:
         x_m: (nx,) east coordinates, ascending [m].
         y_m: (ny,) north coordinates, ascending [m].
-        z_m: (nz,) altitudes, ascending [m]: above the ground datum, or with `ground_m` above the
-            ground below each position.
+        z_m: (nz,) altitudes, ascending [m]: above the datum, or above the ground if `ground_m` is
+            given.
         ground_m: (ny, nx) height of the ground above the datum [m]; None: altitudes are above the
             datum.
     """
@@ -47,7 +47,7 @@ class Lattice:
     @classmethod
     def over(cls, x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float, step_m: float,
              altitudes_m: Sequence[float]) -> "Lattice":
-        """Make a lattice from the south-west corner on.
+        """Make the lattice of an extent, from its south-west corner.
 
         Args:
             x_min_m: West border [m].
@@ -66,23 +66,22 @@ class Lattice:
                    np.array(sorted(altitudes_m), dtype=float))
 
     def part(self, z: slice, y: slice, x: slice) -> "Lattice":
-        """Return the lattice of some of its altitudes, rows and columns."""
+        """Return the lattice of a range of altitudes, rows and columns."""
         ground_m = None if self.ground_m is None else self.ground_m[y, x]
         return Lattice(self.x_m[x], self.y_m[y], self.z_m[z], ground_m)
 
     def equals(self, other: "Lattice") -> bool:
         """Return whether another lattice has the same positions, but for rounding."""
         axes = ((self.x_m, other.x_m), (self.y_m, other.y_m), (self.z_m, other.z_m))
-        if any(ours.shape != theirs.shape or not np.allclose(ours, theirs)
-               for ours, theirs in axes):
+        if any(a_m.shape != b_m.shape or not np.allclose(a_m, b_m) for a_m, b_m in axes):
             return False
-        ours_m, theirs_m = (0.0 if each.ground_m is None else each.ground_m
-                            for each in (self, other))
-        return bool(np.allclose(ours_m, theirs_m))
+        ground_m, other_ground_m = (0.0 if lattice.ground_m is None else lattice.ground_m
+                                    for lattice in (self, other))
+        return bool(np.allclose(ground_m, other_ground_m))
 
     @property
     def above(self) -> str:
-        """Reference of the altitudes, as people read it: `ground` or `datum`."""
+        """Reference of the altitudes: `ground` or `datum`."""
         return "datum" if self.ground_m is None else "ground"
 
     @property
@@ -105,10 +104,10 @@ class Lattice:
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
     def index_of(self, positions_m: np.ndarray) -> np.ndarray:
-        """Return the flat (z, y, x) index (n,) of positions (n, 3) on the lattice, to within 1 cm.
+        """Return the flat (z, y, x) index (n,) of positions (n, 3) [m] that lie on the lattice.
 
         Raises:
-            BadInput: A position is not on the lattice.
+            BadInput: A position is more than 1 cm off the lattice.
         """
         index: list[np.ndarray] = []
         for axis, values in zip((0, 1, 2), (self.x_m, self.y_m, self.z_m)):

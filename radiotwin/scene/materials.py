@@ -1,6 +1,6 @@
-"""Radio materials: ITU-R P.2040, own constants, and those that scene files and maps declare.
+"""Radio materials: the ITU-R P.2040 table, and materials declared by scene files, models and maps.
 
-Names of shapes and materials are those that Sionna RT, Mitsuba and file systems accept.
+Also names of shapes and materials that Sionna RT, Mitsuba and file systems accept.
 """
 
 import re
@@ -76,44 +76,38 @@ ITU_TABLE: dict[str, tuple[tuple[float, float, float, float, float, float], ...]
 _SIONNA_LOAD_FREQUENCY_HZ = 3.5e9
 DEFAULT_MATERIAL = "concrete"
 _COPY = re.compile(r"\.\d{3}$")
-_LIMITS = {  # far beyond any material, and well inside single precision
+_RANGES = {  # allowed: far beyond any material, and well inside single precision
     "relative_permittivity": (1, 1e6), "conductivity_s_per_m": (0, 1e10), "thickness_m": (0, 1e4),
     "scattering_coefficient": (0, 1), "xpd_coefficient": (0, 1)}
 MATERIAL_KEY = "building:material"
-_OWN = ("default", "ground", "roof")
+_FIELDS = ("default", "ground", "roof")  # entries of a `MaterialTable` that are no tags
 
 
 def safe_name(text: str) -> str:
-    """Return a text with everything but ASCII letters, digits, `_` and `-` replaced by `_`.
+    """Replace everything but ASCII letters, digits, `_` and `-` by `_`, and cut at 100 characters.
 
     Sionna RT 2.2 stops at `$` (a Mitsuba parameter) in a name, and reads scene files in the
     system's own encoding; `.` is Mitsuba's separator; `/` and the like cannot be in a file name.
-    More than 100 characters are cut off.
     """
     return re.sub(r"[^A-Za-z0-9_-]", "_", text)[:100] or "unnamed"
 
 
 class Names(set[str]):
-    """Names in use, in lower case, that remember the last number of each: for many equal names."""
+    """Names in use, in lower case."""
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         super().__init__(names)
-        self.last_numbers: dict[str, int] = {}
+        self._last_numbers: dict[str, int] = {}  # so that many equal names take linear time
 
-
-def unique_name(name: str, taken: set[str]) -> str:
-    """Return a name, with a number appended if it is taken, and add it to `taken`.
-
-    Names in `taken` are in lower case; `Names` if they may be many.
-    """
-    numbers = taken.last_numbers if isinstance(taken, Names) else {}
-    free, number = name, numbers.get(name.lower(), 1)
-    while free.lower() in taken:
-        number += 1
-        free = f"{name}_{number}"
-    numbers[name.lower()] = number
-    taken.add(free.lower())
-    return free
+    def unique(self, name: str) -> str:
+        """Add a name, with a number appended if it is taken but for its case, and return it."""
+        free, number = name, self._last_numbers.get(name.lower(), 1)
+        while free.lower() in self:
+            number += 1
+            free = f"{name}_{number}"
+        self._last_numbers[name.lower()] = number
+        self.add(free.lower())
+        return free
 
 
 @dataclass(frozen=True)
@@ -121,8 +115,8 @@ class Material:
     """Radio properties of a surface.
 
     Attributes:
-        name: Used in files; letters, digits, `_` and `-`.
-        itu: Key of `ITU_TABLE`, or None for a material with its own constants.
+        name: Name in files; letters, digits, `_` and `-`.
+        itu: Key of `ITU_TABLE`; None: a material with constants of its own.
         relative_permittivity: Real part, at least 1; None for an ITU material.
         conductivity_s_per_m: None where `relative_permittivity` is.
         thickness_m: Thickness of the slab that models a wall or roof.
@@ -140,7 +134,7 @@ class Material:
 
 
 def itu_name(text: str) -> str | None:
-    """Return the key of `ITU_TABLE` for a name like `itu-metal` or `brick`, or None.
+    """Return the key of `ITU_TABLE` for a name like `itu-metal` or `brick`; None if there is none.
 
     >>> itu_name("mat-itu_wet_ground")
     'wet_ground'
@@ -152,7 +146,11 @@ def itu_name(text: str) -> str | None:
 
 
 def itu_material(text: str, **settings: Any) -> Material:
-    """Return a material of the ITU table, named after its type, with other fields of `Material`.
+    """Return a material of the ITU table.
+
+    Args:
+        text: Name as `itu_name` accepts it.
+        settings: Other fields of `Material`; its name is by default the key of the table.
 
     Raises:
         BadInput: Not in the table.
@@ -164,10 +162,10 @@ def itu_material(text: str, **settings: Any) -> Material:
 
 
 def permittivity(name: str, frequency_hz: float) -> tuple[float, float, bool]:
-    """Return the constants of an ITU material (ITU-R P.2040-4, section 2.1.4).
+    """Return the constants of an ITU material at a frequency (ITU-R P.2040-4, section 2.1.4).
 
-    Outside the frequency ranges of its fit, the nearest end of the nearest range is used: the power
-    laws are not extrapolated, as no measurements support them there.
+    Outside the frequency ranges of the table, the nearest end of the nearest range is used: the
+    power laws are not extrapolated, as no measurements support them there.
 
     Returns:
         Relative permittivity (real part), conductivity [S/m], and whether the frequency is in a
@@ -190,19 +188,20 @@ def permittivity(name: str, frequency_hz: float) -> tuple[float, float, bool]:
 
 
 def _power_laws(row: tuple[float, ...], frequency_ghz: float) -> tuple[float, float]:
+    """Return relative permittivity and conductivity [S/m] by a row of `ITU_TABLE`."""
     _, _, a, b, c, d = row
     return a * frequency_ghz**b, c * frequency_ghz**d
 
 
 def ranges_text(name: str) -> str:
-    """Return the frequency ranges of an ITU material as `1-100 GHz, 110-330 GHz`."""
+    """Format the frequency ranges of an ITU material: `1-100 GHz, 110-330 GHz`."""
     return ", ".join(f"{low:g}-{high:g} GHz" for low, high, *_ in ITU_TABLE[name])
 
 
 def constants(material: Material, frequency_hz: float) -> tuple[float, float, bool]:
-    """Return relative permittivity and conductivity [S/m] of a material, and if ITU covers it.
+    """Return relative permittivity, conductivity [S/m], and whether they hold at the frequency.
 
-    The last is whether the frequency is in a range of the table; True for own constants.
+    The last is False for an ITU material outside its frequency ranges.
     """
     if material.itu is not None:
         return permittivity(material.itu, frequency_hz)
@@ -230,13 +229,16 @@ def traceable(material: Material, frequency_hz: float) -> Material:
 def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],
                   overrides: Mapping[str, str], must_use_all: bool = True
                   ) -> tuple[list[Material | None], list[Problem]]:
-    """Find the radio material of every shape, None where there is none, and problems.
+    """Find the radio material of every shape of a Mitsuba or Sionna RT file.
 
     Args:
-        shapes: As declared.
+        shapes: Shapes as declared in the file.
         declared: `<bsdf>` elements of the file by identifier.
         overrides: Identifier of a material (with or without `mat-`) -> ITU material to use.
         must_use_all: Whether each override has to name a material of these shapes.
+
+    Returns:
+        The material of each shape (None: with an error among the problems), and the problems.
 
     Raises:
         BadInput: An override names a material that the city does not use, or no ITU material.
@@ -250,21 +252,22 @@ def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],
 
 
 def _unused(names: Collection[str], known: Iterable[str]) -> BadInput:
+    """Return the error that overrides name materials that the city does not use."""
     return BadInput(f"material {min(names)!r} is to be replaced, but the city does not use it; "
                     f"it uses: {', '.join(sorted(known)) or '(none)'}")
 
 
 def materials_by_name(names: Sequence[str | None], overrides: Mapping[str, str],
                       must_use_all: bool = True) -> tuple[list[Material | None], list[Problem]]:
-    """Find radio materials by nothing but their names, as models in OBJ or glTF have them.
+    """Find the radio materials of a model in OBJ or glTF, which has only names of materials.
 
     Args:
-        names: Of the material of each shape; None: it has none.
-        overrides: Name of a material -> ITU material to use; `default`: of all others.
+        names: Name of each shape's material; None: it has none.
+        overrides: Name of a material -> ITU material to use; `default`: for all unknown names.
         must_use_all: Whether each override has to name a material of these shapes.
 
     Returns:
-        The material of each shape, and a problem about those that concrete was taken for.
+        The material of each shape, and a warning about unknown names, which became concrete.
 
     Raises:
         BadInput: As `map_materials`.
@@ -276,7 +279,7 @@ def materials_by_name(names: Sequence[str | None], overrides: Mapping[str, str],
     for name in dict.fromkeys(names):
         key = next((key for key in (name, (name or "").removeprefix("mat-")) if key in overrides),
                    None)
-        # Blender numbers copies (brick.001), exported scenes have constants of ITU's (brick-fixed)
+        # Blender numbers copies (brick.001); `traceable` appends -fixed, which exports keep
         itu = itu_name(_COPY.sub("", name or "").removesuffix("-fixed").lower())
         if key is not None:
             used.add(key)
@@ -302,6 +305,8 @@ class _Unmapped(Exception):
 
 @dataclass
 class _Mapper:
+    """Finds the materials of shapes one by one, and collects the problems."""
+
     declared: Mapping[str, Node]
     overrides: Mapping[str, str]
     known: dict[str, Material | None] = field(default_factory=dict)
@@ -311,6 +316,7 @@ class _Mapper:
     bare: list[str] = field(default_factory=list)
 
     def material_of(self, shape: DeclaredShape) -> Material | None:
+        """Return the material of a shape; None if it has none or an unknown one."""
         if shape.material is None:
             self.bare.append(shape.name)
             return None
@@ -330,6 +336,7 @@ class _Mapper:
         return self.known[identifier]
 
     def all_problems(self) -> list[Problem]:
+        """Return the problems of all shapes so far."""
         found = list(self.problems)
         if self.legacy:
             found.append(problems.fixed(
@@ -342,6 +349,7 @@ class _Mapper:
         return found
 
     def _resolve(self, identifier: str, node: Node | None) -> Material:
+        """Return the material of an identifier and its `<bsdf>`; _Unmapped if it is unknown."""
         base = identifier.removeprefix("mat-")
         for key in (identifier, base):
             if key in self.overrides:
@@ -376,13 +384,13 @@ class _Mapper:
 
 
 def _with_surface(identifier: str, node: Node, material: Material) -> Material:
-    """Add what a `<bsdf>` says about thickness and scattering, and check all constants."""
+    """Add thickness and scattering of a `<bsdf>` to its material, and check all constants."""
     material = replace(
         material,
         thickness_m=node.number("thickness", Material.thickness_m),
         scattering_coefficient=node.number("scattering_coefficient", 0.0),
         xpd_coefficient=node.number("xpd_coefficient", 0.0))
-    for name, (low, high) in _LIMITS.items():
+    for name, (low, high) in _RANGES.items():
         value = getattr(material, name)
         if value is not None and not low <= value <= high:
             raise _Unmapped(f"{node.position}: material {identifier!r}: {name} = {value:g} is not "
@@ -390,18 +398,18 @@ def _with_surface(identifier: str, node: Node, material: Material) -> Material:
     return material
 
 
-def settle(materials: Sequence[Material], frequency_hz: float, taken: set[str]
-           ) -> tuple[dict[Material, Material], list[Problem]]:
-    """Return materials as Sionna RT accepts them at a frequency, with unique names.
+def traceable_materials(materials: Sequence[Material], frequency_hz: float, taken: Names
+                        ) -> tuple[dict[Material, Material], list[Problem]]:
+    """Convert materials to the form that Sionna RT accepts at a frequency, with unique names.
 
     Returns:
-        Material as declared -> as written, whose name is added to `taken` in lower case, and a
-        problem for each that is written as constants.
+        Declared material -> traceable material, whose name is added to `taken`, and a problem for
+        each ITU material that became one with constants.
     """
     written, found = {}, []
     for material in sorted(set(materials), key=lambda one: (one.name, repr(one))):
         usable = traceable(material, frequency_hz)
-        written[material] = replace(usable, name=unique_name(usable.name, taken))
+        written[material] = replace(usable, name=taken.unique(usable.name))
         if usable is material:
             continue
         epsilon, sigma, in_range = constants(material, frequency_hz)
@@ -421,13 +429,13 @@ def settle(materials: Sequence[Material], frequency_hz: float, taken: set[str]
 
 @dataclass(frozen=True)
 class MaterialTable:
-    """ITU materials by tag.
+    """ITU materials of a map's buildings, by tag.
 
     Attributes:
         default: material of buildings without a tag of the table.
         ground: material of the ground plane.
         by_tag: key -> value -> material; keys are looked up in this order.
-        roof: material of roofs; None: that of their buildings.
+        roof: material of roofs; None: that of the building's walls.
     """
 
     default: str
@@ -436,9 +444,9 @@ class MaterialTable:
     roof: str | None = None
 
     def material_of(self, tags: Mapping[str, str]) -> tuple[Material, str]:
-        """Return the material of a building, and the tag it follows from or `default`.
+        """Return the material of a building, and its source: `building:material=brick`, `default`.
 
-        The value of a tag may be a list with `;`. A tag is returned as `building:material=brick`.
+        A tag may have several values, separated by `;`: the first one in the table is used.
         """
         for key, known in self.by_tag.items():
             for value in _values(tags, key):
@@ -447,13 +455,14 @@ class MaterialTable:
         return itu_material(self.default), "default"
 
     def unknown(self, tags: Mapping[str, str]) -> str | None:
-        """Return the value of `building:material` if it is not in the table."""
+        """Return the value of `building:material` if it is not in the table, else None."""
         values = [value for value in _values(tags, MATERIAL_KEY) if value]
         known = self.by_tag.get(MATERIAL_KEY, {})
         return values[0] if values and not any(value in known for value in values) else None
 
 
 def _values(tags: Mapping[str, str], key: str) -> list[str]:
+    """Return the values of a tag, which `;` separates, in lower case."""
     return [value.strip() for value in tags.get(key, "").lower().split(";")]
 
 
@@ -477,23 +486,20 @@ STANDARD = MaterialTable(
 
 
 def read_material_table(path: Path | str) -> MaterialTable:
-    """Read a TOML file that changes the standard table.
+    """Read a TOML file whose entries replace, and come before, those of the standard table.
 
     Args:
         path: file with `default`, `ground`, `roof`, and tables named after keys of tags, which are
             looked up in the order of the file, before the other keys of the standard table.
-
-    Returns:
-        The changed table.
 
     Raises:
         BadInput: no such file, not TOML, or a material that is not in ITU-R P.2040.
     """
     path = Path(path)
     data = read_toml(path, "TOML file with materials by tag")
-    own = {name: data.pop(name) for name in _OWN
-           if name in data and not (name == "roof" and isinstance(data[name], dict))}  # a tag
-    named: list[tuple[str, object]] = list(own.items())
+    fields = {name: data.pop(name) for name in _FIELDS
+              if name in data and not (name == "roof" and isinstance(data[name], dict))}  # a tag
+    named: list[tuple[str, object]] = list(fields.items())
     for key, values in data.items():
         if not isinstance(values, dict):
             raise BadInput(f"{path}: {key} = {values!r:.60} is in no table; write it under the key "
@@ -510,19 +516,23 @@ def read_material_table(path: Path | str) -> MaterialTable:
     by_tag = {key: dict(STANDARD.by_tag.get(key, {}))
               | {value.lower(): name for value, name in values.items()}
               for key, values in data.items()}
-    rest = {key: known for key, known in STANDARD.by_tag.items() if key not in data}
-    return replace(STANDARD, **own, by_tag=by_tag | rest)
+    unchanged = {key: known for key, known in STANDARD.by_tag.items() if key not in data}
+    return replace(STANDARD, **fields, by_tag=by_tag | unchanged)
 
 
-def with_pairs(table: MaterialTable, pairs: Mapping[str, str]) -> MaterialTable:
-    """Return a table with entries replaced: values of `building:material`, default, ground, roof.
+def with_materials(table: MaterialTable, overrides: Mapping[str, str]) -> MaterialTable:
+    """Override entries of a table.
+
+    Args:
+        table: table to change.
+        overrides: `default`, `ground`, `roof`, or a value of `building:material` -> ITU material.
 
     Raises:
         BadInput: a material is not in ITU-R P.2040.
     """
-    for name in pairs.values():
+    for name in overrides.values():
         itu_material(name)
-    own = {name: itu for name, itu in pairs.items() if name in _OWN}
-    values = {name.lower(): itu for name, itu in pairs.items() if name not in own}
+    fields = {name: itu for name, itu in overrides.items() if name in _FIELDS}
+    values = {name.lower(): itu for name, itu in overrides.items() if name not in fields}
     by_tag = dict(table.by_tag) | {MATERIAL_KEY: dict(table.by_tag[MATERIAL_KEY]) | values}
-    return replace(table, **own, by_tag=by_tag)
+    return replace(table, **fields, by_tag=by_tag)

@@ -1,4 +1,4 @@
-"""Triangles of shapes: read from their files or made from their kind, transformed and cleaned."""
+"""Triangle meshes: reading OBJ and the shapes of scene files, cutting polygons, cleaning, tests."""
 
 import io
 import os
@@ -22,21 +22,21 @@ from radiotwin.scene.ply import read_ply
 WELD_M = 1e-4  # vertices equal when rounded to this are one; float32 resolves 6e-5 m at 1 km
 # Height of a triangle over its longest side below which its normal is numerical noise
 _MIN_ASPECT = 1e-6
-_MAX_NAME = 200  # characters of an object or a material
-_FEW_CORNERS = 200  # of a face: cutting it takes a hundredth of a second, however it crosses itself
-_SEGMENTS_AT_ONCE = 256
+_MAX_NAME = 200  # characters of an object's or a material's name
+_FEW_CORNERS = 200  # a face with no more is cut within 0.01 s, even if it crosses itself
+_SEGMENTS_AT_ONCE = 256  # bounds the memory of the search for crossings
 # In the file's units: a city in UTM coordinates and millimetres reaches 10^10
 _MAX_COORDINATE = 1e11
 
 
 @dataclass(frozen=True, eq=False)
 class RawMesh:
-    """Triangles as the file gives them.
+    """A mesh in the units of its file.
 
     Attributes:
         vertices: (v, 3)
-        faces: (f, 3) indices of vertices.
-        polygons: Number of faces in the file with more than three corners.
+        faces: (f, 3) triangles, indices of vertices.
+        polygons: Number of faces in the file with more than three corners, which were cut.
     """
 
     vertices: np.ndarray
@@ -45,10 +45,10 @@ class RawMesh:
 
 
 def load_shapes(shapes: Iterable[DeclaredShape], source: Path) -> Iterator[RawMesh]:
-    """Load the shapes of the XML file `source` one by one, within the budgets of all together.
+    """Load the shapes of the XML file `source` one by one.
 
     Raises:
-        BadInput: As `load_shape`, or they have too many vertices or faces.
+        BadInput: As `load_shape`, or all shapes together have too many vertices or faces.
     """
     budget = MeshBudget(source)
     for shape in shapes:
@@ -58,14 +58,17 @@ def load_shapes(shapes: Iterable[DeclaredShape], source: Path) -> Iterator[RawMe
 
 
 class MeshBudget:
-    """Vertices and faces of a city so far; messages begin with `source`."""
+    """Counts the vertices and faces of a city's meshes against their budgets.
+
+    Messages begin with `source`.
+    """
 
     def __init__(self, source: Path) -> None:
         self._subject = f"{source} with its meshes"
         self._vertices = self._faces = 0
 
     def add(self, mesh: RawMesh) -> None:
-        """Add the mesh of a shape; BadInput if all together have too many vertices or faces."""
+        """Count a mesh; BadInput if all meshes so far have too many vertices or faces."""
         self._vertices += len(mesh.vertices)
         self._faces += len(mesh.faces)
         VERTICES.check(self._vertices, self._subject)
@@ -73,9 +76,7 @@ class MeshBudget:
 
 
 def load_shape(shape: DeclaredShape) -> RawMesh:
-    """Read or make a declared shape's triangles and apply its `to_world` transform.
-
-    They are in the file's units and axes.
+    """Return the mesh of a declared shape after its `to_world` transform, in the file's units.
 
     Raises:
         BadInput: A missing, truncated, unreadable or too large mesh file, an unsupported kind of
@@ -98,6 +99,7 @@ def load_shape(shape: DeclaredShape) -> RawMesh:
 
 
 def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
+    """Read the PLY or OBJ file of a shape."""
     path = shape.mesh_path
     if path is None:
         raise BadInput(f"{shape.node.position}: the shape names no mesh file; add "
@@ -108,15 +110,20 @@ def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
     if shape.kind == "ply":
         return cut_polygons(path, *read_ply(path))
     vertices, groups = read_obj_groups(path)  # all objects are one mesh, as in Mitsuba
-    return cut_polygons(path, vertices, [each for group in groups.values() for each in group])
+    return cut_polygons(path, vertices, [one for polygons in groups.values() for one in polygons])
 
 
 def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -> RawMesh:
-    """Check polygons, (n, k) indices for each number of corners k, and cut them into triangles.
+    """Check polygons and cut them into triangles.
+
+    Args:
+        path: File, for messages.
+        vertices: (v, 3) positions.
+        polygons: For each number of corners k, (n, k) indices of vertices.
 
     Raises:
-        BadInput: a coordinate is not finite or too large, a face names a vertex that is not there,
-            or there are too many faces.
+        BadInput: A coordinate is not finite or too large, a face names a vertex that does not
+            exist, or there are too many faces.
     """
     check_vertices(vertices, str(path))
     for group in polygons:
@@ -132,7 +139,7 @@ def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -
 
 
 def check_vertices(vertices: np.ndarray, source: str) -> None:
-    """Raise BadInput, which begins with `source`, if one of (v, 3) is not finite, or too large."""
+    """Raise BadInput if a coordinate of (v, 3) is not finite or too large; `source` is named."""
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         raise BadInput(f"{source}: vertex {np.flatnonzero(~finite)[0] + 1} is not finite (NaN or "
@@ -146,7 +153,7 @@ def check_vertices(vertices: np.ndarray, source: str) -> None:
 
 
 def triangulate(vertices: np.ndarray, polygons: np.ndarray) -> np.ndarray:
-    """Cut (n, k) planar polygons, convex or not, into (t, 3) triangles."""
+    """Cut planar polygons, convex or not, (n, k) indices of vertices, into triangles (t, 3)."""
     k = polygons.shape[1]
     if k == 3:
         return polygons
@@ -164,10 +171,14 @@ def triangulate(vertices: np.ndarray, polygons: np.ndarray) -> np.ndarray:
 
 
 def cut_polygon(corners: np.ndarray, ends: Sequence[int]) -> np.ndarray:
-    """Cut a planar polygon with holes into triangles (t, 3), which turn as its outline does.
+    """Cut a planar polygon with holes into triangles, oriented as its outline.
 
-    The corners (n, 3) are those of its rings, of which the first is the outline; `ends` are the
-    numbers of corners up to the end of each ring.
+    Args:
+        corners: (n, 3) corners of the rings; the first ring is the outline, others are holes.
+        ends: Number of corners up to the end of each ring.
+
+    Returns:
+        (t, 3) indices of corners.
     """
     outline = corners[:ends[0]]
     # Twice its area, as a vector (Newell)
@@ -185,7 +196,7 @@ def cut_polygon(corners: np.ndarray, ends: Sequence[int]) -> np.ndarray:
 def _check_crossings(rings: list[np.ndarray]) -> None:
     """Raise BadInput if a polygon (rings of (n, 2) corners) crosses itself too often.
 
-    Earcut takes a time by the square of the corners then, or more.
+    Earcut's time then grows with the square of the number of corners, or faster.
     """
     import shapely
 
@@ -199,9 +210,9 @@ def _check_crossings(rings: list[np.ndarray]) -> None:
 
 
 def _with_left_out_corners(triangles: np.ndarray, ends: Sequence[int]) -> np.ndarray:
-    """Add triangles to the corners that were cut off since they lie on a line, as seen from above.
+    """Add triangles at corners that earcut dropped because they lie on a straight line.
 
-    Without them a closed surface opens: its neighbour still has these corners.
+    Neighbouring faces still have these corners: without such triangles a closed surface would open.
     """
     n = ends[-1]
     if len(triangles) == n + 2 * len(ends) - 4 or len(triangles) == 0:
@@ -222,21 +233,20 @@ def _with_left_out_corners(triangles: np.ndarray, ends: Sequence[int]) -> np.nda
         while corner != b and corner != a:
             added.append((a, corner, ahead[corner]))
             corner = ahead[corner]
-    # Only of a ring that crosses itself may more be missing than lies between
-    whole = len(added) <= n
-    return np.concatenate([triangles, np.array(added, dtype=np.int64)]) \
-        if added and whole else triangles
+    if not added or len(added) > n:  # more than corners: the ring crosses itself
+        return triangles
+    return np.concatenate([triangles, np.array(added, dtype=np.int64)])
 
 
 def read_obj_groups(path: Path
                     ) -> tuple[np.ndarray, dict[tuple[str, str | None], list[np.ndarray]]]:
     """Read vertices and polygons of a Wavefront OBJ file by object (`o`, else `g`) and material.
 
-    The file of materials that it names is not opened.
+    A file of materials (`mtllib`) is not opened.
 
     Returns:
-        (v, 3) vertices, and for each pair of an object and a material with faces an (n, k) array of
-        vertex indices for each number of corners k.
+        (v, 3) vertices, and (object, material) -> polygons: for each number of corners k, (n, k)
+        indices of vertices.
 
     Raises:
         BadInput: No such file, too large, or a line with a wrong number, with its row.
@@ -279,6 +289,7 @@ def read_obj_groups(path: Path
 
 
 def _analytic(shape: DeclaredShape) -> RawMesh:
+    """Return the mesh of a cube, rectangle or sphere, as Mitsuba defines them."""
     import trimesh  # slow to load, and few scenes have such shapes
 
     if shape.kind == "cube":
@@ -298,15 +309,15 @@ def _analytic(shape: DeclaredShape) -> RawMesh:
 
 
 def clean(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Weld vertices that coincide, and drop triangles without area and unused vertices.
+    """Weld coincident vertices, and drop triangles without area and unused vertices.
 
-    Sionna RT finds a diffracting edge where two triangles share its two vertices, so a mesh that
-    repeats vertices for every face would never diffract.
+    Sionna RT takes an edge for a diffracting one if two triangles share its two vertices: a mesh
+    that repeats vertices for every face would never diffract.
 
     Returns:
         (v', 3) vertices [m], (f', 3) faces, and the number of triangles dropped.
     """
-    first, index = _distinct(np.round(vertices_m / WELD_M).astype(np.int64))
+    first, index = _distinct_rows(np.round(vertices_m / WELD_M).astype(np.int64))
     faces = index[faces]
     corners = vertices_m[first][faces]
     sides = corners - np.roll(corners, 1, axis=1)
@@ -317,10 +328,11 @@ def clean(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     return vertices_m[first][used], faces.reshape(-1, 3), int(np.count_nonzero(~good))
 
 
-def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first row of each kind, in ascending order, and the (n,) kind of each of (n, 3).
+def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the index of the first of all equal rows of (n, 3), ascending, and the inverse (n,).
 
-    As `np.unique` with an axis, but in a tenth of its time where there are few rows.
+    As `np.unique(rows, axis=0, return_index=True, return_inverse=True)`, but in a tenth of the time
+    for few rows.
     """
     order = np.lexsort(rows.T[::-1])
     ordered = rows[order]
@@ -332,28 +344,32 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Return whether (f, 3) faces pass every edge as often in one direction as in the other."""
-    there, back = _edges(faces)
-    return len(there) > 0 and bool((there == back).all())
+    """Return whether a surface of triangles (f, 3) is closed and consistently oriented.
+
+    It is if its triangles run along every edge as often in one direction as in the other.
+    """
+    forward, backward = _edges(faces)
+    return len(forward) > 0 and bool((forward == backward).all())
 
 
 def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sorted numbers of all edges (3 f,) of faces, and of the same edges backwards."""
+    """Return the sorted keys of all directed edges of triangles, and of the reversed edges."""
     start, end = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
     count = int(faces.max(initial=0)) + 1
     return np.sort(start * count + end), np.sort(end * count + start)
 
 
 def is_volume(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
-    """Return whether triangles enclose a volume: every edge joins two of them, normals outwards."""
-    there, back = _edges(faces)
-    if len(there) == 0 or (there != back).any() or (there[1:] == there[:-1]).any():
+    """Return whether triangles enclose a volume: two at every edge, normals outwards."""
+    forward, backward = _edges(faces)
+    if (len(forward) == 0 or (forward != backward).any()
+            or (forward[1:] == forward[:-1]).any()):
         return False
     a, b, c = (vertices_m - vertices_m[0])[faces].swapaxes(0, 1)
     return bool(np.einsum("ij,ij->", a, np.cross(b, c)) > 0)
 
 
 def connected(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return the group (count,) that each thing is in, by the pairs (n, 2) that belong together."""
+    """Return the connected component (count,) of each node of a graph with edges (n, 2)."""
     graph = coo_matrix((np.ones(len(pairs), dtype=bool), pairs.T), shape=(count, count))
     return connected_components(graph, directed=False)[1]

@@ -1,18 +1,18 @@
-"""Mitsuba 3 and Sionna RT scene files, read without Mitsuba and by an allowlist.
+"""Reader of Mitsuba 3 and Sionna RT scene files: shapes, transforms and materials, by an allowlist.
 
-This is the only reader of scene XML. Mitsuba would load files and plugins that a file names:
-nothing of it reaches Mitsuba but the triangles and materials that are read here.
+This is the only reader of scene XML. Mitsuba's own would load files and plugins that a file names;
+it only gets the triangles and materials that are parsed here.
 
 Read are `ply`, `obj`, `cube`, `rectangle` and `sphere` shapes (also within `merge`), `to_world`
 transforms, materials by reference or inline, `<default>` parameters, `<include>` and `<path>`
 within the file's folder. Cameras, lights and integrators have no meaning for radio and are skipped.
 
-The `city.xml` of a scene folder may say less:
+The `city.xml` of a scene folder is restricted:
 - Read: `scene`; `bsdf` and `shape` of the types below; `ref`; `transform` with `translate`,
   `rotate`, `scale`, `matrix`; `string`, `float`, `integer`, `boolean`, `rgb`, `point`, `vector`.
-- Ignored, with all that is in them: `integrator`, `sensor` and `emitter` beside the shapes.
-- Refused: every other element, attribute or type, so `default`, `include`, `path`, `alias`,
-  `texture`; a `$` in a value; a number that is none.
+- Ignored with their content: `integrator`, `sensor` and `emitter` beside the shapes.
+- Refused: every other element, attribute or type, such as `default`, `include`, `path`, `alias`,
+  `texture`; a `$` in a value; a text in the place of a number.
 """
 
 import os
@@ -27,7 +27,7 @@ from radiotwin.io.budgets import DOCUMENT_BYTES, ELEMENTS, FILES, NESTING, SEARC
 from radiotwin.io.inputs import parse_elements, require_within
 
 SHAPE_TYPES = ("ply", "obj", "cube", "rectangle", "sphere", "merge")
-# The last four are colours of older files: the name of such a material says what it is made of.
+# The last four are colours, as older files have: the ITU material follows from the name.
 BSDF_TYPES = ("itu-radio-material", "radio-material", "diffuse", "twosided", "principled",
               "roughconductor")
 IGNORED = ("integrator", "sensor", "emitter")
@@ -54,7 +54,7 @@ _ATTRIBUTES: dict[str, tuple[str, ...]] = {
 }
 _COUNTS = {"float": (1,), "integer": (1,), "rgb": (1, 3)}
 MAX_INCLUDE_DEPTH = 15  # the limit of Mitsuba
-MAX_NAME = 1000  # characters of a file's name with its folders: no system has longer ones
+MAX_NAME = 1000  # characters of a file's name with its folders
 
 
 @dataclass(slots=True)
@@ -94,7 +94,7 @@ class Node:
 
 
 class XmlReader:
-    """Reads files into trees within one budget of bytes and elements for all of them.
+    """Parses XML files into trees, within one budget of bytes and elements for all files.
 
     Messages about the budget name `path`, the first file.
     """
@@ -114,12 +114,12 @@ class XmlReader:
         FILES.check(self._files, self._path)
         top = Node("", {}, path, 0)
         open_nodes = [top]
-        limits = ELEMENTS.limit, NESTING.limit
+        max_elements, max_depth = ELEMENTS.limit, NESTING.limit  # looked up once
 
         def start(tag: str, attributes: dict[str, str], line: int) -> None:
             self._elements += 1
             node = Node(tag, attributes, path, line)
-            if self._elements > limits[0] or len(open_nodes) > limits[1]:
+            if self._elements > max_elements or len(open_nodes) > max_depth:
                 ELEMENTS.check(self._elements, self._path)
                 NESTING.check(len(open_nodes), node.position)
             open_nodes[-1].children.append(node)
@@ -134,10 +134,15 @@ class XmlReader:
 
 
 def read_numbers(node: Node, text: str, counts: tuple[int, ...]) -> np.ndarray:
-    """Return the finite numbers in a text, separated by blanks or commas.
+    """Parse finite numbers separated by blanks or commas.
+
+    Args:
+        node: Element that the text is from, for messages.
+        text: Text to parse.
+        counts: Allowed numbers of values.
 
     Raises:
-        BadInput: Something else, or a number of them that is not in `counts`; it names the node.
+        BadInput: Another text, or another number of values.
     """
     words = text.replace(",", " ").split(maxsplit=max(counts))
     try:
@@ -154,10 +159,12 @@ def read_numbers(node: Node, text: str, counts: tuple[int, ...]) -> np.ndarray:
 
 
 def read_vector(node: Node, default: float) -> np.ndarray:
-    """Return the (3,) of `value="x, y, z"`, of `value="s"`, or of x=, y=, z=, else the default.
+    """Return the vector (3,) in `value="x, y, z"`, `value="s"` (for all three), or x=, y=, z=.
+
+    A missing x, y or z has the default.
 
     Raises:
-        BadInput: Something else than finite numbers.
+        BadInput: A value is no finite number.
     """
     if "value" in node.attributes:
         return np.broadcast_to(read_numbers(node, node.attributes["value"], (1, 3)), 3)
@@ -166,14 +173,14 @@ def read_vector(node: Node, default: float) -> np.ndarray:
 
 
 def shown(text: str) -> str:
-    """Return a text for a message: quoted, control characters escaped, a long one cut."""
+    """Format a stranger's text for a message: quoted, escaped, cut at 60 characters."""
     return repr(text if len(text) <= 60 else text[:60] + "…")
 
 
 def _check_city(root: Node) -> None:
-    """Raise BadInput unless `city.xml` of a scene folder says only what is allowed.
+    """Raise BadInput if the `city.xml` of a scene folder has an element that is not allowed.
 
-    Elements that are ignored are removed from its `<scene>`.
+    Ignored elements are removed from its `<scene>`.
     """
     root.children = [child for child in root.children if child.tag not in IGNORED]
     waiting = [root]
@@ -189,6 +196,7 @@ def _check_city(root: Node) -> None:
 
 
 def _check_attributes(node: Node) -> None:
+    """Raise BadInput if an element of `city.xml` has an attribute, type or value not allowed."""
     for name, value in node.attributes.items():
         if name not in _ATTRIBUTES[node.tag]:
             raise BadInput(f"{node.position}: <{node.tag}> has {shown(name)}, which is not "
@@ -211,12 +219,12 @@ class DeclaredShape:
     """A `<shape>` element.
 
     Attributes:
-        name: Its identifier, or a name made from its mesh file or kind.
+        name: Identifier, or a name made from its mesh file or kind.
         kind: Mitsuba's type: `ply`, `obj`, `cube`, ...
         node: The element.
         to_world: (4, 4) transform.
-        mesh_path: Mesh file, if it has one.
-        material: Its `<bsdf>`, the identifier of the one that it refers to, or None.
+        mesh_path: Mesh file; None: it has none.
+        material: Inline `<bsdf>`, or the identifier of a declared one; None: it has none.
     """
 
     name: str
@@ -229,11 +237,11 @@ class DeclaredShape:
 
 @dataclass
 class DeclaredCity:
-    """The declarations of a scene file that matter for radio.
+    """The shapes and materials of a scene file.
 
     Attributes:
-        shapes: In the file's order.
-        materials: `<bsdf>` elements by identifier.
+        shapes: Shapes in the file's order.
+        materials: Identifier -> `<bsdf>` element.
     """
 
     shapes: list[DeclaredShape] = field(default_factory=list)
@@ -241,11 +249,11 @@ class DeclaredCity:
 
 
 def read_mitsuba_xml(path: Path | str, scene_folder: bool = False) -> DeclaredCity:
-    """Read shapes and materials of a scene file and of those that it includes; meshes stay closed.
+    """Read shapes and materials of a scene file and its includes; mesh files are not opened.
 
     Args:
         path: XML file; mesh files are looked for relative to the file that names them.
-        scene_folder: Whether it is the `city.xml` of a scene folder, which may say less.
+        scene_folder: Whether it is the `city.xml` of a scene folder, which is restricted.
 
     Raises:
         BadInput: No such file, malformed XML, not a scene, an element that is not allowed, a value
@@ -256,17 +264,20 @@ def read_mitsuba_xml(path: Path | str, scene_folder: bool = False) -> DeclaredCi
 
 
 class _Reader:
+    """Reads one scene file with its includes into a `DeclaredCity`."""
+
     def __init__(self, path: Path, scene_folder: bool) -> None:
         self.city = DeclaredCity()
         self.scene_folder = scene_folder
-        self.parameters: dict[str, str] = {}
-        self.lengths: list[int] = []  # of the parameters' names, from the longest
-        self.substituted = 0  # characters
+        self.parameters: dict[str, str] = {}  # name -> value, by <default>
+        self.lengths: list[int] = []  # of the parameters' names, the longest first
+        self.substituted = 0  # characters that parameters were replaced by
         self.folders = [path.parent]
         self.xml = XmlReader(path)
         self._read_file(path, ())
 
     def _read_file(self, path: Path, above: tuple[Path, ...]) -> None:
+        """Read a file; `above` are the files that include it, from the outermost."""
         root = self.xml.read(path)
         if root.tag != "scene":
             raise BadInput(f"{root.position}: the file begins with <{root.tag[:60]}>, not <scene>; "
@@ -276,6 +287,7 @@ class _Reader:
         self._read_children(root, (*above, path.resolve()))
 
     def _read_children(self, parent: Node, files: tuple[Path, ...]) -> None:
+        """Read the elements of a `<scene>`, and those within `merge`; `files` are open."""
         waiting = parent.children[::-1]
         while waiting:
             node = waiting.pop()
@@ -303,6 +315,7 @@ class _Reader:
                 self._read_shape(node)
 
     def _include(self, node: Node, files: tuple[Path, ...]) -> None:
+        """Read the file of an `<include>`; BadInput if files include each other in a loop."""
         path = self._find(node, node.attributes.get("filename", ""))
         if len(files) > MAX_INCLUDE_DEPTH or path.resolve() in files:
             raise BadInput(f"{node.position}: more than {MAX_INCLUDE_DEPTH} files include each "
@@ -310,12 +323,16 @@ class _Reader:
         self._read_file(path, files)
 
     def _declare(self, name: str, value: str) -> None:
+        """Declare a parameter; the first value of a name holds."""
         self.parameters.setdefault(name, value)
         if name and len(name) not in self.lengths:
             self.lengths = sorted([*self.lengths, len(name)], reverse=True)
 
     def _substitute(self, node: Node) -> None:
-        """Replace `$name` by the parameter's value; identifiers may keep an undeclared `$`."""
+        """Replace `$name` in an element's attributes by the parameter's value.
+
+        In identifiers and names, a `$` without a parameter stays.
+        """
         for key, text in node.attributes.items():
             if "$" not in text:
                 continue
@@ -336,6 +353,7 @@ class _Reader:
             node.attributes[key] = "".join(parts)
 
     def _find(self, node: Node, name: str) -> Path:
+        """Return the path of a file that an element names; it must lie below the first file's."""
         if len(name) > MAX_NAME:
             raise BadInput(f"{node.position}: {shown(name)} is not the name of a file: it has "
                            f"{len(name):,} characters")
@@ -346,6 +364,7 @@ class _Reader:
         return require_within(self.folders[0], node.file.parent / name, node.position)
 
     def _read_shape(self, node: Node) -> None:
+        """Add the shape of a `<shape>` element to the city."""
         SHAPES.check(len(self.city.shapes) + 1, node.file)
         kind = node.attributes.get("type", "")
         file_name = node.get("string", "filename")
@@ -366,7 +385,7 @@ class _Reader:
 
 
 def _read_transform(node: Node) -> np.ndarray:
-    """Return the (4, 4) matrix of a `<transform>`, whose operations follow each other."""
+    """Return the (4, 4) matrix of a `<transform>`: its operations, applied one after another."""
     matrix = np.eye(4)
     for step in node.children:
         operation = np.eye(4)

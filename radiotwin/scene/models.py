@@ -1,10 +1,10 @@
-"""Models of cities as meshes, from any program: OBJ, STL, PLY and glTF 2.0 [1].
+"""Readers of mesh models of cities: OBJ, STL, PLY and glTF 2.0 [1].
 
-Their coordinates are metres, and z points up; in glTF, by its specification, y. Only triangles,
-their places and the names of objects and materials are read, each checked against the bytes that
-are there: a header can claim any number of vertices, and a graph of objects can hold itself.
-General readers, trimesh's too, believe the former and open the pictures. No file that a model names
-is opened, except the buffers of a `.gltf`, in its own folder.
+Coordinates are in metres, and z points up; in glTF, by its specification, y. Only triangles, their
+positions and the names of objects and materials are read, and checked against the size of the file:
+a header can claim any number of vertices, and a graph of objects can contain itself. General
+readers, including trimesh's, trust such a header, and open pictures. No file that a model names is
+opened, except the buffers of a `.gltf` in its own folder.
 
 [1] https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html
 """
@@ -42,19 +42,18 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression",
                "KHR_mesh_quantization")
 UP_AXES = {".obj": "z", ".glb": "y", ".gltf": "y", ".stl": "z", ".ply": "z"}
-"""Suffix -> axis that points up where nothing else is said: that of glTF is fixed [1]."""
-# [1] https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#coordinate-system-and-units
+"""Suffix -> axis that usually points up; that of glTF is fixed [1, section 3.4]."""
 _STL_HEADER, _STL_FACE = 84, 50  # bytes
 
 
 @dataclass(frozen=True, eq=False)
 class ModelPart:
-    """One object of a model.
+    """An object of a model, or its part of one material.
 
     Attributes:
-        name: of the object.
-        material: name of its material; None: it has none.
-        mesh: its triangles, in the file's units and axes.
+        name: name of the object.
+        material: name of the material; None: it has none.
+        mesh: triangles in the file's units and axes.
     """
 
     name: str
@@ -63,7 +62,7 @@ class ModelPart:
 
 
 def _read_gltf(path: Path) -> list[ModelPart]:
-    """Read the objects of a `.glb` or `.gltf` file in the places that it gives them, y up."""
+    """Read the objects of a `.glb` or `.gltf` file, placed by its scene graph, y up."""
     data = read_bytes(path, "glTF model")
     text, binary = _chunks(path, data) if data[:4] == _MAGIC else (data, None)
     DOCUMENT_BYTES.check(len(text), path)
@@ -98,7 +97,7 @@ def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
 
 
 class _Document:
-    """The parts of one file."""
+    """A glTF document with its buffers; errors in its structure are ValueError and the like."""
 
     def __init__(self, path: Path, document: dict[str, Any], binary: bytes | None) -> None:
         self.path, self.document = path, document
@@ -108,22 +107,25 @@ class _Document:
                            "read; export it without compression")
         self.buffers = self._buffers(binary)
 
-    def _all(self, key: str) -> list[Any]:
+    def _list(self, key: str) -> list[Any]:
+        """Return a top-level list of the document, such as `meshes`; empty if absent."""
         found = self.document.get(key) or []
         if not isinstance(found, list):
             raise ValueError(f"{key} is no list")
         return found
 
-    def _at(self, key: str, index: Any) -> Any:
+    def _entry(self, key: str, index: Any) -> Any:
+        """Return an entry of a top-level list by its index."""
         if isinstance(index, bool) or not isinstance(index, int) or index < 0:
             raise ValueError(f"{index!r:.20} is no index of {key}")
-        return self._all(key)[index]
+        return self._list(key)[index]
 
     def _buffers(self, binary: bytes | None) -> list[bytes]:
+        """Return the content of all buffers: the binary chunk, base64 texts, files beside it."""
         buffers, size = [], 0
-        FILES.check(len(self._all("buffers")), self.path)
-        for number, known in enumerate(self._all("buffers")):
-            uri = known.get("uri")
+        FILES.check(len(self._list("buffers")), self.path)
+        for number, buffer in enumerate(self._list("buffers")):
+            uri = buffer.get("uri")
             if uri is None:
                 if number or binary is None:
                     raise ValueError(f"buffer {number} has no content")
@@ -144,6 +146,7 @@ class _Document:
 
     @staticmethod
     def _decoded(uri: str) -> bytes:
+        """Decode the base64 text of a `data:` URI."""
         head, comma, content = uri.partition(",")
         if not comma or not head.endswith(";base64"):
             raise ValueError("a buffer is not in base64")
@@ -153,10 +156,10 @@ class _Document:
             raise ValueError(f"a buffer is not in base64: {error}") from None
 
     def parts(self) -> Iterator[ModelPart]:
-        """Yield what the scene's objects are made of."""
+        """Yield the primitives of the scene's objects, in its coordinates."""
         vertices = parts = 0
         for name, mesh, to_world in self._placed():
-            for primitive in self._at("meshes", mesh)["primitives"]:
+            for primitive in self._entry("meshes", mesh)["primitives"]:
                 parts += 1
                 SHAPES.check(parts, self.path)
                 points = self._accessor(primitive["attributes"]["POSITION"], "VEC3")
@@ -175,15 +178,18 @@ class _Document:
                     RawMesh(moved, faces[:, ::-1] if mirrored else faces))
 
     def _placed(self) -> Iterator[tuple[str, int, np.ndarray]]:
-        """Yield name, mesh and transform of each node of the scene; each node stands once."""
-        scenes = self._all("scenes")
-        roots = self._at("scenes", self.document.get("scene", 0)).get("nodes") or [] if scenes \
-            else list(range(len(self._all("nodes"))))
+        """Yield name, mesh index and (4, 4) transform of each node that has a mesh.
+
+        A node that occurs twice in the scene's graph is an error.
+        """
+        scenes = self._list("scenes")
+        roots = self._entry("scenes", self.document.get("scene", 0)).get("nodes") or [] \
+            if scenes else list(range(len(self._list("nodes"))))
         waiting = [(node, np.eye(4)) for node in reversed(roots)]
         seen: set[int] = set()
         while waiting:
             index, above = waiting.pop()
-            node = self._at("nodes", index)
+            node = self._entry("nodes", index)
             if index in seen:
                 if not scenes:
                     continue
@@ -198,10 +204,11 @@ class _Document:
             waiting += [(child, to_world) for child in reversed(node.get("children") or [])]
 
     def _name(self, key: str, index: Any) -> str:
-        return str(self._at(key, index).get("name") or f"{key}_{index}")[:200]
+        """Return the name of an entry of a top-level list, or one made from its index."""
+        return str(self._entry(key, index).get("name") or f"{key}_{index}")[:200]
 
     def _faces(self, primitive: dict[str, Any], points: int) -> np.ndarray | None:
-        """Return (f, 3) indices; None of points and lines."""
+        """Return the triangles (f, 3) of a primitive, strips and fans cut; None: points, lines."""
         mode = primitive.get("mode", _TRIANGLES)
         if mode not in (_TRIANGLES, _STRIP, _FAN):
             return None
@@ -224,23 +231,24 @@ class _Document:
         return strip
 
     def _accessor(self, index: Any, kind: str) -> np.ndarray:
-        """Return (n, components) numbers, a view of the bytes that are there."""
-        known = self._at("accessors", index)
-        if known["type"] != kind or "sparse" in known or known.get("bufferView") is None:
+        """Return the (n, components) values of an accessor, a view of its buffer."""
+        accessor = self._entry("accessors", index)
+        if accessor["type"] != kind or "sparse" in accessor or accessor.get("bufferView") is None:
             raise ValueError(f"accessor {index} is sparse, empty, or not of type {kind}")
-        dtype = _TYPES[known["componentType"]]
+        dtype = _TYPES[accessor["componentType"]]
         if (dtype.kind == "f") != (kind == "VEC3"):
-            raise ValueError(f"accessor {index} is of component type {known['componentType']}")
-        view = self._at("bufferViews", known["bufferView"])
+            raise ValueError(f"accessor {index} is of component type {accessor['componentType']}")
+        view = self._entry("bufferViews", accessor["bufferView"])
         buffer = self.buffers[view["buffer"]]
         width = _COMPONENTS[kind] * dtype.itemsize
         stride = view.get("byteStride") or width
-        start = view.get("byteOffset", 0) + known.get("byteOffset", 0)
-        count = known["count"]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        count = accessor["count"]
         if not all(isinstance(value, int) and value >= 0 for value in (start, count)) \
                 or not (isinstance(stride, int) and width <= stride <= 252) \
                 or count and start + stride * (count - 1) + width > len(buffer):
-            raise ValueError(f"accessor {index} claims {count!r:.20} values, which are not there")
+            raise ValueError(f"accessor {index} claims {count!r:.20} values, more than the buffer "
+                             "holds")
         found: np.ndarray = np.ndarray((count, _COMPONENTS[kind]), dtype, buffer, start,
                                        (stride, dtype.itemsize)) if count else \
             np.zeros((0, _COMPONENTS[kind]), dtype)
@@ -251,21 +259,22 @@ def _transform(node: dict[str, Any]) -> np.ndarray:
     """Return the (4, 4) transform of a node: a matrix, or translation × rotation × scale [1]."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=float).reshape(4, 4).T
-    made = np.eye(4)
+    transform = np.eye(4)
     if "rotation" in node:
         x, y, z, w = np.array(node["rotation"], dtype=float).reshape(4)
-        made[:3, :3] = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+        transform[:3, :3] = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
     if "scale" in node:
-        made[:3, :3] *= np.array(node["scale"], dtype=float).reshape(3)
+        transform[:3, :3] *= np.array(node["scale"], dtype=float).reshape(3)
     if "translation" in node:
-        made[:3, 3] = np.array(node["translation"], dtype=float).reshape(3)
-    return made
+        transform[:3, 3] = np.array(node["translation"], dtype=float).reshape(3)
+    return transform
 
 
 def read_model(path: Path) -> list[ModelPart]:
-    """Read the objects of a model, one for each material; of STL and PLY the connected parts.
+    """Read a model: its objects, cut by material; in STL and PLY, the connected parts.
 
     Raises:
         BadInput: no such file, damaged, too large, or without triangles.
@@ -275,14 +284,14 @@ def read_model(path: Path) -> list[ModelPart]:
     if suffix == ".obj":
         vertices, groups = read_obj_groups(path)
         check_vertices(vertices, str(path))
-        parts = [ModelPart(name or path.stem, material, _own_mesh(path, vertices, polygons))
+        parts = [ModelPart(name or path.stem, material, _submesh(path, vertices, polygons))
                  for (name, material), polygons in groups.items()]
     elif suffix in (".glb", ".gltf"):
         parts = _read_gltf(path)
     else:
-        whole = (cut_polygons(path, *read_ply(path)) if suffix == ".ply" else _read_stl(path))
+        model = cut_polygons(path, *read_ply(path)) if suffix == ".ply" else _read_stl(path)
         parts = [ModelPart(f"{path.stem}_{number}", None, mesh)
-                 for number, mesh in enumerate(_connected(whole), start=1)]
+                 for number, mesh in enumerate(_connected_parts(model), start=1)]
     if not any(len(part.mesh.faces) for part in parts):
         raise BadInput(f"{path} holds no triangles; export the surfaces of the city")
     SHAPES.check(len(parts), path)
@@ -331,23 +340,23 @@ def _ascii_corners(path: Path, data: bytes) -> np.ndarray:
     return np.array(corners).reshape(-1, 3, 3)
 
 
-def _own_mesh(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -> RawMesh:
-    """Return the mesh of one of many objects that share vertices (v, 3)."""
-    used = np.unique(np.concatenate([each.ravel() for each in polygons]))
+def _submesh(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -> RawMesh:
+    """Return the mesh of one object of a model; `vertices` (v, 3) are those of all objects."""
+    used = np.unique(np.concatenate([group.ravel() for group in polygons]))
     if len(used) and (used[0] < 0 or used[-1] >= len(vertices)):
-        return cut_polygons(path, vertices, polygons)  # which says what is wrong
-    own = [np.searchsorted(used, each) for each in polygons]
-    return _compact(cut_polygons(path, vertices[used], own))
+        return cut_polygons(path, vertices, polygons)  # raises the error
+    renumbered = [np.searchsorted(used, group) for group in polygons]
+    return _compact(cut_polygons(path, vertices[used], renumbered))
 
 
 def _compact(mesh: RawMesh) -> RawMesh:
-    """Return a mesh with the vertices that its faces use."""
+    """Drop the vertices of a mesh that no face uses."""
     used, faces = np.unique(mesh.faces, return_inverse=True)
     return RawMesh(mesh.vertices[used], faces.reshape(-1, 3), mesh.polygons)
 
 
-def _connected(mesh: RawMesh) -> list[RawMesh]:
-    """Return the parts of a mesh that share no corner, in the order of their first faces."""
+def _connected_parts(mesh: RawMesh) -> list[RawMesh]:
+    """Split a mesh into parts that share no corner, in the order of their first faces."""
     if not len(mesh.faces):
         return [mesh]
     vertices, same = np.unique(mesh.vertices, axis=0, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Extent, altitudes, devices and UAVs for a city that declares none."""
+"""Choice of extent, altitudes, devices and UAVs for a city that declares none."""
 
 from dataclasses import dataclass
 from itertools import cycle
@@ -21,17 +21,17 @@ from radiotwin.scene.surfaces import Surfaces
 
 _DEVICE_CLEARANCE_M = 10.0  # free ground around a device [m]
 _UAV_CLEARANCE_M = 2.0  # free air beside the start of a UAV [m]
-_MAX_CELLS = 2_000_000  # of a `BuiltGrid`
-_MAX_LENGTHS = 10_000  # of an extent, in its widths
+_MAX_CELLS = 2_000_000  # of a `BuiltGrid`: bounds its memory
+_MAX_ASPECT = 10_000  # of an extent, length over width
 
 
 @dataclass(frozen=True, eq=False)
 class BuiltGrid:
-    """Cells of the extent's plane that are under a building.
+    """Map of the extent's cells that are under a building.
 
     Attributes:
         x_m, y_m: (nx,), (ny,) centres of cells [m].
-        built: (ny, nx) bool.
+        built: (ny, nx) bool, whether a building covers the centre.
     """
 
     x_m: np.ndarray
@@ -42,16 +42,16 @@ class BuiltGrid:
     def over(cls, extent: Extent, buildings: CityMap | None) -> "BuiltGrid":
         """Make a grid with cells of 1 m, larger where that would need more than 2 million.
 
-        `buildings` is a map of them alone; None: there are none.
+        `buildings` is a map without ground; None: there are no buildings.
 
         Raises:
-            BadInput: The extent is but a line.
+            BadInput: The extent is too narrow for its length.
         """
         x_min, x_max, y_min, y_max = extent.bounds
         width, depth = x_max - x_min, y_max - y_min
-        if max(width, depth) > _MAX_LENGTHS * min(width, depth):
+        if max(width, depth) > _MAX_ASPECT * min(width, depth):
             raise BadInput(f"an extent of {width:g} x {depth:g} m is but a line; its longer side "
-                           f"may be {_MAX_LENGTHS:,} times the other: widen it")
+                           f"may be {_MAX_ASPECT:,} times the other: widen it")
         cell_m = max(min(1.0, width / 50, depth / 50), np.sqrt(width * depth / _MAX_CELLS))
         x_m = np.arange(x_min + cell_m / 2, x_max, cell_m)
         y_m = np.arange(y_min + cell_m / 2, y_max, cell_m)
@@ -86,8 +86,8 @@ class BuiltGrid:
 def building_bounds(surfaces: Surfaces, solid: np.ndarray) -> tuple[float, float, float, float]:
     """Return the horizontal bounding box of the buildings, x_min, x_max, y_min, y_max [m].
 
-    Where the buildings, faces (f,) that are `solid`, are but a line or nothing, it is that of the
-    whole city. It is never narrower than a tenth of its length.
+    `solid`, (f,) bool, are the faces of buildings. If there are none, or their box is narrower than
+    a tenth of its length, the box of the whole city is taken, and widened to that if necessary.
     """
     box = np.zeros((2, 2))
     for faces in (solid, np.ones_like(solid)):
@@ -103,10 +103,10 @@ def building_bounds(surfaces: Surfaces, solid: np.ndarray) -> tuple[float, float
 
 def building_tops(surfaces: Surfaces, solid: np.ndarray, ground: CityMap | None
                   ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the highest point of each shape (shapes,) above the datum, and above the ground [m].
+    """Return the height (shapes,) of each building's top above the datum, and above the ground [m].
 
-    The ground is that below the shape's middle, of a map of the ground alone. A shape without faces
-    that are `solid`, (f,) bool, counts 0.
+    The ground is taken below the middle of the shape, from a map without buildings (None: at 0).
+    Shapes without faces of buildings (`solid`, (f,) bool) have 0.
     """
     _, high = surfaces.face_bounds()
     tops_m = np.zeros(surfaces.shapes)
@@ -120,13 +120,13 @@ def building_tops(surfaces: Surfaces, solid: np.ndarray, ground: CityMap | None
 
 
 def _height_m(ground: CityMap, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-    """Return the heights (n,) of a terrain, or of the ground of a city model [m]."""
-    at = ground.height_at if ground.terrain is None else ground.ground_height_m
-    return at(x_m, y_m)
+    """Return the heights (n,) of a terrain, or of a city model's ground, at x and y (n,) [m]."""
+    height_m = ground.height_at if ground.terrain is None else ground.ground_height_m
+    return height_m(x_m, y_m)
 
 
 def choose_extent(bounds: tuple[float, float, float, float]) -> Extent:
-    """Move bounds outwards to whole steps of the lattice, so that both borders lie on it."""
+    """Round bounds (x_min, x_max, y_min, y_max) [m] outwards to whole steps of the lattice."""
     step_m = choose_step(bounds)
     x_min, x_max, y_min, y_max = bounds
     return make_extent((np.floor(x_min / step_m) * step_m, np.ceil(x_max / step_m) * step_m,
@@ -154,10 +154,10 @@ def choose_step(bounds: tuple[float, float, float, float]) -> float:
 
 
 def choose_altitudes(heights_m: np.ndarray) -> list[float]:
-    """Return three altitudes from 10 m above 95 % of the roofs (n,) upwards, 5 m apart [m].
+    """Return three altitudes, 5 m apart, the lowest 10 m above 95 % of the roofs (n,) [m].
 
-    They are low enough that streets next to tall buildings stay without line of sight, and high
-    enough that few lattice positions lie inside a building.
+    So low, streets beside tall buildings have no line of sight, and few lattice positions lie
+    inside a building.
     """
     top_m = float(np.percentile(heights_m, 95)) if len(heights_m) else 0.0
     lowest_m = max(30.0, 5.0 * np.ceil((top_m + 10.0) / 5.0))
@@ -168,9 +168,9 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
                   ) -> list[DeviceConfig]:
     """Place devices on free ground, 10 m clear of buildings; three, or 30 %, are anchors.
 
-    Positions are drawn one by one at random, preferably where much is built within 100 m around,
-    each at some distance from all before; the distance shrinks until there is room for all.
-    `ground` is a map of the ground alone; None: flat at the datum.
+    Positions are drawn at random, with a probability by the built share of the surroundings, and
+    accepted if they are far enough from those before; that distance shrinks until all have room.
+    `ground` is a map without buildings; None: flat at the datum.
 
     Raises:
         BadInput: There is not enough free ground.
@@ -205,7 +205,7 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
 
 
 def _spread_out(positions: np.ndarray, count: int) -> set[int]:
-    """Choose `count` positions, from the middle on each the farthest from those before."""
+    """Choose the position nearest to the middle, then each time the farthest from those chosen."""
     chosen = [int(np.linalg.norm(positions - positions.mean(axis=0), axis=1).argmin())]
     gaps = np.linalg.norm(positions - positions[chosen[0]], axis=1)
     while len(chosen) < count:
@@ -218,9 +218,9 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
                ground: CityMap | None = None) -> list[UavConfig]:
     """Place UAVs at the free lattice position nearest to the middle, at one altitude each.
 
-    They end where they start, with a battery for 80 % of the moves along two sides of the extent,
-    at least 20. `buildings` and `ground` are maps of these alone; None: there are none, and the
-    lattice is above the datum.
+    They end where they start. The battery has 80 % of the moves along two sides of the extent, at
+    least 20. `buildings` is a map without ground, None: there are none. `ground` is a map without
+    buildings that altitudes count from, None: they count from the datum.
 
     Raises:
         BadInput: No lattice position is free at an altitude.

@@ -1,4 +1,4 @@
-"""Draw a scene from above, into any axes or a picture."""
+"""Plots of a scene from above: heights, vegetation, devices, UAV starts."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ Bounds = tuple[float, float, float, float]
 GROUND_COLOUR = "#eef0ee"
 VEGETATION_COLOUR = "#7fb069"
 STREET_COLOUR = "#9aa3ab"
-BUILDING_M = 2.0  # lowest height that is outlined
-MIN_HEIGHT_M = 0.5  # of what is drawn as a building
+BUILDING_M = 2.0  # lower surfaces are not outlined
+MIN_HEIGHT_M = 0.5  # lower surfaces have the colour of the ground
 PLOT_CELLS = 400  # along the longer side of a plot
 MARKS = (("anchor", "^", 110, "#d1495b", "anchor"),
          ("unknown", "*", 170, "#f08a00", "device to be found"))
@@ -40,24 +40,23 @@ MARKS = (("anchor", "^", 110, "#d1495b", "anchor"),
 
 def height_grid(scene: Scene, cells: int = 1000,
                 above_datum: bool = False) -> tuple[np.ndarray, Bounds]:
-    """Sample the heights of the map over the scene's extent.
+    """Sample the heights of the 3D map over the scene's extent.
 
     Args:
-        scene: Scene with its 3D map.
+        scene: Scene to sample.
         cells: Number of cells along the longer side.
-        above_datum: Whether heights are above z = 0, or above the ground.
+        above_datum: Whether heights are above the datum z = 0; else above the ground.
 
     Returns:
         (ny, nx) heights, south first [m], and (x_min, x_max, y_min, y_max) [m].
     """
-    x_m, y_m = _centres(scene, cells)
-    grid_m = np.meshgrid(x_m, y_m)
-    height_m = scene.city.height_at(*grid_m) if above_datum else _built_m(scene, grid_m)
+    grid_m = np.meshgrid(*_centres(scene, cells))
+    height_m = scene.city.height_at(*grid_m) if above_datum else _above_ground_m(scene, grid_m)
     return height_m, scene.config.extent.bounds
 
 
-def _built_m(scene: Scene, grid_m: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the heights of the highest surface above the ground at x and y [m]."""
+def _above_ground_m(scene: Scene, grid_m: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the height of the highest surface above the ground at x and y (ny, nx) [m]."""
     height_m = scene.city.height_at(*grid_m)
     return height_m if scene.city.terrain is None else \
         height_m - scene.city.ground_height_m(*grid_m)
@@ -69,7 +68,7 @@ def plot_scene(scene: Scene, ax: Axes | None, geographic: bool | None) -> Axes:
 
     frame, ax = PlotFrame.choose(scene.config.origin, geographic), new_axes(ax)
     x_m, y_m = _centres(scene, PLOT_CELLS)
-    height_m = _built_m(scene, np.meshgrid(x_m, y_m))
+    height_m = _above_ground_m(scene, np.meshgrid(x_m, y_m))
     top_m = _top_m(height_m)
     ax.set_facecolor(GROUND_COLOUR)
     drawn = draw_cells(ax, frame, x_m, y_m, np.ma.masked_less(height_m, MIN_HEIGHT_M),
@@ -86,22 +85,21 @@ def plot_scene(scene: Scene, ax: Axes | None, geographic: bool | None) -> Axes:
 
 def draw_outlines(ax: Axes, scene: Scene, frame: PlotFrame) -> None:
     """Draw the outlines of the buildings."""
-    x_m, y_m = _centres(scene, PLOT_CELLS)
-    grid_m = np.meshgrid(x_m, y_m)
-    built = _built_m(scene, grid_m) > BUILDING_M
+    grid_m = np.meshgrid(*_centres(scene, PLOT_CELLS))
+    built = _above_ground_m(scene, grid_m) > BUILDING_M
     if built.any() and not built.all():
         ax.contour(*frame.at(*grid_m), built.astype(float), levels=[0.5], colors="black",
                    linewidths=0.5, alpha=0.6)
 
 
 def draw_vegetation(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None:
-    """Draw declared vegetation."""
+    """Draw the vegetation that a scene declares."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
-    for number, each in enumerate(scene.config.vegetation):
+    for number, area in enumerate(scene.config.vegetation):
         rings = [Path(np.column_stack(frame.at(*np.array([*ring, ring[0]]).T)), closed=True)
-                 for ring in each.rings_m]
+                 for ring in area.rings_m]
         axes.add_patch(PathPatch(Path.make_compound_path(*rings), facecolor=VEGETATION_COLOUR,
                                  edgecolor="none", alpha=0.45, zorder=1.5,
                                  label="" if number else "vegetation"))
@@ -133,16 +131,16 @@ def draw_devices(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None:
 
 
 def _top_m(height_m: np.ndarray) -> float:
-    """Return the upper end of the scale of heights [m]: nearly all buildings are lower."""
+    """Return the upper end of the colour scale [m]: the 99.5th percentile of building heights."""
     built = height_m[height_m > MIN_HEIGHT_M]
     return max(float(np.percentile(built, 99.5)), 1.0) if len(built) else 1.0
 
 
 def _centres(scene: Scene, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return x (nx,) and y (ny,) of cells over the extent [m]."""
+    """Return x (nx,) and y (ny,) of the centres of a scene's cells [m]."""
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     cell_m = max(x_max - x_min, y_max - y_min) / cells
-    # At least two each way: contours and shades are of differences.
+    # At least two each way, which contours and shades need
     nx, ny = (max(round(side_m / cell_m), 2) for side_m in (x_max - x_min, y_max - y_min))
     return (x_min + (np.arange(nx) + 0.5) * (x_max - x_min) / nx,
             y_min + (np.arange(ny) + 0.5) * (y_max - y_min) / ny)
@@ -177,7 +175,7 @@ def draw_preview(scene: Scene, path: Path | str) -> None:
 
 
 def _draw_contours(axes: Axes, scene: Scene) -> None:
-    """Draw lines of equal height of a terrain above the datum, with their heights [m]."""
+    """Draw labelled contour lines of a terrain's height above the datum [m]."""
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     x_m, y_m = np.meshgrid(np.linspace(x_min, x_max, 200), np.linspace(y_min, y_max, 200))
     lines = axes.contour(x_m, y_m, scene.city.ground_height_m(x_m, y_m), levels=10,
@@ -186,7 +184,7 @@ def _draw_contours(axes: Axes, scene: Scene) -> None:
 
 
 def draw_heights(axes: Axes, height_m: np.ndarray, bounds: Bounds) -> AxesImage:
-    """Draw heights (ny, nx), south first [m], with shaded relief; return the image."""
+    """Draw heights (ny, nx), south first [m], with shaded relief."""
     from matplotlib import colormaps
     from matplotlib.colors import LightSource
 

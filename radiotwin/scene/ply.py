@@ -1,13 +1,12 @@
-"""PLY files: read polygons from the ASCII and binary forms, write triangles as binary.
+"""PLY files: reader of polygons from ASCII and binary files, writer of triangles.
 
-trimesh reads PLY, too, but silently accepts a truncated ASCII file or a face that names a missing
-vertex, and refuses binary files that mix triangles with quadrilaterals.
+trimesh's reader silently accepts a truncated ASCII file, or a face that names a missing vertex, and
+refuses binary files that mix triangles with quadrilaterals.
 """
 
 import re
 import struct
 from array import array
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,20 +22,22 @@ _TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2
 _STRUCT_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f",
                  "f8": "d"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_INDICES = ("vertex_indices", "vertex_index")  # names that programs give the list of a face
+_INDICES = ("vertex_indices", "vertex_index")  # usual names of a face's list of corners
 _LINE_END = re.compile("\r\n|\n|\r")
 _BUDGETS = {"vertex": VERTICES, "face": FACES}
 
 
 @dataclass
 class _Element:
+    """An element of a PLY header, such as `vertex`: its number of rows and its properties."""
+
     name: str
     count: int
     # Name, type, and type of the list's length (None: not a list)
     properties: list[tuple[str, str, str | None]] = field(default_factory=list)
 
     def dtype(self, order: str, lengths: dict[str, int]) -> np.dtype:
-        """Return the type of one row whose lists have the given lengths."""
+        """Return NumPy's type of one binary row whose lists have the given lengths."""
         fields: list[tuple] = []
         for name, kind, length_kind in self.properties:
             if length_kind is None:
@@ -47,13 +48,13 @@ class _Element:
         return np.dtype(fields)
 
     def is_read(self, name: str) -> bool:
-        """Return whether the values of a property are needed."""
+        """Return whether a property holds positions or faces; others are skipped."""
         return name in {"vertex": tuple("xyz"), "face": _INDICES}.get(self.name, ())
 
     def add(self, name: str, kind: str, length_kind: str | None) -> None:
-        """Add a property; KeyError or ValueError where no mesh has such a one."""
-        whole = {length_kind, kind if self.name == "face" and self.is_read(name) else None}
-        if (any(one is not None and _TYPES[one].startswith("f") for one in whole)
+        """Add a property; KeyError or ValueError if its type is unknown or cannot be of a mesh."""
+        integers = {length_kind, kind if self.name == "face" and self.is_read(name) else None}
+        if (any(one is not None and _TYPES[one].startswith("f") for one in integers)
                 or self.is_read(name) and (length_kind is None) != (self.name == "vertex")):
             raise ValueError
         self.properties.append((name, _TYPES[kind],
@@ -62,25 +63,26 @@ class _Element:
 
 @dataclass
 class _Lists:
-    """Lists of whole numbers, one after the other."""
+    """Lists of integers of different lengths, stored one after the other."""
 
     lengths: array = field(default_factory=lambda: array("q"))
     values: array = field(default_factory=lambda: array("q"))
 
     def append(self, values: tuple | list) -> None:
+        """Add a list."""
         self.lengths.append(len(values))
         self.values.extend(values)
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Read vertices and polygons.
+    """Read vertices and polygons of a PLY file.
 
     Returns:
-        (v, 3) vertices, and an (n, k) array of vertex indices for each number of corners k.
+        (v, 3) vertices, and polygons: for each number of corners k, (n, k) indices of vertices.
 
     Raises:
         BadInput: No such file, not a PLY file, truncated, too large, a header without vertices or
-            faces, or a number that cannot be one of a mesh.
+            faces, or a text or number that is impossible in a mesh.
     """
     data = read_bytes(path, "PLY mesh")
     order, elements, start = _read_header(path, data)
@@ -102,6 +104,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def _by_corners(path: Path, polygons: np.ndarray | _Lists) -> list[np.ndarray]:
+    """Group polygons by their number of corners k into arrays (n, k)."""
     if isinstance(polygons, np.ndarray):
         CORNERS.check(polygons.shape[1], path)
         return [polygons.astype(np.int64)]
@@ -114,6 +117,7 @@ def _by_corners(path: Path, polygons: np.ndarray | _Lists) -> list[np.ndarray]:
 
 
 def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
+    """Return byte order ("": ASCII), elements, and the position where the data begin."""
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0:
         raise BadInput(f"{path} is not a PLY file, or it was cut off within its header; export "
@@ -146,7 +150,7 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _check_elements(path: Path, elements: list[_Element], size: int) -> None:
-    """Compare the header's counts with the size of the rest, before any memory is reserved."""
+    """Check the header's counts against the size of the data, before any memory is reserved."""
     COLUMNS.check(sum(len(element.properties) for element in elements), path)
     names = [(element.name, name) for element in elements for name, *_ in element.properties]
     if len(set(names)) < len(names) or len({element.name for element in elements}) < len(elements):
@@ -159,18 +163,20 @@ def _check_elements(path: Path, elements: list[_Element], size: int) -> None:
             _BUDGETS[element.name].check(element.count, path)
 
 
-def _lines(data: bytes) -> Iterator[str]:
-    # Unlike `splitlines`, not at bytes that are parts of characters in UTF-8.
-    return iter(_LINE_END.split(data.decode("latin-1")))
+def _lines(data: bytes) -> list[str]:
+    """Split ASCII data into lines; `splitlines` would also split within UTF-8 characters."""
+    return _LINE_END.split(data.decode("latin-1"))
 
 
 def _truncated(path: Path, element: _Element, row: int) -> BadInput:
+    """Return the error that the file ends before the header's count of rows."""
     return BadInput(f"{path} is truncated: its header promises {element.count} rows of "
                     f"{element.name[:60]!r}, the file ends in row {row + 1}; copy or export the "
                     "mesh again")
 
 
 def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
+    """Return (element, property) -> values of an ASCII file's data, of those that are needed."""
     lines = [line for line in _lines(data) if line.strip()]
     columns: dict[tuple[str, str], array | _Lists] = {}
     first = 0
@@ -195,11 +201,13 @@ def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
 
 
 def _empty(element: _Element) -> dict[str, array | _Lists]:
+    """Return an empty container for each needed property of an element."""
     return {name: array("d") if length_kind is None else _Lists()
             for name, _, length_kind in element.properties if element.is_read(name)}
 
 
 def _read_words(words: list[str], element: _Element, found: dict) -> None:
+    """Append the values of an ASCII row to the containers of its properties."""
     at = 0
     for name, kind, length_kind in element.properties:
         cast = float if kind.startswith("f") else int
@@ -222,6 +230,7 @@ def _read_words(words: list[str], element: _Element, found: dict) -> None:
 
 def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list[_Element]
                  ) -> dict:
+    """Return (element, property) -> values of a binary file's data, of those that are needed."""
     columns: dict[tuple[str, str], np.ndarray | array | _Lists] = {}
     for element in elements:
         found, start = (_read_uniform(data, start, order, element)
@@ -232,7 +241,10 @@ def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list
 
 def _read_uniform(data: bytes, start: int, order: str, element: _Element
                   ) -> tuple[dict, int] | None:
-    """Read all rows at once if every row's lists are as long as the first row's; else None."""
+    """Read all rows of an element at once; None if their lists differ in length.
+
+    Also returns the position behind them.
+    """
     if element.count == 0:
         return None
     lengths, at = {}, start
@@ -259,7 +271,7 @@ def _read_uniform(data: bytes, start: int, order: str, element: _Element
 
 def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element
                  ) -> tuple[dict, int]:
-    """Read row by row."""
+    """Read the rows of an element one by one; also return the position behind them."""
     found = _empty(element)
     for row in range(element.count):
         try:

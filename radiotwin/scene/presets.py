@@ -1,8 +1,8 @@
-"""Built-in scenes: random cities of blocks between avenues and streets, with a mission in each.
+"""Built-in scenes: random cities of blocks between avenues and streets, each with a mission.
 
-Two follow the maps of Chen et al., "Model-aided Federated Reinforcement Learning for Multi-UAV
-Trajectory Planning in IoT Networks", GLOBECOM Workshops 2023, a small one is for demonstration. The
-cities are our own draws.
+`rbm` and `rdm` follow the maps of Chen et al., "Model-aided Federated Reinforcement Learning for
+Multi-UAV Trajectory Planning in IoT Networks", GLOBECOM Workshops 2023; their buildings are drawn
+anew. `small` is for demonstration.
 """
 
 from dataclasses import dataclass, replace
@@ -45,8 +45,8 @@ class CityParameters:
         side_min_m, side_mean_m: Side of a building: max(min, Exp(mean)), clipped to its block.
         mean_height_m: Mean height of buildings.
         first_block_m: South-west corner of the first large block; may lie off the map.
-        min_height_m, max_height_m: Limits of the heights.
-        side_kept_m: Least length of a clipped side; shorter ones are dropped with their building.
+        min_height_m, max_height_m: Heights are clipped to this range.
+        side_kept_m: A building with a shorter side, after clipping, is dropped.
         buildings_per_m2: Density of buildings in a small block, before any is dropped.
         clearance_m: Free ground on each side of a device.
     """
@@ -70,9 +70,9 @@ class CityParameters:
 
 
 def draw_buildings(parameters: CityParameters, keep_free_m: np.ndarray, seed: int) -> np.ndarray:
-    """Draw the buildings of a city as axis-aligned boxes, which may overlap.
+    """Draw the buildings of a city at random: axis-aligned boxes, which may overlap.
 
-    Points (k, 2) [m] are kept clear of them by `clearance_m`.
+    No building comes closer than `clearance_m` to the points `keep_free_m` (k, 2) [m].
 
     Returns:
         (n, 5) x_min, y_min, x_max, y_max, height [m].
@@ -91,9 +91,10 @@ def draw_buildings(parameters: CityParameters, keep_free_m: np.ndarray, seed: in
 
 def _small_blocks(low: float, length_m: float, p: CityParameters, rng: np.random.Generator
                   ) -> list[tuple[float, float]]:
-    """Cut one side of the large block at `low` by streets, and clip the pieces to the map.
+    """Cut a side of a large block, from `low` on, into small blocks (start, end) between streets.
 
-    The rest after the last street is a block of at least the minimum.
+    The piece behind the last street has at least the minimum length. All are clipped to the map,
+    0 to `length_m`.
     """
     blocks, high = [], low + p.avenue_spacing_m
     while high - low >= 2 * p.block_min_m + p.street_width_m:
@@ -107,6 +108,7 @@ def _small_blocks(low: float, length_m: float, p: CityParameters, rng: np.random
 
 def _buildings_in(column: tuple[float, float], row: tuple[float, float], p: CityParameters,
                   keep_free_m: np.ndarray, rng: np.random.Generator) -> list[tuple]:
+    """Draw the buildings (x_min, y_min, x_max, y_max, height) [m] of one small block."""
     (x0, x1), (y0, y1) = column, row
     boxes = []
     for _ in range(rng.poisson((x1 - x0) * (y1 - y0) * p.buildings_per_m2)):
@@ -126,7 +128,7 @@ def _buildings_in(column: tuple[float, float], row: tuple[float, float], p: City
 
 def _trimmed(low: np.ndarray, high: np.ndarray, keep_free_m: np.ndarray, clearance_m: float
              ) -> tuple[np.ndarray, np.ndarray]:
-    """Free every point from a rectangle by moving the side that costs the least area."""
+    """Trim a rectangle to be clear of every point, each time at the side that costs least area."""
     for point in keep_free_m:
         near, far = point - clearance_m, point + clearance_m
         if np.any(far <= low) or np.any(near >= high):
@@ -142,10 +144,10 @@ def _trimmed(low: np.ndarray, high: np.ndarray, keep_free_m: np.ndarray, clearan
 
 
 def building_meshes(boxes: np.ndarray) -> list[trimesh.Trimesh]:
-    """Return boxes as watertight solids from west to east, one per group of boxes that touch.
+    """Unite boxes (n, 5) that touch into watertight solids, from west to east.
 
-    Overlapping boxes are united, as the ray tracer would hit coplanar walls and roofs inside one
-    another twice. A box is x_min, y_min, x_max, y_max, height [m].
+    Otherwise the ray tracer would hit coplanar walls and roofs twice. A box is x_min, y_min, x_max,
+    y_max, height [m].
     """
     solids = [trimesh.creation.box(bounds=[[x0, y0, 0.0], [x1, y1, height]])
               for x0, y0, x1, y1, height in boxes]
@@ -160,7 +162,7 @@ class Preset:
     Attributes:
         city: Parameters of the city.
         devices_m: (x, y) of the devices [m].
-        anchors: numbers of the devices whose positions a survey reports, from 0.
+        anchors: Indices of the devices that are anchors.
         start_m, terminal_m: (x, y) where all UAVs start and end [m].
         battery: Battery units of each UAV.
         data_units: Data at each device.
@@ -260,9 +262,9 @@ def build_preset(name: str, folder: Path | str) -> None:
 
 
 def build_preset_scene(name: str, folder: Path | str, check_only: bool = False) -> BuildReport:
-    """Write the scene folder of a preset, and report on it as on any other city.
+    """Write the scene folder of a preset, and report on it as `build_scene` does.
 
-    To check only, it is built in a temporary folder, and nothing is left behind.
+    With `check_only` it is written to a temporary folder, and nothing remains.
 
     Raises:
         BadInput: As `build_preset`.
@@ -280,6 +282,7 @@ def build_preset_scene(name: str, folder: Path | str, check_only: bool = False) 
 
 
 def _find(name: str) -> Preset:
+    """Return a preset by its name; BadInput if there is none."""
     if name not in PRESETS:
         raise BadInput(f"preset {name!r} does not exist; allowed are {', '.join(PRESETS)}")
     return PRESETS[name]

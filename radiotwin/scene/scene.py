@@ -1,4 +1,4 @@
-"""The scene folder as an object."""
+"""`Scene`: a scene folder that was read and checked, with its 3D map, lattice and antennas."""
 
 import hashlib
 import os
@@ -12,7 +12,7 @@ import pandas as pd
 
 from radiotwin.display import Summarised, Summary, count, geo_data_frame, some
 from radiotwin.errors import BadInput
-from radiotwin.geo import origin_attributes, with_places
+from radiotwin.geo import origin_attributes, with_coordinates
 from radiotwin.io.budgets import SHAPES
 from radiotwin.io.files import atomic_folder
 from radiotwin.io.forms import Origin
@@ -45,7 +45,7 @@ class Scene(Summarised):
     """A scene folder that was read and checked.
 
     Attributes:
-        folder: Its path.
+        folder: Path of the scene folder.
         config: Content of `scene.toml`.
     """
 
@@ -69,7 +69,7 @@ class Scene(Summarised):
                            "`radiotwin build-scene` makes it")
         for name in ("scene.toml", "city.xml"):
             require_within(folder, folder / name, str(folder))
-        scene = cls(folder, read_config(folder / "scene.toml"))._on_ground()
+        scene = cls(folder, read_config(folder / "scene.toml"))._with_datum_heights()
         scene._check_devices()
         # Report a broken file before any work.
         _ = scene.device_antennas, scene.uav_antenna, scene.streets_m
@@ -77,10 +77,10 @@ class Scene(Summarised):
 
     @classmethod
     def of(cls, given: "Scene | Path | str") -> "Scene":
-        """Return a scene as it is, or the one in a folder.
+        """Return a scene unchanged, or load it from the path of its folder.
 
         Raises:
-            BadInput: It is neither, or as `load`.
+            BadInput: Neither a scene nor a path, or as `load`.
         """
         if isinstance(given, Scene):
             return given
@@ -92,7 +92,7 @@ class Scene(Summarised):
     def save(self, folder: Path | str) -> None:
         """Write a copy of the scene folder, with the configuration of this object.
 
-        Its preview and what tracing left in it are not copied.
+        The preview and files of traces are not copied.
 
         Args:
             folder: Scene folder to write; a scene that is already in it is replaced.
@@ -117,7 +117,7 @@ class Scene(Summarised):
 
         Args:
             ax: Axes of matplotlib to draw into; None: a new figure.
-            geographic: Whether axes are longitude and latitude; None: where the origin is known.
+            geographic: Whether axes are longitude and latitude; None: if the origin is known.
 
         Returns:
             The axes.
@@ -130,7 +130,7 @@ class Scene(Summarised):
         return plot_scene(self, ax, geographic)
 
     def to_xarray(self, step_m: float = 1.0) -> "xr.Dataset":
-        """Return the heights over the extent as a raster.
+        """Return the heights of the 3D map over the extent as a raster.
 
         Args:
             step_m: Width of a cell [m].
@@ -158,8 +158,8 @@ class Scene(Summarised):
         """Return buildings or devices as rows with a geometry, in metres of the local frame.
 
         Args:
-            layer: `buildings` (`building, material, height_m` of the highest point above the
-                ground below it, and their outline) or `devices`.
+            layer: `buildings` (columns `building`, `material`, `height_m`: largest height above
+                the ground below, and the outline) or `devices`.
 
         Raises:
             BadInput: GeoPandas is not installed, or another layer.
@@ -191,7 +191,7 @@ class Scene(Summarised):
         return len(self.config.devices)
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave the 3D map out: it is read again from the folder where it is needed."""
+        """Pickle folder and configuration: the 3D map is read again from the folder when needed."""
         return {"folder": Path(os.path.abspath(self.folder)), "config": self.config}
 
     @property
@@ -211,36 +211,36 @@ class Scene(Summarised):
             ("altitudes", some(f"{z:g}" for z in config.lattice.altitudes_m) + " m"),
             ("lattice step", f"{config.lattice.step_m:g} m")))
 
-    def _on_ground(self) -> "Scene":
-        """Return the scene with all its devices' heights above the datum.
+    def _with_datum_heights(self) -> "Scene":
+        """Convert the devices' heights above the ground to heights above the datum.
 
-        A device of which no height is declared stands `ANTENNA_HEIGHT_M` above the ground, too.
+        A device without a declared height is `ANTENNA_HEIGHT_M` above the ground.
         """
-        if self.config.terrain is None:
-            if all(device.above_ground_m is None for device in self.config.devices):
-                return self
+        if self.config.terrain is None and all(device.above_ground_m is None
+                                               for device in self.config.devices):
+            return self
         above_m = [device.above_ground_m if device.above_ground_m is not None else
                    None if "z_m" in device.model_fields_set else device.z_m
                    for device in self.config.devices]
         ground_m = self.city.ground_height_m(*np.array(
             [(device.x_m, device.y_m) for device in self.config.devices]).reshape(-1, 2).T)
-        devices = [device if own_m is None else device.model_copy(update={
-                       "z_m": round(float(low_m) + own_m, 3), "above_ground_m": None})
-                   for device, own_m, low_m in zip(self.config.devices, above_m, ground_m)]
+        devices = [device if height_m is None else device.model_copy(update={
+                       "z_m": round(float(low_m) + height_m, 3), "above_ground_m": None})
+                   for device, height_m, low_m in zip(self.config.devices, above_m, ground_m)]
         scene = Scene(self.folder, self.config.model_copy(update={"devices": devices}))
         scene.__dict__["city"] = self.city
         return scene
 
     @property
     def origin(self) -> Origin | None:
-        """Of its local frame; None where that is not known."""
+        """WGS84 origin of the local frame; None: not known."""
         return self.config.origin
 
     @property
     def devices(self) -> pd.DataFrame:
-        """Declared devices: `device, role, x_m, y_m, z_m`; with an origin their place, too."""
-        named = [(each.device, each.role) for each in self.config.devices]
-        return with_places(pd.DataFrame(named, columns=["device", "role"]), self.device_m,
+        """Declared devices: `device, role, x_m, y_m, z_m`, and latitude and longitude if known."""
+        named = [(device.device, device.role) for device in self.config.devices]
+        return with_coordinates(pd.DataFrame(named, columns=["device", "role"]), self.device_m,
                            self.origin)
 
     @property
@@ -250,7 +250,7 @@ class Scene(Summarised):
 
     @cached_property
     def city(self) -> CityMap:
-        """3D map of the city, with its vegetation."""
+        """3D map of the city, with its vegetation and terrain."""
         terrain = self.config.terrain
         return CityMap.from_xml(self.xml_path, Vegetation.of(self.config.vegetation),
                                 None if terrain is None else terrain.shape,
@@ -267,7 +267,10 @@ class Scene(Summarised):
             *np.meshgrid(lattice.x_m, lattice.y_m)))
 
     def altitude_m(self, x_m: float, y_m: float, declared_m: float) -> float:
-        """Return the height above the datum of an altitude as the lattice declares them [m]."""
+        """Return the height above the datum of a declared altitude at x and y [m].
+
+        It counts from the ground if the scene's lattice does.
+        """
         if self.config.lattice.above != "ground":
             return declared_m
         return float(self.city.ground_height_m(x_m, y_m)) + declared_m
@@ -291,7 +294,7 @@ class Scene(Summarised):
     @cached_property
     def device_antennas(self) -> list[Antenna | None]:
         """Antenna of each declared device; None: isotropic."""
-        pattern = cache(self._pattern)  # many devices may share a file
+        pattern = cache(self._pattern)  # devices may share a file
         return [None if device.antenna is None else
                 Antenna(pattern(device.antenna), device.azimuth_deg or 0.0, device.tilt_deg or 0.0)
                 for device in self.config.devices]
@@ -309,12 +312,13 @@ class Scene(Summarised):
 
     @property
     def _antenna_files(self) -> set[str]:
+        """Names of the antenna files of all devices and UAVs."""
         ends: list[DeviceConfig | UavConfig] = [*self.config.devices, *self.config.uavs]
         return {end.antenna for end in ends if end.antenna is not None}
 
     @property
     def files(self) -> list[Path]:
-        """Files and folders that the scene is read from, and its tables."""
+        """Paths of the files and folders that a scene folder consists of."""
         return [self.folder / name for name in sorted(SCENE_FILES | self._antenna_files)]
 
     def copy_antennas(self, folder: Path) -> None:
@@ -339,33 +343,31 @@ class Scene(Summarised):
             (folder / name).write_bytes(read_bytes(path, "file of a scene"))
 
     def _antenna_path(self, name: str) -> Path:
+        """Return the path of an antenna file; BadInput if it lies outside the folder."""
         return require_within(self.folder, self.folder / name, str(self.folder / "scene.toml"))
 
     def _pattern(self, name: str) -> Pattern:
         return read_pattern(self._antenna_path(name))
 
     def _check_devices(self) -> None:
-        """Raise BadInput if a device or an end of a flight is in a building or the ground."""
+        """Raise BadInput if a device, or a start or end of a flight, is indoors or underground."""
         path = self.folder / "scene.toml"
         for device, where in zip(self.config.devices, self.city.misplaced(self.device_m)):
+            if not where:
+                continue
             if where == "on a surface":
-                raise BadInput(
-                    f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
-                    f"{device.z_m:g}) m is on a surface of the city, from where rays would begin "
-                    "on either side of it; move it 0.01 m or more off the wall, roof or ground")
-            if where == "below the ground":
+                reason = ("on a surface of the city, from where rays would begin on either side of "
+                          "it; move it 0.01 m or more off the wall, roof or ground")
+            elif where == "below the ground":
                 ground_m = float(self.city.ground_height_m(device.x_m, device.y_m))
-                raise BadInput(
-                    f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
-                    f"{device.z_m:g}) m is below the ground, which is {ground_m:.1f} m above the "
-                    "datum there; z_m counts from the datum: raise it, or give above_ground_m "
-                    "instead")
-            if where:
+                reason = (f"below the ground, which is {ground_m:.1f} m above the datum there; z_m "
+                          "counts from the datum: raise it, or give above_ground_m instead")
+            else:
                 top_m = float(self.city.height_at(device.x_m, device.y_m))
-                raise BadInput(
-                    f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
-                    f"{device.z_m:g}) m is inside a building {top_m:.1f} m high; move it, or put "
-                    f"it on the roof (z_m > {top_m:.1f})")
+                reason = (f"inside a building {top_m:.1f} m high; move it, or put it on the roof "
+                          f"(z_m > {top_m:.1f})")
+            raise BadInput(f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
+                           f"{device.z_m:g}) m is {reason}")
         ends = [(uav, end, (x_m, y_m, self.altitude_m(x_m, y_m, uav.altitude_m)))
                 for uav in self.config.uavs
                 for end, x_m, y_m in (("start", uav.start_x_m, uav.start_y_m),
@@ -377,9 +379,9 @@ class Scene(Summarised):
                                f"is {where}; move it or raise altitude_m")
 
     def content_hash(self) -> str:
-        """Return the SHA-256 of all inputs of a gain map.
+        """Return the SHA-256 of everything that a traced map depends on.
 
-        These are geometry, materials, frequency, sensitivity, devices and antennas.
+        This is geometry, materials, frequency, power, sensitivity, devices and antennas.
 
         Raises:
             BadInput: A mesh outside the folder, or one that cannot be read.
@@ -387,9 +389,9 @@ class Scene(Summarised):
         digest = hashlib.sha256()
         meshes = sorted(path for path in self.folder.glob("meshes/*") if path.is_file())
         SHAPES.check(len(meshes), self.folder / "meshes")
-        usual = {path.resolve() for path in meshes}
+        in_meshes = {path.resolve() for path in meshes}
         elsewhere = sorted(path for path in mesh_paths(self.xml_path)
-                           if path.resolve() not in usual)
+                           if path.resolve() not in in_meshes)
         for path in (self.xml_path, *meshes, *elsewhere):
             require_within(self.folder, path, str(self.folder))
             name = os.path.relpath(path, self.folder) if path in elsewhere else path.name

@@ -1,4 +1,4 @@
-"""All triangles of a city in one array: their sense, the ground, and the edges where they meet."""
+"""`Surfaces`: all triangles of a city in one array; their orientation, ground faces, edges."""
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -7,9 +7,9 @@ import numpy as np
 
 from radiotwin.scene.meshes import WELD_M, connected
 
-FLAT_M = 0.5  # surfaces that differ by less than a kerb or a step are at one level [m]
-_MAX_WALL_COSINE = 0.3  # of a wall's normal to the vertical: walls lean by at most 17 degrees
-_MIN_GROUND_SHARE = 0.3  # of the city's plane that the ground covers
+FLAT_M = 0.5  # surfaces whose heights differ by less (a kerb, a step) are at one level [m]
+_MAX_WALL_COSINE = 0.3  # between normal and vertical: walls lean by at most 17 degrees
+_MIN_GROUND_SHARE = 0.3  # least share of the city's plan that the ground covers
 
 
 class Surfaces:
@@ -23,8 +23,8 @@ class Surfaces:
         faces: (f, 3) indices of vertices.
         shape: (f,) index of the mesh that each face belongs to.
         shapes: Number of meshes.
-        part: (f,) index of the connected part of its mesh, unique in the city.
-        parts: Number of connected parts.
+        part: (f,) index of the connected part that each face belongs to; a mesh may have several.
+        parts: Number of connected parts of all meshes.
     """
 
     def __init__(self, meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
@@ -57,14 +57,15 @@ class Surfaces:
 
     @cached_property
     def free_edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 2) edges of only one triangle of their mesh, and (n,) the faces they belong to."""
+        """(n, 2) edges with only one triangle, and (n,) the faces they belong to."""
         edges, owner = self._edges()
         _, inverse, counts = np.unique(_edge_keys(np.sort(edges, axis=1)), return_inverse=True,
                                        return_counts=True)
-        alone = counts[inverse] == 1
-        return edges[alone], owner[alone]
+        is_free = counts[inverse] == 1
+        return edges[is_free], owner[is_free]
 
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the (3 f, 2) directed edges of all faces, and (3 f,) the faces they belong to."""
         edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         return edges, np.repeat(np.arange(len(self.faces)), 3)
 
@@ -76,9 +77,9 @@ class Surfaces:
             yield slice(first, last), slice(start, end)
 
     def meshes(self, keep: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return (vertices, faces) of each mesh, of the faces to `keep`, (f,) bool; None: all.
+        """Return (vertices, faces) of each mesh, without unused vertices.
 
-        Meshes that keep none are left out.
+        `keep`, (f,) bool, are the faces to keep, None: all. Meshes without any are left out.
         """
         keep = np.ones(len(self.faces), dtype=bool) if keep is None else keep
         result = []
@@ -88,9 +89,9 @@ class Surfaces:
                 result.append((self.vertices[used], index.reshape(-1, 3)))
         return result
 
-    def turned(self, which: np.ndarray) -> "Surfaces":
-        """Return the surfaces with the faces `which`, (f,) bool, turned round."""
-        faces = np.where(which[:, None], self.faces[:, ::-1], self.faces)
+    def turned(self, reverse: np.ndarray) -> "Surfaces":
+        """Return the surfaces with the orientation of the faces `reverse`, (f,) bool, reversed."""
+        faces = np.where(reverse[:, None], self.faces[:, ::-1], self.faces)
         return Surfaces([(self.vertices[points], faces[rows] - points.start)
                          for rows, points in self._slices()])
 
@@ -122,7 +123,7 @@ class Surfaces:
 
     @cached_property
     def wall_share(self) -> np.ndarray:
-        """(parts,) share of each part's area that is upright."""
+        """(parts,) share of each part's area that is walls."""
         return self.part_sum(self.areas * self._upright) / self.part_sum(self.areas)
 
     @cached_property
@@ -133,7 +134,7 @@ class Surfaces:
         return closed
 
     def inconsistent_shapes(self) -> np.ndarray:
-        """Return the indices of meshes in which neighbouring triangles have opposite senses."""
+        """Return the indices of meshes with neighbouring triangles of opposite orientation."""
         edges, owner = self._edges()
         _, inverse, counts = np.unique(_edge_keys(edges), return_inverse=True, return_counts=True)
         _, pair, pairs = np.unique(_edge_keys(np.sort(edges, axis=1)), return_inverse=True,
@@ -141,11 +142,11 @@ class Surfaces:
         return np.unique(self.shape[owner[(counts[inverse] == 2) & (pairs[pair] == 2)]])
 
     def inward(self) -> np.ndarray:
-        """Return (f,) bool: faces to turn so that solids face outwards and sheets upwards.
+        """Return (f,) bool: faces to reverse so that solids face outwards and sheets upwards.
 
-        The flux of (x, y, 0) through a part is twice the volume it encloses, also where a flat
-        bottom is missing, as that would add nothing. Walls without a roof are judged together
-        within a mesh: those of a courtyard rightly face inwards, and alone would seem wrong.
+        The flux of (x, y, 0) through a part is twice the volume it encloses, even without a flat
+        bottom, which would add nothing. Walls without a roof are judged by the flux of their whole
+        mesh: those of a courtyard rightly face inwards.
         """
         middle = np.stack([self.part_sum(self.areas * axis) for axis in self.centres.T], axis=1)
         offset = self.centres - (middle / self.part_sum(self.areas)[:, None])[self.part]
@@ -161,12 +162,12 @@ class Surfaces:
         return (measure < -1e-6 * scale)[self.part]
 
     def ground_faces(self) -> np.ndarray:
-        """Return (f,) bool: faces of the ground (terrain, plane, streets), none if there is none.
+        """Return (f,) bool: faces of the ground (terrain, plane, streets).
 
-        Ground is a sheet or slab that covers at least 30 % of the city's plane and lies no higher
-        than half of the other parts reach, and the upward faces at the lowest level, if they cover
-        as much (they may be of one piece with buildings). Thin sheets at the level of a flat
-        ground belong to it.
+        Ground is a sheet or slab that covers at least 30 % of the city's plan, and whose mean
+        height is at most the median top of the other parts. Upward faces at the lowest level are
+        ground, too, if they cover as much (they may be connected to buildings). So are thin sheets
+        at the level of flat ground.
         """
         low, high = self.part_bounds()
         extent_m2 = np.prod(np.maximum((high.max(axis=0) - low.min(axis=0))[:2], 1e-9))
@@ -190,7 +191,7 @@ class Surfaces:
         return faces
 
     def level_m(self, faces: np.ndarray) -> float:
-        """Return the height that halves the upward area of the faces, (f,) bool, not none [m]."""
+        """Return the median height [m], weighted by area, of the faces (f,) bool that look up."""
         up = faces & (self.area_vectors[:, 2] > 0)
         up = up if up.any() else faces
         order = np.argsort(self.centres[up, 2])
@@ -198,7 +199,7 @@ class Surfaces:
         return float(self.centres[up, 2][order][np.searchsorted(area, area[-1] / 2)])
 
     def seams(self) -> np.ndarray:
-        """Return (n, 2) pairs of meshes: a roof of one meets a wall of the other in an edge."""
+        """Return (n, 2) pairs of meshes: a roof of one shares an edge with a wall of the other."""
         edges, owner = self.free_edges
         if len(edges) == 0:
             return np.zeros((0, 2), dtype=int)
@@ -215,5 +216,5 @@ class Surfaces:
 
 
 def _edge_keys(edges: np.ndarray) -> np.ndarray:
-    """Return one integer for each (a, b) of (n, 2) edges."""
+    """Return a unique integer (n,) for each edge of (n, 2) indices of vertices."""
     return edges[:, 0].astype(np.int64) << 32 | edges[:, 1].astype(np.int64)

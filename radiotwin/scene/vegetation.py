@@ -1,4 +1,4 @@
-"""Vegetation that a scene declares: prisms from the ground to the tree tops."""
+"""Vegetation that a scene declares, as prisms up to the tree tops, and path lengths through it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,17 +13,18 @@ from radiotwin.io.budgets import VEGETATION_CORNERS, VEGETATION_MEETINGS
 from radiotwin.io.forms import Metres, Number, Table
 
 KINDS = ("wood", "park", "tree_row")
-SAMPLE_M, SAMPLES_AT_ONCE = 2.0, 1_000_000  # of ways on a terrain
-SIDES_AT_ONCE, WORK_AT_ONCE = 64, 5_000_000  # of outlines; ways by corners: bound the memory
+SAMPLE_M = 2.0  # spacing of samples along links over terrain
+# These bound the memory: samples, sides of outlines, links times corners of outlines
+SAMPLES_AT_ONCE, SIDES_AT_ONCE, WORK_AT_ONCE = 1_000_000, 64, 5_000_000
 
 
 class VegetationConfig(Table):
     """One area of vegetation, declared in `scene.toml`.
 
     Attributes:
-        name: as in the map.
+        name: name in the map.
         kind: one of `KINDS`.
-        height_m: of the tree tops above the ground [m].
+        height_m: height of the tree tops above the ground [m].
         rings_m: x, y of the corners of the outline, then of each clearing [m].
     """
 
@@ -52,9 +53,9 @@ class Vegetation:
     """Areas of vegetation that do not overlap.
 
     Attributes:
-        areas: (k,) polygons [m]; where declared ones overlap, the higher one has it.
-        height_m: (k,) [m].
-        kind: (k,) of each, of `KINDS`.
+        areas: (k,) polygons [m]; where declared ones overlap, the higher one is kept.
+        height_m: (k,) heights of the tree tops above the ground [m].
+        kind: (k,) kinds, of `KINDS`.
     """
 
     areas: np.ndarray
@@ -63,23 +64,23 @@ class Vegetation:
 
     @classmethod
     def of(cls, declared: Sequence[VegetationConfig]) -> "Vegetation":
-        """Return declared areas without overlaps; an outline that crosses itself is taken apart.
+        """Make areas without overlaps from declared ones; self-crossing outlines are repaired.
 
         Raises:
-            BadInput: they have too many corners, or their outlines meet too often.
+            BadInput: the outlines have too many corners, or meet too often.
         """
-        _require_few_meetings([ring for each in declared for ring in each.rings_m])
+        _require_few_meetings([ring for config in declared for ring in config.rings_m])
         areas, heights_m, kinds = [], [], []
         taken: BaseGeometry = shapely.MultiPolygon()
-        for each in sorted(declared, key=lambda one: -one.height_m):
-            outline, *holes = each.rings_m
+        for config in sorted(declared, key=lambda one: -one.height_m):
+            outline, *holes = config.rings_m
             area = shapely.make_valid(shapely.Polygon(outline, holes))
             parts = [part for part in shapely.get_parts(shapely.get_parts(
                 shapely.difference(area, taken))) if part.geom_type == "Polygon"]
             taken = shapely.union(taken, area)
             areas += parts
-            heights_m += [each.height_m] * len(parts)
-            kinds += [each.kind] * len(parts)
+            heights_m += [config.height_m] * len(parts)
+            kinds += [config.kind] * len(parts)
         return cls(np.array(areas, dtype=object), np.array(heights_m, dtype=float),
                    np.array(kinds, dtype=str))
 
@@ -88,20 +89,26 @@ class Vegetation:
         return len(self.areas)
 
     def state(self) -> tuple[list[bytes], np.ndarray, list[str]]:
-        """Return all that decides the answers."""
+        """Return areas, heights and kinds, for a hash."""
         return [area.wkb for area in self.areas], self.height_m, self.kind.tolist()
 
     def of_kind(self, kind: str) -> "Vegetation":
         """Return the areas of one kind."""
-        own = self.kind == kind
-        return Vegetation(self.areas[own], self.height_m[own], self.kind[own])
+        is_kind = self.kind == kind
+        return Vegetation(self.areas[is_kind], self.height_m[is_kind], self.kind[is_kind])
 
     def metres_through(self, a_m: np.ndarray, b_m: np.ndarray,
                        ground: GroundHeight | None = None) -> np.ndarray:
-        """Return the length (n,) of each way from a to b, (n, 3), that is in vegetation [m].
+        """Return the length that straight links run through vegetation.
 
-        `ground` returns the heights (p,) of a terrain at x and y (p,) [m]; ways are then sampled
-        every `SAMPLE_M`. None: flat, at z = 0.
+        Args:
+            a_m: (n, 3) one end of each link [m].
+            b_m: (n, 3) other end [m].
+            ground: Function of x and y (p,) that returns the height (p,) of a terrain [m]; links
+                are then sampled every `SAMPLE_M`. None: flat ground at z = 0.
+
+        Returns:
+            (n,) lengths [m]
         """
         if ground is not None:
             return self._metres_on_terrain(a_m, b_m, ground)
@@ -113,45 +120,46 @@ class Vegetation:
             step = max(1, WORK_AT_ONCE // int(shapely.get_num_coordinates(areas).sum()))
             for start in range(0, len(rows), step):
                 part = slice(start, start + step)
-                flat = np.asarray(shapely.linestrings(
+                plan = np.asarray(shapely.linestrings(
                     np.stack([low_a_m[part, :2], low_b_m[part, :2]], axis=1)))
-                way, area = tree.query(flat, predicate="intersects")
-                flat_m = shapely.length(shapely.intersection(flat[way], areas[area]))
-                whole_m = shapely.length(flat[way])
-                long_m = np.linalg.norm(low_b_m[part] - low_a_m[part], axis=1)[way]
-                share = np.where(whole_m > 1e-6, flat_m / np.maximum(whole_m, 1e-6), 1.0)
-                np.add.at(through_m, rows[part][way], share * long_m)
+                link, area = tree.query(plan, predicate="intersects")
+                inside_m = shapely.length(shapely.intersection(plan[link], areas[area]))
+                plan_m = shapely.length(plan[link])
+                slant_m = np.linalg.norm(low_b_m[part] - low_a_m[part], axis=1)[link]
+                share = np.where(plan_m > 1e-6, inside_m / np.maximum(plan_m, 1e-6), 1.0)
+                np.add.at(through_m, rows[part][link], share * slant_m)
         return through_m
 
     def _metres_on_terrain(self, a_m: np.ndarray, b_m: np.ndarray,
                            ground: GroundHeight) -> np.ndarray:
+        """Return `metres_through` over terrain, from samples along each link."""
         through_m = np.zeros(len(a_m))
         if not len(self.areas):
             return through_m
         tree = shapely.STRtree(self.areas)
         length_m = np.linalg.norm(b_m - a_m, axis=1)
-        flat = shapely.linestrings(np.stack([a_m[:, :2], b_m[:, :2]], axis=1))
-        ways = np.unique(tree.query(flat, predicate="intersects")[0])
-        samples = np.maximum(np.ceil(length_m[ways] / SAMPLE_M), 1).astype(int)
-        parts = np.split(np.arange(len(ways)), np.flatnonzero(
+        plan = shapely.linestrings(np.stack([a_m[:, :2], b_m[:, :2]], axis=1))
+        links = np.unique(tree.query(plan, predicate="intersects")[0])
+        samples = np.maximum(np.ceil(length_m[links] / SAMPLE_M), 1).astype(int)
+        parts = np.split(np.arange(len(links)), np.flatnonzero(
             np.diff(np.cumsum(samples) // SAMPLES_AT_ONCE)) + 1)
         for part in parts:
             row = np.repeat(part, samples[part])
             first = np.cumsum(samples[part]) - samples[part]
             share = (np.arange(len(row)) - np.repeat(first, samples[part]) + 0.5) / samples[row]
-            way = ways[row]
-            at_m = a_m[way] + share[:, None] * (b_m[way] - a_m[way])
+            link = links[row]
+            at_m = a_m[link] + share[:, None] * (b_m[link] - a_m[link])
             above_m = at_m[:, 2] - ground(at_m[:, 0], at_m[:, 1])
             low = np.flatnonzero((above_m >= 0) & (above_m <= self.height_m.max()))
             point, area = tree.query(shapely.points(at_m[low, :2]), predicate="intersects")
             inside = above_m[low[point]] <= self.height_m[area]
             hit = np.unique(low[point[inside]])  # on the border of two areas: once
-            np.add.at(through_m, way[hit], (length_m[ways] / samples)[row[hit]])
+            np.add.at(through_m, link[hit], (length_m[links] / samples)[row[hit]])
         return through_m
 
 
 def _require_few_meetings(rings: list) -> None:
-    """Check, before geometry is computed from rings, how many corners and meetings they have."""
+    """Raise BadInput if rings have too many corners, or sides that meet, for shapely to process."""
     corners = sum(map(len, rings))
     VEGETATION_CORNERS.check(corners, "the vegetation")
     if not corners:
@@ -163,15 +171,17 @@ def _require_few_meetings(rings: list) -> None:
 
 
 def count_meetings(sides: np.ndarray, at_once: int, check: Callable[[int], None]) -> int:
-    """Count how often sides (n,) of rings meet others than those beside them.
+    """Count the pairs of sides (n,) of rings that meet, without neighbours along a ring.
 
-    Pairs of `at_once` lines are found at once, which bounds the memory; `check` is called with the
-    count so far, and raises an exception to end the search.
+    Args:
+        sides: (n,) lines.
+        at_once: Number of sides that are queried at once; bounds the memory.
+        check: Called with the count so far; may raise an exception to stop.
     """
     tree, found = shapely.STRtree(sides), 0
     for start in range(0, len(sides), at_once):
         part = sides[start:start + at_once]
-        # Each meets itself and the two beside it; both of a pair find it
+        # A side meets itself and its two neighbours; a pair is found from both sides
         found += max(tree.query(part, predicate="intersects").shape[1] - 3 * len(part), 0)
         check(found // 2)
     return found // 2
@@ -179,7 +189,11 @@ def count_meetings(sides: np.ndarray, at_once: int, check: Callable[[int], None]
 
 def _below(a_m: np.ndarray, b_m: np.ndarray,
            height_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which ways (m,) have a part between the ground and a height, and its ends (m, 3)."""
+    """Cut links (a, b) to their parts between z = 0 and a height.
+
+    Returns:
+        (m,) rows of the links that have such a part, and (m, 3) both ends of it [m].
+    """
     rise_m = b_m[:, 2] - a_m[:, 2]
     flat = np.abs(rise_m) < 1e-9
     slope = np.where(flat, 1.0, rise_m)
@@ -188,5 +202,5 @@ def _below(a_m: np.ndarray, b_m: np.ndarray,
     last = np.where(flat, 1.0, np.clip(np.maximum(at_top, at_ground), 0.0, 1.0))
     level = flat & (a_m[:, 2] >= 0) & (a_m[:, 2] <= height_m)
     rows = np.flatnonzero(np.where(flat, level, last > first))
-    way_m = (b_m - a_m)[rows]
-    return rows, a_m[rows] + first[rows, None] * way_m, a_m[rows] + last[rows, None] * way_m
+    link_m = (b_m - a_m)[rows]
+    return rows, a_m[rows] + first[rows, None] * link_m, a_m[rows] + last[rows, None] * link_m

@@ -17,7 +17,7 @@ from radiotwin.propagation.laws.published import MAX_FACTOR, PublishedLaw
 from radiotwin.runtime.execution import Executor, Job, Resources
 from radiotwin.runtime.pieces import with_pieces
 from radiotwin.scene import Scene
-from radiotwin.scene.footing import standing
+from radiotwin.scene.footing import moved_outdoors
 from radiotwin.twin import Twin, fit_twin
 
 # Models that are compared unless others are named.
@@ -332,7 +332,7 @@ def _los(scene: Scene, true_m: dict, links: Measurements) -> np.ndarray:
     """Return (n,) 1 with LoS, 0 without, NaN where the true position is unknown."""
     position_m = np.array([true_m.get(name, (np.nan,) * 3) for name in links.devices["device"]])
     placed = np.isfinite(position_m).all(axis=1)
-    position_m[placed] = standing(scene.city, position_m[placed])  # as the twins have them
+    position_m[placed] = moved_outdoors(scene.city, position_m[placed])  # as the twins have them
     device_m = position_m[links.device_index]
     los = np.full(len(device_m), np.nan)
     known = np.isfinite(device_m).all(axis=1)

@@ -27,7 +27,7 @@ from radiotwin.display import (
 )
 from radiotwin.effects.base import Effect
 from radiotwin.errors import BadInput
-from radiotwin.geo import is_same_frame, place, with_places
+from radiotwin.geo import is_same_frame, origin_text, with_coordinates
 from radiotwin.inference.student import sd_of_scale
 from radiotwin.io.files import atomic_folder
 from radiotwin.io.forms import Origin
@@ -151,7 +151,7 @@ class Twin(Summarised):
         rows = [(each.device, each.role, each.located, each.credible_radius_m)
                 for each in self.devices]
         table = pd.DataFrame(rows, columns=["device", "role", "located", "radius_m"])
-        return with_places(table, self.device_m, self.origin)
+        return with_coordinates(table, self.device_m, self.origin)
 
     @property
     def channel(self) -> ChannelModel:
@@ -507,8 +507,9 @@ class Twin(Summarised):
         """
         own, other = self.origin, scene.config.origin
         if own is not None and other is not None and not is_same_frame(own, other):
-            raise BadInput(f"the twin is in the frame about {place(own)}, the scene {scene.folder} "
-                           f"in that about {place(other)}: positions would be elsewhere; build the "
+            raise BadInput(f"the twin is in the frame about {origin_text(own)}, the scene "
+                           f"{scene.folder} in that about {origin_text(other)}: positions would be "
+                           "elsewhere; build the "
                            f"scene with --origin {own.latitude_deg:.10g},{own.longitude_deg:.10g}"
                            f",{own.altitude_m:g}, or fit again with this one")
 

@@ -29,7 +29,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.folder import CityShape, write_city
-from radiotwin.scene.materials import STANDARD, itu_material, with_pairs
+from radiotwin.scene.materials import STANDARD, itu_material, with_materials
 from radiotwin.scene.plot import draw_preview
 from radiotwin.scene.readers import MapOptions, build_scene_from_map
 from radiotwin.trace import SolverSettings, trace_gains
@@ -103,7 +103,7 @@ def test_roofs_that_are_off_are_raised_and_lowered_and_the_table_follows(tmp_pat
         {"type": "Feature", "properties": {"height": height}, "geometry": {"type": "Polygon", "coordinates": [
             [[east, 47.0], [east + 3e-4, 47.0], [east + 3e-4, 47.0002], [east, 47.0002], [east, 47.0]]]}}
         for east, height in ((8.0, 12), (8.001, 20), (8.002, None))]}))
-    materials = STANDARD if roof == "default" else with_pairs(STANDARD, {"roof": roof})
+    materials = STANDARD if roof == "default" else with_materials(STANDARD, {"roof": roof})
     build_scene_from_map(tmp_path / "town.geojson", tmp_path / "scene",
                          MapOptions(default_height_m=9.0, materials=materials), BuildOptions())
     scene = Scene.load(tmp_path / "scene")

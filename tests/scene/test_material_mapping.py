@@ -3,11 +3,11 @@ import pytest
 from radiotwin.errors import BadInput
 from radiotwin.scene.materials import (
     Material,
+    Names,
     itu_material,
     map_materials,
     safe_name,
-    settle,
-    unique_name,
+    traceable_materials,
 )
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 
@@ -167,16 +167,16 @@ def test_safe_name(text, safe):
     assert safe_name(text) == safe
 
 
-def test_unique_name_counts_and_minds_case():
-    taken = {"wall"}
-    assert [unique_name("Wall", taken) for _ in range(2)] == ["Wall_2", "Wall_3"]
+def test_unique_names_differ_in_more_than_case():
+    taken = Names(["wall"])
+    assert [taken.unique("Wall") for _ in range(2)] == ["Wall_2", "Wall_3"]
 
 
-def test_settle_names_what_is_out_of_range():
+def test_materials_become_traceable_with_unique_names_and_a_warning_out_of_range():
     concrete, thick = itu_material("concrete"), itu_material("concrete", thickness_m=0.5)
-    written, problems = settle([concrete, thick, concrete], 5e9, {"concrete"})
+    written, problems = traceable_materials([concrete, thick, concrete], 5e9, Names(["concrete"]))
     assert {written[concrete].name, written[thick].name} == {"concrete_2", "concrete_3"} and not problems
-    written, problems = settle([concrete], 700e6, set())
+    written, problems = traceable_materials([concrete], 700e6, Names())
     assert written[concrete].relative_permittivity == 5.24
     assert problems[0].severity == "warning" and "1-100 GHz" in problems[0].message
     assert "5.24" in problems[0].message and "0.0462" in problems[0].message

@@ -165,7 +165,7 @@ def test_strips_and_fans(tmp_path):
 
 BAD_GLTF = {
     "asset__version": ("1.0", "its version is '1.0'"), "accessors__0__count": (10**9, "claims 1000000000 values"),
-    "accessors__0__byteOffset": (-12, "which are not there"), "bufferViews__0__byteStride": (0.5, "which are not there"),
+    "accessors__0__byteOffset": (-12, "more than the buffer holds"), "bufferViews__0__byteStride": (0.5, "more than the buffer holds"),
     "accessors__0__sparse": ({}, "is sparse"), "accessors__0__componentType": (5125, "component type 5125"),
     "nodes__0__children": ([0], "node 0 stands in its graph twice"), "scenes__0__nodes": ([0, 0], "twice"),
     "scenes__0__nodes__0": (-1, "is no index of nodes"), "nodes__0__mesh": (7, "not a readable glTF"),

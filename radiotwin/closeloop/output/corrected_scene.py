@@ -25,7 +25,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, write_config
 from radiotwin.scene.folder import SCENE_FILES, CityShape, check_target, read_city, write_city
-from radiotwin.scene.materials import itu_material, safe_name, traceable, unique_name
+from radiotwin.scene.materials import Names, itu_material, safe_name, traceable
 from radiotwin.scene.plot import draw_preview
 from radiotwin.scene.streets import STREETS
 
@@ -77,9 +77,9 @@ def with_antennas(config: SceneConfig, found: Sequence[Correction], links: Links
                                " has devices above z = 0, whose names are of letters, digits and "
                                "_.+-")
                 continue
-        others = {Path(each.antenna).stem.lower() for each in devices.values()
-                  if each.antenna is not None and each.device != name}
-        file = f"{ANTENNAS}/{unique_name(f'found_{safe_name(name)}', others)}.csv"
+        others = Names(Path(each.antenna).stem.lower() for each in devices.values()
+                       if each.antenna is not None and each.device != name)
+        file = f"{ANTENNAS}/{others.unique(f'found_{safe_name(name)}')}.csv"
         azimuth_deg = round(antenna.azimuth_deg % 360, DECIMALS)
         devices[name] = device.model_copy(update={
             "antenna": file, "azimuth_deg": azimuth_deg, "tilt_deg": None})
@@ -312,7 +312,7 @@ def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
             used, faces = np.unique(shape.mesh.faces[own], return_inverse=True)
             mesh = trimesh.Trimesh(shape.mesh.vertices[used], faces.reshape(-1, 3), process=False)
             shapes.append(replace(shape, mesh=mesh))
-    taken = {name.lower() for shape in shapes for name in (shape.name, shape.material.name)}
+    taken = Names(name.lower() for shape in shapes for name in (shape.name, shape.material.name))
     write_city(folder, [*shapes, *_box_shapes(scene, boxes, taken)])
     return shapes_of, {shape.name for shape in shapes}
 
@@ -332,9 +332,9 @@ def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof],
     return trimesh.Trimesh(vertices_m, mesh.faces, process=False)
 
 
-def _box_shapes(scene: Scene, boxes: list[Box], taken: set[str]) -> list[CityShape]:
+def _box_shapes(scene: Scene, boxes: list[Box], taken: Names) -> list[CityShape]:
     """Return shapes from the lowest point of the map up, with names that are not `taken`."""
-    name = unique_name(f"found_{BOX_MATERIAL}", taken)
+    name = taken.unique(f"found_{BOX_MATERIAL}")
     material = traceable(itu_material(BOX_MATERIAL, name=name), scene.config.radio.frequency_hz)
     bottom_m = min(float(scene.city.vertices[:, 2].min()), 0.0)
     shapes = []
@@ -343,5 +343,5 @@ def _box_shapes(scene: Scene, boxes: list[Box], taken: set[str]) -> list[CitySha
         top_m = float(scene.city.ground_height_m(box.x_m, box.y_m)) + box.height_m
         turned[:3, 3] = box.x_m, box.y_m, 0.5 * (bottom_m + top_m)
         mesh = trimesh.creation.box((box.length_m, box.width_m, top_m - bottom_m), turned)
-        shapes.append(CityShape(unique_name("found_box", taken), mesh, material))
+        shapes.append(CityShape(taken.unique("found_box"), mesh, material))
     return shapes

@@ -9,7 +9,7 @@ from radiotwin.io.forms import Origin, as_origin
 from radiotwin.scene.build import BuildOptions, BuildReport
 from radiotwin.scene.build import build_scene as build_from_city
 from radiotwin.scene.folder import MAP_SUFFIXES, scene_name
-from radiotwin.scene.materials import STANDARD, MaterialTable, read_material_table, with_pairs
+from radiotwin.scene.materials import STANDARD, MaterialTable, read_material_table, with_materials
 from radiotwin.scene.presets import build_preset_scene
 from radiotwin.scene.readers.build import MapOptions, build_scene_from_map, map_name, map_suffix
 from radiotwin.scene.readers.heights import HeightColumn, declared_column
@@ -123,7 +123,7 @@ def _material_table(table: MaterialTable | Path | str | None,
                     pairs: Mapping[str, str]) -> MaterialTable:
     if not isinstance(table, MaterialTable):
         table = STANDARD if table is None else read_material_table(Path(table))
-    return with_pairs(table, dict(pairs))
+    return with_materials(table, dict(pairs))
 
 
 def _download(path: Path | str, bbox_deg: tuple[float, float, float, float] | None) -> None:

@@ -27,7 +27,6 @@ from radiotwin.scene.materials import (
     Names,
     itu_material,
     safe_name,
-    unique_name,
 )
 from radiotwin.scene.placement import choose_extent, make_extent
 from radiotwin.scene.readers.citygml import read_citygml
@@ -466,14 +465,14 @@ def _city(
     taken = Names({*RESERVED_NAMES, GROUND})
     shape_of: dict[int, str] = {}
     for block in make_blocks(prisms, contacts):
-        name = unique_name(safe_name(prisms[block.members[0]].name), taken)
+        name = taken.unique(safe_name(prisms[block.members[0]].name))
         shape_of |= dict.fromkeys(block.members, name)
         walls, roof = split_roof(block.mesh) if table.roof else (block.mesh, None)
         names.append(name)
         materials.append(block.material)
         meshes.append((np.asarray(walls.vertices), np.asarray(walls.faces)))
         if roof is not None:
-            names.append(unique_name(f"{name}_roof", taken))
+            names.append(taken.unique(f"{name}_roof"))
             materials.append(itu_material(table.roof or ""))
             meshes.append((np.asarray(roof.vertices), np.asarray(roof.faces)))
     surfaces = Surfaces(meshes)

@@ -129,9 +129,9 @@ def test_only_a_scene_is_replaced(tmp_path, empty_map):
 
 def test_the_table_of_materials_is_used(tmp_path):
     from radiotwin.scene.materials import STANDARD
-    from radiotwin.scene.readers import with_pairs
+    from radiotwin.scene.readers import with_materials
 
-    options = MapOptions(materials=with_pairs(STANDARD, {"straw": "itu_wood", "ground": "wet_ground"}))
+    options = MapOptions(materials=with_materials(STANDARD, {"straw": "itu_wood", "ground": "wet_ground"}))
     report = build_scene_from_map(TOWN, tmp_path / "unused", options, check_only=True)
     assert {use.name: use.shapes for use in report.materials}["wood"] == 2
     assert "wet_ground" in {use.name for use in report.materials} and not (tmp_path / "unused").exists()

@@ -17,7 +17,7 @@ from radiotwin.io.budgets import TAG_BYTES, VERTICES
 from radiotwin.io.forms import Origin
 from radiotwin.scene import Scene
 from radiotwin.scene.materials import STANDARD
-from radiotwin.scene.readers import MapOptions, build_scene_from_map, with_pairs
+from radiotwin.scene.readers import MapOptions, build_scene_from_map, with_materials
 from radiotwin.scene.readers.citygml import read_citygml
 from radiotwin.scene.readers.extrude import make_blocks
 from radiotwin.scene.readers.gis_files import read_json_map
@@ -335,7 +335,7 @@ def test_budgets(tmp_path, monkeypatch):
 
 
 def test_roofs_of_a_material_of_their_own(tmp_path):
-    options = MapOptions(materials=with_pairs(STANDARD, {"roof": "metal"}))
+    options = MapOptions(materials=with_materials(STANDARD, {"roof": "metal"}))
     report = build_scene_from_map(write(tmp_path, made.cityjson(HOUSES)), tmp_path / "out", options)
     assert {use.name: use.shapes for use in report.materials} == {"concrete": 2, "metal": 2, "asphalt_concrete": 1}
     assert dict(report.facts)["buildings"] == "3 in 2 blocks"

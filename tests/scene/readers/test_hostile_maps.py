@@ -11,7 +11,7 @@ import shapely
 
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.io.budgets import CROSSINGS, OUTLINE_CORNERS, OVERLAPS, TOUCHING_CORNERS
-from radiotwin.scene.materials import Names, unique_name
+from radiotwin.scene.materials import Names
 from radiotwin.scene.readers import build_scene_from_map, overpass
 from radiotwin.scene.readers.gis_files import _other_tags, read_geopackage
 from radiotwin.scene.readers.osm import stitch
@@ -97,7 +97,7 @@ def test_many_ways_that_meet_in_one_node():
 
 def test_equal_names_are_numbered_in_one_pass():
     taken = Names(["a_3"])
-    names = [unique_name("A", taken) for _ in range(50_000)]
+    names = [taken.unique("A") for _ in range(50_000)]
     assert names[:4] == ["A", "A_2", "A_4", "A_5"] and len(set(names)) == 50_000
 
 

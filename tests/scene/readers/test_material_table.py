@@ -1,7 +1,7 @@
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.materials import ITU_TABLE, STANDARD, read_material_table, with_pairs
+from radiotwin.scene.materials import ITU_TABLE, STANDARD, read_material_table, with_materials
 
 
 def of(table, **tags):
@@ -36,7 +36,7 @@ def test_a_users_table_goes_first(tmp_path):
 
 
 def test_pairs_of_the_command_line():
-    table = with_pairs(STANDARD, {"straw": "wood", "default": "brick", "ground": "wet_ground"})
+    table = with_materials(STANDARD, {"straw": "wood", "default": "brick", "ground": "wet_ground"})
     assert of(table, building__material="straw")[0] == "wood" and table.ground == "wet_ground"
     assert table.unknown({"building:material": "straw"}) is None
     assert STANDARD.unknown({"building:material": "straw"}) == "straw"
