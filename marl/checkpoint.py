@@ -9,6 +9,7 @@ this run would have written, before it is used. Compiled code checks no index.
 
 import json
 import math
+import sys
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 from numpy.typing import ArrayLike
 
 from marl.environment import ACTION_COUNT, feasible
@@ -80,6 +80,12 @@ def refusing(path: Path) -> Iterator[None]:
                        "the run's folder and start again") from None
 
 
+def _is_tensor(value: Any) -> bool:
+    """Return whether a value is a tensor of torch, which is imported only where there are any."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
 def _packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     """Return a value as JSON has it, and add its arrays to `arrays`."""
     if isinstance(value, pd.DataFrame):
@@ -88,7 +94,7 @@ def _packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         return {"$table": _packed(columns, arrays)}
     if isinstance(value, np.generic):
         value = value.item()
-    if isinstance(value, torch.Tensor):
+    if _is_tensor(value):
         return {"$tensor": _packed(value.detach().cpu().numpy(), arrays)["$array"]}
     if isinstance(value, np.ndarray):
         name = str(len(arrays))
@@ -114,6 +120,8 @@ def _unpacked(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     if "$array" in value:
         return arrays.pop(value["$array"])
     if "$tensor" in value:
+        import torch
+
         return torch.from_numpy(arrays.pop(value["$tensor"]).copy())
     if "$number" in value:
         return {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}[value["$number"]]
@@ -168,8 +176,8 @@ def require(value: Any, form: Any, what: str = "the state") -> Any:
             if type(value) is not int or value not in form:
                 raise Damaged(f"{what}, {str(value)[:40]}, should be a whole number from "
                               f"{form[0]} to {form[-1]}")
-        case torch.Tensor():
-            if not isinstance(value, torch.Tensor) or value.dtype != form.dtype \
+        case _ if _is_tensor(form):
+            if not _is_tensor(value) or value.dtype != form.dtype \
                     or value.shape != form.shape or not value.isfinite().all():
                 raise Damaged(f"{what} should be finite, of the shape {tuple(form.shape)}")
         case Within(like=like):

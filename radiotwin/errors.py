@@ -12,6 +12,10 @@ class BadInput(Exception):
     """
 
 
+class MissingPackage(BadInput):
+    """What was asked for needs a package that is not installed; the message says which extra."""
+
+
 class RunFailed(Exception):
     """Valid input on which the work could not be done: exit status 1."""
 
@@ -24,9 +28,9 @@ def optional_package(name: str, message: str) -> Any:
         message: what needs it, and how to install it or do without.
 
     Raises:
-        BadInput: it is not installed.
+        MissingPackage: it is not installed.
     """
     try:
         return import_module(name)
     except ImportError:
-        raise BadInput(message) from None
+        raise MissingPackage(message) from None

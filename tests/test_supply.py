@@ -1,12 +1,17 @@
 """What is installed, and what SECURITY.md promises about it."""
 
 import re
+import subprocess
+import sys
 import tomllib
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
 
+from radiotwin.errors import MissingPackage
 from radiotwin.io import budgets
+from radiotwin.trace import SolverSettings, mended
 
 ROOT = Path(__file__).parents[1]
 
@@ -79,3 +84,40 @@ def test_nothing_takes_packages_from_two_indexes():
     for name in ("README.md", "Makefile", "SECURITY.md", "CONTRIBUTING.md"):
         lines = [line for line in (ROOT / name).read_text().splitlines() if "--extra-index-url " in line]
         assert not lines, name
+
+
+WITHOUT_EXTRAS = """
+import sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {"torch", "tensorboard", "sionna", "mitsuba", "drjit", "pythreejs"}:
+            raise ModuleNotFoundError(f"No module named {name!r}")
+
+sys.meta_path.insert(0, Absent())
+import radiotwin
+for name in radiotwin.__all__:
+    getattr(radiotwin, name)
+import radiotwin.cli.commands
+import marl.plan_flights, marl.plan_output
+from radiotwin.errors import MissingPackage
+from radiotwin.propagation.laws import channel_named
+try:
+    channel_named("segmented_nn")().fit(None, None, None)
+except MissingPackage as error:
+    print(error)
+"""
+
+
+def test_without_torch_and_sionna_rt_everything_is_imported_and_the_network_names_its_extra():
+    done = subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], capture_output=True, text=True, timeout=300, check=True)
+    assert "pip install 'radiotwin[nn]'" in done.stdout
+
+
+def test_tracing_without_sionna_rt_names_its_extra(monkeypatch):
+    def absent(name):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(mended, "version", absent)
+    with pytest.raises(MissingPackage, match=re.escape("pip install 'radiotwin[trace]'")):
+        SolverSettings()

@@ -12,7 +12,7 @@ import typer
 
 from marl.fedqmix.settings import FederationSettings
 from marl.settings import LearnerSettings, RunSettings, checked, settings_of, with_settings
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.runtime.command import exit_status, with_output_options
 from radiotwin.runtime.console import say, show_warnings_plainly
 
@@ -34,6 +34,9 @@ def fedqmix(
     is that of the preset fast.
     """
     show_warnings_plainly()
+    for package in ("torch", "tensorboard"):
+        optional_package(package, f"training needs {package}, which is not installed; install it "
+                                  "with `pip install 'radiotwin[train]'`")
     run, learner = settings_of(given)
     federation = checked(given, FederationSettings())
     name = f"{run.scene.name}-{run.truth}-{run.twin}-{run.algorithm}-{run.seed}"

@@ -7,10 +7,12 @@ import shutil
 import sys
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.util import find_spec
 from pathlib import Path
 
 from rich.console import Console
 
+from radiotwin.errors import MissingPackage
 from radiotwin.runtime import cuda, llvm
 from radiotwin.runtime.cuda import FREE_SPACE_GAIN_DB, TrialFailed, trace_trial_link
 from radiotwin.runtime.processes import usable_cores
@@ -53,6 +55,10 @@ def diagnose() -> Diagnosis:
     diagnosis.sections["Machine"] = _check_machine(diagnosis)
     diagnosis.sections["GPU"] = _check_gpu()
     diagnosis.sections["Packages"] = _check_packages(diagnosis)
+    if find_spec("sionna") is None:
+        diagnosis.sections["Tracing"] = [
+            ("Sionna RT", "not installed: pip install 'radiotwin[trace]'; everything else works")]
+        return diagnosis
     diagnosis.sections["libLLVM"] = _check_llvm(diagnosis)
     diagnosis.sections["Tracing"] = (
         _check_tracing(diagnosis) if llvm.available()
@@ -114,6 +120,8 @@ def _check_gpu() -> Rows:
     for work, refusal in (("tracing", cuda.tracing_refusal), ("training", cuda.torch_refusal)):
         try:
             reason = refusal()
+        except MissingPackage as error:
+            reason = str(error)
         except (ImportError, OSError) as error:
             reason = f"torch cannot be imported: {error}"
         rows.append((work, f"on the processor: {reason}" if reason else "on the GPU"))

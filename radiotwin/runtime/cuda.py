@@ -16,7 +16,7 @@ from typing import Literal, cast
 
 from scipy.constants import speed_of_light
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 
 TIMEOUT_S = 120  # a first run compiles its kernels
 TOLERANCE_DB = 0.01
@@ -131,8 +131,7 @@ def tracing_refusal() -> str | None:
 @cache
 def torch_refusal() -> str | None:
     """Return why PyTorch cannot train on a GPU, None if it can: one product is tried."""
-    import torch  # takes seconds
-
+    torch = optional_package("torch", "torch is not installed (`pip install 'radiotwin[nn]'`)")
     if not torch.cuda.is_available():
         return (NO_DRIVER if not has_driver() else
                 f"torch {torch.__version__} finds none (a build without CUDA, or the driver)")

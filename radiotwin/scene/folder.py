@@ -259,7 +259,7 @@ def find_source(source: Path | str) -> Path:
         scenes = sionna_scenes()
         if not scenes:
             raise BadInput(f"{text}: no scenes of sionna-rt were found; install it with "
-                           "`pip install sionna-rt`")
+                           "`pip install 'radiotwin[trace]'`")
         name = text.removeprefix("sionna:")
         if name not in scenes:
             raise BadInput(f"{text}: sionna-rt has no scene {name!r}; it has: {', '.join(scenes)}")

@@ -26,8 +26,10 @@ Three faults are mended, for the time of a call:
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Literal
+
+from radiotwin.errors import MissingPackage
 
 KNOWN_VERSION = "2.2.0"
 
@@ -35,8 +37,16 @@ _SERIES_FROM = 20.0  # argument of the transition function; above, Sionna RT's l
 
 
 def installed_version() -> str:
-    """Return the version of Sionna RT that is installed."""
-    return version("sionna-rt")
+    """Return the version of Sionna RT that is installed.
+
+    Raises:
+        MissingPackage: none is.
+    """
+    try:
+        return version("sionna-rt")
+    except PackageNotFoundError:
+        raise MissingPackage("tracing rays needs Sionna RT, which is not installed; install it "
+                             "with `pip install 'radiotwin[trace]'`") from None
 
 
 def default_diffraction() -> Literal["reciprocal", "sionna"]:

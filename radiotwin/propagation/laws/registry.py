@@ -10,7 +10,7 @@ import json
 
 import numpy as np
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, MissingPackage
 from radiotwin.inference.gaussian import Limit
 from radiotwin.io.array_file import pack_arrays, parse_arrays
 from radiotwin.io.inputs import parse_json
@@ -118,6 +118,7 @@ def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np
 
     Raises:
         BadInput: it is damaged, of a model that is not installed, or of something else.
+        MissingPackage: the model needs a package that is not installed.
     """
     models = channel_models()
     try:
@@ -135,6 +136,8 @@ def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np
         if type(model) in BUILT_IN:  # one of a package's own may need a map
             _try_to_predict(model)
         return model, beside
+    except MissingPackage:
+        raise
     except (BadInput, LookupError, ValueError, TypeError, AttributeError, ArithmeticError,
             RuntimeError) as error:
         raise BadInput(f"{source}: not a whole channel model of one of {', '.join(models)} "

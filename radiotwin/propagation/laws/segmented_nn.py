@@ -9,16 +9,15 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-import torch
 from typing_extensions import override
 
+from radiotwin.errors import optional_package
 from radiotwin.inference.gaussian import Limit, fit_sd_db, gaussian_nll_torch
 from radiotwin.inference.held_out import deal_groups
 from radiotwin.links import LinkGeometry
-from radiotwin.propagation.laws.adam import Adam
 from radiotwin.propagation.laws.base import (
     MAX_DB,
     MAX_POSITION_M,
@@ -30,6 +29,9 @@ from radiotwin.propagation.laws.base import (
 )
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.runtime.console import progress
+
+if TYPE_CHECKING:  # an extra, which takes seconds to load
+    import torch
 
 WEIGHTS = ("w1", "b1", "w2", "b2", "w3", "b3")  # names of the tensors, as stored
 INPUTS = 4  # see TrainingData.inputs
@@ -67,12 +69,21 @@ class TrainingData:
     fold: np.ndarray
 
 
+def _torch() -> Any:
+    """Return the module torch; raise BadInput where it is not installed."""
+    return optional_package(
+        "torch", "the channel model segmented_nn needs torch, which is not installed; install it "
+                 "with `pip install 'radiotwin[nn]'`, or take another --model")
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Restrict torch to one thread, so that sums have one order and repeat bit for bit.
 
     The layers are too small to gain by more threads.
     """
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -86,6 +97,8 @@ def forward(weights: dict[str, torch.Tensor], inputs: torch.Tensor) -> torch.Ten
 
     Two tanh layers and a linear one. Weights are by the names in WEIGHTS, inputs (n, INPUTS).
     """
+    import torch
+
     hidden = torch.tanh(torch.baddbmm(weights["b1"], inputs.expand(MEMBERS, -1, -1), weights["w1"]))
     hidden = torch.tanh(torch.baddbmm(weights["b2"], hidden, weights["w2"]))
     return torch.baddbmm(weights["b3"], hidden, weights["w3"])[..., 0]
@@ -93,6 +106,8 @@ def forward(weights: dict[str, torch.Tensor], inputs: torch.Tensor) -> torch.Ten
 
 def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
     """Return random hidden layers and an output of zero: every member starts as the line."""
+    import torch
+
     shapes = {"w1": (INPUTS, HIDDEN), "w2": (HIDDEN, HIDDEN)}
     weights = {
         name: torch.randn((MEMBERS, *shape), generator=generator) / shape[0] ** 0.5
@@ -116,6 +131,10 @@ def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.nda
         weights by name, (MEMBERS, ...) each, and for every link the output (n,) of the member that
         it was held out from.
     """
+    import torch
+
+    from radiotwin.propagation.laws.adam import Adam
+
     generator = torch.Generator().manual_seed(seed)
     inputs = torch.as_tensor(data.inputs, dtype=torch.float32)
     target = torch.as_tensor(data.target, dtype=torch.float32)
@@ -200,6 +219,7 @@ class SegmentedNN(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
+        _torch()
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         law_db, law_sd_db = self.law.predict(links)
@@ -263,6 +283,7 @@ class SegmentedNN(ChannelModel):
 
     def _tabulate(self) -> None:
         """Tabulate the ensemble's mean residual [dB] over each class's box, (2, TABLE, TABLE)."""
+        torch = _torch()
         weights = {name: torch.as_tensor(array) for name, array in self.weights.items()}
         self._table = np.zeros((2, TABLE, TABLE))
         for s, line in enumerate((self.law.nlos, self.law.los)):
