@@ -1,9 +1,9 @@
-"""Loss along terrain and around the Earth: the delta-Bullington method of ITU-R P.526-15 [1].
+"""Diffraction loss over terrain and the curved Earth: delta-Bullington of ITU-R P.526-15 [1].
 
-It is for links that no path over the map reaches because the ground is in the way, and for those so
-long that the Earth's curvature counts. All obstacles of the profile, ground and roofs, are replaced
-by one knife edge where the horizons of both ends meet (Bullington), with an empirical correction
-for what several or rounded obstacles lose on top; what a smooth Earth loses beyond that is added.
+It is for links that the ground blocks and no path over the map reaches, and for links so long that
+the Earth's curvature matters. All obstacles of the profile, ground and roofs, are replaced by one
+knife edge where the horizons of both ends meet (Bullington), with an empirical correction for
+multiple or rounded obstacles; the excess loss over a smooth Earth is added.
 
 [1] Recommendation ITU-R P.526-15, "Propagation by diffraction", 2019.
 """
@@ -17,21 +17,21 @@ from scipy.constants import speed_of_light
 from radiotwin.scene.citymap import EARTH_RADIUS_M, FAR_M, CityMap
 
 STEP_M = 2.5  # between the points of a profile, up to 5 km
-POINTS = (64, 128, 256, 512, 1024, 2048)  # of a profile
-CHUNK_POINTS = 500_000  # of profiles at a time: about 100 MB
-MIN_HEIGHT_M = 0.1  # of an end above the smooth Earth
-PERMITTIVITY, CONDUCTIVITY_S_M = 22.0, 0.003  # of land (section 3.1.1.1)
+POINTS = (64, 128, 256, 512, 1024, 2048)  # allowed numbers of points of a profile
+CHUNK_POINTS = 500_000  # points of profiles at a time: about 100 MB
+MIN_HEIGHT_M = 0.1  # least antenna height above the smooth Earth
+PERMITTIVITY, CONDUCTIVITY_S_M = 22.0, 0.003  # of land ([1], section 3.1.1.1)
 
 
 class Profiles(NamedTuple):
-    """Profiles between the ends of n links; heights are above the datum.
+    """Terrain profiles of n links; heights are above the datum.
 
     Attributes:
-        length_m: (n,) distance of the ends along the ground [m].
-        at_m: (n, p) distances of the points from the first end [m].
-        ground_m: (n, p + 2) heights of the ground, at the ends, too [m].
-        surface_m: (n, p) heights of the ground and of what stands on it [m].
-        end_m: (n, 2) heights of the ends [m].
+        length_m: (n,) horizontal distance between the ends [m].
+        at_m: (n, p) horizontal distances of the points from the first end [m].
+        ground_m: (n, p + 2) heights of the ground at the points and at both ends [m].
+        surface_m: (n, p) heights of ground or roofs at the points [m].
+        end_m: (n, 2) heights of the antennas [m].
     """
 
     length_m: np.ndarray
@@ -54,13 +54,13 @@ class TerrainPaths(NamedTuple):
 
 
 def is_far(device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:
-    """Return whether receivers (n, 3) are so far from a device (3,) that the Earth is round."""
+    """Return (n,) bool: receiver and device (3,) [m] are over FAR_M apart, so Earth is curved."""
     return np.hypot(*(receiver_m - device_m)[:, :2].T) > FAR_M
 
 
 def terrain_paths(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
                   frequency_hz: float) -> TerrainPaths:
-    """Return the power at receivers (n, 3) over the profiles from a device (3,) [m]."""
+    """Compute the power gain over terrain from a device (3,) to receivers (n, 3) [m]."""
     found = TerrainPaths(np.zeros(len(receiver_m)), (device_m + receiver_m) / 2)
     for rows, profiles in _profiles(city, device_m, receiver_m):
         way_m = receiver_m[rows] - device_m
@@ -75,16 +75,16 @@ def terrain_paths(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
 
 def _profiles(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray
               ) -> Iterator[tuple[np.ndarray, Profiles]]:
-    """Yield rows of receivers, and their profiles.
+    """Yield rows of receivers, and their profiles, in chunks.
 
-    How many points one has depends on its length alone: exchanged ends have the same.
+    The number of points depends on the length only, so that exchanged ends have the same profile.
     """
     length_m = np.maximum(np.hypot(*(receiver_m - device_m)[:, :2].T), STEP_M / 10)
     points = np.array(POINTS)[np.searchsorted(POINTS[:-1], length_m / STEP_M)]
     for count in np.unique(points).tolist():
-        alike, at_once = np.flatnonzero(points == count), CHUNK_POINTS // count
+        links, chunk = np.flatnonzero(points == count), CHUNK_POINTS // count
         share, inner = np.linspace(0, 1, count + 2), slice(1, -1)
-        for rows in (alike[first:first + at_once] for first in range(0, len(alike), at_once)):
+        for rows in (links[first:first + chunk] for first in range(0, len(links), chunk)):
             x_m, y_m = (device_m[axis] + share * (receiver_m[rows, axis, None] - device_m[axis])
                         for axis in (0, 1))
             ground_m = city.ground_height_m(x_m, y_m)
@@ -95,10 +95,7 @@ def _profiles(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray
 
 
 def delta_bullington_db(profiles: Profiles, frequency_hz: float) -> np.ndarray:
-    """Return the loss (n,) of the complete method, on top of that of free space [dB].
-
-    [1], section 4.5.2.
-    """
+    """Return the delta-Bullington loss (n,) in excess of free space [dB] ([1], section 4.5.2)."""
     wavelength_m = speed_of_light / frequency_hz
     above_m = np.maximum(profiles.end_m - _smooth_m(profiles), MIN_HEIGHT_M)
     flat_db = _bullington_db(profiles, np.zeros_like(profiles.surface_m), above_m, wavelength_m)
@@ -108,21 +105,28 @@ def delta_bullington_db(profiles: Profiles, frequency_hz: float) -> np.ndarray:
 
 
 def knife_edge_db(nu: np.ndarray) -> np.ndarray:
-    """Return the loss J(ν) over a knife edge [dB] ([1], Eq. 31); 0 from ν = -0.78 down."""
+    """Return the knife-edge loss J(ν) [dB] ([1], Eq. 31); 0 for ν <= -0.78."""
     shifted = np.maximum(nu, -0.78) - 0.1
     return np.where(nu > -0.78, 6.9 + 20 * np.log10(np.sqrt(shifted**2 + 1) + shifted), 0.0)
 
 
 def _edges(profiles: Profiles, height_m: np.ndarray,
            end_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which links (n,) have no sight, and where the horizons of their ends meet (m,) [m].
+    """Return the links that are blocked, and the points where the horizons of their ends meet.
 
-    Of profiles (n, p) and ends (n, 2): distances from the first end, and heights.
+    Args:
+        profiles: profiles of n links.
+        height_m: (n, p) heights of the profile [m].
+        end_m: (n, 2) heights of the antennas [m].
+
+    Returns:
+        (n,) bool, blocked; for the m blocked links, distances (m,) from the first end and heights
+        (m,) of the meeting point [m].
     """
     at_m, back_m = profiles.at_m, profiles.length_m[:, None] - profiles.at_m
     curved_m = height_m + at_m * back_m / (2 * EARTH_RADIUS_M)
-    up, down = (((curved_m - each[:, None]) / way_m).max(axis=1)
-                for each, way_m in zip(end_m.T, (at_m, back_m)))
+    up, down = (((curved_m - antenna_m[:, None]) / way_m).max(axis=1)
+                for antenna_m, way_m in zip(end_m.T, (at_m, back_m)))
     rise_m = end_m[:, 1] - end_m[:, 0]
     beyond = up >= rise_m / profiles.length_m
     cross_m = (rise_m + down * profiles.length_m)[beyond] / (up + down)[beyond]
@@ -131,16 +135,20 @@ def _edges(profiles: Profiles, height_m: np.ndarray,
 
 def _bullington_db(profiles: Profiles, height_m: np.ndarray, end_m: np.ndarray,
                    wavelength_m: float) -> np.ndarray:
-    """Return the loss (n,) over a profile (n, p) between ends (n, 2) [dB] ([1], section 4.5.1)."""
+    """Return the Bullington loss (n,) of profile heights (n, p) between antennas at heights (n, 2).
+
+    In decibels, heights in metres ([1], section 4.5.1).
+    """
     length_m = profiles.length_m[:, None]
 
     def parameter(rows: np.ndarray, at_m: np.ndarray, over_datum_m: np.ndarray) -> np.ndarray:
+        """Return the knife-edge parameter ν of points at a distance and height [m]."""
         back_m = length_m[rows] - at_m
         line_m = (end_m[rows, :1] * back_m + end_m[rows, 1:] * at_m) / length_m[rows]
         return (over_datum_m - line_m) * np.sqrt(
             2 * length_m[rows] / (wavelength_m * at_m * back_m))
 
-    # With line of sight the most obstructed point, else where the horizons cross
+    # With line of sight, the edge is the most obstructed point; else where the horizons cross.
     bulge_m = profiles.at_m * (length_m - profiles.at_m) / (2 * EARTH_RADIUS_M)
     nu = parameter(np.ones(len(end_m), bool), profiles.at_m, height_m + bulge_m).max(axis=1)
     beyond, cross_m, top_m = _edges(profiles, height_m, end_m)
@@ -150,7 +158,7 @@ def _bullington_db(profiles: Profiles, height_m: np.ndarray, end_m: np.ndarray,
 
 
 def _smooth_m(profiles: Profiles) -> np.ndarray:
-    """Return the heights (n, 2) of a smooth Earth below the ends [m] ([1], section 4.5.2)."""
+    """Fit a smooth Earth to the ground; return its heights (n, 2) at the ends [m] ([1], 4.5.2)."""
     length_m, end_m, ground_m = profiles.length_m[:, None], profiles.end_m, profiles.ground_m
     at_m = np.column_stack([np.zeros(len(length_m)), profiles.at_m, length_m])
     step_m, low_m, high_m = np.diff(at_m), ground_m[:, :-1], ground_m[:, 1:]
@@ -163,8 +171,8 @@ def _smooth_m(profiles: Profiles) -> np.ndarray:
     back_m = length_m[:, None] - profiles.at_m
     over_m = ground_m[:, 1:-1] - (end_m[:, :1] * back_m
                                   + end_m[:, 1:] * profiles.at_m) / length_m[:, None]
-    slope = np.column_stack([(over_m / each).max(axis=1) for each in (profiles.at_m, back_m)])
-    highest_m = np.maximum(over_m.max(axis=1), 0.0)  # where the ground blocks, it is lowered
+    slope = np.column_stack([(over_m / way_m).max(axis=1) for way_m in (profiles.at_m, back_m)])
+    highest_m = np.maximum(over_m.max(axis=1), 0.0)  # lower the smooth Earth if the ground blocks
     slope = np.where(highest_m[:, None] > 0, slope, 1.0)
     smooth_m -= highest_m[:, None] * slope / slope.sum(axis=1, keepdims=True)
     return np.minimum(smooth_m, ground_m[:, [0, -1]])
@@ -172,17 +180,17 @@ def _smooth_m(profiles: Profiles) -> np.ndarray:
 
 def spherical_earth_db(distance_m: np.ndarray, height_m: np.ndarray,
                        frequency_hz: float) -> np.ndarray:
-    """Return the loss (n,) around a smooth Earth of 4/3 of its radius [dB] ([1], section 3.2).
+    """Return the diffraction loss (n,) over a smooth Earth of 4/3 radius [dB] ([1], section 3.2).
 
     Args:
-        distance_m: (n,) along the ground [m].
-        height_m: (n, 2) of the ends above the ground [m].
+        distance_m: (n,) horizontal distance [m].
+        height_m: (n, 2) antenna heights above the ground [m].
         frequency_hz: of the radio [Hz]; vertical polarisation.
     """
     first, second = height_m.T
     root_m = np.sqrt(height_m).sum(axis=1)
     is_beyond = distance_m >= np.sqrt(2 * EARTH_RADIUS_M) * root_m
-    # Within the horizon: the clearance where it is least, over that at which nothing is lost
+    # Within the horizon: least clearance over the clearance of zero loss
     c = (first - second) / (first + second)
     m = distance_m**2 / (4 * EARTH_RADIUS_M * (first + second))
     b = 2 * np.sqrt((m + 1) / (3 * m)) * np.cos(

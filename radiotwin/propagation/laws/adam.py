@@ -23,7 +23,7 @@ class Adam:
 
         Args:
             tensors: parameters to optimise.
-            decay: weight decay of each; None: none.
+            decay: weight decay, one for each tensor; None: no decay.
         """
         self.tensors = list(tensors)
         self._decay = [0.0] * len(self.tensors) if decay is None else list(decay)
@@ -33,10 +33,10 @@ class Adam:
 
     @torch.no_grad()
     def step(self, gradients: Sequence[torch.Tensor], rate: float) -> None:
-        """Take one step downhill.
+        """Update the parameters in place by one step of Adam.
 
         Args:
-            gradients: of the loss, one for each of `tensors`.
+            gradients: gradient of the loss, one for each of `tensors`.
             rate: learning rate.
         """
         self.count += 1
@@ -56,7 +56,7 @@ class Adam:
 
     @torch.no_grad()
     def load_state_dict(self, state: dict) -> None:
-        """Resume from what `state_dict` returned for tensors of the same shapes."""
+        """Restore count and moments that `state_dict` returned for tensors of the same shapes."""
         self.count = state["count"]
         for name in ("mean", "square"):
             for moment, stored in zip(getattr(self, name), state[name], strict=True):

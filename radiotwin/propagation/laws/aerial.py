@@ -1,16 +1,16 @@
-"""Published laws of links through the air: Al-Hourani et al. [1, 2] and 3GPP TR 36.777 [3].
+"""Published path loss of air-to-ground links: Al-Hourani et al. [1, 2] and 3GPP TR 36.777 [3].
 
-Al-Hourani: free space, plus an excess loss by class and elevation. The lower end is the terminal on
-the ground, the higher one the platform. The papers' platforms fly above all roofs; where a map says
-how high those are, the validity requires it. [1] has the probability of line of sight (Eq. 5), [2]
-the excess losses and their standard deviations, by frequency.
+Al-Hourani: free-space loss plus an excess loss by LoS class and elevation. The lower end is the
+terminal on the ground, the higher one the platform. The papers' platforms fly above all roofs; if a
+map gives their heights, the validity requires it. [1] gives the probability of line of sight
+(Eq. 5), [2] the excess losses and their standard deviations, by frequency.
 
-TR 36.777: a receiver above 22.5 m that is the higher end is an aerial terminal (Annex B) at its
-height. The lower end, a device near the ground, is where the report has a base station at 25 m
-(UMa) or 10 m (UMi). The formulas there do not contain the base station's height; the probability of
-line of sight was simulated for it, and is too high for a device in the street. Otherwise the higher
-end, such as a mast, is the base station of TR 38.901 [4] and the lower end its terminal, with an
-environment height of 1 m.
+TR 36.777: a receiver above 22.5 m that is the higher end is an aerial terminal (Annex B). The lower
+end, a device near the ground, takes the place of the report's base station at 25 m (UMa) or 10 m
+(UMi). The path loss does not contain the base station's height; the probability of line of sight
+was simulated for it, and is too high for a device in the street. Otherwise the higher end, such as
+a mast, is the base station of TR 38.901 [4] and the lower end its terminal, with an environment
+height of 1 m.
 
 [1] Al-Hourani, Kandeepan, Lardner, "Optimal LAP altitude for maximum coverage", IEEE Wireless
     Communications Letters 3(6), 2014.
@@ -41,21 +41,23 @@ from radiotwin.propagation.laws.published import (
     mean_roof_m,
 )
 
-FREQUENCIES_HZ = (0.7e9, 2.0e9, 5.8e9)  # between which excess losses are interpolated over log f
-AERIAL_M = 22.5  # height of a receiver above which TR 36.777 holds
+FREQUENCIES_HZ = (0.7e9, 2.0e9, 5.8e9)  # of [2]; excess losses are interpolated over log f
+AERIAL_M = 22.5  # TR 36.777 holds for receivers above this height
 MAX_HEIGHT_M, MAX_NLOS_HEIGHT_M = 300.0, 100.0  # of TR 36.777; the second for UMa-AV without LoS
-MAX_AERIAL_M, MAX_DISTANCE_M = 4000.0, 5000.0  # distances of TR 36.777 and of TR 38.901
-MIN_TERMINAL_M = 1.5
+MAX_AERIAL_M, MAX_DISTANCE_M = 4000.0, 5000.0  # greatest distance of TR 36.777, of TR 38.901
+MIN_TERMINAL_M = 1.5  # lowest terminal of TR 38.901
 ENVIRONMENT_M = 1.0  # effective environment height of TR 38.901
 
 
 class Environment(NamedTuple):
-    """Parameters of an environment; three values are those at `FREQUENCIES_HZ`.
+    """Parameters of an environment ([1], [2]); pairs are for LoS and NLoS.
+
+    Triples are values at `FREQUENCIES_HZ`.
 
     Attributes:
-        a, b: of the probability of line of sight 1 / (1 + a exp(-b (elevation - a))), in degrees.
-        excess_db: mean excess loss with line of sight and without [dB].
-        sd_db, decay: its standard deviation is sd_db exp(-decay elevation), of both classes.
+        a, b: LoS probability 1 / (1 + a exp(-b (elevation - a))), elevation in degrees.
+        excess_db: mean excess loss over free space [dB].
+        sd_db, decay: the excess loss has the standard deviation sd_db exp(-decay elevation) [dB].
     """
 
     a: float
@@ -66,7 +68,7 @@ class Environment(NamedTuple):
 
 
 class _AlHourani(PublishedLaw):
-    """The law; subclasses have the environment."""
+    """Air-to-ground loss of Al-Hourani et al.; subclasses set the environment."""
 
     source = "Al-Hourani et al. 2014"
     frequency_range_hz = (0.7e9, 5.8e9)
@@ -85,9 +87,8 @@ class _AlHourani(PublishedLaw):
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
-        each = 0 if los else 1
         excess_db, sd_db, decay = (
-            np.interp(np.log(self.frequency_hz), np.log(FREQUENCIES_HZ), values[each])
+            np.interp(np.log(self.frequency_hz), np.log(FREQUENCIES_HZ), values[0 if los else 1])
             for values in self.environment[2:])
         loss_db = free_space_db(links.distance_m, self.frequency_hz) + excess_db
         return Branch(loss_db, sd_db * np.exp(-decay * _elevation_deg(links)))
@@ -99,12 +100,12 @@ class _AlHourani(PublishedLaw):
 
 
 def _elevation_deg(links: LinkGeometry) -> np.ndarray:
-    """Return the angle (n,) at the lower end up to the higher one [deg]."""
+    """Return the elevation (n,) of the higher end seen from the lower end [deg]."""
     return np.abs(np.degrees(links.elevation_rad))
 
 
 class AlHouraniSuburban(_AlHourani):
-    """Suburban."""
+    """Air-to-ground path loss of Al-Hourani et al., suburban."""
 
     name = "al_hourani_suburban"
     environment = Environment(4.88, 0.43, ((0.0, 0.1, 0.2), (18.0, 21.0, 24.0)),
@@ -113,7 +114,7 @@ class AlHouraniSuburban(_AlHourani):
 
 
 class AlHouraniUrban(_AlHourani):
-    """Urban."""
+    """Air-to-ground path loss of Al-Hourani et al., urban."""
 
     name = "al_hourani_urban"
     environment = Environment(9.61, 0.16, ((0.6, 1.0, 1.2), (17.0, 20.0, 23.0)),
@@ -122,7 +123,7 @@ class AlHouraniUrban(_AlHourani):
 
 
 class AlHouraniDenseUrban(_AlHourani):
-    """Dense urban."""
+    """Air-to-ground path loss of Al-Hourani et al., dense urban."""
 
     name = "al_hourani_dense_urban"
     environment = Environment(12.08, 0.11, ((1.0, 1.6, 1.8), (20.0, 23.0, 26.0)),
@@ -131,7 +132,7 @@ class AlHouraniDenseUrban(_AlHourani):
 
 
 class AlHouraniHighRise(_AlHourani):
-    """High-rise urban."""
+    """Air-to-ground path loss of Al-Hourani et al., high-rise urban."""
 
     name = "al_hourani_high_rise"
     environment = Environment(27.23, 0.08, ((1.5, 2.3, 2.5), (29.0, 34.0, 41.0)),
@@ -139,15 +140,15 @@ class AlHouraniHighRise(_AlHourani):
                               ((0.03, 0.03, 0.03), (0.03, 0.03, 0.03)))
 
 
-class _AerialLaw(PublishedLaw):
-    """Heights and distances as the reports have them, and the choice between them."""
+class _Urban3gpp(PublishedLaw):
+    """TR 36.777 for aerial receivers, TR 38.901 for others; subclasses set UMa or UMi."""
 
     frequency_range_hz = (0.5e9, 100e9)
-    station_m: ClassVar[float]  # height of the base station of the reports [m]
-    max_nlos_m: ClassVar[float]  # height of an aerial terminal, without line of sight [m]
-    intercept_db: ClassVar[float]  # of TR 38.901 with LoS, before the breakpoint
-    exponent: ClassVar[float]
-    beyond_db: ClassVar[float]  # factor of the breakpoint's term
+    station_m: ClassVar[float]  # height of the reports' base station [m]
+    max_nlos_m: ClassVar[float]  # greatest height of an aerial terminal in NLoS [m]
+    intercept_db: ClassVar[float]  # of TR 38.901 LoS, before the breakpoint
+    exponent: ClassVar[float]  # path-loss exponent of TR 38.901 LoS, before the breakpoint
+    beyond_db: ClassVar[float]  # factor of the breakpoint term of TR 38.901 LoS [dB]
 
     @override
     def validity(self, links: LinkGeometry) -> Validity:
@@ -159,9 +160,9 @@ class _AerialLaw(PublishedLaw):
             (MIN_TERMINAL_M, np.where(aerial, max(self.station_m, AERIAL_M), AERIAL_M)))
 
     def terrestrial_los_db(self, links: LinkGeometry) -> np.ndarray:
-        """Return the loss (n,) [dB] of TR 38.901, Table 7.4.1-1, with line of sight."""
+        """Return the LoS path loss (n,) [dB] of TR 38.901, Table 7.4.1-1."""
         high_m, low_m = self._ends_m(links)
-        frequency_db = 20 * np.log10(self.frequency_hz / 1e9)
+        frequency_db = 20 * self._log_ghz()
         breakpoint_m = (4 * (high_m - ENVIRONMENT_M) * (low_m - ENVIRONMENT_M)
                         * self.frequency_hz / speed_of_light)
         near_db = self.intercept_db + 10 * self.exponent * links.log_distance + frequency_db
@@ -170,19 +171,22 @@ class _AerialLaw(PublishedLaw):
         return np.where(ground_m(links) < breakpoint_m, near_db, far_db)
 
     def _ends_m(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return heights (n,) of the higher and lower end, clipped to the reports' range [m]."""
         high_m, low_m = ends_m(links)
         return (np.clip(high_m, MIN_TERMINAL_M, MAX_HEIGHT_M),
                 np.clip(low_m, MIN_TERMINAL_M, AERIAL_M))
 
     def _is_aerial(self, links: LinkGeometry) -> np.ndarray:
+        """Return (n,) bool: the receiver is the higher end and above AERIAL_M."""
         device_m, receiver_m = heights_m(links)
         return (receiver_m > AERIAL_M) & (receiver_m >= device_m)
 
     def _log_ghz(self) -> float:
+        """Return log10 of the frequency in GHz."""
         return float(np.log10(self.frequency_hz / 1e9))
 
 
-class UrbanMacro(_AerialLaw):
+class UrbanMacro(_Urban3gpp):
     """UMa-AV of TR 36.777; UMa of TR 38.901 for receivers up to 22.5 m."""
 
     name = "tr36777_uma"
@@ -210,15 +214,15 @@ class UrbanMacro(_AerialLaw):
         flat_m = ground_m(links)
         height = np.log10(np.maximum(high_m, AERIAL_M))
         reach_m = np.where(high_m > 100.0, np.inf, np.maximum(460 * height - 700, 18.0))
-        above = _falling(flat_m, reach_m, 4300 * height - 3800)
+        above = _los_probability(flat_m, reach_m, 4300 * height - 3800)
         # TR 38.901, Table 7.4.2-1: a terminal above 13 m sees farther.
         extra = np.maximum((low_m - 13) / 10, 0.0) ** 1.5
         far = 1 + extra * 1.25 * (flat_m / 100) ** 3 * np.exp(-flat_m / 150)
-        below = np.minimum(_falling(flat_m, 18.0, 63.0) * far, 1.0)
+        below = np.minimum(_los_probability(flat_m, 18.0, 63.0) * far, 1.0)
         return np.where(self._is_aerial(links), above, below)
 
 
-class UrbanMicro(_AerialLaw):
+class UrbanMicro(_Urban3gpp):
     """UMi-AV of TR 36.777; UMi street canyon of TR 38.901 for receivers up to 22.5 m."""
 
     name = "tr36777_umi"
@@ -246,12 +250,19 @@ class UrbanMicro(_AerialLaw):
     def los_probability(self, links: LinkGeometry) -> np.ndarray:
         high_m, flat_m = self._ends_m(links)[0], ground_m(links)
         height = np.log10(np.maximum(high_m, AERIAL_M))
-        above = _falling(flat_m, np.maximum(294.05 * height - 432.94, 18.0), 233.98 * height - 0.95)
-        return np.where(self._is_aerial(links), above, _falling(flat_m, 18.0, 36.0))
+        above = _los_probability(flat_m, np.maximum(294.05 * height - 432.94, 18.0),
+                                 233.98 * height - 0.95)
+        return np.where(self._is_aerial(links), above, _los_probability(flat_m, 18.0, 36.0))
 
 
-def _falling(flat_m: np.ndarray, sure_m: np.ndarray | float,
-             length_m: np.ndarray | float) -> np.ndarray:
-    """Return the probability (n,) of line of sight: 1 up to a distance, and falling from there."""
+def _los_probability(flat_m: np.ndarray, sure_m: np.ndarray | float,
+                     length_m: np.ndarray | float) -> np.ndarray:
+    """Return the LoS probability (n,) in the form of TR 38.901, Table 7.4.2-1.
+
+    Args:
+        flat_m: (n,) horizontal distance [m].
+        sure_m: distance up to which it is 1 [m].
+        length_m: decay length beyond [m].
+    """
     share = np.minimum(np.divide(sure_m, np.maximum(flat_m, 1e-9)), 1.0)
     return share + np.exp(-flat_m / length_m) * (1 - share)

@@ -1,6 +1,6 @@
-"""The interface of every channel model, and checks of what one is fitted to and stored as.
+"""ChannelModel, the interface of every channel model; checks of training links and of files.
 
-The bounds of stored numbers are far beyond what is measured; within them, predictions are
+The bounds of stored numbers are far wider than any measurement; within them, predictions are
 finite.
 """
 
@@ -17,53 +17,53 @@ from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.links import LinkGeometry, Links
 
-MIN_DETECTED = 20  # detected links that a line and its standard deviation are learnt from
+MIN_DETECTED = 20  # detected links needed to learn a line and its standard deviation
 LEVEL_SD_DB = 20.0  # prior standard deviation of a refitted level: weak
 SLOPE_SD_DB = 10.0  # and of its slope [dB per decade]: one unit of the path-loss exponent
-ANY_LEVEL_SD_DB = 300.0  # of a level that is free: wider than the range of measured levels
-MAX_DB = 1e4  # of a level, a residual or an intercept
-MAX_SD_DB = 1e3
-MAX_POSITION_M = 1e8  # ten times what a measurement may have
+ANY_LEVEL_SD_DB = 300.0  # prior of an unconstrained level: wider than the range of measured levels
+MAX_DB = 1e4  # largest stored level, residual or intercept
+MAX_SD_DB = 1e3  # largest stored standard deviation
+MAX_POSITION_M = 1e8  # largest stored coordinate: ten times the largest allowed in measurements
 
 
 class ChannelModel(ABC):
-    """Level of a link as a Gaussian whose mean and standard deviation follow from its geometry.
+    """Predict the level of a link as a Gaussian: mean and standard deviation from its geometry.
 
     `docs/add-a-channel-model.md` is a guide to writing one.
     """
 
     name: ClassVar[str]
-    """As it is chosen and stored, such as `log_distance`."""
+    """Name in options and files, such as `log_distance`."""
 
     uses_map: ClassVar[bool]
-    """Whether predictions depend on line of sight, which only a 3D map shows."""
+    """True if predictions depend on line of sight, which only a 3D map shows."""
 
     follows_paths: ClassVar[bool] = False
-    """Whether predictions follow paths over the map, so that `quick` is much quicker."""
+    """True if predictions trace reflected and diffracted paths, so that `quick` is much faster."""
 
     @abstractmethod
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int) -> Self:
-        """Fit to measured links.
+        """Fit the model to measured links.
 
         Args:
             links: n links.
             level_db: (n,) gain [dB] or received power [dBm]; NaN: not detected.
-            limit_db: level below which the receiver does not detect [dB], one for all or (n,):
-                links that were not detected count as below it (left-censored). None or -inf:
-                unknown, such links are left out with a warning.
-            seed: of whatever is random; equal data and seed give equal bits.
+            limit_db: limit of detection of the receiver [dB], one for all or (n,). A link that was
+                not detected is left-censored at it. None or -inf: unknown; undetected links are
+                left out with a warning.
+            seed: random seed; equal data and seed give equal bits.
 
         Returns:
-            the model itself
+            the fitted model itself
 
         Raises:
-            BadInput: nothing, or too little, was detected.
+            BadInput: too few links were detected, or none.
         """
 
     @abstractmethod
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation [dB] of n links, before any limit of detection.
+        """Predict mean and standard deviation of levels, ignoring the limit of detection.
 
         Args:
             links: n links.
@@ -74,53 +74,62 @@ class ChannelModel(ABC):
 
     @property
     def trend(self) -> ChannelModel:
-        """The part that holds for any device, measured or not; by default the model itself."""
+        """Return the part without residuals of single devices; by default the model itself.
+
+        It predicts devices that were never measured as well as those that were.
+        """
         return self
 
     @property
     def quick(self) -> ChannelModel:
-        """A quicker model of small changes, such as moved ends; by default the model itself."""
+        """Return a faster model for small changes, such as moved ends; by default itself."""
         return self
 
     def level_at(self, links: Links, exact: bool = False) -> np.ndarray:
-        """Return the mean level (n,) [dB] of measured links, of `quick` unless it must be exact."""
+        """Return the mean level (n,) [dB] of measured links with declared antennas and powers.
+
+        Args:
+            links: n links.
+            exact: False: by the faster model `quick`.
+        """
         channel = self if exact else self.quick
         return channel.predict(links.geometry)[0] + channel.declared_db(links)
 
     def declared_db(self, links: Links) -> np.ndarray | float:
-        """Return what is declared of the devices, in the levels of links (n,) [dB].
+        """Return what declared powers, cables and antennas add to the levels (n,) of links [dB].
 
-        Antennas act along the straight line, unless a model knows better.
+        Antenna gains are those along the straight line; models that follow paths override this.
         """
         return links.declared_db
 
     def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return what of the channel is fitted again together with effects.
+        """Return the regression columns that refit the channel's levels together with effects.
 
-        By default, a level and a slope for each class of line of sight, or one of both for all
-        links where there is no map or the model does not use it.
+        By default, a level and a slope over log-distance: one pair each for LoS and NLoS, or one
+        pair for all links if there is no map or the model does not use it.
 
         Args:
             links: n links.
 
         Returns:
-            (n, p) design, and (p,) prior standard deviations [dB].
+            (n, p) design matrix, and (p,) prior standard deviations [dB].
         """
         slope = np.log10(links.distance_m / 100.0)
         classes = [links.los, ~links.los] if self._by_class(links) else [np.ones(len(links), bool)]
-        columns = [column for each in classes for column in (each, each * slope)]
+        columns = [column for of_class in classes for column in (of_class, of_class * slope)]
         prior_sd_db = np.tile([LEVEL_SD_DB, SLOPE_SD_DB], len(classes))
         return np.column_stack(columns).astype(float), prior_sd_db
 
     def error_group(self, links: LinkGeometry) -> np.ndarray:
-        """Return the index (n,) of the error scale: LoS 1, NLoS 0; 0 for all without classes."""
+        """Return the index (n,) of each link's error scale: LoS 1, NLoS 0; 0 without classes."""
         return links.los.astype(int) if self._by_class(links) else np.zeros(len(links), dtype=int)
 
     def error_groups(self, links: LinkGeometry) -> int:
-        """Return how many error scales there are, also where no link is of one of the classes."""
+        """Return the number of error scales: 2 with LoS and NLoS, even if one has no link; or 1."""
         return 2 if self._by_class(links) else 1
 
     def _by_class(self, links: LinkGeometry) -> bool:
+        """Return True if LoS and NLoS links have levels and error scales of their own."""
         return links.city is not None and self.uses_map
 
     @abstractmethod
@@ -130,17 +139,20 @@ class ChannelModel(ABC):
     @classmethod
     @abstractmethod
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
-        """Return a model whose predictions equal those of the one that `state` described."""
+        """Restore a model from its `state`; its predictions are equal to the bit."""
 
 
 def check_fit_data(links: LinkGeometry, level_db: np.ndarray, *, needs_los: bool) -> None:
-    """Refuse links that no channel can be learnt from; levels (n,) [dB] are NaN if not detected.
+    """Raise BadInput if a channel cannot be learnt from these links.
 
-    A model with `uses_map` and a map needs a detected link with line of sight: if there is none,
-    map and positions nearly always disagree.
+    Args:
+        links: n links.
+        level_db: (n,) levels [dB]; NaN: not detected.
+        needs_los: require a detected link with line of sight, as models that use a map do: if
+            there is none, map and positions nearly always disagree.
 
     Raises:
-        BadInput: fewer than MIN_DETECTED detected links, or none with the line of sight needed.
+        BadInput: fewer than MIN_DETECTED links are detected, or none of them has line of sight.
     """
     detected = np.isfinite(level_db)
     n = int(detected.sum())
@@ -162,9 +174,7 @@ def check_fit_data(links: LinkGeometry, level_db: np.ndarray, *, needs_los: bool
 
 def drop_uninformative(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                        ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
-    """Return the links that a fit can use: those that were detected, or have a limit.
-
-    Warns where links are left out.
+    """Drop links that were not detected and have no limit of detection; warn if there are any.
 
     Args:
         links: n links.
@@ -195,7 +205,13 @@ def drop_uninformative(links: LinkGeometry, level_db: np.ndarray, limit_db: Limi
 
 
 def require_names(what: str, given: Collection[str], expected: Collection[str]) -> None:
-    """Raise ValueError where names that are given differ from those that are expected."""
+    """Raise ValueError unless the given names are exactly the expected ones.
+
+    Args:
+        what: kind of the names, for the message.
+        given: names in a file.
+        expected: names that it must have.
+    """
     wrong = sorted(set(given) ^ set(expected))
     if wrong:
         state = "missing" if wrong[0] in expected else "unknown"
@@ -204,11 +220,11 @@ def require_names(what: str, given: Collection[str], expected: Collection[str]) 
 
 def require_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...],
                   low: float, high: float) -> np.ndarray:
-    """Return the array of a name after a check of its shape (None: any length) and its bounds.
+    """Return `arrays[name]` after checking its shape (None: any length) and range of values.
 
     Raises:
-        KeyError: there is none of that name.
-        ValueError: it has another shape, is empty, or has a number outside the bounds.
+        KeyError: the array is missing.
+        ValueError: it is empty, or its shape or a value is wrong.
     """
     array = arrays[name]
     if array.ndim != len(shape) or 0 in array.shape or any(
@@ -220,11 +236,11 @@ def require_array(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int 
 
 
 def require_number(settings: Mapping[str, Any], name: str, low: float, high: float) -> float:
-    """Return a number of some settings after a check.
+    """Return `settings[name]` as a float after checking that it is a number from low to high.
 
     Raises:
-        KeyError: there is none of that name.
-        ValueError: it is no number, or outside the bounds.
+        KeyError: the setting is missing.
+        ValueError: it is no number, or out of range.
     """
     value = settings[name]
     if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:

@@ -1,8 +1,8 @@
-"""Powers and directions of the paths of links over the 3D map, each followed once.
+"""Power and directions of the propagation paths of links over the 3D map, computed once and cached.
 
-`KnownPaths` keeps the paths of links and tests each of them against a box, such as an unknown
-building. What the box itself reflects is missing. Paths that bend at its edges count for the
-straight line only, as those of knife edges, which the caller adds.
+`KnownPaths` stores the paths of links and tells which of them a box, such as an unknown building,
+blocks. It has no reflections at the box. The caller adds knife-edge diffraction at the box, for the
+straight line only.
 """
 
 import time
@@ -30,21 +30,23 @@ from radiotwin.runtime.pieces import KeptParts, Piece
 from radiotwin.runtime.processes import in_threads
 from radiotwin.scene.citymap import CityMap
 
-GRID_M = 0.5  # estimated positions of devices are rounded to it, and share their paths
-MAX_REMEMBERED_BYTES = 3 * 10**8  # of paths: of 250,000 links in a city
-MIN_REMEMBERED = 2  # devices, however many links they have
-BATCH_LINKS = 50_000  # of devices that are followed side by side: 60 MB
-ENDS_CHUNK = 10_000  # of one device, whose directions are held at once: 70 MB
-LINK_CHUNK = 1000  # whose paths are held before the weakest go: tens of megabytes
-UNIT_STEPS = 2**15 - 1  # of a component of a direction that is remembered: 0.002 degrees
-WEAKEST = 1e-3  # of a link's strongest path: most are weaker, and together they carry little
-MIN_STEP_M = 1e-9  # a shorter leg along an axis is none along it
+GRID_M = 0.5  # estimated positions are rounded to this grid, so that neighbours share their paths
+MAX_REMEMBERED_BYTES = 3 * 10**8  # cache of paths: 250,000 links in a city
+MIN_REMEMBERED = 2  # positions that stay in the cache, however many links they have
+BATCH_LINKS = 50_000  # links whose devices are traced in parallel: 60 MB
+ENDS_CHUNK = 10_000  # receivers of one device that are traced at a time: 70 MB
+LINK_CHUNK = 1000  # links whose paths are held before the weakest are dropped: tens of megabytes
+UNIT_STEPS = 2**15 - 1  # steps of a cached direction's component: 0.002 degrees
+WEAKEST = 1e-3  # power of a dropped path, over the strongest: most are weaker, and carry little
+MIN_STEP_M = 1e-9  # a leg shorter than this along an axis counts as parallel to the plane
 
 
 def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> np.ndarray:
-    """Return the power gain (n,) of paths between isotropic antennas.
+    """Return the summed power gain (n,) of the paths of links between isotropic antennas, linear.
 
-    Kinds are components of `radiotwin.propagation.paths.PathPowers`; None: all.
+    Args:
+        geometry: n links over a map.
+        kinds: fields of `radiotwin.propagation.paths.PathPowers` to sum; None: all.
     """
     columns = [COMPONENTS.index(kind) for kind in (COMPONENTS if kinds is None else kinds)]
     power = np.zeros(len(geometry))
@@ -54,36 +56,36 @@ def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> 
 
 
 def interaction_gains(geometry: LinkGeometry) -> np.ndarray:
-    """Return the power gain (n, 3) of the direct, the reflected and the diffracted paths.
+    """Return the power gain (n, 3) of direct, reflected and diffracted paths, linear.
 
-    A path with an edge is diffracted, whatever else it has.
+    A path that is reflected and diffracted counts as diffracted.
     """
     diffracted = np.array(["diffracted" in kind for kind in COMPONENTS])
     direct = np.array([kind == "direct" for kind in COMPONENTS])
     power = np.zeros((len(geometry), 3))
     for rows, followed, index in _by_device(geometry):
         by_kind = followed.powers[index]
-        power[rows] = np.column_stack([by_kind[:, which].sum(axis=1) for which in
+        power[rows] = np.column_stack([by_kind[:, columns].sum(axis=1) for columns in
                                        (direct, ~direct & ~diffracted, diffracted)])
     return power
 
 
 def paths_of(geometry: LinkGeometry) -> PathDirections:
-    """Return power and directions of the single paths of links."""
+    """Return power and directions of every single path of n links."""
     parts = [NO_DIRECTIONS]
     for rows, followed, index in _by_device(geometry):
-        some = followed.paths.of_links(index)
-        parts.append(some._replace(link=rows[some.link].astype(np.int32)))
+        paths = followed.paths.of_links(index)
+        parts.append(paths._replace(link=rows[paths.link].astype(np.int32)))
     joined = PathDirections.joined(parts)
     scale = np.float32(1 / UNIT_STEPS)
     return joined._replace(departure=joined.departure * scale, arrival=joined.arrival * scale)
 
 
 def declared_antenna_db(links: Links) -> np.ndarray | float:
-    """Return what declared antennas add to the followed power of links (n,) [dB].
+    """Return what declared antennas add to the path power of n links (n,) [dB].
 
-    Each path has the gains of the directions in which it leaves and arrives. Without a map, or
-    where there is no path, they are those of the straight line.
+    Each path is weighted by the antenna gains in the directions in which it departs and arrives.
+    Without a map or a path, the gains are those along the straight line.
     """
     declared = links.declared
     if not declared.has_antennas:
@@ -99,10 +101,10 @@ def declared_antenna_db(links: Links) -> np.ndarray | float:
     return np.where(np.isnan(along_db), straight_db, along_db)
 
 
-def free_space(geometry: LinkGeometry) -> np.ndarray:
-    """Return the power gain (n,) along the straight line if nothing were in the way (ITU-R P.525).
+def free_space_gains(geometry: LinkGeometry) -> np.ndarray:
+    """Return the free-space power gain (n,) of links over a map, linear (ITU-R P.525); 0 without.
 
-    0 without a map, where the straight line is all that is known.
+    Without a map there are no scattered paths, whose power is relative to it.
     """
     if geometry.city is None:
         return np.zeros(len(geometry))
@@ -111,25 +113,28 @@ def free_space(geometry: LinkGeometry) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """Directions in which the paths of n links leave one of their ends.
+    """Power and directions of the paths of n links at one end, device or receiver.
 
     Attributes:
         link: (p,) row of the link, ascending.
-        power: (p,) power gain.
+        power: (p,) power gain, linear.
         direction: (p, 3) unit vectors from that end along the path.
-        free: (n,) power gain in free space; 0 where the straight line is all that is known.
+        free_space: (n,) free-space power gain, linear; 0 if only the straight line is known.
     """
 
     link: np.ndarray
     power: np.ndarray
     direction: np.ndarray
-    free: np.ndarray
+    free_space: np.ndarray
 
     @classmethod
     def of(cls, links: Links, of_device: bool, straight: bool = False) -> "Rays":
         """Return the rays of links at their devices, or at their receivers.
 
-        Without a map, or if `straight`, each link has one, along the straight line.
+        Args:
+            links: n links.
+            of_device: True: at the devices; False: at the receivers.
+            straight: use one ray a link, along the straight line, as without a map.
         """
         if straight or links.city is None:
             way_m = links.offset_m if of_device else -links.offset_m
@@ -138,45 +143,46 @@ class Rays:
                        np.zeros(len(links)))
         paths = paths_of(links.geometry)
         return cls(paths.link, paths.power, paths.departure if of_device else paths.arrival,
-                   free_space(links.geometry))
+                   free_space_gains(links.geometry))
 
     @cached_property
-    def _reached(self) -> tuple[np.ndarray, np.ndarray]:
-        """Links that have rays, and the first ray of each."""
+    def _first_rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the links that have rays, and the index of the first ray of each link."""
         return np.unique(self.link, return_index=True)
 
     @cached_property
     def _isotropic(self) -> np.ndarray:
+        """Return the power gain (n,) of links with an isotropic antenna, linear."""
         return self._sums(self.power)
 
     def _sums(self, power: np.ndarray) -> np.ndarray:
-        """Return the sums (n,) over the rays (p,) of each link."""
-        sums, (reached, first) = np.zeros(len(self.free)), self._reached
-        sums[reached] = np.add.reduceat(power, first, dtype=float)  # a third of bincount's time
+        """Sum the power (p,) of rays over each link; return (n,)."""
+        sums, (links, first) = np.zeros(len(self.free_space)), self._first_rays
+        sums[links] = np.add.reduceat(power, first, dtype=float)  # a third of bincount's time
         return sums
 
     def through_antenna_db(self, gain: np.ndarray, scattered_db: float = -np.inf,
                            mean_gain: float = 1.0) -> np.ndarray:
-        """Return what an antenna adds to the links (n,) [dB]; NaN where there is no power.
+        """Return what an antenna adds to the levels (n,) [dB]; NaN for links without power.
 
         Args:
-            gain: (p,) of the antenna in the directions of the rays, linear.
-            scattered_db: power that comes from everywhere, under that in free space [dB].
-            mean_gain: of the antenna over all directions, which applies to it, linear.
+            gain: (p,) antenna gain in the directions of the rays, linear.
+            scattered_db: power scattered from all directions, relative to free space [dB].
+            mean_gain: antenna gain averaged over all directions, for the scattered power, linear.
         """
-        scattered = self.free * 10 ** (scattered_db / 10)
+        scattered = self.free_space * 10 ** (scattered_db / 10)
         received = self._sums(self.power * gain) + scattered * mean_gain
         with np.errstate(invalid="ignore"):
             return 10 * np.log10(received / (self._isotropic + scattered))
 
 
 class _Followed(NamedTuple):
-    """Paths from one position to ends.
+    """Cached paths from one position to n receivers.
 
     Attributes:
-        ends: (n,) keys of the ends, sorted.
-        powers: (n, kinds)
-        paths: of rows of the ends; directions times `UNIT_STEPS`, int16.
+        ends: (n,) `_keys` of the receivers' positions, sorted.
+        powers: (n, kinds) power gain by `COMPONENTS`, linear.
+        paths: single paths, by row of `ends`; directions times `UNIT_STEPS`, int16.
     """
 
     ends: np.ndarray
@@ -185,11 +191,11 @@ class _Followed(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes [bytes]."""
-        return sum(each.nbytes for each in (self.ends, self.powers, *self.paths))
+        """Return the size in memory [bytes]."""
+        return sum(array.nbytes for array in (self.ends, self.powers, *self.paths))
 
-    def and_others(self, other: "_Followed") -> "_Followed":
-        """Return these paths and those to other ends."""
+    def merged(self, other: "_Followed") -> "_Followed":
+        """Merge with the paths from the same position to other receivers."""
         ends = np.concatenate([self.ends, other.ends])
         order = np.argsort(ends)
         others = other.paths._replace(link=other.paths.link + np.int32(len(self.ends)))
@@ -204,7 +210,7 @@ _remembered: OrderedDict[tuple[CityMap, _Position, float], _Followed] = OrderedD
 
 
 def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
-    """Yield for each device the rows of its links, its paths, and each link's row in these."""
+    """Yield for each device the rows of its links, its cached paths, and the links' rows there."""
     city = geometry.city
     if city is None:
         raise BadInput("the channel image_paths follows paths over a 3D map, and none is given; "
@@ -220,7 +226,10 @@ def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, 
 
 
 def followed_from_m(geometry: LinkGeometry, row: int) -> _Position:
-    """Return where paths of the device of a link are followed from [m]."""
+    """Return the position from which paths of a link's device are traced [m].
+
+    It is the device's, rounded to GRID_M if estimated and if the rounded one is not in a building.
+    """
     assert geometry.city is not None
     position_m = geometry.device_m[row]
     if geometry.estimated is not None and geometry.estimated[row]:
@@ -232,18 +241,27 @@ def followed_from_m(geometry: LinkGeometry, row: int) -> _Position:
 
 def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
             frequency_hz: float) -> list[tuple[_Followed, np.ndarray]]:
-    """Return the paths from positions to ends (n, 3) of each, and the row of each end."""
+    """Return the paths from positions to their receivers, from the cache or newly traced.
+
+    Args:
+        city: the map.
+        wanted: positions, each with its receivers (n, 3) [m].
+        frequency_hz: of the radio [Hz].
+
+    Returns:
+        for each position its cached paths, and the row (n,) of each receiver in them.
+    """
     nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))),
                         _packed(NO_DIRECTIONS))
     keys = [_keys(ends_m) for _, ends_m in wanted]
-    # Sectors of one mast are at one place: what one has followed serves the others.
-    at: dict[_Position, list[int]] = {}
+    # Sectors of one mast have the same position and share their paths.
+    at_position: dict[_Position, list[int]] = {}
     for number, (position_m, _) in enumerate(wanted):
-        at.setdefault(position_m, []).append(number)
+        at_position.setdefault(position_m, []).append(number)
     known = {position_m: _remembered.pop((city, position_m, frequency_hz), nothing)
-             for position_m in at}
+             for position_m in at_position}
     missing = {}
-    for position_m, numbers in at.items():
+    for position_m, numbers in at_position.items():
         ends, old = np.concatenate([keys[number] for number in numbers]), known[position_m]
         unknown = np.append(old.ends, -1)[np.searchsorted(old.ends, ends)] != ends
         if unknown.any():
@@ -252,11 +270,11 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
             missing[position_m] = new, (position_m, ends_m[unknown][first])
     followed = _new_paths(city, [asked for _, asked in missing.values()], frequency_hz)
     for (position_m, (new, _)), found in zip(missing.items(), followed, strict=True):
-        known[position_m] = known[position_m].and_others(_Followed(new, *found))
-    for position_m, each in known.items():
-        _remembered[city, position_m, frequency_hz] = each
+        known[position_m] = known[position_m].merged(_Followed(new, *found))
+    for position_m, paths in known.items():
+        _remembered[city, position_m, frequency_hz] = paths
     while len(_remembered) > MIN_REMEMBERED \
-            and sum(each.nbytes for each in _remembered.values()) > MAX_REMEMBERED_BYTES:
+            and sum(paths.nbytes for paths in _remembered.values()) > MAX_REMEMBERED_BYTES:
         _remembered.popitem(last=False)
     return [(known[position_m], np.searchsorted(known[position_m].ends, ends))
             for (position_m, _), ends in zip(wanted, keys, strict=True)]
@@ -264,8 +282,12 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
 
 def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
                frequency_hz: float) -> list[_NewPaths]:
-    """Follow the paths from positions to ends (n, 3); return powers and paths as in `_Followed`."""
-    if not asked:  # usually all paths are remembered, and no progress bar is needed
+    """Trace the paths from positions to receivers (n, 3), or read them from an earlier run.
+
+    Returns:
+        powers and paths for each position, see `_Followed`.
+    """
+    if not asked:  # usually all paths are cached, and no progress bar is needed
         return []
 
     def follow(number: int) -> _NewPaths:
@@ -286,10 +308,10 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
         powers, paths = arrays.pop("powers"), PathDirections(**arrays)
         link, count = paths.link, len(paths.link)
         if powers.shape[1:] != (len(COMPONENTS),) \
-                or [each.shape for each in paths] != [(count,), (count,), *[(count, 3)] * 2] \
+                or [array.shape for array in paths] != [(count,), (count,), *[(count, 3)] * 2] \
                 or (count and not 0 <= link[0] <= link[-1] < len(powers)) \
                 or (np.diff(link) < 0).any():
-            raise ValueError("other shapes, or links that do not ascend")
+            raise ValueError("wrong shapes, or links that do not ascend")
         return powers, paths
 
     parts: KeptParts[int, _NewPaths] = KeptParts(
@@ -307,7 +329,7 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
             advance()
             return value, time.perf_counter() - started
 
-        # Threads follow, and one keeps: what is kept notes warnings, of which there is one place.
+        # Threads trace; this one stores, since the record of warnings is shared by all threads.
         for number, (value, seconds) in zip(new, in_threads(timed, new), strict=True):
             parts.put(number, value, [], seconds)
             found[number] = value
@@ -315,25 +337,25 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
 
 
 def _packed(paths: PathDirections) -> PathDirections:
-    """Return paths with directions times `UNIT_STEPS`, in half of the memory."""
+    """Return paths with directions times `UNIT_STEPS` as int16, in half of the memory."""
     return paths._replace(**{end: np.round(getattr(paths, end) * UNIT_STEPS).astype(np.int16)
                              for end in ("departure", "arrival")})
 
 
 def _keys(positions_m: np.ndarray) -> np.ndarray:
-    """Return (n,) positions (n, 3) to the centimetre as one integer; equal ones are 20 km apart."""
+    """Encode positions (n, 3) [m] as integers (n,), to the centimetre; they repeat after 20 km."""
     x, y, z = (np.round(positions_m * 100).astype(np.int64) & 0x1FFFFF).T
     return x << 42 | y << 21 | z
 
 
 class UprightBox(NamedTuple):
-    """An upright box, such as an unknown building.
+    """An upright box without a floor, such as an unknown building.
 
     Attributes:
-        centre_m: x and y [m].
+        centre_m: x and y of its centre [m].
         half_m: half of its length and of its width [m].
-        turn_rad: of the length, counter-clockwise from east [rad].
-        top_m: z of its roof [m]; below it reaches any depth.
+        turn_rad: direction of its length, counter-clockwise from east [rad].
+        top_m: z of its roof [m].
     """
 
     centre_m: tuple[float, float]
@@ -343,7 +365,13 @@ class UprightBox(NamedTuple):
 
 
 class Power(NamedTuple):
-    """Power gains (n,) of links, linear: of the direct path, of all others, of these past a box."""
+    """Power gains of n links, linear, with and without a box in the way.
+
+    Attributes:
+        direct: (n,) of the direct path.
+        others: (n,) sum over all other paths.
+        others_past: (n,) sum over the other paths that the box does not block.
+    """
 
     direct: np.ndarray
     others: np.ndarray
@@ -351,16 +379,21 @@ class Power(NamedTuple):
 
 
 class KnownPaths:
-    """The stronger paths of n links over a map; a link's paths are followed on first use."""
+    """The stronger paths of n links over a map, each traced on first use, to test against boxes."""
 
     def __init__(self, geometry: LinkGeometry, city: CityMap) -> None:
         self._geometry, self._city = geometry, city
         self._is_followed = np.zeros(len(geometry), dtype=bool)
         self._direct = np.zeros(len(geometry))
-        self._paths: tuple[np.ndarray, ...] = ()  # link, power, points and their number, (p, ...)
+        self._paths: tuple[np.ndarray, ...] = ()  # link, power, points, number of points; (p, ...)
 
     def past(self, box: UprightBox, rows: np.ndarray) -> Power:
-        """Return the power of some links (r,), without a box and past one."""
+        """Return the power of links `rows` (r,), in total and of paths that a box does not block.
+
+        Args:
+            box: the box.
+            rows: (r,) indices of links.
+        """
         self.follow(rows)
         if not self._paths:
             nothing = np.zeros(len(rows))
@@ -371,7 +404,7 @@ class KnownPaths:
                      np.bincount(link, power_past, n)[rows])
 
     def follow(self, rows: np.ndarray) -> None:
-        """Follow the paths of links (r,) that are not known yet."""
+        """Trace the paths of links `rows` (r,) that were not traced before."""
         geometry, parts = self._geometry, [self._paths] if self._paths else []
         rows = rows[~self._is_followed[rows]]
         if not len(rows):
@@ -388,16 +421,25 @@ class KnownPaths:
                 kept = found.power > WEAKEST * strongest[found.receiver]
                 parts.append((chunk[found.receiver[kept]], found.power[kept],
                               found.points_m[kept], found.points[kept]))
-        self._paths = tuple(np.concatenate(each) for each in zip(*parts, strict=True))
+        self._paths = tuple(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         followed = geometry.select(rows)
-        self._direct[rows] = np.where(followed.los, free_space(followed), 0.0)
+        self._direct[rows] = np.where(followed.los, free_space_gains(followed), 0.0)
         self._is_followed[rows] = True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _blocked(points_m: np.ndarray, count: np.ndarray, centre_m: tuple[float, float],
              half_m: tuple[float, float], turn_rad: float, top_m: float) -> np.ndarray:
-    """Return whether a leg of each path (p,) goes through a box."""
+    """Return (p,) bool: a leg of the path goes through a box, see `UprightBox`.
+
+    Args:
+        points_m: (p, k, 3) points of each path [m].
+        count: (p,) number of points of each path.
+        centre_m: see `UprightBox`.
+        half_m: see `UprightBox`.
+        turn_rad: see `UprightBox`.
+        top_m: see `UprightBox`.
+    """
     out = np.zeros(len(count), dtype=np.bool_)
     cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
     reach_m = np.hypot(half_m[0], half_m[1])
@@ -407,14 +449,15 @@ def _blocked(points_m: np.ndarray, count: np.ndarray, centre_m: tuple[float, flo
             to_x = points_m[path, leg + 1, 0] - centre_m[0]
             to_y = points_m[path, leg + 1, 1] - centre_m[1]
             if min(x, to_x) > reach_m or max(x, to_x) < -reach_m or min(y, to_y) > reach_m \
-                    or max(y, to_y) < -reach_m:  # as nearly all
+                    or max(y, to_y) < -reach_m:  # nearly every leg misses the circle around the box
                 continue
             z, dx, dy = points_m[path, leg, 2], to_x - x, to_y - y
-            enter, leave = _within(cosine * x + sine * y, cosine * dx + sine * dy, -half_m[0],
-                                   half_m[0], 0.0, 1.0)
-            enter, leave = _within(cosine * y - sine * x, cosine * dy - sine * dx, -half_m[1],
-                                   half_m[1], enter, leave)
-            enter, leave = _within(z, points_m[path, leg + 1, 2] - z, -np.inf, top_m, enter, leave)
+            enter, leave = _clip_leg(cosine * x + sine * y, cosine * dx + sine * dy, -half_m[0],
+                                     half_m[0], 0.0, 1.0)
+            enter, leave = _clip_leg(cosine * y - sine * x, cosine * dy - sine * dx, -half_m[1],
+                                     half_m[1], enter, leave)
+            enter, leave = _clip_leg(z, points_m[path, leg + 1, 2] - z, -np.inf, top_m, enter,
+                                     leave)
             if enter < leave:
                 out[path] = True
                 break
@@ -422,9 +465,18 @@ def _blocked(points_m: np.ndarray, count: np.ndarray, centre_m: tuple[float, flo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _within(start_m: float, step_m: float, low_m: float, high_m: float, enter: float,
-            leave: float) -> tuple[float, float]:
-    """Return the part of a leg from `enter` to `leave` in which it is between two planes."""
+def _clip_leg(start_m: float, step_m: float, low_m: float, high_m: float, enter: float,
+              leave: float) -> tuple[float, float]:
+    """Clip the interval (enter, leave) of a leg's parameter 0..1 to the slab between two planes.
+
+    Args:
+        start_m: coordinate across the slab where the leg begins [m].
+        step_m: coordinate where it ends, minus `start_m` [m].
+        low_m: coordinate of the first plane [m].
+        high_m: coordinate of the second plane [m].
+        enter: start of the interval so far.
+        leave: its end; enter > leave: empty.
+    """
     if abs(step_m) < MIN_STEP_M:
         return (enter, leave) if low_m <= start_m <= high_m else (1.0, 0.0)
     first, second = (low_m - start_m) / step_m, (high_m - start_m) / step_m

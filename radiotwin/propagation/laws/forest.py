@@ -1,7 +1,7 @@
-"""Regression trees as plain arrays, evaluated without the library that grew them.
+"""Forest: regression trees of scikit-learn as plain arrays that are safe to store and load.
 
-scikit-learn keeps its trees as pickled objects, which run code when they are loaded. These arrays
-are data, and predict the same.
+scikit-learn stores trees as pickles, which run code when they are loaded. These arrays are data,
+and predict the same.
 """
 
 from __future__ import annotations
@@ -12,26 +12,26 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from radiotwin.io.budgets import TREE_NODES
-from radiotwin.propagation.laws.base import MAX_DB, require_array, require_names
+from radiotwin.propagation.laws.base import MAX_DB, require_array, require_names, require_number
 
 if TYPE_CHECKING:
     from sklearn.ensemble import ExtraTreesRegressor, HistGradientBoostingRegressor
 
-BATCH = 4000  # rows that are predicted at a time: bounds memory
-MAX_FEATURES = 10_000
+BATCH = 4000  # rows predicted at a time: bounds memory
+_ARRAYS = ("root", "feature", "threshold", "left", "right", "value")
 
 
 @dataclass(frozen=True, eq=False)
 class Forest:
-    """The sum of t trees with m nodes in all; a leaf is its own child.
+    """The sum of t regression trees with m nodes in all; a leaf is its own child.
 
     Attributes:
-        root: (t,) node that each tree begins with.
-        feature: (m,) column that a node asks for.
-        threshold: (m,) up to which the way goes left.
-        left, right: (m,) nodes, after the node itself; of a leaf the node itself.
-        value: (m,) what a leaf adds.
-        constant: added to all.
+        root: (t,) index of each tree's first node.
+        feature: (m,) feature column that a node compares.
+        threshold: (m,) values up to this go to the left child.
+        left, right: (m,) index of the children, greater than the node's; of a leaf, its own.
+        value: (m,) prediction of a leaf.
+        constant: added to the sum.
     """
 
     root: np.ndarray
@@ -44,14 +44,14 @@ class Forest:
 
     @classmethod
     def of_extra_trees(cls, fitted: ExtraTreesRegressor) -> Self:
-        """Return the trees of a fitted ensemble, whose mean is its prediction."""
-        trees, count = [each.tree_ for each in fitted.estimators_], len(fitted.estimators_)
-        return cls._of([(each.children_left, each.children_right, each.feature, each.threshold,
-                         each.value[:, 0, 0] / count) for each in trees], 0.0)
+        """Convert fitted extra trees, whose prediction is the mean of the trees."""
+        trees, count = [tree.tree_ for tree in fitted.estimators_], len(fitted.estimators_)
+        return cls._joined([(tree.children_left, tree.children_right, tree.feature, tree.threshold,
+                             tree.value[:, 0, 0] / count) for tree in trees], 0.0)
 
     @classmethod
     def of_boosting(cls, fitted: HistGradientBoostingRegressor) -> Self:
-        """Return the trees of fitted boosting on numbers without gaps."""
+        """Convert fitted gradient boosting; its features must not contain NaN."""
         trees: list[tuple[np.ndarray, ...]] = []
         for (predictor,) in fitted._predictors:  # the library has no public way to its nodes
             nodes = predictor.nodes
@@ -59,63 +59,61 @@ class Forest:
             trees.append((np.where(leaf, -1, nodes["left"].astype(int)),
                           np.where(leaf, -1, nodes["right"].astype(int)), nodes["feature_idx"],
                           nodes["num_threshold"], nodes["value"]))
-        return cls._of(trees, float(np.ravel(fitted._baseline_prediction)[0]))
+        return cls._joined(trees, float(np.ravel(fitted._baseline_prediction)[0]))
 
     @classmethod
-    def _of(cls, trees: list[tuple[np.ndarray, ...]], constant: float) -> Self:
-        """Join trees: left and right (negative at a leaf), feature, threshold, value of nodes."""
-        sizes = [len(each[0]) for each in trees]
-        first = np.cumsum([0, *sizes[:-1]])
-        own = np.arange(sum(sizes))
-        left, right, feature, threshold, value = (np.concatenate(each) for each in zip(
+    def _joined(cls, trees: list[tuple[np.ndarray, ...]], constant: float) -> Self:
+        """Join trees, given as (left, right, feature, threshold, value); left < 0 at a leaf."""
+        sizes = [len(tree[0]) for tree in trees]
+        root = np.cumsum([0, *sizes[:-1]])
+        node = np.arange(sum(sizes))
+        left, right, feature, threshold, value = (np.concatenate(arrays) for arrays in zip(
             *trees, strict=True))
-        leaf, shift = left < 0, np.repeat(first, sizes)
-        return cls(first.astype(np.int32), np.where(leaf, 0, feature).astype(np.int16),
+        leaf, shift = left < 0, np.repeat(root, sizes)
+        return cls(root.astype(np.int32), np.where(leaf, 0, feature).astype(np.int16),
                    np.where(leaf, 0.0, threshold),
-                   np.where(leaf, own, left + shift).astype(np.int32),
-                   np.where(leaf, own, right + shift).astype(np.int32),
+                   np.where(leaf, node, left + shift).astype(np.int32),
+                   np.where(leaf, node, right + shift).astype(np.int32),
                    np.where(leaf, value, 0.0), constant)
 
     def predict(self, features: np.ndarray) -> np.ndarray:
-        """Return the sum of the leaves (n,) that rows (n, p) of features fall into."""
+        """Return the prediction (n,) of the summed trees for feature rows (n, p)."""
         features = np.asarray(features, dtype=np.float32)  # as scikit-learn compares them
         total = np.full(len(features), self.constant)
         for start in range(0, len(features), BATCH):
             rows = slice(start, start + BATCH)
-            own = features[rows]
-            node = np.broadcast_to(self.root, (len(own), len(self.root)))
-            index = np.arange(len(own))[:, None]
+            batch = features[rows]
+            node = np.broadcast_to(self.root, (len(batch), len(self.root)))
+            index = np.arange(len(batch))[:, None]
             while True:
-                goes_left = own[index, self.feature[node]] <= self.threshold[node]
-                below = np.where(goes_left, self.left[node], self.right[node])
-                if (below == node).all():
+                goes_left = batch[index, self.feature[node]] <= self.threshold[node]
+                child = np.where(goes_left, self.left[node], self.right[node])
+                if (child == node).all():
                     break
-                node = below
+                node = child
             total[rows] += self.value[node].sum(axis=1)
         return total
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return arrays by name, and settings that JSON can hold, for `from_state`."""
-        names = ("root", "feature", "threshold", "left", "right", "value")
-        return {name: getattr(self, name) for name in names}, {"constant": self.constant}
+        return {name: getattr(self, name) for name in _ARRAYS}, {"constant": self.constant}
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any],
                    width: int) -> Self:
-        """Return what `state` described.
+        """Restore a forest from its `state`, after checking it.
 
         Args:
-            arrays: of `state`.
-            settings: of `state`.
-            width: number of columns p that it may ask for.
+            arrays: arrays of `state`.
+            settings: settings of `state`.
+            width: number of feature columns p.
 
         Raises:
             BadInput: too many nodes.
-            ValueError: damaged, such as nodes in a circle.
-            KeyError: a part is missing.
+            ValueError: damaged, such as a cycle of nodes.
+            KeyError: an array is missing.
         """
-        require_names("arrays", arrays,
-                      ["root", "feature", "threshold", "left", "right", "value"])
+        require_names("arrays", arrays, _ARRAYS)
         require_names("settings", settings, ["constant"])
         nodes = len(arrays["value"])
         TREE_NODES.check(nodes, "the learnt residual")
@@ -123,18 +121,14 @@ class Forest:
         feature = require_array(arrays, "feature", (nodes,), 0, width - 1)
         left, right = (require_array(arrays, name, (nodes,), 0, nodes - 1)
                        for name in ("left", "right"))
-        own = np.arange(nodes)
-        leaf = left == own
-        # A child comes after its parent, so that every way ends.
-        if not ((right == own) == leaf).all() or not (
-                (left > own) & (right > own) | leaf).all():
-            raise ValueError("a tree runs in a circle")
-        if any(each.dtype.kind not in "iu" for each in (root, feature, left, right)):
-            raise ValueError("nodes are counted in whole numbers")
-        constant = settings["constant"]
-        if isinstance(constant, bool) or not isinstance(constant, int | float) \
-                or not abs(constant) <= MAX_DB:
-            raise ValueError("constant is no level")
+        node = np.arange(nodes)
+        leaf = left == node
+        # Children have greater indices than their parent, so that the descent ends.
+        if not ((right == node) == leaf).all() or not (
+                (left > node) & (right > node) | leaf).all():
+            raise ValueError("a tree has a cycle")
+        if any(array.dtype.kind not in "iu" for array in (root, feature, left, right)):
+            raise ValueError("indices of nodes are not integers")
         return cls(root, feature, require_array(arrays, "threshold", (nodes,), -1e9, 1e9), left,
                    right, require_array(arrays, "value", (nodes,), -MAX_DB, MAX_DB),
-                   float(constant))
+                   require_number(settings, "constant", -MAX_DB, MAX_DB))

@@ -1,7 +1,7 @@
-"""The channel that follows reflected and diffracted paths over the 3D map.
+"""ImagePaths: the channel model of reflected and diffracted paths over the 3D map.
 
-With it: levels of paths over a map whose frame, materials or shapes may be other than declared, and
-the level and error scale of links with, and without, line of sight over such a map.
+Also: path levels over a map with a wrong frame, materials or shapes, and fits of level and error
+scale for LoS and NLoS over such a map.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from typing_extensions import override
 from radiotwin.inference import student
 from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.inference.student import DOF
-from radiotwin.links import LinkGeometry, Links, design_effect
+from radiotwin.links import LinkGeometry, Links
+from radiotwin.links import design_effect as design_effect_of
 from radiotwin.propagation.laws.base import (
     ANY_LEVEL_SD_DB,
     ChannelModel,
@@ -25,52 +26,52 @@ from radiotwin.propagation.laws.base import (
 )
 from radiotwin.propagation.laws.followed_paths import (
     declared_antenna_db,
-    free_space,
+    free_space_gains,
     interaction_gains,
     path_gains,
 )
 from radiotwin.propagation.laws.log_distance import SegmentedLogDistance
 from radiotwin.propagation.laws.published import free_space_db
 
-BLOCK_M = 100.0  # side of the ground within which the links of a device err alike
-MIN_NLOS = 30  # links without line of sight that the diffuse power is fitted to
-DIFFUSE_DEFAULT = (-150.0, 3.0)  # nearly nothing; the exponent then does not matter
-DIFFUSE_BOUNDS = np.array([[-150.0, 2.0], [-60.0, 6.0]])
-NEAR_QUANTILE = 0.05  # of links that are nearer than where diffuse power is bounded
-MIN_LOSS_DB = 6.0  # of diffuse power beside free space: one reflection at concrete loses as much
+BLOCK_M = 100.0  # side of a square of ground in which a device's links have a common error
+MIN_NLOS = 30  # NLoS links needed to fit the diffuse power
+DIFFUSE_DEFAULT = (-150.0, 3.0)  # nearly no power; the exponent then does not matter
+DIFFUSE_BOUNDS = np.array([[-150.0, 2.0], [-60.0, 6.0]])  # of gain at 100 m [dB] and exponent
+NEAR_QUANTILE = 0.05  # share of links nearer than the distance at which diffuse power is bounded
+MIN_LOSS_DB = 6.0  # of diffuse power below free space: one reflection at concrete loses as much
 DIFFUSE_STARTS_DB = (-100.0, -110.0, -120.0, -130.0)
-LOS_SLOPE_SD_DB, NLOS_SLOPE_SD_DB = 1.0, 5.0  # prior: how wrong the fall may be [dB per decade]
-ERROR_SCALE_DB = 4.0  # of the Cauchy loss of the fit of the diffuse power
-OFFSET_SD_DB = 6.0  # prior of what reflections and diffractions lie above those of the map
+LOS_SLOPE_SD_DB, NLOS_SLOPE_SD_DB = 1.0, 5.0  # prior of errors of the slope [dB per decade]
+ERROR_SCALE_DB = 4.0  # of the Cauchy loss in the fit of the diffuse power
+OFFSET_SD_DB = 6.0  # prior of the offsets of reflected and diffracted paths
 MAX_OFFSET_DB = 20.0
 Offsets = tuple[float, float]
-"""Levels of reflected and of diffracted paths above those of the map [dB]."""
+"""Measured minus computed level of reflected, and of diffracted, paths [dB]."""
 
 
 def scale_db(class_scale_db: float | np.ndarray, square_db: np.ndarray) -> np.ndarray:
-    """Return the Student-t scale (n,) [dB] of links over a map with errors.
+    """Return the Student-t error scale (n,) [dB] of links over a map with errors.
 
     Args:
-        class_scale_db: scale of the class where errors of the map do nothing [dB].
-        square_db: (n,) mean square of what errors of the map do [dB²].
+        class_scale_db: error scale of the LoS or NLoS class over an exact map [dB].
+        square_db: (n,) mean square of the level changes that map errors cause [dB²].
     """
     return np.sqrt(class_scale_db**2 + square_db * (DOF - 2) / DOF)
 
 
 def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
               square_db: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
-    """Fit level and error scale of the links of one class (maximum likelihood).
+    """Fit level offset and error scale of LoS, or of NLoS, links by maximum likelihood.
 
     Args:
         level_db: (n,) measured levels [dB]; NaN: not detected.
-        limits_db: (n,) below which levels are not detected [dB].
-        paths: (n,) levels of the followed paths [dB].
-        square_db: (n,) mean square of what errors of the map do [dB²].
+        limits_db: (n,) limits of detection [dB].
+        paths: (n,) levels computed from paths [dB].
+        square_db: (n,) mean square of the level changes that map errors cause [dB²].
         start: result of an earlier fit to start from; None: the median offset.
 
     Returns:
-        (2,) offset of measured levels from those of the paths [dB], and logarithm of the error
-        scale where errors of the map do nothing.
+        (2,) offset of measured from computed levels [dB], and natural logarithm of the error
+        scale over an exact map [dB].
     """
     if start is None:
         seen = np.isfinite(level_db)
@@ -86,11 +87,13 @@ def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
 
 
 class LinkFit:
-    """Repeated fits of both classes of some links, each started from the result of the last one.
+    """Fit level offset and error scale of LoS and NLoS again and again for other computed levels.
+
+    Each fit starts from the result of the one before.
 
     Attributes:
-        level_db: (n,) [dB]; NaN: not detected.
-        limits_db: (n,) below which levels are not detected [dB].
+        level_db: (n,) measured levels [dB]; NaN: not detected.
+        limits_db: (n,) limits of detection [dB].
     """
 
     def __init__(self, level_db: np.ndarray, limit_db: Limit) -> None:
@@ -100,27 +103,27 @@ class LinkFit:
 
     def fit(self, los: np.ndarray, paths_db: np.ndarray, square_db: np.ndarray | None = None
             ) -> tuple[np.ndarray, np.ndarray]:
-        """Fit both classes.
+        """Fit LoS and NLoS links separately.
 
         Args:
-            los: (n,) bool, class of each link.
-            paths_db: (n,) levels of the followed paths [dB].
-            square_db: (n,) mean square of what the map's errors do [dB²]; None: nothing.
+            los: (n,) bool, line of sight.
+            paths_db: (n,) levels computed from paths [dB].
+            square_db: (n,) mean square of the level changes that map errors cause [dB²]; None: 0.
 
         Returns:
-            negative log-likelihood of each link (n,) [nats], and residuals over their scale (n,), 0
-            where not detected.
+            (n,) negative log-likelihood of each link [nats], and (n,) residuals over their scale, 0
+            for links that were not detected.
         """
         nll, z = np.zeros((2, len(self.level_db)))
         square_db = np.zeros(len(los)) if square_db is None else square_db
-        for state in (False, True):
-            of_class = los == state
+        for is_los in (False, True):
+            of_class = los == is_los
             if not np.isfinite(self.level_db[of_class]).any():
                 continue
             level_db, limits_db = self.level_db[of_class], self.limits_db[of_class]
-            offset_db, log_scale = self._start[state] = fit_class(
+            offset_db, log_scale = self._start[is_los] = fit_class(
                 level_db, limits_db, paths_db[of_class], square_db[of_class],
-                self._start.get(state))
+                self._start.get(is_los))
             mean_db = paths_db[of_class] + offset_db
             errors_db = scale_db(float(np.exp(log_scale)), square_db[of_class])
             nll[of_class] = student.censored_nll(level_db, limits_db, mean_db, errors_db, DOF)
@@ -128,29 +131,29 @@ class LinkFit:
         return nll, z
 
 
-def links_as_one(links: LinkGeometry, z: np.ndarray) -> float:
-    """Return how many links carry the information of one, as neighbours err alike.
+def block_design_effect(links: LinkGeometry, z: np.ndarray) -> float:
+    """Return how many links carry the information of one independent link (design effect).
 
     Args:
-        links: n links.
+        links: n links; those of one device and one square of BLOCK_M have correlated errors.
         z: (n,) residuals over their scale.
     """
     block = np.column_stack([links.device, np.floor(links.receiver_m[:, :2] / BLOCK_M)])
     label = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)
-    return design_effect(label, z)
+    return design_effect_of(label, z)
 
 
 class ImagePaths(ChannelModel):
-    """Power of the paths over the map (`radiotwin.propagation.paths`) plus diffuse power.
+    """Power of reflected and diffracted paths (`radiotwin.propagation.paths`) plus diffuse power.
 
-    The diffuse power stands for what reaches any position on ways that are not followed: more
-    bounces and edges, rough walls. It falls with distance by a law of its own. Levels and slopes,
-    one for each class of line of sight, are fitted with the effects.
+    The diffuse power stands for paths that are not computed: more bounces and edges, rough walls.
+    It has its own path loss exponent. Levels and slopes for LoS and NLoS are fitted together with
+    the effects.
 
     Attributes:
-        law: fitted to the same links; predicts what small changes do, quickly, and the
-            size of the errors.
-        diffuse: gain of the diffuse power at 100 m [dB], and the exponent of its fall.
+        law: log-distance law fitted to the same links; predicts small changes quickly (`quick`),
+            and the standard deviation of errors.
+        diffuse: gain of the diffuse power at 100 m [dB], and its path loss exponent.
     """
 
     name = "image_paths"
@@ -170,13 +173,13 @@ class ImagePaths(ChannelModel):
 
     def fit_diffuse(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                     antenna_db: np.ndarray | float = 0.0) -> Self:
-        """Fit the diffuse power and a level to the links without line of sight.
+        """Fit the diffuse power, and a level, to the NLoS links.
 
         Args:
             links: n links.
-            level_db: (n,) as in `fit` [dB].
-            limit_db: as in `fit` [dB].
-            antenna_db: (n,) what antennas add to the power of the followed paths [dB].
+            level_db: (n,) measured levels [dB]; NaN: not detected.
+            limit_db: limit of detection [dB], see `fit`.
+            antenna_db: (n,) what antennas add to the power of the paths [dB].
         """
         nlos = links.select(~links.los)
         level_db = level_db[~links.los]
@@ -184,7 +187,7 @@ class ImagePaths(ChannelModel):
         limits_db = limits_of(limit_db, len(links))[~links.los]
         level_db = np.where(blank, limits_db, level_db)
         known = np.isfinite(level_db)
-        # Links that were not detected alone only say that it is weak: take the weakest
+        # Without a detected link, the data only say that diffuse power is weak.
         if known.sum() < MIN_NLOS or blank[known].all():
             self.diffuse = DIFFUSE_DEFAULT
             return self
@@ -212,12 +215,20 @@ class ImagePaths(ChannelModel):
         return self.level_db(_seen_gains(links), links), self.law.predict(links)[1]
 
     def level_db(self, power: np.ndarray, links: LinkGeometry) -> np.ndarray:
-        """Return the mean level (n,) [dB] of links whose paths carry these powers (n,)."""
+        """Return the mean level (n,) [dB] of links from path power (n,), linear, and diffuse power.
+
+        Args:
+            power: (n,) summed power gain of the paths, linear.
+            links: n links.
+        """
         return _with_diffuse_db(power, links.distance_m, *self.diffuse)
 
     @override
     def declared_db(self, links: Links) -> np.ndarray | float:
-        """Return the same with antennas along each path; diffuse power has their mean, 0 dBi."""
+        """Return what declared powers, cables and antennas add to the levels (n,) of links [dB].
+
+        Antenna gains are those along each path; for diffuse power their mean, 0 dBi.
+        """
         if not links.declared.has_antennas:
             return links.declared_db
         geometry, power = links.geometry, _seen_gains(links.geometry)
@@ -232,7 +243,7 @@ class ImagePaths(ChannelModel):
 
     @override
     def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        # Slopes: what the map's materials and walls lack adds up on the way.
+        # Slopes: errors of materials and walls add up along a path.
         los, slope = links.los, np.log10(links.distance_m / 100.0)
         columns = np.column_stack([los, ~los, los * slope, ~los * slope])
         return columns.astype(float), np.array([ANY_LEVEL_SD_DB] * 2 + [LOS_SLOPE_SD_DB,
@@ -255,20 +266,19 @@ class ImagePaths(ChannelModel):
 
 
 def _seen_gains(links: LinkGeometry) -> np.ndarray:
-    """Return the power (n,) of the paths over a map, with the links' own lines of sight.
+    """Return the summed power gain (n,) of paths, with a direct path only for links with `los`.
 
-    A link's line of sight may differ from the map's: an effect adds or removes an obstacle, or the
-    paths start beside an estimated position. Then the direct path is dropped, or added as in free
-    space; all other paths stay.
+    `links.los` may differ from the map: an effect adds or removes an obstacle, or paths start at
+    the rounded position. Then the direct path is dropped, or added with its free-space gain.
     """
     gains = interaction_gains(links)
-    other = (gains[:, 0] > 0) != links.los
-    gains[other, 0] = np.where(links.los[other], free_space(links)[other], 0.0)
+    differs = (gains[:, 0] > 0) != links.los
+    gains[differs, 0] = np.where(links.los[differs], free_space_gains(links)[differs], 0.0)
     return gains.sum(axis=1)
 
 
 def stored_diffuse(value: Any) -> tuple[float, float]:
-    """Return gain at 100 m [dB] and exponent of stored diffuse power; ValueError if damaged."""
+    """Return gain at 100 m [dB] and exponent of diffuse power in a file; ValueError if damaged."""
     if not isinstance(value, list) or len(value) != 2:
         raise ValueError("the diffuse power is not a gain and an exponent")
     named = dict(zip(("gain", "exponent"), value, strict=True))
@@ -276,32 +286,37 @@ def stored_diffuse(value: Any) -> tuple[float, float]:
 
 
 def _clip_diffuse(numbers: np.ndarray, near_m: float, frequency_hz: float) -> np.ndarray:
-    """Clip gain [dB] and exponent (2,) of diffuse power to weaker than free space beyond `near_m`.
+    """Clip gain at 100 m [dB] and exponent (2,) of diffuse power to DIFFUSE_BOUNDS.
 
-    Without that limit, diffuse power would replace paths that explain no measurement, and then
-    the paths of links with line of sight, too: the level of links without line of sight is fitted
-    together with it.
+    Beyond `near_m` it also stays MIN_LOSS_DB below free space. Otherwise it would replace the
+    paths, also those of LoS links: the NLoS level is fitted together with it.
     """
     gain_db, exponent = np.clip(numbers, *DIFFUSE_BOUNDS)
-    most_db = -free_space_db(np.array(100.0), frequency_hz) - MIN_LOSS_DB \
+    max_gain_db = -free_space_db(np.array(100.0), frequency_hz) - MIN_LOSS_DB \
         + 10 * (exponent - 2.0) * np.log10(near_m / 100.0)
-    return np.array([np.clip(gain_db, None, most_db), exponent])
+    return np.array([np.clip(gain_db, None, max_gain_db), exponent])
 
 
 def _with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,
                     exponent: float) -> np.ndarray:
-    """Return the level (n,) [dB] of followed power (n,), linear, and of diffuse power."""
+    """Return the level (n,) [dB] of path power (n,), linear, plus diffuse power."""
     return 10 * np.log10(power + 10 ** (gain_db / 10) * (distance_m / 100.0) ** -exponent)
 
 
 def paths_db(links: LinkGeometry, diffuse: tuple[float, float], offsets_db: Offsets = (0.0, 0.0)
              ) -> np.ndarray:
-    """Return the level (n,) [dB] of followed paths and diffuse power, see `ImagePaths`."""
+    """Return the level (n,) [dB] of links from their paths and diffuse power.
+
+    Args:
+        links: n links.
+        diffuse: diffuse power, see `ImagePaths`.
+        offsets_db: added to the level of reflected, and of diffracted, paths [dB].
+    """
     return _level_db(interaction_gains(links), links.distance_m, diffuse, offsets_db)
 
 
 def moved(links: LinkGeometry, east_m: float, north_m: float) -> LinkGeometry:
-    """Return links with both ends moved over their map, and the line of sight there."""
+    """Move both ends of links over their map [m], and look up the line of sight again."""
     step_m = np.array([east_m, north_m, 0.0])
     device_m, receiver_m = links.device_m + step_m, links.receiver_m + step_m
     los = links.los if links.city is None else links.city.line_of_sight(device_m, receiver_m)
@@ -310,27 +325,27 @@ def moved(links: LinkGeometry, east_m: float, north_m: float) -> LinkGeometry:
 
 def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                 diffuse: tuple[float, float]) -> Offsets:
-    """Estimate how much stronger reflections and diffractions are than over the map [dB].
+    """Estimate how much stronger reflected and diffracted paths are than computed [dB].
 
-    Maximum a posteriori under a normal prior of `OFFSET_SD_DB`, which keeps both at 0 where levels
-    cannot tell them apart, since each class of line of sight has a level of its own.
+    Maximum a posteriori under a normal prior of `OFFSET_SD_DB`. The prior keeps both at 0 if the
+    levels of LoS and NLoS, which are fitted too, explain the data as well.
 
     Args:
         links: n links.
-        level_db: (n,) as in `ImagePaths.fit` [dB].
-        limit_db: as in `ImagePaths.fit` [dB].
-        diffuse: as in `ImagePaths`.
+        level_db: (n,) measured levels [dB]; NaN: not detected.
+        limit_db: limit of detection [dB], see `ImagePaths.fit`.
+        diffuse: diffuse power, see `ImagePaths`.
     """
     fit, gains = LinkFit(level_db, limit_db), interaction_gains(links)
     distance_m = links.distance_m
     undisturbed_db = _level_db(gains, distance_m, diffuse, np.zeros(2))
-    as_one = links_as_one(links, fit.fit(links.los, undisturbed_db)[1])
+    design_effect = block_design_effect(links, fit.fit(links.los, undisturbed_db)[1])
 
     def loss(offsets_db: np.ndarray) -> float:
         clipped_db = np.clip(offsets_db, -MAX_OFFSET_DB, MAX_OFFSET_DB)
         prior = 0.5 * (offsets_db**2).sum() / OFFSET_SD_DB**2
         level_db = _level_db(gains, distance_m, diffuse, clipped_db)
-        return fit.fit(links.los, level_db)[0].sum() / as_one + float(prior)
+        return fit.fit(links.los, level_db)[0].sum() / design_effect + float(prior)
 
     simplex = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])
     found = minimize(loss, np.zeros(2), method="Nelder-Mead",
@@ -341,6 +356,6 @@ def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
 
 def _level_db(gains: np.ndarray, distance_m: np.ndarray, diffuse: tuple[float, float],
               offsets_db: Offsets | np.ndarray) -> np.ndarray:
-    """Return the level (n,) [dB] of `interaction_gains` (n, 3) and diffuse power."""
+    """Return the level (n,) [dB] from `interaction_gains` (n, 3), see `paths_db`."""
     factor = 10 ** (np.array([0.0, *offsets_db]) / 10)
     return _with_diffuse_db(gains @ factor, distance_m, *diffuse)

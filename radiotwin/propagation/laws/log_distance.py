@@ -1,4 +1,4 @@
-"""The log-distance law: one line for all links, which needs no map, or one by class."""
+"""Log-distance path loss: one line for all links (no map needed), or one for LoS and NLoS each."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from radiotwin.propagation.laws.base import (
 # Prior of the gap between the lines: in 3GPP TR 38.901 UMi, at 100 m and 2.4 GHz, LoS lies 19 dB
 # above NLoS.
 NLOS_LOSS_DB, NLOS_LOSS_SD_DB = 20.0, 10.0
-MAX_EXPONENT = 100.0  # of a stored line
+MAX_EXPONENT = 100.0  # largest path loss exponent in a file
 BORROWED_SD_DB = 8.0  # least sd of a borrowed line: UMi NLoS has 7.8 dB (TR 38.901 table 7.4.1-1)
 
 
 class LogDistance(ChannelModel):
-    """gain = intercept - 10 * exponent * log10(d / 1 m) + N(0, sd^2), with or without LoS."""
+    """gain = intercept - 10 * exponent * log10(d / 1 m) + N(0, sd^2), the same in LoS and NLoS."""
 
     name = "log_distance"
     uses_map = False
@@ -65,12 +65,13 @@ class SegmentedLogDistance(ChannelModel):
 
     The segmented law of Chen et al., 'Model-aided federated reinforcement learning for multi-UAV
     trajectory planning in IoT networks' (GLOBECOM Workshops 2023). A class with fewer than
-    MIN_DETECTED detected links borrows the other's line, with a warning: moved by NLOS_LOSS_DB, a
-    prior that its few links correct, and with a standard deviation of at least BORROWED_SD_DB.
+    MIN_DETECTED detected links borrows the line of the other class, with a warning. The borrowed
+    line is shifted by NLOS_LOSS_DB, a prior that the few links correct, and its standard deviation
+    is at least BORROWED_SD_DB.
 
     Attributes:
         los, nlos: the lines.
-        borrowed: class with the borrowed line, "los" or "nlos"; None: both have lines of their own.
+        borrowed: class with the borrowed line, "los" or "nlos"; None: both lines were fitted.
     """
 
     name = "segmented_log_distance"
@@ -117,7 +118,7 @@ class SegmentedLogDistance(ChannelModel):
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return `lines` (2, 3) as `_stored` has them, of NLoS, then of LoS."""
+        """Return `lines` (2, 3) as `_stored` returns them, NLoS first, for `from_state`."""
         lines = np.array([_stored(self.nlos), _stored(self.los)])
         return {"lines": lines}, {"borrowed": self.borrowed}
 
@@ -133,12 +134,12 @@ class SegmentedLogDistance(ChannelModel):
 
 
 def _stored(line: LogDistanceLine) -> np.ndarray:
-    """Return (3,) intercept [dB], minus the path-loss exponent, standard deviation [dB]."""
+    """Return the line as (3,) intercept [dB], minus the path loss exponent, sd [dB]."""
     return np.array([line.intercept_db, -line.exponent, line.sd_db])
 
 
 def _line(stored: np.ndarray) -> LogDistanceLine:
-    """Return the line that `_stored` described; ValueError if it is impossible."""
+    """Return the line of an array of `_stored`; raise ValueError if a number is impossible."""
     if stored.dtype.kind != "f" or not (abs(stored[1]) <= MAX_EXPONENT
                                         and 0 < stored[2] <= MAX_SD_DB):
         raise ValueError("a line's intercept, exponent or standard deviation is impossible")

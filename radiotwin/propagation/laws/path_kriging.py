@@ -1,4 +1,4 @@
-"""Paths over a map that may be wrong, and what was measured near by, each as far as it helps."""
+"""PathKriging: mean of path tracing over an inexact map and of kriging, by held-out weights."""
 
 from __future__ import annotations
 
@@ -32,32 +32,31 @@ from radiotwin.propagation.laws.kriging import RegressionKriging, ResidualField
 from radiotwin.propagation.laws.map_error import Found, MapError, estimate_map_error
 from radiotwin.scene.citymap import perturbed_map
 
-MEMBERS = 6  # maps with errors, beside the one that is given
-FOLDS = 4  # of the links that the weight is found with
-BLOCK_M = 60.0  # side of the squares of ground that are left out together
-SPREAD_FACTOR = np.sqrt(DOF / (DOF - 2))  # standard deviation over scale of the errors
+MEMBERS = 6  # maps with random errors, beside the given one
+FOLDS = 4  # folds from which the weights are found
+BLOCK_M = 60.0  # side of the squares of ground that are held out together
+SPREAD_FACTOR = np.sqrt(DOF / (DOF - 2))  # standard deviation over scale of Student-t errors
 
 
 class PathKriging(ChannelModel):
-    """A mean over two predictions, weighted by how well each predicts links that it has not seen.
+    """Weighted mean of two predictions: traced paths plus kriging, and kriging without paths.
 
-    One follows paths over the map (`ImagePaths`), and over maps with errors as large as the given
-    one seems to have (`MapError`): its mean is theirs, and where they disagree it is unsure. What
-    it leaves of the measured links is interpolated for each device. The other is
-    `RegressionKriging`, which knows only which links have line of sight.
+    The first traces paths over the map (`ImagePaths`) and over random maps with errors of the
+    estimated size (`MapError`). Its mean is theirs, its variance includes their spread, and each
+    device's residuals are interpolated. The second is `RegressionKriging`, which uses the map for
+    line of sight only. Errors on held-out links decide the weights.
 
     A device is its index in `LinkGeometry.device`: use the same indices to fit and to predict.
 
     Attributes:
-        diffuse: power beside the paths, see `ImagePaths`.
-        map_error: of the map, as far as the links show it.
-        lost: devices whose positions are too uncertain to follow paths from; kriging alone predicts
-            their links.
-        classes: (2, 2) level and own error scale [dB] of links without and with line of sight.
-        field: interpolation of what paths leave.
-        kriging: the other prediction.
-        weight: (2,) of the paths' prediction, without and with line of sight.
-        seed: of the maps' errors.
+        diffuse: diffuse power, see `ImagePaths`.
+        map_error: estimated errors of the map.
+        lost: devices whose positions are too uncertain to trace paths; only kriging predicts them.
+        classes: (2, 2) level offset and error scale over an exact map [dB]; rows NLoS, LoS.
+        field: interpolated residuals of traced paths.
+        kriging: the prediction without paths.
+        weight: (2,) weight of traced paths in NLoS, in LoS.
+        seed: of the random map errors.
     """
 
     name = "path_kriging"
@@ -68,9 +67,8 @@ class PathKriging(ChannelModel):
         """Make a model to be fitted.
 
         Args:
-            found: the map's error and the diffuse power if they are known already, see
-                `estimate_map_error`.
-            lost: see the class.
+            found: map errors and diffuse power from `estimate_map_error`; None: `fit` estimates.
+            lost: devices that are predicted by kriging only, see the class.
         """
         self._found, self.lost = found, np.array(lost, dtype=np.int64)
         self.map_error, self.diffuse = found or (MapError(), DIFFUSE_DEFAULT)
@@ -93,7 +91,7 @@ class PathKriging(ChannelModel):
         links, level_db, limit_db = links.select(sure), level_db[sure], limit_db[sure]
         paths = self._over_maps(links)
         self._fit_classes(links, level_db, limit_db, *paths)
-        residual = standardised(level_db, *self._at_paths(links, *paths), limit_db)
+        residual = standardised(level_db, *self._calibrated(links, *paths), limit_db)
         self.field.fit(links.device, links.receiver_m, residual, seed)
         self.weight = self._held_out_weight(links, level_db, limit_db, *paths)
         return self
@@ -104,16 +102,16 @@ class PathKriging(ChannelModel):
         mean_db, sd_db = self.kriging.predict(links)
         sure = np.flatnonzero(~np.isin(links.device, self.lost))
         followed = links.select(sure)
-        by_map_db, by_map_sd_db = self._at_paths(followed, *self._over_maps(followed))
-        shift, left = self.field.predict(followed.device, followed.receiver_m)
-        by_paths = by_map_db + by_map_sd_db * shift, by_map_sd_db * left
-        share = self.weight[followed.los.astype(int)]
-        mean_db[sure], sd_db[sure] = _mixture(share, by_paths, (mean_db[sure], sd_db[sure]))
+        path_db, path_sd_db = self._calibrated(followed, *self._over_maps(followed))
+        residual, residual_sd = self.field.predict(followed.device, followed.receiver_m)
+        by_paths = path_db + path_sd_db * residual, path_sd_db * residual_sd
+        weight = self.weight[followed.los.astype(int)]
+        mean_db[sure], sd_db[sure] = _mixture(weight, by_paths, (mean_db[sure], sd_db[sure]))
         return mean_db, sd_db
 
     @override
     def declared_db(self, links: Links) -> np.ndarray | float:
-        """Return the same with antennas along each path."""
+        """Return declared powers, cables and antenna gains (n,) [dB], the gains along each path."""
         if not links.declared.has_antennas:
             return links.declared_db
         return links.declared.fed_db[links.device] + declared_antenna_db(links)
@@ -129,81 +127,80 @@ class PathKriging(ChannelModel):
         return self.kriging.law
 
     def _over_maps(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean level (n,) [dB] and its mean square change (n,) [dB²] over possible maps."""
+        """Return mean (n,) [dB] and variance (n,) [dB²] of computed levels over possible maps."""
         power = self.diffuse, self.map_error.offsets_db
         levels_db = [paths_db(links, *power)]
         if self.map_error.is_seen and links.city is not None:
             for member in range(MEMBERS):
                 wrong = perturbed_map(links.city, self.map_error.wall_m[0],
                                       self.map_error.height_m[0], self.seed + member)
-                # Line of sight stays that of the given map, whose class the links belong to.
+                # Line of sight stays that of the given map, which decides a link's class.
                 levels_db.append(paths_db(replace(links, city=wrong), *power))
         unbiased = len(levels_db) / max(len(levels_db) - 1, 1)
         return np.mean(levels_db, axis=0), unbiased * np.var(levels_db, axis=0)
 
     def _fit_classes(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                      mean_db: np.ndarray, square_db: np.ndarray) -> None:
-        heard = [int(np.isfinite(level_db[links.los == los]).sum()) for los in (False, True)]
-        for los in (False, True):
-            if heard[los]:
+        """Fit `classes`; NLoS or LoS without a detected link takes the numbers of the other."""
+        detected = [bool(np.isfinite(level_db[links.los == los]).any()) for los in (False, True)]
+        for los in (0, 1):
+            if detected[los]:
                 of_class = links.los == los
                 offset_db, log_scale = fit_class(level_db[of_class], limit_db[of_class],
                                                  mean_db[of_class], square_db[of_class])
-                self.classes[int(los)] = offset_db, np.exp(log_scale)
-        for los in (False, True):
-            if not heard[los]:  # nothing is known of it but what the other shows
-                self.classes[int(los)] = self.classes[1 - int(los)]
+                self.classes[los] = offset_db, np.exp(log_scale)
+        if detected[0] != detected[1]:
+            self.classes[:] = self.classes[detected.index(True)]
 
-    def _at_paths(self, links: LinkGeometry, mean_db: np.ndarray, square_db: np.ndarray
-                  ) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation (n,) [dB] without what is interpolated."""
+    def _calibrated(self, links: LinkGeometry, mean_db: np.ndarray, square_db: np.ndarray
+                    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and sd (n,) [dB] of levels from `_over_maps` after the fit of `classes`."""
         offset_db, class_scale_db = self.classes[links.los.astype(int)].T
         return mean_db + offset_db, SPREAD_FACTOR * scale_db(class_scale_db, square_db)
 
     def _held_out_weight(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                          mean_db: np.ndarray, square_db: np.ndarray) -> np.ndarray:
-        """Return the weights (2,) that predict links in squares of ground left out best.
+        """Return the weights (2,) of traced paths, for NLoS and LoS, with least held-out error.
 
-        Least squares over the detected links, within 0 and 1. The correlations are those of all
-        links.
+        Least squares over the detected links in held-out squares of ground, clipped to 0..1. The
+        kriging correlations stay those of all links.
         """
         square = np.floor(links.receiver_m[:, :2] / BLOCK_M)
         label = np.unique(square, axis=0, return_inverse=True)[1].reshape(-1)
         rng = np.random.default_rng(self.seed)
         fold = rng.permutation(np.arange(label.max() + 1) % FOLDS)[label]
         errors_db = np.full((2, len(links)), np.nan)
-        by_paths = *self._at_paths(links, mean_db, square_db), self.field
+        by_paths = *self._calibrated(links, mean_db, square_db), self.field
         by_law = *self.kriging.law.predict(links), self.kriging.field
         for row, (trend_db, sd_db, field) in enumerate((by_paths, by_law)):
             residual = standardised(level_db, trend_db, sd_db, limit_db)
             for number in range(FOLDS):
-                rest, held = fold != number, fold == number
-                if not held.any() or not rest.any():
+                train, held = fold != number, fold == number
+                if not held.any() or not train.any():
                     continue
-                refitted = field.with_points(links.device[rest], links.receiver_m[rest],
-                                             residual[rest])
-                mean, _ = refitted.predict(links.device[held], links.receiver_m[held])
+                refitted = field.with_points(links.device[train], links.receiver_m[train],
+                                             residual[train])
+                mean = refitted.mean(links.device[held], links.receiver_m[held])
                 errors_db[row, held] = level_db[held] - trend_db[held] - sd_db[held] * mean
         weight = np.ones(2)
-        for los in (False, True):
+        for los in (0, 1):
             of_class = (links.los == los) & np.isfinite(errors_db).all(axis=0)
             paths_error_db, law_error_db = errors_db[:, of_class]
             gap_db = law_error_db - paths_error_db
             if (gap_db**2).sum() > 0:
-                weight[int(los)] = np.clip((law_error_db * gap_db).sum() / (gap_db**2).sum(),
-                                           0.0, 1.0)
+                weight[los] = np.clip((law_error_db * gap_db).sum() / (gap_db**2).sum(), 0.0, 1.0)
         return weight
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        own, own_settings = self.field.state()
+        paths, paths_settings = self.field.state()
         law, law_settings = self.kriging.state()
-        arrays = {f"paths/{name}": value for name, value in own.items()} \
+        arrays = {f"paths/{name}": value for name, value in paths.items()} \
             | {f"law/{name}": value for name, value in law.items()}
         return arrays | {"classes": self.classes, "weight": self.weight}, {
             "lost": self.lost.tolist(),
             "diffuse": list(self.diffuse), "map_error": self.map_error.state(),
-            "paths": own_settings, "law": law_settings, "seed": self.seed}
+            "paths": paths_settings, "law": law_settings, "seed": self.seed}
 
     @classmethod
     @override
@@ -225,17 +222,17 @@ class PathKriging(ChannelModel):
         if not ((model.classes[:, 1] > 0) & (model.classes[:, 1] <= MAX_SD_DB)).all():
             raise ValueError("an error scale is impossible")
         model.weight = require_array(arrays, "weight", (2,), 0.0, 1.0)
-        own, law = ({name.removeprefix(f"{part}/"): value for name, value in arrays.items()
-                     if name.startswith(f"{part}/")} for part in ("paths", "law"))
-        model.field = ResidualField.from_state(own, settings["paths"])
+        paths, law = ({name.removeprefix(f"{part}/"): value for name, value in arrays.items()
+                       if name.startswith(f"{part}/")} for part in ("paths", "law"))
+        model.field = ResidualField.from_state(paths, settings["paths"])
         model.kriging = RegressionKriging.from_state(law, settings["law"])
         return model
 
 
-def _mixture(share: np.ndarray, first: tuple[np.ndarray, np.ndarray],
+def _mixture(weight: np.ndarray, first: tuple[np.ndarray, np.ndarray],
              second: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation (n,) of a mixture of two normal distributions."""
-    mean_db = share * first[0] + (1 - share) * second[0]
-    square_db = share * (first[1]**2 + (first[0] - mean_db)**2) \
-        + (1 - share) * (second[1]**2 + (second[0] - mean_db)**2)
+    """Return mean and sd (n,) [dB] of a mixture of two normals, given as (mean, sd)."""
+    mean_db = weight * first[0] + (1 - weight) * second[0]
+    square_db = weight * (first[1]**2 + (first[0] - mean_db)**2) \
+        + (1 - weight) * (second[1]**2 + (second[0] - mean_db)**2)
     return mean_db, np.sqrt(square_db)

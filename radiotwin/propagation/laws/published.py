@@ -1,12 +1,12 @@
-"""Published laws: predictions of a recommendation as they stand, fitted to nothing.
+"""Published path loss laws, not fitted: their base class; COST 231 and ITU-R P.1411 for cities.
 
-They are priors, where no device of known position was measured, and baselines elsewhere. A link
-has two branches, with line of sight and without. A 3D map decides which one holds; without a map
-they are mixed by the law's probability of line of sight.
+They are priors if no device of known position was measured, and baselines otherwise. A law has a
+LoS and a NLoS branch. A 3D map decides which one applies; without a map both are mixed by the
+law's probability of line of sight.
 
-Recommendations are written for a fixed station and a terminal. Paths are reciprocal, so most laws
-here know a higher and a lower end, heights above the ground. Laws of cities are here, those of
-aerial terminals in `aerial`.
+Recommendations are written for a fixed station and a terminal. Propagation is reciprocal, so most
+laws here take the height of the higher and of the lower end above the ground. Laws of aerial
+terminals are in `aerial`.
 """
 
 from __future__ import annotations
@@ -24,34 +24,35 @@ from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.base import MAX_DB, ChannelModel, require_names, require_number
 from radiotwin.scene.citymap import CityMap
 
-MAX_FACTOR = 2.0  # beyond its range of frequencies to which a law is extrapolated, with a warning
-MIN_ROOF_M = 2.5  # of what counts as a building
-GRID = 128  # points to each side of the map, at which its roofs are looked up
-MAX_ROOF_M = 1e4  # of a stored roof
+MAX_FACTOR = 2.0  # a law is extrapolated to this factor beyond its frequencies, with a warning
+MIN_ROOF_M = 2.5  # lowest building
+GRID = 128  # points along each side of the map at which roof heights are sampled
+MAX_ROOF_M = 1e4  # highest mean roof in a file
 Bounds = tuple[float | np.ndarray, float | np.ndarray]
-"""Least and greatest value, of all links or (n,) of each."""
-BUILDING_M = 35.0  # between buildings: the middle of the report's 20 to 50 m
-STREET_M = BUILDING_M / 2
-STREET_ANGLE_DEG = 90.0  # between street and path
-MIN_BELOW_ROOF_M = 1.0  # that the mobile is below the roofs, whatever their height
-LOS_M = 20.0  # from which on the law along a street holds; it is free space there
-# The report has a standard deviation of 4 to 8 dB: its ends are taken for the two classes.
+"""Least and greatest value, one for all links or (n,)."""
+# COST 231 Walfisch-Ikegami
+BUILDING_M = 35.0  # distance between buildings: the middle of the report's 20 to 50 m
+STREET_M = BUILDING_M / 2  # street width, the report's default
+STREET_ANGLE_DEG = 90.0  # between street and direct path, the report's default
+MIN_BELOW_ROOF_M = 1.0  # least height of roofs over the mobile
+LOS_M = 20.0  # least distance of the LoS law, which equals free space there
+# The report gives a standard deviation of 4 to 8 dB: the ends are used for LoS and NLoS.
 LOS_SD_DB, NLOS_SD_DB = 4.0, 8.0
-BASE_M, MOBILE_M = (4.0, 50.0), (1.0, 3.0)  # heights that the report is for
-# alpha, beta [dB], gamma, sd [dB]: without line of sight, with it
+BASE_M, MOBILE_M = (4.0, 50.0), (1.0, 3.0)  # ranges of antenna heights
+# ITU-R P.1411-12: alpha, beta [dB], gamma, sd [dB], for NLoS, for LoS
 BELOW_ROOFS = (4.00, 10.2, 2.36, 7.60), (2.12, 29.2, 2.11, 5.06)  # Table 4
 OVER_ROOFS = (4.39, -6.27, 2.30, 6.89), (2.29, 28.6, 1.96, 3.48)  # Table 8
-# Distances of the same rows [m].
+# Ranges of distance of the same rows [m]
 BELOW_ROOFS_M, OVER_ROOFS_M = ((30.0, 715.0), (5.0, 660.0)), ((260.0, 1200.0), (55.0, 1200.0))
 
 
 class Validity(NamedTuple):
-    """Range that a law was published for.
+    """Ranges of parameters for which a law was published.
 
     Attributes:
         frequency_hz: of the radio [Hz].
         distance_m: between the ends [m].
-        high_m, low_m: height of the higher and of the lower end [m].
+        high_m, low_m: height of the higher and of the lower end above the ground [m].
     """
 
     frequency_hz: Bounds
@@ -61,23 +62,23 @@ class Validity(NamedTuple):
 
 
 class Branch(NamedTuple):
-    """Median loss (n,) [dB] of links of one class, and the standard deviation of shadowing."""
+    """Median path loss (n,) [dB] in LoS, or in NLoS, and standard deviation of shadowing [dB]."""
 
     loss_db: np.ndarray
     sd_db: np.ndarray | float
 
 
 class PublishedLaw(ChannelModel):
-    """A law of a recommendation; the gain is minus its median loss.
+    """A published path loss law; the predicted gain is minus its median loss.
 
     Attributes:
-        source: recommendation, and the section or table used.
-        frequency_range_hz: least and greatest frequency that any of its branches holds for [Hz].
-        needs_map: whether it has no probability of line of sight, so that a map must decide.
+        source: recommendation, and section or table.
+        frequency_range_hz: least and greatest published frequency [Hz].
+        needs_map: True if the law has no LoS probability, so that a map must decide.
         frequency_hz: of the radio [Hz].
-        with_map: whether `los` of links decides the branch.
+        with_map: True if `los` of links decides the branch; False: the LoS probability.
         roof_m: mean height of the map's roofs [m]; 0 without a map.
-        power_dbm: transmit power, where levels are received powers [dBm]; 0 for gains.
+        power_dbm: transmit power if levels are received powers [dBm]; 0 for gains.
     """
 
     uses_map = True
@@ -92,24 +93,24 @@ class PublishedLaw(ChannelModel):
 
     @abstractmethod
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
-        """Return loss and shadowing of n links, if all have line of sight, or if none has."""
+        """Return loss and shadowing of n links by the LoS branch, or the NLoS branch."""
 
     @abstractmethod
     def validity(self, links: LinkGeometry) -> Validity:
-        """Return what the branches that n links take were published for."""
+        """Return the published ranges of parameters for n links."""
 
     def los_probability(self, links: LinkGeometry) -> np.ndarray:
-        """Return the probability (n,) of line of sight; needed unless `needs_map`."""
+        """Return the probability (n,) of line of sight; subclasses with `needs_map` have none."""
         raise NotImplementedError(f"{self.name} has no probability of line of sight")
 
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        """Take frequency and map from links; nothing is fitted, and there may be no link at all.
+        """Take frequency and mean roof height from the links; levels are not used.
 
         Raises:
-            BadInput: the frequency is unknown or far outside the law's range, or a law that needs
-                a map with buildings has none.
+            BadInput: the frequency is unknown or far out of range, or the law needs a map with
+                buildings and there is none.
         """
         low_hz, high_hz = self.frequency_range_hz
         if not low_hz / MAX_FACTOR <= links.frequency_hz <= high_hz * MAX_FACTOR:
@@ -132,10 +133,9 @@ class PublishedLaw(ChannelModel):
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and standard deviation [dB], see the base class.
+        """Predict mean and standard deviation (n,) [dB] of the mixture of both branches.
 
-        Those of a mixture of both branches: its variance is the mean of theirs, plus that of the
-        two medians.
+        The variance is the mean of both variances plus the variance between the two medians.
         """
         los, nlos = self.branch(links, True), self.branch(links, False)
         share = links.los.astype(float) if self.with_map else self.los_probability(links)
@@ -145,43 +145,46 @@ class PublishedLaw(ChannelModel):
         return self.power_dbm - loss_db, np.sqrt(variance)
 
     def outside(self, links: LinkGeometry) -> list[str]:
-        """Return a sentence on each quantity that lies outside the law's validity."""
+        """Return a message for each quantity that is outside the law's validity for some links."""
         found = []
-        for what, value, least, most, unit in self._quantities(links):
-            odd = (value < least) | (value > most)
+        for what, value, least, greatest, unit in self._quantities(links):
+            odd = (value < least) | (value > greatest)
             if not odd.any():
                 continue
             ends = dict.fromkeys((shortly(value[odd].min()), shortly(value[odd].max())))
             share = "" if (value == value[0]).all() and odd.all() else f" in {percent(odd.mean())}"
-            ranges = sorted(set(zip(least[odd].tolist(), most[odd].tolist(), strict=True)))
-            published = " or ".join(_range(*each) for each in ranges)
+            ranges = sorted(set(zip(least[odd].tolist(), greatest[odd].tolist(), strict=True)))
+            published = " or ".join(
+                f"{low:g} and more" if np.isinf(high) else f"{low:g} to {high:g}"
+                for low, high in ranges)
             found.append(f"{self.name} is used outside what {self.source} was published for: the "
                          f"{what} is {' to '.join(ends)} {unit}{share and share + ' of the links'}"
                          f", published is {published} {unit}")
         return found
 
     def inside(self, links: LinkGeometry) -> np.ndarray:
-        """Return whether all quantities of each link lie within the law's validity (n,)."""
+        """Return (n,) bool: all quantities of the link are within the law's validity."""
         result = np.ones(len(links), dtype=bool)
-        for _, value, least, most, _ in self._quantities(links):
-            result &= (value >= least) & (value <= most)
+        for _, value, least, greatest, _ in self._quantities(links):
+            result &= (value >= least) & (value <= greatest)
         return result
 
     def _quantities(self, links: LinkGeometry,
                     ) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray, str]]:
-        """Return name, values, least and greatest published ones, (n,) each, and the unit."""
+        """Return name, value, least and greatest published value, (n,) each, and unit."""
         high_m, low_m = ends_m(links)
         valid = self.validity(links)
-        least_hz, most_hz = valid.frequency_hz
+        least_hz, greatest_hz = valid.frequency_hz
         frequency_ghz = np.full(len(links), self.frequency_hz / 1e9)
-        every = [("frequency", frequency_ghz, (np.divide(least_hz, 1e9), np.divide(most_hz, 1e9)),
-                  "GHz"),
-                 ("distance", links.distance_m, valid.distance_m, "m"),
-                 ("height of the higher end", high_m, valid.high_m, "m"),
-                 ("height of the lower end", low_m, valid.low_m, "m")]
+        quantities = [
+            ("frequency", frequency_ghz, (np.divide(least_hz, 1e9), np.divide(greatest_hz, 1e9)),
+             "GHz"),
+            ("distance", links.distance_m, valid.distance_m, "m"),
+            ("height of the higher end", high_m, valid.high_m, "m"),
+            ("height of the lower end", low_m, valid.low_m, "m")]
         return [(what, value, np.broadcast_to(least, value.shape),
-                 np.broadcast_to(most, value.shape), unit)
-                for what, value, (least, most), unit in every if len(value)]
+                 np.broadcast_to(greatest, value.shape), unit)
+                for what, value, (least, greatest), unit in quantities if len(value)]
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -207,7 +210,7 @@ class PublishedLaw(ChannelModel):
 
 
 def heights_m(links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights (n,) above the ground of devices and of receivers [m]."""
+    """Return the heights of devices (n,) and of receivers (n,) above the ground [m]."""
     device_m, receiver_m = links.device_m[:, 2], links.receiver_m[:, 2]
     if links.city is not None and links.city.terrain is not None:
         device_m = device_m - links.city.ground_height_m(*links.device_m[:, :2].T)
@@ -216,24 +219,24 @@ def heights_m(links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ends_m(links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights (n,) above the ground of the higher and of the lower end of links [m]."""
+    """Return the heights above the ground of the higher and of the lower end, (n,) each [m]."""
     both_m = heights_m(links)
     return np.maximum(*both_m), np.minimum(*both_m)
 
 
 def ground_m(links: LinkGeometry) -> np.ndarray:
-    """Return the horizontal distance (n,) between the ends [m]."""
+    """Return the horizontal distance (n,) between device and receiver [m]."""
     offset_m = links.receiver_m[:, :2] - links.device_m[:, :2]
     return np.hypot(offset_m[:, 0], offset_m[:, 1])
 
 
 def free_space_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
-    """Return the basic transmission loss of free space [dB] (ITU-R P.525-4, Eq. 4)."""
+    """Return the free-space basic transmission loss (n,) [dB] (ITU-R P.525-4, Eq. 4)."""
     return 32.45 + 20 * np.log10(frequency_hz / 1e6) + 20 * np.log10(distance_m / 1e3)
 
 
 def mean_roof_m(city: CityMap) -> float:
-    """Return the mean height of a map's roofs above the ground below [m]; 0 without any."""
+    """Return the mean height of a map's roofs above the ground [m]; 0 without buildings."""
     low_m, high_m = city.vertices[:, :2].min(axis=0), city.vertices[:, :2].max(axis=0)
     share = (np.arange(GRID) + 0.5) / GRID
     x_m, y_m = (low + share * (high - low) for low, high in zip(low_m, high_m, strict=True))
@@ -242,21 +245,14 @@ def mean_roof_m(city: CityMap) -> float:
     return float(roofs_m.mean()) if len(roofs_m) else 0.0
 
 
-def _range(least: float, most: float) -> str:
-    """Return the words for a published range."""
-    if np.isinf(most):
-        return f"{least:g} and more"
-    return f"{least:g} to {most:g}"
-
-
 class WalfischIkegami(PublishedLaw):
-    """COST 231 Walfisch-Ikegami, medium-sized city: along a street, and over rows of roofs.
+    """COST 231 Walfisch-Ikegami path loss, medium-sized city: along a street or over roofs.
 
     COST Action 231, "Digital mobile radio towards future generation systems", final report, EUR
-    18957, 1999, Sec. 4.4.1. The higher end is the base station, the lower one the mobile in the
-    street. Roofs are as high as those of the map on average; street width and distance of buildings
-    are the report's defaults. The distance is that through the air: in the report's range the one
-    along the ground makes little difference, and above a device it makes no sense.
+    18957, 1999, Sec. 4.4.1. The higher end is the base station, the lower end the mobile in the
+    street. Roofs have the mean height of the map's; street width and distance of buildings are the
+    report's defaults. The distance is the slant distance: in the report's range it hardly differs
+    from the horizontal one, which is no measure of loss for a receiver above the device.
     """
 
     name = "cost231_wi"
@@ -280,7 +276,7 @@ class WalfischIkegami(PublishedLaw):
         return Branch(free_db + np.maximum(excess_db, 0.0), NLOS_SD_DB)
 
     def _roof_to_street_db(self, links: LinkGeometry) -> np.ndarray:
-        """Return L_rts (n,) [dB]: from the last roof down to the mobile, Ikegami's part."""
+        """Return the rooftop-to-street diffraction loss L_rts (n,) [dB] (Ikegami)."""
         mobile_m = np.clip(ends_m(links)[1], *MOBILE_M)
         below_m = np.maximum(self.roof_m - mobile_m, MIN_BELOW_ROOF_M)
         orientation_db = 4.0 - 0.114 * (STREET_ANGLE_DEG - 55)
@@ -288,7 +284,7 @@ class WalfischIkegami(PublishedLaw):
                 + 20 * np.log10(below_m) + orientation_db)
 
     def _many_screens_db(self, links: LinkGeometry) -> np.ndarray:
-        """Return L_msd (n,) [dB]: over the rows of roofs, Walfisch and Bertoni's part."""
+        """Return the multiple-screen diffraction loss L_msd (n,) [dB] (Walfisch and Bertoni)."""
         base_m = np.clip(ends_m(links)[0], *BASE_M)
         over_m, kilometres = base_m - self.roof_m, links.distance_m / 1e3
         above = over_m > 0
@@ -302,20 +298,20 @@ class WalfischIkegami(PublishedLaw):
 
 
 class WalfischIkegamiMetropolitan(WalfischIkegami):
-    """COST 231 Walfisch-Ikegami, metropolitan centre."""
+    """COST 231 Walfisch-Ikegami path loss, metropolitan centre."""
 
     name = "cost231_wi_metropolitan"
     city_factor = 1.5
 
 
 class P1411(PublishedLaw):
-    """ITU-R P.1411-12, site-general, in street canyons and over rooftops.
+    """ITU-R P.1411-12 site-general path loss in street canyons and over rooftops.
 
-    Where both ends are below the mean roof: Sec. 4.1.1, Table 4. Where the higher end is above it:
-    Sec. 4.2.1, Table 8, published for 2.2 to 73 GHz. Both are L = 10 alpha log10 d + beta + 10
-    gamma log10 f, with d in metres and f in GHz (Eqs. 1 and 20). Links without line of sight are
-    those of urban high-rise, the only ones published below 10 GHz. Of them A = L - L_FS, and the
-    loss is L_FS + 10 log10(10^(A / 10) + 1), with L_FS of free space, as the recommendation has it.
+    Both ends below the mean roof: Sec. 4.1.1, Table 4. Higher end above it: Sec. 4.2.1, Table 8,
+    published for 2.2 to 73 GHz. Both are L = 10 alpha log10 d + beta + 10 gamma log10 f, d in
+    metres and f in GHz (Eqs. 1 and 20). NLoS uses the rows for urban high-rise, the only ones
+    published below 10 GHz; its loss is L_FS + 10 log10(10^(A / 10) + 1) with A = L - L_FS and the
+    free-space loss L_FS, as the recommendation says.
     """
 
     name = "p1411"
@@ -326,11 +322,11 @@ class P1411(PublishedLaw):
     @override
     def validity(self, links: LinkGeometry) -> Validity:
         over, los = self._is_over(links), links.los.astype(int)
-        least_m, most_m = np.where(over[:, None], np.array(OVER_ROOFS_M)[los],
-                                   np.array(BELOW_ROOFS_M)[los]).T
+        least_m, greatest_m = np.where(over[:, None], np.array(OVER_ROOFS_M)[los],
+                                       np.array(BELOW_ROOFS_M)[los]).T
         low_hz, high_hz = self.frequency_range_hz
         return Validity((np.where(over, 2.2e9, low_hz), np.where(over, 73e9, high_hz)),
-                        (least_m, most_m))
+                        (least_m, greatest_m))
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
@@ -344,4 +340,5 @@ class P1411(PublishedLaw):
         return Branch(loss_db, sd_db)
 
     def _is_over(self, links: LinkGeometry) -> np.ndarray:
+        """Return (n,) bool: the higher end is above the mean roof."""
         return ends_m(links)[0] > self.roof_m

@@ -1,7 +1,7 @@
-"""Every channel model by name, and a fitted one as a safetensors file.
+"""Look up channel models by name; write and read fitted ones as safetensors files.
 
 A package adds models under the entry-point group `radiotwin.channels`; a script adds one with
-`register`. The file holds arrays and JSON, no code that loading runs.
+`register`. A file holds arrays and JSON; loading it runs no code.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from radiotwin.propagation.laws.segmented_nn import SegmentedNN
 from radiotwin.runtime.pieces import kept
 from radiotwin.runtime.plugins import load_plugins
 
-ENTRY_POINTS = "radiotwin.channels"  # group of the packages' entry points
+ENTRY_POINTS = "radiotwin.channels"  # entry-point group
 BUILT_IN: tuple[type[ChannelModel], ...] = (
     LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging, ImagePaths, PathKriging,
     UrbanMacro, UrbanMicro, AlHouraniSuburban, AlHouraniUrban, AlHouraniDenseUrban,
     AlHouraniHighRise, P1411, WalfischIkegami, WalfischIkegamiMetropolitan)
-ALIASES = {"raytrace": ImagePaths.name}  # as the command line calls it
+ALIASES = {"raytrace": ImagePaths.name}  # names in command-line options
 _registered: dict[str, type[ChannelModel]] = {}
-BESIDE = "beside/"  # begins the names of arrays that are not the model's
-# Distances and heights [m] at which a model that is read must predict numbers.
+BESIDE = "beside/"  # prefix of arrays in the file that do not belong to the model
+# Distances and heights [m] at which a decoded model must predict finite levels.
 _TRIED_M = np.array([(1.0, 0.0), (30.0, 10.0), (300.0, -50.0), (3e3, 100.0), (1e5, 3e3)])
 
 
@@ -49,13 +49,13 @@ def register(model: type[ChannelModel]) -> type[ChannelModel]:
     """Add a channel model to this process; usable as a decorator.
 
     Args:
-        model: subclass of `ChannelModel`, with a name of its own.
+        model: subclass of `ChannelModel` with a new name.
 
     Returns:
         the class itself
 
     Raises:
-        BadInput: not a channel model, or its name is taken.
+        BadInput: not a channel model, or another model has its name.
     """
     if not (isinstance(model, type) and issubclass(model, ChannelModel)):
         raise BadInput(f"{model!r} is not a subclass of radiotwin.propagation.laws.ChannelModel")
@@ -70,14 +70,14 @@ def register(model: type[ChannelModel]) -> type[ChannelModel]:
 def channel_models() -> dict[str, type[ChannelModel]]:
     """Return all channel models by name: built-in, of installed packages, and registered.
 
-    Warns where a package's model cannot be loaded, and goes on without it.
+    A model of a package that cannot be loaded is left out with a warning.
     """
     load_plugins(ENTRY_POINTS, register, "channel model")
     return {each.name: each for each in BUILT_IN} | _registered
 
 
 def channel_named(name: str) -> type[ChannelModel]:
-    """Return the class of a channel model by its name, or an alias of it.
+    """Return the class of a channel model by its name or alias.
 
     Raises:
         BadInput: no such model is installed.
@@ -92,16 +92,16 @@ def channel_named(name: str) -> type[ChannelModel]:
 
 def fit_once(kind: type[ChannelModel], links: LinkGeometry, level_db: np.ndarray,
              limit_db: Limit, seed: int) -> ChannelModel:
-    """Fit a new model of a kind, or take it from an earlier run that was to fit the same.
+    """Fit a new model of the class `kind`, or load it if an earlier run fitted the same data.
 
-    Arguments and errors are those of `ChannelModel.fit`.
+    The other arguments, and errors, are those of `ChannelModel.fit`.
     """
     return kept("channel", (kind, links, level_db, limit_db, seed),
                 lambda: kind().fit(links, level_db, limit_db, seed), kind.state, kind.from_state)
 
 
 def encode_channel(model: ChannelModel, beside: dict[str, np.ndarray] | None = None) -> bytes:
-    """Return a fitted model as a safetensors file, beside which it may hold other arrays."""
+    """Encode a fitted model, and optional other arrays beside it, as a safetensors file."""
     arrays, settings = model.state()
     arrays = arrays | {f"{BESIDE}{name}": array for name, array in (beside or {}).items()}
     header = json.dumps({"model": model.name, "settings": settings}, sort_keys=True)
@@ -110,14 +110,14 @@ def encode_channel(model: ChannelModel, beside: dict[str, np.ndarray] | None = N
 
 
 def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np.ndarray]]:
-    """Return the model that `encode_channel` described, and the arrays beside it.
+    """Decode a file of `encode_channel`: the model, and the other arrays beside it.
 
     Args:
         data: content of the file.
-        source: where it is from, for the message.
+        source: path of the file, for the message.
 
     Raises:
-        BadInput: it is damaged, of a model that is not installed, or of something else.
+        BadInput: the file is damaged or no channel, or its model is not known.
         MissingPackage: the model needs a package that is not installed.
     """
     models = channel_models()
@@ -133,7 +133,7 @@ def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np
         model = models[header["model"]].from_state(
             {name: array.copy() for name, array in arrays.items() if not name.startswith(BESIDE)},
             header["settings"])
-        if type(model) in BUILT_IN:  # one of a package's own may need a map
+        if type(model) in BUILT_IN:  # a model of another package may need a map
             _try_to_predict(model)
         return model, beside
     except MissingPackage:
@@ -146,7 +146,7 @@ def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np
 
 
 def _try_to_predict(model: ChannelModel) -> None:
-    """Raise ValueError where links without a map get a level that is no number."""
+    """Raise ValueError if levels that a model predicts for links without a map are not finite."""
     horizontal_m, rise_m = np.tile(_TRIED_M, (2, 1)).T
     count, zero = len(rise_m), np.zeros(len(rise_m))
     links = LinkGeometry(np.zeros((count, 3)), np.column_stack([horizontal_m, zero, rise_m]),

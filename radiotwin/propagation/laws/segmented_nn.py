@@ -1,6 +1,6 @@
-"""The segmented law, corrected by a small ensemble of networks where measurements support it.
+"""SegmentedNN: segmented log-distance law corrected by a small ensemble of neural networks.
 
-The networks are trained together, and each is stopped early on links held out from it.
+The networks are trained together, each with early stopping on its own held-out links.
 """
 
 from __future__ import annotations
@@ -39,27 +39,28 @@ MEMBERS = 8  # networks, each with an eighth of the links held out
 HIDDEN = 24  # units of each hidden layer
 LEARNING_RATE = 1e-2  # at the first step; a cosine lowers it to a fiftieth
 WEIGHT_DECAY = 1e-2  # of weights, not of biases
-BATCH = 256  # links a step
-STEPS = 1200  # at most
+BATCH = 256  # links in a step
+STEPS = 1200  # maximum
 CHECK_EVERY = 20  # steps between two evaluations of the held-out loss
-PATIENCE = 300  # steps without a better member, then training ends
-BLOCK_M = 100.0  # side of a block on the ground that is held out as a whole
-TABLE = 129  # nodes on each axis of the table
-TRIM = 0.005  # share of the links at each end that the box of the data leaves out
-MAX_HIDDEN, MAX_WEIGHT, MAX_DECADES = 4096, 1e6, 20.0  # of networks that are read
+PATIENCE = 300  # training ends after so many steps in which no member improved
+BLOCK_M = 100.0  # side of a square of ground whose links are held out together
+TABLE = 129  # nodes on each axis of the table of residuals
+TRIM = 0.005  # quantile at both ends of the data beyond which the residual is held constant
+MAX_HIDDEN, MAX_WEIGHT, MAX_DECADES = 4096, 1e6, 20.0  # bounds of networks in a file
 MIN_SPAN = np.array([0.1, 10.0])  # least range that scales log-distance, height difference [m]
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """n links in the units of the network.
+    """Inputs and targets of the networks for n links.
 
     Attributes:
-        inputs: (n, INPUTS), each of about unit range.
-        target: (n,) residual in standard deviations of its class; where `censored`, the limit's.
-        censored: (n,) bool, links that were not detected.
+        inputs: (n, INPUTS) of about unit range, see `SegmentedNN._inputs`.
+        target: (n,) residual over the standard deviation of its class; if `censored`, that of the
+            limit of detection.
+        censored: (n,) bool, the link was not detected.
         los: (n,) bool, line of sight.
-        fold: (n,) in 0..MEMBERS-1, the member that does not train on the link.
+        fold: (n,) index of the member that holds out the link.
     """
 
     inputs: np.ndarray
@@ -70,7 +71,7 @@ class TrainingData:
 
 
 def _torch() -> Any:
-    """Return the module torch; raise BadInput where it is not installed."""
+    """Import torch; raise BadInput if it is not installed."""
     return optional_package(
         "torch", "the channel model segmented_nn needs torch, which is not installed; install it "
                  "with `pip install 'radiotwin[nn]'`, or take another --model")
@@ -78,9 +79,9 @@ def _torch() -> Any:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Restrict torch to one thread, so that sums have one order and repeat bit for bit.
+    """Restrict torch to one thread while in the context, so that results repeat to the bit.
 
-    The layers are too small to gain by more threads.
+    The layers are too small to gain from more threads.
     """
     import torch
 
@@ -93,9 +94,14 @@ def one_thread() -> Iterator[None]:
 
 
 def forward(weights: dict[str, torch.Tensor], inputs: torch.Tensor) -> torch.Tensor:
-    """Return every member's residual in standard deviations of the class, (MEMBERS, n).
+    """Evaluate all networks: two tanh layers and a linear one.
 
-    Two tanh layers and a linear one. Weights are by the names in WEIGHTS, inputs (n, INPUTS).
+    Args:
+        weights: by the names in WEIGHTS.
+        inputs: (n, INPUTS).
+
+    Returns:
+        (MEMBERS, n) residual in standard deviations of the link's class.
     """
     import torch
 
@@ -105,7 +111,7 @@ def forward(weights: dict[str, torch.Tensor], inputs: torch.Tensor) -> torch.Ten
 
 
 def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
-    """Return random hidden layers and an output of zero: every member starts as the line."""
+    """Return initial weights: random hidden layers, and outputs of zero, which is the law."""
     import torch
 
     shapes = {"w1": (INPUTS, HIDDEN), "w2": (HIDDEN, HIDDEN)}
@@ -122,14 +128,14 @@ def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
 
 @one_thread()
 def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Train all members and keep the weights of each that were best on its held-out links.
+    """Train all networks with early stopping, each at its least held-out loss.
 
-    The loss is the censored Gaussian likelihood, with one standard deviation for each class and
-    member that is learned with the weights. Equal data and seed give equal bits.
+    The loss is the negative log-likelihood of a censored Gaussian (Tobit). Each member learns a
+    standard deviation for LoS and one for NLoS. Equal data and seed give equal bits.
 
     Returns:
-        weights by name, (MEMBERS, ...) each, and for every link the output (n,) of the member that
-        it was held out from.
+        weights by name, (MEMBERS, ...) each, and (n,) held-out output: for each link that of the
+        member that was not trained on it.
     """
     import torch
 
@@ -141,7 +147,7 @@ def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.nda
     censored, fold = torch.as_tensor(data.censored), torch.as_tensor(data.fold)
     segment = torch.as_tensor(data.los.astype(np.int64))
     held_out = fold[None, :] == torch.arange(MEMBERS)[:, None]
-    share = held_out.sum(1).clamp(min=1)
+    held_out_count = held_out.sum(1).clamp(min=1)
 
     weights, log_sd = _start(generator), torch.zeros(MEMBERS, 2)
     learnt = [tensor.requires_grad_() for tensor in (*weights.values(), log_sd)]
@@ -150,7 +156,7 @@ def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.nda
     best = {name: tensor.detach().clone() for name, tensor in weights.items()}
     best_loss = torch.full((MEMBERS,), torch.inf)
     last_better = 0
-    order, at = torch.empty(0, dtype=torch.int64), 0
+    order, start = torch.empty(0, dtype=torch.int64), 0
 
     def loss_of(rows: torch.Tensor | slice) -> torch.Tensor:
         output = forward(weights, inputs[rows])
@@ -160,7 +166,7 @@ def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.nda
         for step in range(STEPS + 1):
             if step % CHECK_EVERY == 0:
                 with torch.no_grad():
-                    loss = (loss_of(slice(None)) * held_out).sum(1) / share
+                    loss = (loss_of(slice(None)) * held_out).sum(1) / held_out_count
                     better = loss < best_loss
                     best_loss = torch.where(better, loss, best_loss)
                     for name, tensor in weights.items():
@@ -169,10 +175,10 @@ def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.nda
                     last_better = step
             if step == STEPS or step - last_better >= PATIENCE:
                 break
-            if at + BATCH > len(order):
-                order, at = torch.randperm(len(target), generator=generator), 0
-            rows = order[at : at + BATCH]
-            at += BATCH
+            if start + BATCH > len(order):
+                order, start = torch.randperm(len(target), generator=generator), 0
+            rows = order[start : start + BATCH]
+            start += BATCH
             loss = torch.where(held_out[:, rows], 0.0, loss_of(rows)).mean(1).sum()
             rate = LEARNING_RATE * (0.51 + 0.49 * math.cos(math.pi * step / STEPS))
             optimiser.step(torch.autograd.grad(loss, learnt), rate)
@@ -183,27 +189,25 @@ def _train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.nda
 
 
 class SegmentedNN(ChannelModel):
-    """Segmented log-distance law plus a residual learned of log-distance, elevation and LoS.
+    """Segmented log-distance law plus a residual learnt from log-distance, elevation and LoS.
 
     After Chen et al., 'Model-aided federated reinforcement learning for multi-UAV trajectory
     planning in IoT networks' (GLOBECOM Workshops 2023): the same inputs and likelihood, with a
-    standard deviation for each class. Here the network learns only the law's residual. Each member
-    of the ensemble holds out one part of the links, starts as the law itself and keeps the weights
-    that were best on that part, so that a bad start is never kept; the prediction is the members'
-    mean. Outside the measured distances and heights the residual stays as at the edge, and the law
-    extrapolates. A class that borrowed its line keeps it uncorrected.
+    standard deviation for LoS and NLoS each. Unlike there, the networks learn only the residual of
+    the law. Each network starts as the law itself, holds out a part of the links, and keeps the
+    weights that predict these best; the prediction is the mean of the networks. Outside the
+    measured distances and heights the residual is held constant, and the law extrapolates. A class
+    with a borrowed line is not corrected.
 
-    Predictions come from a table of that mean, TABLE x TABLE values a class, bilinear between them:
-    as exact as the network to hundredths of a decibel and fast enough for millions of candidate
-    positions.
+    Predictions are interpolated bilinearly in a table of that mean, TABLE x TABLE values for LoS
+    and NLoS each: exact to hundredths of a decibel, and fast enough for millions of positions.
 
     Attributes:
         law: the segmented law.
-        low, high: (2, 2) for each class, NLoS first: box of the data's coordinates, see
-            `_coordinates`.
-        residual_db: (2, 2) for each class, lowest and highest residual [dB].
-        sd_db: (2,) standard deviation of each class [dB].
-        weights: of the ensemble by name, see `ensemble.WEIGHTS`.
+        low, high: (2, 2) box of the data's `_coordinates`; rows NLoS, LoS.
+        residual_db: (2, 2) least and greatest residual [dB]; rows NLoS, LoS.
+        sd_db: (2,) standard deviation in NLoS, in LoS [dB].
+        weights: weights of the networks, by the names in WEIGHTS.
     """
 
     name = "segmented_nn"
@@ -228,7 +232,7 @@ class SegmentedNN(ChannelModel):
         corrected = np.array([self.law.borrowed != "nlos", self.law.borrowed != "los"])
         use = corrected[segment]
         for s in (0, 1):
-            # The outermost links are too few to shape the edge that everything beyond is read from.
+            # The outermost links are too few to fit the edge, which extends to all distances.
             source = coordinates[segment == s] if corrected[s] else coordinates[use]
             self.low[s], self.high[s] = np.quantile(source, [TRIM, 1.0 - TRIM], axis=0)
         censored = np.isnan(level_db)
@@ -270,10 +274,10 @@ class SegmentedNN(ChannelModel):
         return self.law.predict(links)[0] + near * (1.0 - u) + far * u, self.sd_db[segment]
 
     def _inputs(self, coordinates: np.ndarray, segment: np.ndarray) -> np.ndarray:
-        """Return the network's inputs (n, 4), the first and last scaled to [-1, 1].
+        """Return the networks' inputs (n, 4) from `_coordinates` (n, 2) and class (n,), LoS 1.
 
-        These are log-distance, elevation [rad], line of sight, and the height difference: where
-        receivers have few altitudes, elevation hardly adds to distance.
+        Log-distance, elevation [rad], line of sight (1 or -1), and height difference; the first and
+        last scaled to [-1, 1]. With few flight altitudes, elevation hardly adds to distance.
         """
         coordinates = np.clip(coordinates, self.low[segment], self.high[segment])
         elevation_rad = np.arcsin(np.clip(coordinates[:, 1] / 10.0 ** coordinates[:, 0], -1.0, 1.0))
@@ -282,7 +286,7 @@ class SegmentedNN(ChannelModel):
         return np.column_stack([scaled[:, 0], elevation_rad, 2.0 * segment - 1.0, scaled[:, 1]])
 
     def _tabulate(self) -> None:
-        """Tabulate the ensemble's mean residual [dB] over each class's box, (2, TABLE, TABLE)."""
+        """Tabulate the networks' mean residual [dB] over the boxes of NLoS and LoS data."""
         torch = _torch()
         weights = {name: torch.as_tensor(array) for name, array in self.weights.items()}
         self._table = np.zeros((2, TABLE, TABLE))
@@ -298,9 +302,9 @@ class SegmentedNN(ChannelModel):
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         arrays, settings = self.law.state()
-        own = {"low": self.low, "high": self.high, "residual_db": self.residual_db,
-               "sigma_db": self.sd_db}
-        return arrays | own | self.weights, settings
+        boxes = {"low": self.low, "high": self.high, "residual_db": self.residual_db,
+                 "sigma_db": self.sd_db}
+        return arrays | boxes | self.weights, settings
 
     @classmethod
     @override
@@ -318,14 +322,14 @@ class SegmentedNN(ChannelModel):
         model.residual_db = require_array(arrays, "residual_db", (2, 2), -MAX_DB, MAX_DB)
         model.sd_db = require_array(arrays, "sigma_db", (2,), np.finfo(float).tiny, MAX_SD_DB)
         if (model.low > model.high).any() or (np.diff(model.residual_db) < 0).any():
-            raise ValueError("a least value is above the greatest")
+            raise ValueError("a lower bound is above its upper bound")
         model.weights = _weights(arrays)
         model._tabulate()
         return model
 
 
 def _weights(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the weights of the ensemble after a check of their shapes against each other."""
+    """Return the networks' weights of a file after checking their shapes and values."""
     hidden = arrays["b1"].shape[-1]
     if hidden > MAX_HIDDEN:
         raise ValueError(f"{hidden} units in a layer; allowed are {MAX_HIDDEN}")
@@ -339,18 +343,18 @@ def _weights(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _coordinates(links: LinkGeometry) -> np.ndarray:
-    """Return log-distance and height of the receiver above the device [m], (n, 2).
+    """Return log10 of the distance [m], and the receiver's height above the device [m]; (n, 2).
 
-    With these as axes, unlike elevation, the box around data of a few altitudes is full of data.
+    With a few flight altitudes, data fill a box in these coordinates, but not with elevation.
     """
     return np.column_stack([links.log_distance, links.receiver_m[:, 2] - links.device_m[:, 2]])
 
 
 def _folds(links: LinkGeometry, rng: np.random.Generator) -> np.ndarray:
-    """Return the member (n,) that each link is held out from.
+    """Return the index (n,) of the network that holds out each link.
 
-    Whole blocks of one device and BLOCK_M of ground go together: neighbouring links share their
-    obstacles, so that a member would be validated on what it has learned already.
+    All links of one device in one square of BLOCK_M have the same one: neighbouring links share
+    their obstacles, so that early stopping on single links would overfit.
     """
     cell = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
     block = np.unique(np.column_stack([links.device, cell]), axis=0, return_inverse=True)[1]

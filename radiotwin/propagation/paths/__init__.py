@@ -1,4 +1,4 @@
-"""Power of reflected and diffracted paths, computed from the geometry of a 3D map alone."""
+"""Find reflected and diffracted paths over a 3D map, and compute their power."""
 
 from radiotwin.propagation.paths.powers import PathPowers, path_powers
 

@@ -1,16 +1,14 @@
-"""Sequences of interactions that are tried from one device: facets by shooting rays, and edges.
+"""Find the sequences of facets and edges that paths from a device may take, by shooting rays.
 
 A path of several reflections visits a sequence of facets. A city has too many sequences to try
 them all, so rays are shot from the device in all directions and reflected where they hit; the
-sequences that they visit are the candidates [1]. The paths themselves are then found by the image
-method, exactly. Facets that face the device, and their edges, are candidates whether a ray hits or
-not.
+sequences that they visit are the candidates [1]. The image method then finds the exact paths.
+Facets that face the device, and their edges, are always candidates.
 
-A city has far more edges than a device sees. Points along each edge are therefore joined with the
-device, by way of the facets in between; an edge of which the device sees no such point is not
-tried. Of the facets that are seen from an edge only those count which the cone of diffracted rays
-can reach: by Keller's law a receiver, or its image, decides where on the edge the ray bends, so
-the corners of a facet bound that place.
+A city has far more edges than a device sees. Points along each edge are therefore connected to the
+device, directly or by reflections; an edge with no visible point is not tried. After an edge, only
+facets that the cone of diffracted rays can reach are tried: by Keller's law the receiver, or its
+image, decides where on the edge the ray is diffracted, so the corners of a facet bound that point.
 
 [1] Ling, Chou, Lee, "Shooting and bouncing rays", IEEE Trans. Antennas Propag. 37(2), 1989.
 """
@@ -50,20 +48,20 @@ from radiotwin.propagation.paths.two_edges import EdgePairsToTry
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
-SAMPLE_M, SAMPLE_RAD = 0.3, 0.002  # [m], [rad] seen from the device: step of points on an edge
-SAMPLE_CHUNK = 100_000  # points at once: about 50 MB
-SAMPLE_STEP, SAMPLE_ORDER = 8, (3, 0, 6, 1, 4, 7, 2, 5)  # points of a way tried after one another
-RAY_CHUNK = 200_000  # rays at once: about 60 MB
+SAMPLE_M, SAMPLE_RAD = 0.3, 0.002  # least step of points on an edge [m], and seen from the device
+SAMPLE_CHUNK = 100_000  # points at a time: about 50 MB
+SAMPLE_STEP, SAMPLE_ORDER = 8, (3, 0, 6, 1, 4, 7, 2, 5)  # each pass tries every 8th point of a way
+RAY_CHUNK = 200_000  # rays at a time: about 60 MB
 DEVICE_RAYS = 100_000  # about half a degree apart
 EDGE_RAYS = 2_000  # from each 20 m of an edge, about 5 degrees apart, 3 at the horizon
 PLASTIC = 0.7548776662466927  # spreads rays along an edge evenly (Roberts' sequence)
-LEVEL_SINE = 0.1  # of the elevation up to which rays are dense
-EDGE_CHUNK = 100  # edges at once whose surroundings are searched: about 100 MB
-MAX_REMEMBERED_BYTES = 2**25  # of one search, so 400 MB of all that `candidate_search` keeps
+LEVEL_SINE = 0.1  # sine of the elevation up to which rays are dense
+EDGE_CHUNK = 100  # edges whose surroundings are searched at a time: about 100 MB
+MAX_REMEMBERED_BYTES = 2**25  # cache of one search; 400 MB for all searches of `candidate_search`
 
 
 class Ways(NamedTuple):
-    """Ways to edges.
+    """Partial paths from a device by reflections to w edges.
 
     Attributes:
         before: (w, a) facets before the edge; then -1.
@@ -81,17 +79,18 @@ class Ways(NamedTuple):
 def _open_ways(
     city: CityMap, surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
 ) -> Ways:
-    """Return the ways (of w) on which the device at (3,) [m] sees some point of the edge."""
+    """Return the ways, of w, by which the device (3,) [m] sees a sampled point of the edge."""
     lit_m, source_m, samples = _lit_parts(surfaces, before, edge, device_m)
     points = PathBuffer.allocate(SAMPLE_CHUNK + int(samples.max(initial=0)))
-    one_by_one = Candidates(before, np.full(len(edge), -1), before[:, :0])
+    reflections = Candidates(before, np.full(len(edge), -1), before[:, :0])
     is_seen = np.zeros(len(edge), dtype=bool)
-    for first in SAMPLE_ORDER:  # few points show most of the ways that are open
+    for first in SAMPLE_ORDER:  # a few points suffice for most open ways
         way = 0
         while way < len(edge):
             found, way = _sample(surfaces, before, edge, device_m, lit_m, samples, is_seen, first,
                                  way, points)
-            is_seen[points.candidate[clear_paths(city, surfaces, one_by_one, points, found)]] = True
+            clear = clear_paths(city, surfaces, reflections, points, found)
+            is_seen[points.candidate[clear]] = True
     seen = np.flatnonzero(is_seen)
     return Ways(before[seen], edge[seen], lit_m[seen], source_m[seen])
 
@@ -100,7 +99,7 @@ def _open_ways(
 def _lit_parts(
     surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return lit part and source as in `Ways`, and the number of points (w,) to try."""
+    """Return `lit_m` and `source_m` of `Ways`, and the number of points (w,) to sample."""
     image = np.empty((MAX_INTERACTIONS + 1, 3))
     lit_m, source_m = np.zeros((len(edge), 2)), np.zeros((len(edge), 2))
     samples = np.zeros(len(edge), dtype=np.int64)
@@ -128,13 +127,13 @@ def _sample(
     lit_m: np.ndarray, samples: np.ndarray, is_seen: np.ndarray, first: int, way: int,
     points: PathBuffer,
 ) -> tuple[int, int]:
-    """Put paths to points on lit parts of edges, just off the edge, into a buffer.
+    """Fill a buffer with paths to points on lit parts of edges, just off the edge.
 
-    Begins at row `way`. Ways known to be open are passed; of the others every `SAMPLE_STEP`-th
-    point is tried, from number `first` on.
+    Begins at row `way`, and skips ways that are already known to be open. Points are every
+    `SAMPLE_STEP`-th of a way, from number `first` on.
 
     Returns:
-        Their number, and the way to go on with.
+        The number of paths, and the way with which to continue.
     """
     edges = surfaces.edges
     image = np.empty((MAX_INTERACTIONS + 1, 3))
@@ -183,18 +182,18 @@ def _with_facets_after(
         first: (e,) first row of each edge in `after`: the empty sequence.
         end: (e,) row after the last one of each edge.
         after: (m, b) facets after an edge; then -1.
-        parent: (m,) row of the sequence without its last facet, which comes earlier.
+        parent: (m,) earlier row of the sequence without its last facet.
         depth: maximum number of interactions.
 
     Returns:
         (c,) rows of the ways, and (c,) rows of `after`.
     """
-    most = total = 0
+    max_rows = total = 0
     for way in range(len(ways.edge)):
         rows = end[ways.edge[way]] - first[ways.edge[way]]
-        most, total = max(most, rows), total + rows
+        max_rows, total = max(max_rows, rows), total + rows
     of_way, of_after = np.empty(total, dtype=np.int64), np.empty(total, dtype=np.int64)
-    window, is_open = np.empty((most, 4)), np.empty(most, dtype=np.bool_)
+    window, is_open = np.empty((max_rows, 4)), np.empty(max_rows, dtype=np.bool_)
     count = 0
     for way in range(len(ways.edge)):
         edge = ways.edge[way]
@@ -227,7 +226,7 @@ class FacetEdges(NamedTuple):
     first: np.ndarray
 
     def of(self, facet: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the edges (m,) of facets (n,), and the row of the facet (m,) of each."""
+        """Return the edges (m,) of facets (n,), and for each edge the row (m,) of its facet."""
         row, within = expand(self.first[facet + 1] - self.first[facet])
         return self.edge[self.first[facet[row]] + within], row
 
@@ -238,10 +237,10 @@ class FacetSequences:
 
     Attributes:
         source: (c,) row of the source.
-        facets: (c, depth) rows of `Surfaces`, then -1.
+        facets: (c, depth) rows of `Surfaces.planes`, then -1.
         order: (c,) number of facets.
-        parent: (c,) row of the sequence without its last facet; of an empty one its own.
-        next_facets: (m, 2) a sequence, and a facet that rays hit after it.
+        parent: (c,) row of the sequence without its last facet; its own row if empty.
+        next_facets: (m, 2) row of a sequence, and a facet that rays hit after it.
     """
 
     source: np.ndarray
@@ -255,23 +254,23 @@ class FacetSequences:
 def _sphere(count: int) -> np.ndarray:
     """Return (count, 3) unit vectors of a Fibonacci lattice (Gonzalez, Math. Geosci. 42, 2010).
 
-    They are densest about the horizon, where what is far, and so looks small, is in a city: three
-    times as dense there, and a third as dense overhead, as if they were uniform.
+    Compared with a uniform density, they are three times as dense at the horizon, where a city's
+    distant facets look small, and a third as dense overhead.
     """
     z = LEVEL_SINE * np.sinh((1 - (2 * np.arange(count) + 1) / count) * np.arcsinh(1 / LEVEL_SINE))
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     radius = np.sqrt(1 - z * z)
     vectors = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
-    vectors.flags.writeable = False  # it is remembered
+    vectors.flags.writeable = False  # cached
     return vectors
 
 
 def _edge_sequences(
     city: CityMap, facets: CityFacets, rows: np.ndarray, depth: int
 ) -> FacetSequences:
-    """Find the sequences of up to `depth` facets that rays from some edges (n,) visit.
+    """Find the sequences of up to `depth` facets that rays from edges (n,) visit.
 
-    As many start from each 20 m of an edge up to 200 m, spread along it.
+    EDGE_RAYS rays start from each 20 m of an edge, for at most 200 m, spread along it.
     """
     edges, ends_m = facets.surfaces.edges[rows], facets.edge_ends_m[rows]
     normal_0, normal_n = edges[:, NORMAL_0:NORMAL_0 + 3], edges[:, NORMAL_N:NORMAL_N + 3]
@@ -281,10 +280,10 @@ def _edge_sequences(
     outward = normal_0 + normal_n
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     direction = _sphere(EDGE_RAYS)
-    aside = np.arange(EDGE_RAYS) * PLASTIC % 1.0
+    spread = np.arange(EDGE_RAYS) * PLASTIC % 1.0
     is_open = np.maximum(normal_0 @ direction.T, normal_n @ direction.T) > 0
-    at, ray = np.nonzero(is_open[source])
-    of_edge, share = source[at], (within[at] + aside[ray]) / starts[source[at]]
+    start, ray = np.nonzero(is_open[source])
+    of_edge, share = source[start], (within[start] + spread[ray]) / starts[source[start]]
     start_m = ends_m[of_edge, 0] + share[:, None] * offset_m[of_edge] + SKIN_M * outward[of_edge]
     return _shoot(city, facets, start_m, direction[ray], of_edge, len(rows), depth, False)
 
@@ -293,9 +292,20 @@ def _shoot(
     city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray,
     source: np.ndarray, sources: int, depth: int, beyond: bool = True,
 ) -> FacetSequences:
-    """Follow rays (n, 3) of sources (n,) through `depth` reflections, and to the facet beyond."""
+    """Trace rays through up to `depth` reflections, and record the facets that they visit.
+
+    Args:
+        city: 3D map.
+        facets: facets of the map.
+        start_m: (n, 3) start of each ray [m].
+        direction: (n, 3) unit vector of each ray.
+        source: (n,) source of each ray.
+        sources: number of sources.
+        depth: maximum number of reflections.
+        beyond: also record the facet hit after the last reflection in `next_facets`.
+    """
     normal = facets.surfaces.planes[:, NORMAL:NORMAL + 3]
-    row = source  # of each ray: the sequence that it has visited
+    row = source  # row of the sequence that each ray has visited
     sequences, of_source = [np.empty((sources, 0), dtype=int)], [np.arange(sources)]
     parents = [np.arange(sources)]
     first = [0]
@@ -307,7 +317,7 @@ def _shoot(
              for a in range(0, len(start_m), RAY_CHUNK)] or [np.empty((2, 0))], axis=1)
         hit = np.flatnonzero(facet >= 0)
         row, facet = row[hit], facet[hit].astype(int)
-        # Few are distinct: faster than `np.unique`, which sorts all.
+        # Few are distinct: faster than np.unique, which sorts all rays.
         inverse, pairs = pd.factorize(row * len(normal) + facet, sort=True)
         parent, last = np.divmod(pairs, len(normal))
         seen.append(np.column_stack([parent, last]))
@@ -333,13 +343,13 @@ def _shoot(
 def _first_facets(
     city: CityMap, facets: CityFacets, start_m: np.ndarray, direction: np.ndarray
 ) -> np.ndarray:
-    """Return (2, n) distance [m] and facet that rays hit first; -1: none, or a face's back."""
+    """Return (2, n) distance [m] and index of the first facet on rays; -1: none, or its back."""
     distance_m, face, cosine = city.first_hits_towards(start_m, direction)
     facet = np.where(face >= 0, facets.of_face[face], -1)
     facet[(face >= 0) & (cosine >= 0)] = -1
     if city.terrain is not None:
         return np.stack([distance_m, facet])
-    # Flat ground is infinite here; the city's mesh of it may end, or there may be none
+    # Flat ground is infinite; the city's mesh of it may end, or be missing.
     with np.errstate(divide="ignore", invalid="ignore"):
         fall_m = np.where(direction[:, 2] < 0, -start_m[:, 2] / direction[:, 2], np.inf)
     on_ground = (fall_m > 0) & (fall_m < np.inf) & (distance_m > fall_m - 0.1)
@@ -347,23 +357,23 @@ def _first_facets(
                      np.where(on_ground, len(facets.surfaces.planes) - 1, facet)])
 
 
-@lru_cache(maxsize=12)  # a map and those with errors that stand beside it
+@lru_cache(maxsize=12)  # a map and its variants with random errors
 def candidate_search(city: CityMap, depth: int) -> "CandidateSearch":
-    """Return the search of a city, made once: it keeps the surroundings of edges it has seen."""
+    """Return the cached search of a city: it caches facets that rays from edges visit."""
     return CandidateSearch(city, depth)
 
 
 class CandidateSearch:
-    """Search for the candidates of devices in one city; several threads may ask it.
+    """Search for the sequences of interactions from any device in one city; thread-safe.
 
     Args:
         city: 3D map.
         depth: maximum number of interactions of a path, at least 1.
 
     Attributes:
-        facets: of the city, and its edges.
-        surfaces: of `facets`.
-        is_ground: (f + 1,) bool, rows of the ground in `surfaces.planes`.
+        facets: facets and edges of the city.
+        surfaces: the same as arrays, `facets.surfaces`.
+        is_ground: (f + 1,) bool, the rows of `surfaces.planes` that are ground.
     """
 
     def __init__(self, city: CityMap, depth: int) -> None:
@@ -379,34 +389,39 @@ class CandidateSearch:
         edges = len(self.surfaces.edges)
         self._first_after, self._end_after = np.full((2, edges), -1)
         self._remembered: OrderedDict[tuple[bytes, int], Candidates] = OrderedDict()
-        self._one_at_a_time = Lock()
+        self._lock = Lock()
         facet, edge = self.facets.edge_facets.ravel(), np.repeat(np.arange(edges), 2)
         order = np.lexsort((edge, facet))
         self._facet_edges = FacetEdges(edge[order], np.searchsorted(
             facet[order], np.arange(len(self.is_ground) + 1)))
 
     def candidates(self, device_m: np.ndarray, rays: int = DEVICE_RAYS) -> Candidates:
-        """Return the sequences of up to `depth` interactions that are worth trying.
+        """Find the sequences of up to `depth` interactions to try from a device (3,) [m].
 
-        Those from a device at (3,) [m] that rays shot from it find; without an edge first.
+        Args:
+            device_m: (3,) position [m].
+            rays: number of rays shot.
+
+        Returns:
+            the candidates, those without an edge first.
         """
         key = np.asarray(device_m, dtype=float).tobytes(), rays
-        with self._one_at_a_time:
+        with self._lock:
             if key in self._remembered:
                 self._remembered.move_to_end(key)
                 return self._remembered[key]
         found = self._find(device_m, rays)
-        with self._one_at_a_time:
+        with self._lock:
             self._remembered[key] = found
             while len(self._remembered) > 1 and sum(
-                    each.nbytes for of_device in self._remembered.values()
-                    for each in of_device) > MAX_REMEMBERED_BYTES:
+                    array.nbytes for of_device in self._remembered.values()
+                    for array in of_device) > MAX_REMEMBERED_BYTES:
                 self._remembered.popitem(last=False)
         return found
 
     def pairs_of_edges(self, edges: np.ndarray) -> EdgePairsToTry:
-        """Return the edges to try as second edge, after edges (s,) that a device sees."""
-        with self._one_at_a_time:
+        """Return the second edges to try after first edges (s,), for paths over two edges."""
+        with self._lock:
             after, first = self._after, self._first_after[edges]
             row, within = expand(self._end_after[edges] - first)
         rows = first[row] + within
@@ -418,6 +433,7 @@ class CandidateSearch:
                               np.searchsorted(pairs[:, 0], np.arange(len(edges) + 1)))
 
     def _find(self, device_m: np.ndarray, rays: int) -> Candidates:
+        """Find the candidates of a device that is not cached, see `candidates`."""
         planes = self.surfaces.planes
         direction = _sphere(rays)
         sequences = _shoot(self._city, self.facets, np.broadcast_to(device_m, direction.shape),
@@ -429,9 +445,9 @@ class CandidateSearch:
         reflections = np.unique(np.concatenate(
             [reflected, single, self._corner_sequences(facing)]), axis=0)
         ways = _open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
-        with self._one_at_a_time:
+        with self._lock:
             self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
-            after, parent = self._after, self._parent_after  # others replace them, rows stay
+            after, parent = self._after, self._parent_after  # other threads only append rows
         way, row = _with_facets_after(self.surfaces, ways, self._first_after, self._end_after,
                                      after, parent, self._depth)
         none = np.full((len(reflections), self._depth), -1)
@@ -440,10 +456,10 @@ class CandidateSearch:
                           np.concatenate([none[:, 1:], after[row]]))
 
     def _corner_sequences(self, facing: np.ndarray) -> np.ndarray:
-        """Return sequences (n, depth) of two facets of a reentrant corner, the first in (f,).
+        """Return sequences (n, depth) of two facets of a reentrant corner, the first facing (f,).
 
-        Such corners reflect rays back to where they come from. From far away the strips that do so
-        are too narrow to be hit by the rays that are shot.
+        Such corners reflect rays back to the device. From far away, the strips that do so are too
+        narrow to be hit by the rays that are shot.
         """
         corners = self.facets.corners
         found = corners[np.isin(corners[:, 0], facing)] if self._depth > 1 else corners[:0]
@@ -454,17 +470,22 @@ class CandidateSearch:
     def _to_edges(
         self, sequences: FacetSequences, facing: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return facets (n, depth) and edge (n,) of the ways to the edges of all facets hit."""
+        """Return facets (n, depth) and edge (n,) of the ways to the edges of all facets hit.
+
+        Args:
+            sequences: facets that rays from the device visit.
+            facing: (f,) facets that face the device.
+        """
         direct = np.column_stack([np.zeros(len(facing), dtype=int), facing])
         reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]
         pairs = np.concatenate([direct, reflected])
         pairs = pairs[sequences.order[pairs[:, 0]] < self._depth]
         edge, row = self._facet_edges.of(pairs[:, 1])
-        both = np.unique(np.column_stack([pairs[row, 0], edge]), axis=0)
-        return sequences.facets[both[:, 0]], both[:, 1]
+        ways = np.unique(np.column_stack([pairs[row, 0], edge]), axis=0)
+        return sequences.facets[ways[:, 0]], ways[:, 1]
 
     def _look_around(self, edges: np.ndarray) -> None:
-        """Find the sequences of facets after edges (n,)."""
+        """Shoot rays from edges (n,), and cache the sequences of facets that they visit."""
         after, parents, count = [self._after], [self._parent_after], len(self._after)
         for start in range(0, len(edges), EDGE_CHUNK):
             part = edges[start:start + EDGE_CHUNK]

@@ -1,18 +1,18 @@
-"""Facets and edges of a triangulated city.
+"""Merge the triangles of a city to plane facets, and find the edges that diffract.
 
 City models are rarely clean: corners are stored once per building, walls are cut into slices that
-do not end where those of the neighbour do (T-junctions), and slivers are left over. So corners
-closer than `WELD_M` become one, every side of a triangle is split at the corners that lie on it,
-and slivers are dropped; their neighbours then meet along the same short segments.
+end elsewhere than those of the neighbour (T-junctions), and slivers are left over. So corners
+closer than `WELD_M` are welded, every side of a triangle is split at the corners that lie on it,
+and slivers are dropped; neighbours then meet along the same short segments.
 
-A facet is triangles of one material that share a segment and lie in one plane. Around a segment the
+A facet is a set of connected triangles of one material in one plane. Around a segment, the
 triangles that meet there are sorted by angle; an open sector of more than 180 degrees between two
-of them is an edge that diffracts. This also holds where several buildings touch: a shared wall that
-is built over leaves no edge.
+of them is an edge that diffracts. This also holds where buildings touch: a shared wall that is
+built over leaves no edge.
 
 Faces of two materials form no edge. In Sionna RT, whose gains are the truth here, they belong to
 two meshes, and no ray is diffracted where two meshes meet; `build-scene --material` gives a
-building one material where its roof is to diffract.
+building one material so that the edge of its roof diffracts.
 """
 
 from dataclasses import dataclass
@@ -35,12 +35,12 @@ from radiotwin.propagation.paths.surfaces import (
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import CityMap
 
-WELD_M = 0.002  # [m], well above the single precision of PLY files: 0.06 mm at 1 km
-QUERY_CHUNK = 2_000  # sides per query of the tree: bounds the memory
-COPLANAR_M = 0.005  # [m], maximum distance of a neighbour's corner from the plane
+WELD_M = 0.002  # well above the single precision of PLY files: 0.06 mm at 1 km
+QUERY_CHUNK = 2_000  # sides in a query of the tree: bounds the memory
+COPLANAR_M = 0.005  # maximum distance of a neighbour's corner from the plane
 MAX_TRIANGLES_AT_SEGMENT = 12  # triangles that may meet at one segment
-FLAT_RAD = 0.1  # flatter folds approximate curved surfaces and diffract too little to count
-TRIED_SIDES = 16  # of a facet's triangles, to lay its bounding rectangle along
+FLAT_RAD = 0.1  # flatter folds approximate curved surfaces and hardly diffract
+TRIED_SIDES = 16  # longest sides of a facet's triangles along which a rectangle is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +51,11 @@ class Topology:
         vertices_m: (v, 3) welded corners [m].
         triangles: (t, 3) indices of corners, counter-clockwise seen from outside; without slivers
             and without faces on flat ground.
-        source: (t,) face of the city that each triangle is.
+        source: (t,) index of each triangle in the city's faces.
         normal: (t, 3) outward unit normals.
-        segments: (s, 2) corners, lower index first, one row for each triangle that borders on the
-            segment, sorted.
-        owner: (s,) the triangle of each row.
-        group: (g + 1,) first row of each distinct segment.
+        segments: (s, 2) corners, lower index first, sorted; one row for each triangle at a segment.
+        owner: (s,) triangle of each row of `segments`.
+        group: (g + 1,) first row of each distinct segment in `segments`.
     """
 
     vertices_m: np.ndarray
@@ -71,7 +70,7 @@ class Topology:
 def _topology(city: CityMap) -> Topology:
     """Weld the corners of a city, split its triangles' sides and sort the segments.
 
-    Of all faces but those of a flat ground, within 5 cm of z = 0.
+    Slivers, and faces on flat ground, within 5 cm of z = 0, are left out.
     """
     if not np.isfinite(city.vertices).all():
         raise BadInput("the city has corners that are not finite numbers [m]; repair its meshes")
@@ -94,7 +93,7 @@ def _topology(city: CityMap) -> Topology:
 
 
 def _weld(vertices_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean positions of corners within `WELD_M`, and the row of each vertex in them."""
+    """Merge vertices (v, 3) within `WELD_M` to their mean [m]; return it and each vertex's row."""
     exact, index = np.unique(vertices_m, axis=0, return_inverse=True)
     pairs = cKDTree(exact).query_pairs(WELD_M, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), pairs.T.reshape(2, -1)), shape=(len(exact),) * 2)
@@ -105,7 +104,7 @@ def _weld(vertices_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _normals_and_heights(triangle_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals (n, 3) and smallest heights (n,) [m] of triangles (n, 3, 3)."""
+    """Return unit normals (n, 3) and smallest heights (n,) [m] of triangles (n, 3, 3) [m]."""
     outward = np.cross(triangle_m[:, 1] - triangle_m[:, 0], triangle_m[:, 2] - triangle_m[:, 0])
     twice_area = np.linalg.norm(outward, axis=1)
     sides_m = np.linalg.norm(triangle_m - np.roll(triangle_m, 1, axis=1), axis=2)
@@ -114,7 +113,7 @@ def _normals_and_heights(triangle_m: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _split(vertices_m: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split sides at the corners on them; return (p, 2) corners and the side of each piece (p,)."""
+    """Split sides (s, 2) at corners that lie on them; return pieces (p, 2) and their sides (p,)."""
     tree = cKDTree(vertices_m)
     start, end = vertices_m[sides[:, 0]], vertices_m[sides[:, 1]]
     length_m = np.linalg.norm(end - start, axis=1)
@@ -143,7 +142,14 @@ def _split(vertices_m: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.nd
 def _rows_of_sides(
     pieces: np.ndarray, side_of_piece: np.ndarray, side_of_row: np.ndarray, side_count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners (s, 2) and triangle (s,) of each piece of each side of each triangle."""
+    """Return corners (s, 2) and triangle (s,) of the pieces of all triangles' sides.
+
+    Args:
+        pieces: (p, 2) corners of the pieces of distinct sides.
+        side_of_piece: (p,) distinct side of each piece.
+        side_of_row: (3 t,) distinct side of each side of each triangle.
+        side_count: number of distinct sides.
+    """
     count = np.bincount(side_of_piece, minlength=side_count)
     first = np.cumsum(count) - count
     row, within = expand(count[side_of_row])
@@ -151,7 +157,7 @@ def _rows_of_sides(
 
 
 def expand(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for `count[i]` repeats of each row i, the row and the number of the repeat.
+    """Repeat each row i `count[i]` times; return the row and the number of each repetition.
 
     >>> [array.tolist() for array in expand(np.array([2, 0, 1]))]
     [[0, 0, 2], [0, 1, 0]]
@@ -164,11 +170,11 @@ class CityFacets(NamedTuple):
     """Facets and edges of a city.
 
     Attributes:
-        surfaces: both, for compiled code.
+        surfaces: facets and edges as arrays for compiled code.
         of_face: (city faces,) facet of each face of the city; -1: a sliver, or on flat ground.
         edge_ends_m: (e, 2, 3) starts and ends of the edges [m].
-        edge_facets: (e, 2) face 0 and face n of the edges.
-        corners: (c, 2) facets that meet in a reentrant corner; each pair in both orders.
+        edge_facets: (e, 2) facets that are face 0 and face n of the edges.
+        corners: (c, 2) pairs of facets that meet in a reentrant corner, in both orders.
     """
 
     surfaces: Surfaces
@@ -181,7 +187,7 @@ class CityFacets(NamedTuple):
 def extract_facets(city: CityMap) -> CityFacets:
     """Merge the triangles of a city to facets, and find the convex edges between them.
 
-    Faces on flat ground, z = 0, are left out, and so are edges on it.
+    Faces and edges on flat ground, z = 0, are left out.
 
     Args:
         city: 3D map.
@@ -203,7 +209,7 @@ def extract_facets(city: CityMap) -> CityFacets:
 
 
 def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return planes (f, 19), triangles (t, 6) and facets of faces, in order of first triangles."""
+    """Return `planes` (f, 19) and `triangle_uv_m` (t, 6) of `Surfaces`, and each face's facet."""
     material = city.material[topology.source]
     if city.terrain is not None:
         material = np.where(city.terrain[topology.source], GROUND_MATERIAL, material)
@@ -227,7 +233,7 @@ def _facets(city: CityMap, topology: Topology) -> tuple[np.ndarray, np.ndarray, 
 
 
 def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
-    """Return the facet (t,) of each triangle, which is of a material (t,)."""
+    """Label coplanar neighbours of the same material (t,); return the facet (t,) of triangles."""
     size = np.diff(topology.group)
     pairs = [np.empty((0, 2), dtype=int)]
     for i in range(MAX_TRIANGLES_AT_SEGMENT):
@@ -239,8 +245,8 @@ def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
     normal = topology.normal
     same = np.einsum("ij,ij->i", normal[a], normal[b]) > np.cos(np.radians(0.5))
     same &= material[a] == material[b]
-    for one, other in ((a, b), (b, a)):
-        off_m = np.einsum("ikj,ij->ik", corners_m[other] - corners_m[one][:, :1], normal[one])
+    for first, second in ((a, b), (b, a)):
+        off_m = np.einsum("ikj,ij->ik", corners_m[second] - corners_m[first][:, :1], normal[first])
         same &= (np.abs(off_m) < COPLANAR_M).all(axis=1)
     graph = coo_matrix((np.ones(same.sum()), (a[same], b[same])), shape=(len(normal),) * 2)
     return connected_components(graph, directed=False)[1]
@@ -248,9 +254,9 @@ def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
 
 @njit(cache=True)
 def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Return the planes of facets and their smallest bounding rectangles.
+    """Compute the plane of each facet and its smallest bounding rectangle.
 
-    A rectangle is tried along the `TRIED_SIDES` longest sides of a facet's triangles.
+    Rectangles are tried along the `TRIED_SIDES` longest sides of a facet's triangles.
 
     Args:
         corners_m: (t, 3, 3) triangles, facet after facet [m].
@@ -258,7 +264,7 @@ def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np
         first: (f + 1,) first triangle of each facet.
 
     Returns:
-        (f, 15) normal, origin, axes u and v, size, and whether the facet fills the rectangle.
+        (f, 15) normal, origin [m], axes u and v, size [m], and 1 if the facet fills the rectangle.
     """
     out = np.empty((len(first) - 1, 15))
     for facet in range(len(first) - 1):
@@ -267,13 +273,13 @@ def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np
         normal = weight.sum(axis=0)
         area_m2 = np.sqrt(dot(normal, normal)) / 2.0
         normal = normal / (2.0 * area_m2)
-        distance_m = whole = 0.0
+        distance_m = total = 0.0
         sides = np.empty_like(points_m)
         for k in range(len(points_m)):
             sides[k] = points_m[k + 1 if k % 3 < 2 else k - 2] - points_m[k]
-            share = np.sqrt(dot(weight[k // 3], weight[k // 3]))
-            distance_m += share * dot(points_m[k], normal)
-            whole += share
+            area = np.sqrt(dot(weight[k // 3], weight[k // 3]))
+            distance_m += area * dot(points_m[k], normal)
+            total += area
         longest = np.argsort(-(sides ** 2).sum(axis=1), kind="mergesort")[:TRIED_SIDES]
         min_area_m2 = np.inf
         for k in longest:
@@ -289,7 +295,7 @@ def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np
             tried_m2 = (high_u - low_u) * (high_v - low_v)
             if tried_m2 < min_area_m2 * (1.0 - 1e-9):
                 min_area_m2 = tried_m2
-                out[facet, 3:6] = low_u * along + low_v * across + distance_m / whole * normal
+                out[facet, 3:6] = low_u * along + low_v * across + distance_m / total * normal
                 out[facet, 6:9], out[facet, 9:12] = along, across
                 out[facet, 12], out[facet, 13] = high_u - low_u, high_v - low_v
         out[facet, :3] = normal
@@ -299,7 +305,7 @@ def _frames(corners_m: np.ndarray, outward: np.ndarray, first: np.ndarray) -> np
 
 def _edges(planes: np.ndarray, of_face: np.ndarray, topology: Topology
            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return edges (e, 19), their ends (e, 2, 3) [m] and facets (e, 2), sorted by these."""
+    """Return `Surfaces.edges` (e, 19), their ends (e, 2, 3) [m] and facets (e, 2), which ascend."""
     if not len(planes):
         return np.empty((0, 19)), np.empty((0, 2, 3)), np.empty((0, 2), dtype=int)
     normal, material = planes[:, NORMAL:NORMAL + 3], planes[:, MATERIAL]
@@ -312,7 +318,7 @@ def _edges(planes: np.ndarray, of_face: np.ndarray, topology: Topology
     length_m = np.linalg.norm(direction, axis=1)
     direction /= np.maximum(length_m, 1e-12)[:, None]
     normal_0, normal_n = normal[pair[:, 0]], normal[pair[:, 1]]
-    # At a convex edge each face runs against the normal of the other
+    # At a convex edge, each face extends against the normal of the other face.
     tangent_0 = _tangent(direction, normal_0, normal_n)
     tangent_n = _tangent(direction, normal_n, normal_0)
     sine = np.einsum("ij,ij->i", tangent_n, normal_0)
@@ -323,14 +329,15 @@ def _edges(planes: np.ndarray, of_face: np.ndarray, topology: Topology
     return edges, ends_m, pair
 
 
-def _tangent(direction: np.ndarray, normal: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _tangent(direction: np.ndarray, normal: np.ndarray, other_normal: np.ndarray) -> np.ndarray:
+    """Return unit vectors (e, 3) in a face, at right angles to its edge, pointing into the face."""
     tangent = np.cross(normal, direction)
-    sign = -np.sign(np.einsum("ij,ij->i", tangent, other))
+    sign = -np.sign(np.einsum("ij,ij->i", tangent, other_normal))
     return tangent * np.where(sign == 0, 1.0, sign)[:, None]
 
 
 def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join consecutive pieces between the same two facets; return ends and facets."""
+    """Join touching pieces (p, 2, 3) [m] between the same facets (p, 2); return ends and facets."""
     order = np.lexsort((pair[:, 1], pair[:, 0]))
     ends_m, pair = ends_m[order], pair[order]
     is_new = np.append(True, (pair[1:] != pair[:-1]).any(axis=1))[:len(pair)]
@@ -341,7 +348,15 @@ def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @njit(cache=True)
 def _joined(ends_m: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Join pieces (p, 2, 3) of groups that overlap; return ends (e, 2, 3) and one row (e,) each."""
+    """Join pieces (p, 2, 3) [m] that touch or overlap within groups of collinear pieces.
+
+    Args:
+        ends_m: pieces, group after group.
+        first: first piece of each group, and the number of pieces.
+
+    Returns:
+        (e, 2, 3) ends of the joined pieces [m], and (e,) a piece of each one's group.
+    """
     out_m, row = np.empty_like(ends_m), np.empty(len(ends_m), dtype=np.int64)
     count = 0
     for g in range(len(first) - 1):
@@ -368,7 +383,7 @@ def _joined(ends_m: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _wedges(topology: Topology, min_rad: float, max_rad: float) -> np.ndarray:
-    """Return (w, 3) row of `segments` and the two triangles of each open sector of such angles."""
+    """Return open sectors with angles in a range, (w, 3): row of `segments`, and two triangles."""
     return _open_sectors(topology.vertices_m, topology.triangles, topology.normal,
                          topology.segments, topology.owner, topology.group, min_rad, max_rad)
 
@@ -378,6 +393,7 @@ def _open_sectors(
     vertices_m: np.ndarray, triangles: np.ndarray, normal: np.ndarray, segments: np.ndarray,
     owner: np.ndarray, group: np.ndarray, min_rad: float, max_rad: float,
 ) -> np.ndarray:
+    """Find the open sectors of `_wedges` by sorting the triangles at each segment by angle."""
     found = []
     for g in range(len(group) - 1):
         a, n = group[g], group[g + 1] - group[g]
@@ -399,7 +415,7 @@ def _open_sectors(
             angle[i] = np.arctan2(sine, cosine)
             turn = cosine * y - sine * x  # towards a larger angle
             opens[i] = (turn * normal[owner[a + i]]).sum()
-        # Of two coincident faces the one that looks back comes first: no space opens between them
+        # Of two coincident faces, that with the open space before it is sorted first.
         order = np.argsort(angle + np.where(opens > 0, 1e-4, -1e-4))
         for k in range(n):
             i, j = order[k], order[(k + 1) % n]

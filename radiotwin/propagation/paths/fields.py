@@ -1,7 +1,4 @@
-"""Power gain of a path, and its complex gain, between vertically polarised antennas.
-
-The field of the ray is followed from one interaction to the next.
-"""
+"""Power gains and complex gains of single paths, from the ray's field at each interaction."""
 
 import numpy as np
 
@@ -17,68 +14,64 @@ from radiotwin.runtime.compiled import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def path_gains(
+def buffer_gains(
     surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
     buffer: PathBuffer, rows: np.ndarray,
 ) -> np.ndarray:
-    """Compute the power gains of paths between vertically polarised isotropic antennas.
+    """Compute the power gains of paths in a buffer, for vertically polarised isotropic antennas.
 
     Args:
-        surfaces: of the map.
-        candidates: that the paths were found with.
+        surfaces: facets and edges of the map.
+        candidates: interactions of the paths.
         wave_number: 2 π / wavelength [1/m].
         slabs: materials of the map.
         buffer: the paths.
-        rows: (m,) paths of the buffer to compute.
+        rows: (m,) rows of the buffer.
 
     Returns:
-        (m,) linear.
+        (m,) power gain, linear.
     """
     gain = np.empty(len(rows))
-    legs, field = _room()
+    legs, field = np.empty((MAX_INTERACTIONS + 1, 4)), np.empty(3, dtype=np.complex128)
     for i in range(len(rows)):
-        received, spread, _ = _follow(surfaces, candidates, wave_number, slabs, buffer, rows[i],
-                                      legs, field)
+        received, spread, _ = _received_field(surfaces, candidates, wave_number, slabs, buffer,
+                                              rows[i], legs, field)
         gain[i] = spread * abs(received) ** 2 / (2.0 * wave_number) ** 2
     return gain
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def path_amplitudes(
+def buffer_amplitudes(
     surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
     buffer: PathBuffer, rows: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the complex gains of paths as `path_gains` does their powers.
+    """Compute the complex gains and lengths of paths in a buffer; arguments as in `buffer_gains`.
 
     Returns:
-        (m,) received over sent field, with the phase of the delay, for fields that vary as
-        exp(+j ω t), whose squared magnitude is the gain of `path_gains`; and (m,) lengths of the
-        paths [m].
+        (m,) received over transmitted field, with the phase of the delay, for fields that vary as
+        exp(+j ω t); its squared magnitude is the power gain. And (m,) lengths of the paths [m].
     """
     amplitude, total_m = np.empty(len(rows), dtype=np.complex128), np.empty(len(rows))
-    legs, field = _room()
+    legs, field = np.empty((MAX_INTERACTIONS + 1, 4)), np.empty(3, dtype=np.complex128)
     for i in range(len(rows)):
-        received, spread, total_m[i] = _follow(surfaces, candidates, wave_number, slabs,
-                                               buffer, rows[i], legs, field)
+        received, spread, total_m[i] = _received_field(surfaces, candidates, wave_number, slabs,
+                                                       buffer, rows[i], legs, field)
         amplitude[i] = received * np.sqrt(spread) / (2.0 * wave_number) \
             * np.exp(-1j * wave_number * total_m[i])
     return amplitude, total_m
 
 
-@njit(cache=True)
-def _room() -> tuple[np.ndarray, np.ndarray]:
-    """Return room for directions and lengths (m, 4) of a path's legs, and for its field (3,)."""
-    return np.empty((MAX_INTERACTIONS + 1, 4)), np.empty(3, dtype=np.complex128)
-
-
 @njit(cache=True, error_model="numpy")
-def _follow(
+def _received_field(
     surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
     buffer: PathBuffer, path: int, legs: np.ndarray, field: np.ndarray,
 ) -> tuple[complex, float, float]:
-    """Return the received field, the spreading factor of its power [1/m²], and the length [m].
+    """Compute the field of one path at the receiver by reflecting and diffracting it on the way.
 
-    What `legs` and `field` of `_room` hold is overwritten.
+    Overwrites `legs`, directions and lengths of up to MAX_INTERACTIONS + 1 legs, and `field` (3,).
+
+    Returns:
+        The received field, the spreading factor of its power [1/m²], and the length [m].
     """
     planes, row, count = surfaces.planes, buffer.candidate[path], buffer.count[path] - 1
     direction, length_m = legs[:count, :3], legs[:count, 3]
@@ -107,7 +100,7 @@ def _follow(
 
 @njit(cache=True, error_model="numpy")
 def vertical(direction: np.ndarray) -> Triple:
-    """Return the unit vector of a ray's vertical polarisation; north for a vertical ray."""
+    """Return the unit vector of vertical polarisation for a ray; north if the ray is vertical."""
     flat2 = direction[0] ** 2 + direction[1] ** 2
     if flat2 < 1e-12:
         return 0.0, 1.0, 0.0

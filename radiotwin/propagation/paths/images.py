@@ -1,7 +1,7 @@
-"""Paths over given facets and at most one edge by the image method, and the test for obstacles.
+"""Image method: paths over given facets and at most one edge, and the test for obstacles.
 
-The device is mirrored in the facets before the edge, one after another, and the receiver in those
-after it; the ray is reflected where the straight line between the images goes through a facet [1].
+The device is mirrored in the facets before the edge one after another, the receiver in the facets
+after it; the ray is reflected where the straight line between the images crosses a facet [1].
 `find_paths` does not test for obstacles, `found_clear` does.
 
 [1] Balanis, "Advanced Engineering Electromagnetics", 2nd ed., 2012: ch. 5.
@@ -38,15 +38,15 @@ from radiotwin.propagation.paths.surfaces import (
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
-MAX_INTERACTIONS = 6  # reflections and diffraction of one path: bounds the arrays
+MAX_INTERACTIONS = 6  # reflections and diffractions of a path: size of the arrays
 
 
 class Candidates(NamedTuple):
     """Sequences of interactions to try between one device and any receiver.
 
     Attributes:
-        before: (c, a) facets before the edge, or all facets where there is no edge; then -1.
-        edge: (c,) row of the edges; -1: none.
+        before: (c, a) facets before the edge, or all facets if there is no edge; then -1.
+        edge: (c,) row of the edge; -1: none.
         after: (c, b) facets after the edge; then -1.
     """
 
@@ -56,7 +56,7 @@ class Candidates(NamedTuple):
 
 
 class PathBuffer(NamedTuple):
-    """Paths that were found.
+    """Arrays that hold paths found between one device and receivers.
 
     Attributes:
         receiver: (capacity,) row of the receiver.
@@ -79,7 +79,7 @@ class PathBuffer(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def sequence_length(facets: np.ndarray, row: int) -> int:
-    """Return how many facets a row of `Candidates` has before its first -1."""
+    """Return the number of facets in a row of `Candidates.before` or `after` (-1: none)."""
     length = 0
     while length < facets.shape[1] and facets[row, length] >= 0:
         length += 1
@@ -91,23 +91,29 @@ def find_paths(
     surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray, receiver_m: np.ndarray,
     cursor: int, buffer: PathBuffer,
 ) -> tuple[int, int]:
-    """Try candidates × receivers (n, 3) in order from a cursor on until the buffer is full.
+    """Find paths for all candidates and receivers in order, until the buffer is full.
 
-    The cursor is candidate · n + receiver; the buffer is filled from its first row on.
+    Args:
+        surfaces: facets and edges.
+        candidates: sequences of interactions to try.
+        device_m: (3,) position [m].
+        receiver_m: (n, 3) positions [m].
+        cursor: candidate · n + receiver at which to begin.
+        buffer: filled from its first row on.
 
     Returns:
-        The number of paths found, and the cursor to go on with.
+        The number of paths found, and the cursor at which to continue.
     """
     planes, uv_m, edges = surfaces.planes, surfaces.triangle_uv_m, surfaces.edges
     n = len(receiver_m)
     image, mirror = np.empty((MAX_INTERACTIONS + 1, 3)), np.empty((MAX_INTERACTIONS + 1, 3))
     possible, spheres = np.empty(n, dtype=np.int64), spheres_around(receiver_m)
     lit_m, source_m = np.empty(2), np.empty(2)
-    # Row k: narrowed to the first k facets after the edge
+    # Row k: window after the first k facets behind the edge
     windows = np.empty((MAX_INTERACTIONS + 1, 4))
     frame = np.empty((3, 4))
     found = narrowed = 0
-    is_lit, way = False, -1  # the candidate that `image` and `windows` are of
+    is_lit, way = False, -1  # candidate for which `image` and `windows` were computed
     for row in range(cursor // n, len(candidates.edge)):
         before = sequence_length(candidates.before, row)
         after = sequence_length(candidates.after, row)
@@ -171,7 +177,7 @@ def find_paths(
 
 @njit(cache=True, error_model="numpy")
 def _same_way(candidates: Candidates, row: int, other: int) -> bool:
-    """Return whether two candidates have the same edge and the same facets before it."""
+    """Return True if two candidates have the same edge and the same facets before it."""
     same = candidates.edge[row] == candidates.edge[other]
     for k in range(candidates.before.shape[1]):
         same = same and candidates.before[row, k] == candidates.before[other, k]
@@ -180,7 +186,7 @@ def _same_way(candidates: Candidates, row: int, other: int) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def _same_facets(facets: np.ndarray, row: int, other: int) -> int:
-    """Return how many facets two rows of `Candidates` begin with alike."""
+    """Return the number of leading facets that two rows of `Candidates.after` share."""
     k = 0
     while k < facets.shape[1] and facets[row, k] >= 0 and facets[row, k] == facets[other, k]:
         k += 1
@@ -191,7 +197,10 @@ def _same_facets(facets: np.ndarray, row: int, other: int) -> int:
 def source_images(
     planes: np.ndarray, facets: np.ndarray, device_m: np.ndarray, image: np.ndarray
 ) -> bool:
-    """Mirror the device in facets, one after another; return whether it lies before each."""
+    """Mirror the device in facets one after another; False if an image is behind the next facet.
+
+    Writes the device and its images into `image` (n + 1, 3) [m].
+    """
     image[0] = device_m
     for k in range(len(facets)):
         x, y, z = image[k, 0], image[k, 1], image[k, 2]
@@ -206,10 +215,9 @@ def reflections_back(
     planes: np.ndarray, uv_m: np.ndarray, facets: np.ndarray, x: float, y: float, z: float,
     image: np.ndarray, points_m: np.ndarray,
 ) -> bool:
-    """Find the reflections from a point, on the edge or the receiver, back to the device.
+    """Find the reflection points between the device and x, y, z, the receiver or edge point [m].
 
-    Returns:
-        Whether there is such a path; the points are in `points_m[1:]`.
+    Writes them into `points_m[1:]`; returns False if there is no such path.
     """
     for k in range(len(facets) - 1, -1, -1):
         ok, x, y, z = _meet(planes, uv_m, facets[k], x, y, z,
@@ -226,13 +234,15 @@ def _from_edge(
     first: int, along_m: float, across_m: float, x: float, y: float, z: float, mirror: np.ndarray,
     points_m: np.ndarray,
 ) -> tuple[bool, float, float, float]:
-    """Find the diffraction at an edge and the reflections from there to the receiver x, y, z.
+    """Find the diffraction point on an edge and the reflection points from there to x, y, z [m].
+
+    Writes them into `points_m[first:]`. `along_m` and `across_m` are the coordinates of the
+    device's image around the edge.
 
     Returns:
-        Whether there is such a path, and the point on the edge; all points are in
-        `points_m[first:]`.
+        False if there is no such path, and the point on the edge [m].
     """
-    for k in range(len(facets) - 1, -1, -1):  # mirror[k]: receiver in facets from the last to k
+    for k in range(len(facets) - 1, -1, -1):  # mirror[k]: receiver mirrored in facets[k:]
         if height(planes, facets[k], x, y, z) < ON_PLANE_M:
             return False, x, y, z
         x, y, z = mirrored(planes, facets[k], x, y, z)
@@ -261,7 +271,7 @@ def _meet(
     planes: np.ndarray, uv_m: np.ndarray, facet: int, x: float, y: float, z: float,
     image_x: float, image_y: float, image_z: float,
 ) -> tuple[bool, float, float, float]:
-    """Return whether and where the line from a point to an image goes through a facet."""
+    """Intersect the line from a point to an image [m] with a facet; False if it misses."""
     before_m = height(planes, facet, x, y, z)
     behind_m = -height(planes, facet, image_x, image_y, image_z)
     if before_m < ON_PLANE_M or behind_m < ON_PLANE_M:
@@ -277,12 +287,10 @@ def found_clear(
     city: CityMap, surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
     receiver_m: np.ndarray, buffer: PathBuffer,
 ) -> Iterator[np.ndarray]:
-    """Find the paths from a device (3,) to receivers (n, 3) [m] that nothing blocks.
-
-    As many at a time as a buffer holds.
+    """Find the unblocked paths from a device (3,) to receivers (n, 3) [m], one buffer at a time.
 
     Yields:
-        (m,) rows of the buffer, ascending; the next paths take their places.
+        (m,) rows of the buffer with unblocked paths, ascending; the next step overwrites them.
     """
     order = _neighbours_together(receiver_m)
     sorted_m = np.ascontiguousarray(receiver_m[order])
@@ -294,7 +302,7 @@ def found_clear(
 
 
 def _neighbours_together(points_m: np.ndarray) -> np.ndarray:
-    """Return an order (n,) in which each `GROUP` of points (n, 3) [m] are neighbours."""
+    """Sort points (n, 3) [m] so that `GROUP` consecutive ones are neighbours; return rows (n,)."""
     order = np.arange(len(points_m))
     parts = [(0, len(points_m))]
     while parts:
@@ -312,18 +320,15 @@ def _neighbours_together(points_m: np.ndarray) -> np.ndarray:
 def clear_paths(
     city: CityMap, surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer, found: int
 ) -> np.ndarray:
-    """Return the rows of the first `found` paths in a buffer that nothing blocks.
+    """Test the first `found` paths in a buffer for obstacles; return the unblocked rows (m,).
 
     Points of interaction are moved off their surface by `SKIN_M`, so that no surface blocks the
     path that it reflects or diffracts.
-
-    Returns:
-        (m,) rows of the buffer, ascending.
     """
     legs = buffer.count[:found] - 1
     points_m = np.empty((int(legs.max(initial=0)) + 1, found, 3))
     _move_off_surfaces(surfaces, candidates, buffer, SKIN_M, points_m)
-    # The first legs are those that rays have gone: the last ones are blocked most often.
+    # Last legs first: these are blocked most often, since rays were shot along the first ones.
     rows = np.arange(found)
     for leg in range(len(points_m) - 1):
         used = np.flatnonzero(legs[rows] > leg)
@@ -340,6 +345,7 @@ def _move_off_surfaces(
     surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer, skin_m: float,
     points_m: np.ndarray,
 ) -> None:
+    """Write the points of paths (k, paths, 3) [m], moved by `skin_m` off their surfaces."""
     planes, edges = surfaces.planes, surfaces.edges
     for path in range(points_m.shape[1]):
         row, last = buffer.candidate[path], buffer.count[path] - 1

@@ -1,19 +1,17 @@
-"""A ray at a surface and at an edge: coefficients, position of the interaction, and field after it.
+"""Reflection at a slab and UTD diffraction at a wedge: coefficients, and the field after them.
 
-A surface is a slab of one dielectric, of the thickness that its material declares [1]: behind a
-thin wall is air again, which reflects, too. The ground is a half space. What a rough surface
-scatters is missing from its reflection: with the scattering coefficient S the field is
-sqrt(1 - S²) times as strong [5].
+A surface is a dielectric slab of the thickness that its material declares [1]; its back reflects,
+too. The ground is a half space. Scattering by a rough surface weakens the reflected field by
+sqrt(1 - S²) with the scattering coefficient S [5].
 
-An edge is a wedge in the uniform theory of diffraction [2]. By Keller's law the angle between ray
-and edge stays the same: the ray is straight once the half planes before and after the edge are
-folded into one. For faces that are not conductors there are heuristics only, which differ by many
-decibels away from the boundaries of shadow and reflection. This is Luebbers' [3], which multiplies
-the two terms of the reflection boundaries by the reflection at the face. He takes the angles of
-reflection from the incident ray, so that his coefficient changes when the two ends are swapped.
-Here the smaller of the angles of the incident and the diffracted ray to each face is taken. It is
-the same at the reflection boundaries and in the shadow behind a lit face, for which he gave it, and
-it is reciprocal everywhere. For conductors it is exact.
+An edge is a wedge in the uniform theory of diffraction [2]. By Keller's law, incident and
+diffracted ray have the same angle to the edge. For dielectric faces there are only heuristics,
+which differ by many decibels away from the shadow and reflection boundaries. This is Luebbers' [3]:
+the two terms of the reflection boundaries are multiplied by the reflection coefficients of the
+faces. He takes the angles of reflection from the incident ray, which is not reciprocal. Here the
+smaller of the angles of incident and diffracted ray to each face is used. It agrees with his at the
+reflection boundaries and in the shadow behind a lit face, for which he gave it, and it is
+reciprocal everywhere. For conductors it is exact.
 
 The knife edge of ITU-R P.526 is not used: it has neither the angle of the wedge nor its material
 nor the polarisation, and it holds close to the shadow boundary only.
@@ -54,17 +52,17 @@ from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import Material, constants
 
 VACUUM_PERMITTIVITY_F_M = 8.8541878128e-12  # [F/m], CODATA 2018
-MIN_SINE = 1e-9  # of the angle between ray and surface; -1 is the limit of all coefficients at 0
-MIN_FACE_SINE = 1e-4  # of the angle between ray and face; rays closer to a face are not followed
+MIN_SINE = 1e-9  # of the angle between ray and surface; at 0 all coefficients tend to -1
+MIN_FACE_SINE = 1e-4  # of the angle between ray and face of a wedge; flatter rays are dropped
 
 
 class Slabs(NamedTuple):
-    """Materials of a city at one frequency, that of the ground after the last one.
+    """Materials of a city at one frequency; the last is the ground.
 
     Attributes:
-        permittivity: (m,) complex relative permittivities, for fields that vary as exp(+j ω t).
+        permittivity: (m,) complex relative permittivity, for fields that vary as exp(+j ω t).
         phase_rad: (m,) thickness times wave number in vacuum [rad]; infinite: a half space.
-        specular: (m,) field that is left to the reflection over that of a smooth surface.
+        specular: (m,) factor of the reflected field for a rough surface, sqrt(1 - S²).
     """
 
     permittivity: np.ndarray
@@ -73,18 +71,19 @@ class Slabs(NamedTuple):
 
 
 def city_slabs(city: CityMap, frequency_hz: float) -> Slabs:
-    """Return a city's materials at a frequency [Hz], and last that of its ground, a half space."""
+    """Return the slabs of a city's materials at a frequency [Hz]; the last is the ground."""
     slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
     slabs.phase_rad[-1] = np.inf
     return slabs
 
 
 def slabs_of(materials: Sequence[Material], frequency_hz: float) -> Slabs:
-    """Return m materials at a frequency [Hz], outside ITU's ranges as `materials.constants`."""
+    """Return the slabs of m materials at a frequency [Hz], by `materials.constants`."""
     angular = 2 * np.pi * frequency_hz
-    real, conductivity_s_m, _ = np.array([constants(each, frequency_hz) for each in materials]).T
-    thickness_m, scattering = np.array([(each.thickness_m, each.scattering_coefficient)
-                                        for each in materials]).T
+    real, conductivity_s_m, _ = np.array([constants(material, frequency_hz)
+                                          for material in materials]).T
+    thickness_m, scattering = np.array([(material.thickness_m, material.scattering_coefficient)
+                                        for material in materials]).T
     return Slabs(real - 1j * conductivity_s_m / (angular * VACUUM_PERMITTIVITY_F_M),
                  angular / speed_of_light * thickness_m, np.sqrt(1 - scattering**2))
 
@@ -98,8 +97,7 @@ def fresnel(sine: float, permittivity: complex) -> tuple[complex, complex]:
         permittivity: complex relative permittivity of the half space.
 
     Returns:
-        The coefficients for the field across (TE) and in (TM) the plane of incidence, which tend
-        to -1 and +1 for a perfect conductor.
+        The coefficients TE and TM, which tend to -1 and +1 for a perfect conductor.
     """
     root = np.sqrt(permittivity - (1.0 - sine * sine) + 0j)
     te = (sine - root) / (sine + root)
@@ -113,11 +111,10 @@ def reflection(sine: float, slabs: Slabs, row: int) -> tuple[complex, complex]:
     Args:
         sine: sine of the angle between ray and surface.
         slabs: materials.
-        row: of the slab's material.
+        row: row of the material in `slabs`.
 
     Returns:
-        The coefficients across (TE) and in (TM) the plane of incidence, with the signs of
-        `fresnel`, without what is scattered.
+        The coefficients TE and TM of the specular field, with the signs of `fresnel`.
     """
     sine = max(sine, MIN_SINE)
     permittivity = slabs.permittivity[row]
@@ -125,10 +122,9 @@ def reflection(sine: float, slabs: Slabs, row: int) -> tuple[complex, complex]:
     if np.isinf(slabs.phase_rad[row]):
         return te * slabs.specular[row], tm * slabs.specular[row]
     root = np.sqrt(permittivity - (1.0 - sine * sine) + 0j)
-    there_and_back = np.exp(-2j * slabs.phase_rad[row] * root)
-    rest = slabs.specular[row] * (1.0 - there_and_back)
-    return (te * rest / (1.0 - te * te * there_and_back),
-            tm * rest / (1.0 - tm * tm * there_and_back))
+    round_trip = np.exp(-2j * slabs.phase_rad[row] * root)
+    scale = slabs.specular[row] * (1.0 - round_trip)
+    return te * scale / (1.0 - te * te * round_trip), tm * scale / (1.0 - tm * tm * round_trip)
 
 
 @njit(cache=True)
@@ -222,9 +218,14 @@ def _cotangent_term(beta: float, x: float, n: float, sign: int) -> complex:
 def reflect(
     normal: np.ndarray, material: int, direction_in: np.ndarray, slabs: Slabs, field: np.ndarray
 ) -> Triple:
-    """Reflect the complex field (3,) of a ray, in place, and return the reflected ray's direction.
+    """Reflect the complex field (3,) of a ray in place, and return the reflected ray's direction.
 
-    The surface has a unit normal (3,), on either side, and a material, a row of the slabs.
+    Args:
+        normal: (3,) unit normal of the surface, to either side.
+        material: row of the material in `slabs`.
+        direction_in: (3,) unit vector of the incident ray.
+        slabs: materials.
+        field: (3,) complex field, changed in place.
     """
     cosine = dot(direction_in, normal)
     direction = (direction_in[0] - 2.0 * cosine * normal[0],
@@ -232,7 +233,7 @@ def reflect(
                  direction_in[2] - 2.0 * cosine * normal[2])
     across = cross(direction_in, normal)
     size2 = dot(across, across)
-    if size2 < 1e-12:  # normal incidence: any direction in the plane is across
+    if size2 < 1e-12:  # normal incidence: any direction in the surface is TE
         other = (1.0, 0.0, 0.0) if abs(normal[0]) < 0.7 else (0.0, 1.0, 0.0)
         across = cross(direction_in, other)
         size2 = dot(across, across)
@@ -250,13 +251,11 @@ def reflect(
 def around_edge(
     edges: np.ndarray, edge: int, x: float, y: float, z: float
 ) -> tuple[bool, float, float]:
-    """Return whether a point is in an edge's open space, and its cylindrical coordinates.
-
-    The edge is a row of `Surfaces.edges`, the point has x, y and z [m].
+    """Return cylindrical coordinates of a point x, y, z [m] around an edge.
 
     Returns:
-        Whether it is in the open space, its distance along the edge from the start [m], and its
-        distance from the edge's line [m].
+        True if the point is outside the wedge, its coordinate along the edge from the start [m],
+        and its distance from the edge's line [m].
     """
     x, y, z = x - edges[edge, START], y - edges[edge, START + 1], z - edges[edge, START + 2]
     along_m = x * edges[edge, ALONG] + y * edges[edge, ALONG + 1] + z * edges[edge, ALONG + 2]
@@ -274,7 +273,7 @@ def diffract(
     edges: np.ndarray, edge: int, direction_in: np.ndarray, direction: np.ndarray, before_m: float,
     after_m: float, wave_number: float, slabs: Slabs, field: np.ndarray,
 ) -> None:
-    """Diffract the field of a ray at an edge (Kouyoumjian and Pathak, eq. 9-13), without spreading.
+    """Diffract the field of a ray at an edge in place [2, eq. 9-13], without the spreading factor.
 
     Args:
         edges: of `Surfaces`.
@@ -294,7 +293,7 @@ def diffract(
     exterior = row[EXTERIOR]
     phi_in = np.arctan2(-dot(direction_in, normal_0), -dot(direction_in, tangent)) % (2.0 * np.pi)
     phi = np.arctan2(dot(direction, normal_0), dot(direction, tangent)) % (2.0 * np.pi)
-    if dot(direction_in, normal_0) >= 0.0:  # face 0 is one that the source sees
+    if dot(direction_in, normal_0) >= 0.0:  # make face 0 the one that the source sees
         phi_in, phi = exterior - phi_in, exterior - phi
         normal_0, normal_n = normal_n, normal_0
         material_0, material_n = material_n, material_0

@@ -1,9 +1,9 @@
-"""All paths between a scene's devices and any points, as one dataset and NetCDF file.
+"""List all paths between a scene's devices and points as one dataset and NetCDF file.
 
-The paths are a contiguous ragged array of the CF conventions, section 9.3.3: those of the first
-link, then those of the second, and so on; `path_count` has their numbers. Each has its field, its
-way, its angles and its interactions. Each link has the spreads of delay, angle and Doppler, the K
-factor and the impulse response of its paths.
+The paths are a contiguous ragged array of the CF conventions, section 9.3.3: the paths of the first
+link, then of the second, and so on; `path_count` is their number. Each path has gain, phase, delay,
+angles and interactions. Each link has the spreads of delay, angle and Doppler, the K factor and the
+impulse response.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from radiotwin.io.budgets import PATHS, RESPONSE_VALUES, ROWS
 from radiotwin.io.files import atomic_file, require_suffix, require_writable
 from radiotwin.maps.file import CONVENTIONS
 from radiotwin.propagation.paths.candidates import candidate_search
-from radiotwin.propagation.paths.fields import path_amplitudes
+from radiotwin.propagation.paths.fields import buffer_amplitudes
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
 from radiotwin.propagation.paths.interactions import city_slabs
 from radiotwin.propagation.terrain import is_far, terrain_paths
@@ -31,8 +31,8 @@ from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.trace.run import device_indices
 
-RECEIVER_CHUNK = 500  # receivers at once
-PATH_CHUNK = 20_000  # paths at once: about 10 MB
+RECEIVER_CHUNK = 500  # receivers at a time
+PATH_CHUNK = 20_000  # paths at a time: about 10 MB
 NO_INTERACTION, REFLECTION, DIFFRACTION, TERRAIN = 0, 1, 2, 3
 SCHEMA = "radiotwin.paths/1"
 _UNITS = {"db": "dB", "s": "s", "hz": "Hz", "deg": "degree", "rad": "rad", "m": "m"}
@@ -48,7 +48,7 @@ _LONG_NAMES = {
     "tap_delay_s": "delay after the link's first path",
     "interaction_m": "points of interaction, from device to receiver (NaN: none)",
 }
-EDGE_TAPS = 16  # before the first and after the last path: a path between two taps rings that long
+EDGE_TAPS = 16  # taps before the first and after the last path for the ringing of the low-pass
 
 
 class Rays(NamedTuple):
@@ -58,8 +58,8 @@ class Rays(NamedTuple):
         receiver: (p,) row of the receiver.
         amplitude: (p,) complex gain between vertically polarised isotropic antennas, with the phase
             of the delay, for fields that vary as exp(+j ω t).
-        length_m: (p,) [m].
-        kinds: (p, MAX_INTERACTIONS) of each interaction, then NO_INTERACTION.
+        length_m: (p,) length [m].
+        kinds: (p, MAX_INTERACTIONS) kind of each interaction, then NO_INTERACTION.
         points_m: (p, MAX_INTERACTIONS, 3) points of interaction [m], then NaN.
         departure: (p, 3) unit vectors from the device along the path.
         arrival: (p, 3) unit vectors from the receiver along the path.
@@ -75,7 +75,7 @@ class Rays(NamedTuple):
 
     @property
     def delay_s(self) -> np.ndarray:
-        """(p,) delays [s]."""
+        """Return the delays (p,) [s]."""
         return self.length_m / speed_of_light
 
 
@@ -86,12 +86,12 @@ NO_RAYS = Rays(np.zeros(0, dtype=int), np.zeros(0, dtype=complex), np.zeros(0),
 
 def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float,
                 depth: int = 4) -> Iterator[tuple[Rays, int]]:
-    """Follow paths of up to `depth` interactions from a device (3,) to receivers (n, 3) [m].
+    """Find paths of up to `depth` interactions from a device (3,) to receivers (n, 3) [m].
 
     Paths along terrain are included, see `radiotwin.propagation.paths.powers.PathPowers`.
 
     Yields:
-        The paths to the next receivers, whose rows are among all, and the number of these.
+        The paths to the next chunk of receivers, with rows of all receivers, and the chunk's size.
     """
     search = candidate_search(city, depth)
     candidates = search.candidates(device_m)
@@ -105,7 +105,7 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
         near = np.flatnonzero(~far)
         parts = [_direct(city, device_m, ends_m[near], wave_number)]
         for rows in found_clear(city, search.surfaces, candidates, device_m, ends_m[near], buffer):
-            found = path_amplitudes(search.surfaces, candidates, wave_number, slabs, buffer, rows)
+            found = buffer_amplitudes(search.surfaces, candidates, wave_number, slabs, buffer, rows)
             parts.append(_rays(buffer, rows, kinds[buffer.candidate[rows]], *found))
         joined = _joined(parts)
         joined = joined._replace(receiver=near[joined.receiver])
@@ -113,12 +113,12 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
         rows = np.append(np.flatnonzero(far), dark[city.hidden_by_ground(device_m, ends_m[dark])])
         joined = _joined([joined, _along_terrain(city, device_m, ends_m, rows, wave_number)])
         order = np.lexsort((joined.length_m, joined.receiver))
-        rays = Rays(*(each[order] for each in joined))
+        rays = Rays(*(array[order] for array in joined))
         yield rays._replace(receiver=rays.receiver + first), len(ends_m)
 
 
 def _direct(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, wave_number: float) -> Rays:
-    """Return the straight paths (ITU-R P.525-4, eq. 4) to the ends that see the device."""
+    """Return the direct paths (ITU-R P.525-4, eq. 4) to the receivers that see the device."""
     seen = np.flatnonzero(city.line_of_sight(device_m, ends_m))
     length_m = np.linalg.norm(ends_m[seen] - device_m, axis=1)
     forth = (ends_m[seen] - device_m) / np.maximum(length_m, 1e-9)[:, None]
@@ -129,7 +129,7 @@ def _direct(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, wave_number
 
 def _along_terrain(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, rows: np.ndarray,
                    wave_number: float) -> Rays:
-    """Return one path over the terrain profile for each of some ends (rows)."""
+    """Return one path over the terrain profile to each of the receivers `rows`."""
     ends_m = ends_m[rows]
     along = terrain_paths(city, device_m, ends_m, wave_number * speed_of_light / (2 * np.pi))
     legs = along.edge_m - device_m, along.edge_m - ends_m
@@ -145,11 +145,12 @@ def _along_terrain(city: CityMap, device_m: np.ndarray, ends_m: np.ndarray, rows
 
 def _rays(buffer: PathBuffer, rows: np.ndarray, kinds: np.ndarray, amplitude: np.ndarray,
           length_m: np.ndarray) -> Rays:
+    """Return the paths in rows (p,) of a buffer with their directions and points."""
     points_m, last = buffer.points_m[rows], buffer.count[rows] - 1
     path = np.arange(len(rows))
     ends = [points_m[:, 1] - points_m[:, 0], points_m[path, last - 1] - points_m[path, last]]
-    departure, arrival = (each / np.maximum(np.linalg.norm(each, axis=1, keepdims=True), 1e-9)
-                          for each in ends)
+    departure, arrival = (leg_m / np.maximum(np.linalg.norm(leg_m, axis=1, keepdims=True), 1e-9)
+                          for leg_m in ends)
     between_m = np.where(kinds[:, :, None] == NO_INTERACTION, np.nan, points_m[:, 1:-1])
     return Rays(buffer.receiver[rows], amplitude, length_m, kinds, between_m, departure, arrival)
 
@@ -166,18 +167,19 @@ def _kinds(candidates: Candidates) -> np.ndarray:
 
 
 def _joined(parts: list[Rays]) -> Rays:
-    return Rays(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    """Concatenate paths."""
+    return Rays(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def list_paths(scene: Scene | Path | str, points_m: np.ndarray, out_path: Path | str | None = None,
                devices: list[str] | None = None, velocity_m_s: ArrayLike | None = None,
                bandwidth_hz: float | None = None) -> xr.Dataset:
-    """Follow the paths from a scene's devices to points, and describe each link by them.
+    """Find the paths from a scene's devices to points, with gain, delay, angles and spreads.
 
-    Paths have up to 4 interactions, one of them a diffraction. Where terrain is in the way and
-    there is none, and beyond 5 km, the loss along the profile is one path of its own kind. Both
-    ends are vertically polarised and have the scene's antennas. Azimuths are clockwise from north,
-    elevations above the horizon; angles of arrival are of the direction that the path comes from.
+    Paths have up to 4 interactions, at most one of them a diffraction. If terrain blocks a link
+    without paths, and beyond 5 km, there is one path along the terrain profile. Both ends are
+    vertically polarised and have the scene's antennas. Azimuths are clockwise from north,
+    elevations above the horizon; an angle of arrival is the direction from which the path arrives.
 
     Args:
         scene: 3D map, devices and radio.
@@ -193,8 +195,8 @@ def list_paths(scene: Scene | Path | str, points_m: np.ndarray, out_path: Path |
         have no paths; `reason` says so.
 
     Raises:
-        BadInput: an unknown device, points of another shape, a bandwidth or velocity that is none,
-            more paths than the budget, or an output that cannot be written.
+        BadInput: unknown device, wrong shape of points, impossible bandwidth or velocity, more
+            paths than the budget, or an output that cannot be written.
     """
     scene, points_m = Scene.of(scene), np.asarray(points_m, dtype=float)
     velocity = None if velocity_m_s is None else np.asarray(velocity_m_s, dtype=float)
@@ -226,6 +228,7 @@ def list_paths(scene: Scene | Path | str, points_m: np.ndarray, out_path: Path |
 
 def _check(points_m: np.ndarray, velocity: np.ndarray | None, bandwidth_hz: float | None,
            out_path: Path | str | None) -> None:
+    """Raise BadInput if an argument of `list_paths` is impossible."""
     if points_m.ndim != 2 or points_m.shape[1] != 3 or not len(points_m) \
             or not np.isfinite(points_m).all():
         raise BadInput("points_m must hold finite positions [m] of shape (n, 3), n at least 1; it "
@@ -242,7 +245,7 @@ def _check(points_m: np.ndarray, velocity: np.ndarray | None, bandwidth_hz: floa
 
 
 def _reasons(scene: Scene, device: int, points_m: np.ndarray) -> np.ndarray:
-    """Return why a device has no link to each point (n,), empty where it may have."""
+    """Return the reason (n,) why a device has no link to a point; empty if it may have one."""
     inside, below = scene.city.inside(points_m), scene.city.below_ground(points_m)
     wavelength_m = speed_of_light / scene.config.radio.frequency_hz
     near = np.linalg.norm(points_m - scene.device_m[device], axis=1) < wavelength_m
@@ -252,7 +255,7 @@ def _reasons(scene: Scene, device: int, points_m: np.ndarray) -> np.ndarray:
 
 def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.ndarray
             ) -> Iterator[Rays]:
-    """Yield the paths of some links at a time, in their order, with antennas and rows of links."""
+    """Yield the paths of a chunk of links, with antenna gains and rows of all links, in order."""
     count = 0
     with progress("following paths", total=int(usable.sum())) as advance:
         for row, device in enumerate(index):
@@ -261,10 +264,10 @@ def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.nda
                                                points_m[points],
                                                scene.config.radio.frequency_hz):
                 gain_dbi = np.zeros(len(rays.length_m))
-                for antenna, way in ((scene.device_antennas[device], rays.departure),
-                                     (scene.uav_antenna, rays.arrival)):
+                for antenna, direction in ((scene.device_antennas[device], rays.departure),
+                                           (scene.uav_antenna, rays.arrival)):
                     if antenna is not None:
-                        gain_dbi += antenna.gain_dbi(way)
+                        gain_dbi += antenna.gain_dbi(direction)
                 count += len(gain_dbi)
                 PATHS.check(count, f"paths of {len(index)} devices to {len(points_m)} points")
                 yield rays._replace(receiver=row * len(points_m) + points[rays.receiver],
@@ -273,7 +276,7 @@ def _follow(scene: Scene, index: list[int], points_m: np.ndarray, usable: np.nda
 
 
 def _links(scene: Scene, index: list[int], points_m: np.ndarray) -> xr.Dataset:
-    """Return the two ends of each link."""
+    """Return a dataset of links with device name, device position and receiver position [m]."""
     names = np.array([scene.config.devices[device].device for device in index], dtype=object)
     ends = {"device": np.repeat(names, len(points_m))}
     for axis, name in enumerate("xyz"):
@@ -284,7 +287,7 @@ def _links(scene: Scene, index: list[int], points_m: np.ndarray) -> xr.Dataset:
 
 def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np.ndarray | None,
               bandwidth_hz: float | None) -> None:
-    """Add the paths, and the figures of each link, to a dataset of links."""
+    """Add the paths, and each link's gain, spreads and K factor, to a dataset of links."""
     links, link = dataset.sizes["link"], rays.receiver
     amplitude, delay_s, kinds = rays.amplitude, rays.delay_s, rays.kinds
     power = np.abs(amplitude) ** 2
@@ -338,6 +341,7 @@ def _describe(dataset: xr.Dataset, rays: Rays, frequency_hz: float, velocity: np
 
 
 def _db(power: np.ndarray) -> np.ndarray:
+    """Convert power to decibels; NaN for zero power."""
     with np.errstate(divide="ignore"):
         return np.where(power > 0, 10 * np.log10(power), np.nan)
 
@@ -345,8 +349,8 @@ def _db(power: np.ndarray) -> np.ndarray:
 def _write(dataset: xr.Dataset, path: Path | str) -> None:
     """Write the dataset as compressed NetCDF-4."""
     packed = {"zlib": True, "complevel": 4}
-    encoding = {str(name): packed for name, each in dataset.data_vars.items()
-                if each.dtype.kind in "fi" and each.size}
+    encoding = {str(name): packed for name, array in dataset.data_vars.items()
+                if array.dtype.kind in "fi" and array.size}
     content = BytesIO()
     dataset.assign_attrs(Conventions=CONVENTIONS).to_netcdf(content, engine="h5netcdf",
                                                             encoding=encoding)
@@ -355,7 +359,7 @@ def _write(dataset: xr.Dataset, path: Path | str) -> None:
 
 
 def sums(values: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
-    """Return the sum (links,) of real or complex values (p,) over the paths of each link (p,)."""
+    """Sum real or complex values (p,) over the paths of each link; return (links,)."""
     if np.iscomplexobj(values):
         return sums(values.real, link, links) + 1j * sums(values.imag, link, links)
     return np.bincount(link, weights=values, minlength=links)
@@ -364,17 +368,17 @@ def sums(values: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
 def rms_spread(values: np.ndarray, power: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
     """Return the power-weighted standard deviation of a quantity over the paths of each link.
 
-    Of delays this is the RMS delay spread (Rappaport, "Wireless Communications", 2nd ed., 2002, eq.
-    5.35), of Doppler shifts the RMS Doppler spread.
+    For delays it is the RMS delay spread (Rappaport, "Wireless Communications", 2nd ed., 2002, eq.
+    5.35), for Doppler shifts the RMS Doppler spread.
 
     Args:
-        values: (p,) of the paths.
-        power: (p,) linear.
+        values: (p,) quantity of each path.
+        power: (p,) power of each path, linear.
         link: (p,) row of each path's link.
         links: number of links.
 
     Returns:
-        (links,) in the unit of `values`; NaN where there is no path.
+        (links,) in the unit of `values`; NaN without a path.
     """
     total = sums(power, link, links)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -384,9 +388,9 @@ def rms_spread(values: np.ndarray, power: np.ndarray, link: np.ndarray, links: i
 
 def angular_spread_deg(angle_rad: np.ndarray, power: np.ndarray, link: np.ndarray, links: int
                        ) -> np.ndarray:
-    """Return the circular angular spread of each link (3GPP TR 38.901, Annex A.1).
+    """Return the circular spread (links,) of angles (p,) [rad] [deg] (TR 38.901, Annex A.1).
 
-    Of azimuths or zeniths [rad], with the arguments of `rms_spread`; NaN where there is no path.
+    The other arguments are those of `rms_spread`; NaN without a path.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         resultant = np.abs(sums(power * np.exp(1j * angle_rad), link, links)) \
@@ -395,20 +399,30 @@ def angular_spread_deg(angle_rad: np.ndarray, power: np.ndarray, link: np.ndarra
 
 
 def k_factor_db(power: np.ndarray, direct: np.ndarray, link: np.ndarray, links: int) -> np.ndarray:
-    """Return the power of the direct path over that of all others (links,) [dB].
+    """Return the Rician K factor (links,): power of the direct path over all others [dB].
 
-    A path (p,) is direct if it has no interaction; the other arguments are those of `rms_spread`.
-    NaN where there is no direct path, or no other.
+    Args:
+        power: (p,) power of each path, linear.
+        direct: (p,) bool, the path has no interaction.
+        link: (p,) row of each path's link.
+        links: number of links.
+
+    Returns:
+        NaN without a direct path, or without another path.
     """
-    first, rest = sums(power * direct, link, links), sums(power * ~direct, link, links)
+    direct_power, others = sums(power * direct, link, links), sums(power * ~direct, link, links)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where((first > 0) & (rest > 0), 10 * np.log10(first / rest), np.nan)
+        return np.where((direct_power > 0) & (others > 0), 10 * np.log10(direct_power / others),
+                        np.nan)
 
 
 def doppler_hz(arrival: np.ndarray, velocity_m_s: np.ndarray, wavelength_m: float) -> np.ndarray:
-    """Return the Doppler shifts (p,) of paths to a moving receiver, positive where it approaches.
+    """Return the Doppler shifts (p,) [Hz] of paths to a moving receiver; approaching is positive.
 
-    Arrivals are unit vectors (p, 3) from the receiver along the paths.
+    Args:
+        arrival: (p, 3) unit vectors from the receiver along the paths.
+        velocity_m_s: (3,) velocity of the receiver [m/s].
+        wavelength_m: wavelength [m].
     """
     return arrival @ velocity_m_s / wavelength_m
 
@@ -418,17 +432,23 @@ def impulse_response(amplitude: np.ndarray, excess_s: np.ndarray, link: np.ndarr
     """Return the band-limited impulse response of each link, sampled at the bandwidth.
 
     Tap l of an ideal low-pass is the sum of a sinc(l - B τ) over the paths (Tse and Viswanath,
-    "Fundamentals of Wireless Communication", 2005, eq. 2.34). Tap `EDGE_TAPS` is at the excess
-    delay 0; those before and after hold the ringing of the low-pass. Amplitudes (p,) have the phase
-    of the carrier over the whole delay; rows of links (p,) ascend.
+    "Fundamentals of Wireless Communication", 2005, eq. 2.34). Tap `EDGE_TAPS` is at excess delay 0.
+
+    Args:
+        amplitude: (p,) complex gain with the phase of the carrier over the total delay.
+        excess_s: (p,) delay after the link's first path [s].
+        link: (p,) row of each path's link, ascending.
+        links: number of links.
+        bandwidth_hz: bandwidth [Hz].
+        taps: number of taps.
 
     Returns:
         (links, taps) complex.
     """
     response = np.zeros((links, taps), dtype=complex)
-    at = np.arange(taps) - EDGE_TAPS
+    tap = np.arange(taps) - EDGE_TAPS
     bounds = np.searchsorted(link, np.arange(links + 1))
     for row, (first, end) in enumerate(zip(bounds[:-1], bounds[1:])):
-        shape = np.sinc(at - bandwidth_hz * excess_s[first:end, None])
-        response[row] = amplitude[first:end] @ shape
+        pulse = np.sinc(tap - bandwidth_hz * excess_s[first:end, None])
+        response[row] = amplitude[first:end] @ pulse
     return response

@@ -1,4 +1,4 @@
-"""Power of the paths between devices and receivers."""
+"""Compute the power of all paths between a device and receivers: `path_powers`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -9,7 +9,8 @@ from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.propagation.paths.candidates import DEVICE_RAYS, CandidateSearch, candidate_search
-from radiotwin.propagation.paths.fields import path_gains
+from radiotwin.propagation.paths.facets import expand
+from radiotwin.propagation.paths.fields import buffer_gains
 from radiotwin.propagation.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, found_clear
 from radiotwin.propagation.paths.interactions import Slabs, city_slabs
 from radiotwin.propagation.paths.two_edges import paths_over_two_edges, two_edge_gains
@@ -17,21 +18,21 @@ from radiotwin.propagation.terrain import is_far, terrain_paths
 from radiotwin.scene.antennas import Antenna
 from radiotwin.scene.citymap import CityMap
 
-PATH_CHUNK = 50_000  # paths at once: about 30 MB
-DARK_CHUNK = 100  # receivers at once that only two edges may reach
-DEPTH = 4  # interactions of a path at most
-WEAK_SHARE = 1e-3  # of a link's power: a weaker path need not be tried from places nearby
-NEGLECTED = 1e-5  # of a link's power, carried by its weakest paths, whose directions are not kept
+PATH_CHUNK = 50_000  # paths at a time: about 30 MB
+DARK_CHUNK = 100  # receivers at a time to which paths over two edges are searched
+DEPTH = 4  # largest number of interactions of a path
+WEAK_SHARE = 1e-3  # of a link's power: weaker paths are not tried from nearby positions
+NEGLECTED = 1e-5  # of a link's power: the weakest paths, whose directions are dropped
 
 
 class PathsWithPoints(NamedTuple):
-    """Paths from one device.
+    """Paths from one device with their points of interaction.
 
     Attributes:
         receiver: (p,) row of the receiver.
-        power: (p,) linear gain between isotropic antennas.
-        points_m: (p, m, 3) device, points of interaction, receiver [m]; what follows means nothing.
-        points: (p,) number of these points.
+        power: (p,) power gain between isotropic antennas, linear.
+        points_m: (p, m, 3) device, points of interaction, receiver [m]; then unused rows.
+        points: (p,) number of used rows in `points_m`.
     """
 
     receiver: np.ndarray
@@ -41,14 +42,14 @@ class PathsWithPoints(NamedTuple):
 
 
 class PathDirections(NamedTuple):
-    """Power and directions of single paths, for antennas, by ascending link.
+    """Power and directions of single paths, from which antenna gains are computed.
 
-    The weakest paths of a link, which carry less than `NEGLECTED` of its power together, are left
-    out: 0.04 dB at most, with an antenna whose gain varies by 30 dB over the paths of the link.
+    The weakest paths of a link, which together carry less than `NEGLECTED` of its power, are left
+    out: at most 0.04 dB, with an antenna whose gain varies by 30 dB over the paths of the link.
 
     Attributes:
-        link: (p,) int32 row of the link.
-        power: (p,) float32 linear gain between isotropic antennas.
+        link: (p,) int32 row of the link, ascending.
+        power: (p,) float32 power gain between isotropic antennas, linear.
         departure: (p, 3) float32 unit vectors from the device along the path.
         arrival: (p, 3) float32 unit vectors from the receiver along the path.
     """
@@ -60,25 +61,23 @@ class PathDirections(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Sequence["PathDirections"]) -> "PathDirections":
-        """Return the paths of several parts, by ascending link."""
+        """Concatenate paths and sort them by link."""
         link = np.concatenate([part.link for part in parts])
         order = np.argsort(link, kind="stable")
-        return cls(*(np.concatenate(each)[order] for each in zip(*parts, strict=True)))
+        return cls(*(np.concatenate(arrays)[order] for arrays in zip(*parts, strict=True)))
 
     def of_links(self, rows: np.ndarray) -> "PathDirections":
-        """Return the paths of some links (r,), each with its place among them as the link."""
+        """Select the paths of links `rows` (r,); `link` then counts from 0 in their order."""
         first, end = (np.searchsorted(self.link, rows, side) for side in ("left", "right"))
-        count = end - first
-        # The k-th path of the part is the k-th of its link after the paths of the links before
-        path = np.arange(count.sum()) + np.repeat(first - (np.cumsum(count) - count), count)
-        return PathDirections(np.repeat(np.arange(len(rows), dtype=np.int32), count),
-                              *(each[path] for each in self[1:]))
+        link, within = expand(end - first)
+        path = first[link] + within
+        return PathDirections(link.astype(np.int32), *(array[path] for array in self[1:]))
 
     def antenna_gain_db(self, links: int, device_antenna: Antenna | None,
                         receiver_antenna: Antenna | None = None) -> np.ndarray:
-        """Return what antennas at the ends add to links (links,) [dB]; NaN where there is no path.
+        """Return what antennas add to the level of each link (links,) [dB]; NaN without a path.
 
-        Each path has the gains of its own directions, and stays vertically polarised.
+        Each path is weighted by the gains in its directions, and stays vertically polarised.
         """
         gain_dbi = np.zeros(len(self.link))
         for antenna, ray in ((device_antenna, self.departure), (receiver_antenna, self.arrival)):
@@ -95,28 +94,27 @@ NO_DIRECTIONS = PathDirections(np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np
 
 @dataclass(frozen=True, eq=False)
 class PathPowers:
-    """Linear power gains (n,) between vertically polarised isotropic antennas, by kind of path.
+    """Power gains (n,) between vertically polarised isotropic antennas, linear, by kind of path.
 
-    A reflection by the ground counts as a reflection where there are other interactions; alone it
-    is `ground`. Powers are added, not fields: where direct and reflected or diffracted rays nearly
-    coincide, their fields would cancel or add up.
+    A single reflection by the ground is `ground`; with other interactions it counts as a
+    reflection. Powers are added, not fields: the interference of nearly coincident rays is missing.
 
     Attributes:
-        direct: free space; 0 where blocked.
+        direct: free space; 0 if blocked.
         reflected_1: one reflection, not by the ground.
         reflected_2: two reflections, at most one of them by the ground.
         reflected_more: three or more reflections.
         diffracted: one diffraction, on either side of the shadow boundary.
         reflected_diffracted: one diffraction, and reflections before or after it.
-        diffracted_2: diffractions at two edges; looked for where there is no other path.
+        diffracted_2: diffractions at two edges; searched only for links without another path.
         ground: one reflection, by the ground: z = 0, or a triangle of the terrain.
-        diffracted_terrain: along the profile of the terrain, see `radiotwin.propagation.terrain`:
-            where terrain is in the way and there is no other path, and beyond the horizon. Ends
-            more than 5 km apart have this or, with line of sight, `direct` less what the ground
-            takes of it, and nothing else.
-        directions: of the single paths.
-        strongest: the candidates of the paths that carry nearly all of these powers, and all edges
-            that the device sees: what is worth trying from places a few metres away.
+        diffracted_terrain: diffraction along the terrain profile, see
+            `radiotwin.propagation.terrain`, if terrain blocks the link and there is no other path,
+            and beyond the horizon. Links over more than 5 km have only this or, with line of sight,
+            `direct` with the loss of the profile.
+        directions: power and directions of single paths.
+        strongest: candidates of the paths that carry nearly all power, and all edges that the
+            device sees: those to try from positions a few metres away.
     """
 
     direct: np.ndarray
@@ -133,7 +131,7 @@ class PathPowers:
 
     @property
     def total(self) -> np.ndarray:
-        """Sum of all kinds, (n,) linear."""
+        """Return the power gain (n,) summed over all kinds, linear."""
         return np.sum([getattr(self, name) for name in COMPONENTS], axis=0)
 
 
@@ -144,10 +142,9 @@ def path_powers(
     city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float, *,
     depth: int = DEPTH, rays: int = DEVICE_RAYS, candidates: Candidates | None = None,
 ) -> PathPowers:
-    """Follow the paths from a device to receivers and add up their powers.
+    """Find the paths from a device to receivers and add up their powers by kind.
 
-    Surfaces are slabs of the map's materials, and the ground is a half space of
-    `city.ground_material`.
+    Surfaces are slabs of the map's materials, the ground is a half space of `city.ground_material`.
     Ends inside buildings are accepted, but their results mean little.
 
     Args:
@@ -156,8 +153,8 @@ def path_powers(
         receiver_m: (n, 3) positions of the receivers [m].
         frequency_hz: carrier frequency [Hz].
         depth: maximum number of interactions of a path, 1 to 6.
-        rays: shot from the device to find what paths of several interactions visit.
-        candidates: what to try instead, such as the `strongest` of a place nearby.
+        rays: number of rays shot from the device to find sequences of facets.
+        candidates: sequences to try instead, such as the `strongest` of a nearby position.
 
     Raises:
         BadInput: a position or the frequency is no number, or the depth is out of its range.
@@ -221,27 +218,25 @@ def _strongest_candidates(
     candidates: Candidates, found: Sequence[tuple[np.ndarray, ...]], total: np.ndarray,
     over_seen_edge: np.ndarray,
 ) -> Candidates:
-    """Return candidates (c,) that matter for a link, and one for each edge seen.
+    """Select the candidates with a path above `WEAK_SHARE` of a link, and one for each edge seen.
 
     Args:
-        candidates: that were tried.
-        found: of paths (p,): candidate, link, and power.
+        candidates: c candidates that were tried.
+        found: candidate (p,), link (p,) and power (p,) of paths, in parts.
         total: (n,) power of each link.
-        over_seen_edge: (c,) bool, whether the first interaction is at an edge.
+        over_seen_edge: (c,) bool, the first interaction is at an edge.
     """
-    candidate, link, power = (np.concatenate(each) for each in zip(*found, strict=True))
-    matters = np.zeros(len(candidates.edge), dtype=bool)
-    matters[candidate[power > WEAK_SHARE * total[link]]] = True
-    rows = np.flatnonzero(over_seen_edge & (candidates.after[:, :1] < 0).all(axis=1))
-    matters[rows] = True
-    return Candidates(*(each[matters] for each in candidates))
+    candidate, link, power = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    keep = over_seen_edge & (candidates.after[:, :1] < 0).all(axis=1)
+    keep[candidate[power > WEAK_SHARE * total[link]]] = True
+    return Candidates(*(array[keep] for array in candidates))
 
 
 def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
                       frequency_hz: float) -> PathsWithPoints:
-    """Follow the paths as `path_powers` does, and return each by itself.
+    """Find single paths with their points of interaction.
 
-    Without the direct ones, those over two edges, and those along terrain.
+    Unlike `path_powers`, without direct paths, paths over two edges, and along terrain.
 
     Args:
         city: 3D map.
@@ -262,21 +257,21 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
         parts.append(PathsWithPoints(buffer.receiver[clear], gain,
                                      buffer.points_m[clear].astype(np.float32),
                                      buffer.count[clear]))
-    return PathsWithPoints(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+    return PathsWithPoints(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 def clear_paths_gains(
     city: CityMap, search: CandidateSearch, candidates: Candidates, device_m: np.ndarray,
     receiver_m: np.ndarray, buffer: PathBuffer, wave_number: float, slabs: Slabs,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield rows (p,) of a buffer that hold paths which nothing blocks, and their gains (p,)."""
+    """Yield rows (p,) of a buffer that hold unblocked paths, and their power gains (p,), linear."""
     for clear in found_clear(city, search.surfaces, candidates, device_m, receiver_m, buffer):
-        yield clear, path_gains(search.surfaces, candidates, wave_number, slabs, buffer, clear)
+        yield clear, buffer_gains(search.surfaces, candidates, wave_number, slabs, buffer, clear)
 
 
 def _directions(link: np.ndarray, power: np.ndarray, departure_m: np.ndarray,
                 arrival_m: np.ndarray) -> PathDirections:
-    """Return paths (p,) of links by their first and last legs (p, 3), each away from its end."""
+    """Return paths (p,) with unit vectors from the first and last legs (p, 3) [m]."""
     departure, arrival = (
         (leg_m / np.maximum(np.linalg.norm(leg_m, axis=1, keepdims=True), 1e-9)).astype(np.float32)
         for leg_m in (departure_m, arrival_m))
@@ -284,28 +279,28 @@ def _directions(link: np.ndarray, power: np.ndarray, departure_m: np.ndarray,
 
 
 def _strongest(paths: PathDirections, links: int) -> PathDirections:
-    """Return paths without the weakest, which carry less than `NEGLECTED` of a link together."""
+    """Drop the weakest paths, which together carry less than `NEGLECTED` of a link's power."""
     total = np.bincount(paths.link, paths.power, links)
     share = paths.power / np.maximum(total, 1e-300)[paths.link]
     order = np.lexsort((share, paths.link))
-    upto = np.cumsum(share[order])
-    before = np.concatenate([[0.0], upto])[np.searchsorted(paths.link, paths.link)]
+    cumulated = np.cumsum(share[order])
+    before = np.concatenate([[0.0], cumulated])[np.searchsorted(paths.link, paths.link)]
     kept = np.zeros(len(share), dtype=bool)
-    kept[order] = upto - before > NEGLECTED
-    return PathDirections(*(each[kept] for each in paths))
+    kept[order] = cumulated - before > NEGLECTED
+    return PathDirections(*(array[kept] for array in paths))
 
 
 def _direct(
     city: CityMap, from_m: np.ndarray, to_m: np.ndarray, wave_number: float
 ) -> np.ndarray:
-    """Return the free-space gains (n,) (ITU-R P.525-4, eq. 4), 0 where blocked."""
+    """Return the free-space power gains (n,), linear (ITU-R P.525-4, eq. 4); 0 if blocked."""
     distance_m = np.linalg.norm(to_m - from_m, axis=1)
     gain = 1 / np.maximum(2 * wave_number * distance_m, 1e-9) ** 2
     return np.where(city.line_of_sight(from_m, to_m), gain, 0.0)
 
 
 def _kinds(candidates: Candidates, is_ground: np.ndarray) -> np.ndarray:
-    """Return the row of COMPONENTS (c,) of each candidate."""
+    """Return the kind of path, an index of COMPONENTS (c,), of each candidate."""
     reflections = (candidates.before >= 0).sum(axis=1) + (candidates.after >= 0).sum(axis=1)
     only_ground = ((candidates.before >= 0) <= is_ground[candidates.before]).all(axis=1)
     over_edge = np.where(reflections > 0, COMPONENTS.index("reflected_diffracted"),

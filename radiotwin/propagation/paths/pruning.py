@@ -1,6 +1,6 @@
-"""Fast rejection of receivers that a candidate cannot reach, before the image method is applied.
+"""Reject receivers that a sequence of interactions cannot reach, before the image method.
 
-Every test is necessary and none is sufficient; all are slightly looser than the exact ones.
+Every test is necessary, none is sufficient; all are slightly looser than the exact ones.
 """
 
 import numpy as np
@@ -26,14 +26,13 @@ from radiotwin.propagation.paths.surfaces import (
 )
 from radiotwin.runtime.compiled import njit
 
-ROUNDING_M = 1e-6  # [m], slack of the tests for rounding in double precision
-ROUNDING_RAD = 1e-6  # [rad], the same
-GROUP = 16  # receivers that are tested together first
+ROUNDING_M, ROUNDING_RAD = 1e-6, 1e-6  # slack of the tests for rounding in double precision
+GROUP = 16  # neighbouring receivers that are tested together first
 
 
 @njit(cache=True, error_model="numpy")
 def spheres_around(receiver_m: np.ndarray) -> np.ndarray:
-    """Return (g, 4) centres and radii [m] of spheres around each `GROUP` receivers of (n, 3)."""
+    """Return centres and radii (g, 4) [m] of spheres around each `GROUP` of receivers (n, 3)."""
     spheres = np.empty((-(-len(receiver_m) // GROUP), 4))
     for group in range(len(spheres)):
         points_m = receiver_m[group * GROUP:(group + 1) * GROUP]
@@ -50,12 +49,11 @@ def spheres_around(receiver_m: np.ndarray) -> np.ndarray:
 def lit_part(
     planes: np.ndarray, edges: np.ndarray, edge: int, before: np.ndarray, image: np.ndarray
 ) -> tuple[float, float]:
-    """Return the part of an edge that the device can light by way of the facets before it.
+    """Return the part of an edge that the device can light by reflections at facets before it.
 
-    A point at t metres along the edge lies before a facet, and its line to the image passes within
-    a side of the facet's rectangle, where expressions that are linear in t are positive. For the
-    facet next to the edge these hold for the edge itself, for the one before that for its mirror
-    image, and so on.
+    A point at t metres along the edge is in front of a facet, and its line to the image passes
+    within a side of the facet's rectangle, if expressions that are linear in t are positive. They
+    are evaluated for the edge at the last facet, for its mirror image at the one before, and so on.
 
     Args:
         planes: of `Surfaces`.
@@ -65,7 +63,7 @@ def lit_part(
         image: (b + 1, 3) the device and its images in them [m].
 
     Returns:
-        Start and end of the lit part along the edge [m]; the part is empty where start >= end.
+        Start and end of the lit part along the edge [m]; it is empty if start >= end.
     """
     length_m = edges[edge, LENGTH]
     low_m, high_m = -ROUNDING_M, length_m + ROUNDING_M
@@ -85,11 +83,11 @@ def lit_part(
             before_m = height(planes, facet, ends[end, 0], ends[end, 1], ends[end, 2])
             u = image_u * before_m + behind_m * _coordinate(ends[end], origin, axis_u)
             v = image_v * before_m + behind_m * _coordinate(ends[end], origin, axis_v)
-            whole_m = before_m + behind_m
+            apart_m = before_m + behind_m
             values[end, 0] = before_m
             values[end, 1], values[end, 2] = u, v
-            values[end, 3] = planes[facet, SIZE] * whole_m - u
-            values[end, 4] = planes[facet, SIZE + 1] * whole_m - v
+            values[end, 3] = planes[facet, SIZE] * apart_m - u
+            values[end, 4] = planes[facet, SIZE + 1] * apart_m - v
         bounds = 1 if facet == len(planes) - 1 else 5  # the ground has no sides
         for i in range(bounds):
             low_m, high_m = _positive(values[0, i], values[1, i], length_m, low_m, high_m)
@@ -105,8 +103,8 @@ def lit_part(
 def open_window(edges: np.ndarray, edge: int, lit_m: np.ndarray, window: np.ndarray) -> None:
     """Write the window (4,) of all rays that the lit part (2,) [m] of an edge diffracts.
 
-    A window is start and end along the edge [m], and smallest and largest angle from face 0 around
-    it [rad]. Facets after an edge are unfolded: mirrored so that rays to them stay straight.
+    A window is start and end along the edge [m], and least and greatest angle around it from face
+    0 [rad].
     """
     window[0], window[1] = lit_m[0], lit_m[1]
     window[2], window[3] = -ROUNDING_RAD, edges[edge, EXTERIOR] + ROUNDING_RAD
@@ -117,25 +115,26 @@ def narrow(
     planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, k: int,
     source_m: np.ndarray, window: np.ndarray,
 ) -> bool:
-    """Narrow a window to diffracted rays that go through facet k of those after an edge.
+    """Narrow a window of diffracted rays to those that pass through facet `after[k]`.
 
     A ray to a point at q along the edge and r from its line leaves the edge at t, where
     (q - s) d = (t - s) (d + r), with the source at s along the edge and d from its line. So t is
-    above a bound where (q - s) d > (bound - s) (d + r). For all points of a facet that holds if it
-    holds at the corners of its rectangle: r is convex, and where that is the wrong way round, a
-    lower bound of r that is linear takes its place. The angle around the edge stays the same.
+    above a bound if (q - s) d > (bound - s) (d + r). That holds for all points of a facet if it
+    holds at the corners of its rectangle: r is convex; where convexity does not help, a linear
+    lower bound of r is used. Facets are mirrored so that rays to them stay straight; the angle
+    around the edge is not changed by that.
 
     Args:
-        planes: of `Surfaces`.
-        edges: of `Surfaces`.
+        planes: `Surfaces.planes`.
+        edges: `Surfaces.edges`.
         edge: row of `edges`.
         after: (b,) facets after the edge.
-        k: which of them.
+        k: index in `after`.
         source_m: (2,) position of the source along the edge, and distance from its line [m].
-        window: (4,) of `open_window`, narrowed to the facets before k; changed in place.
+        window: (4,) window narrowed to the facets before k, see `open_window`; changed in place.
 
     Returns:
-        Whether the window is still open; True may be wrong, False never is.
+        False if no ray passes; True may be wrong.
     """
     facet = after[k]
     if facet == len(planes) - 1:
@@ -177,7 +176,7 @@ def narrow(
     for i in range(4):
         aside_rad = np.arctan2(centre_x * y[i] - centre_y * x[i], centre_x * x[i] + centre_y * y[i])
         least_rad, most_rad = min(least_rad, aside_rad), max(most_rad, aside_rad)
-    if size == 0.0 or most_rad - least_rad >= np.pi - ROUNDING_RAD:  # the edge's line goes through
+    if size == 0.0 or most_rad - least_rad >= np.pi - ROUNDING_RAD:  # edge's line crosses the facet
         return True
     middle_rad = np.arctan2(centre_y, centre_x)
     parts, low_rad, high_rad = 0, 0.0, 0.0
@@ -202,7 +201,7 @@ def _coordinate(point_m: np.ndarray, origin_m: np.ndarray, axis: np.ndarray) -> 
 def _positive(
     at_start: float, at_end: float, length_m: float, low_m: float, high_m: float
 ) -> tuple[float, float]:
-    """Narrow an interval of an edge to where a function linear along the edge is positive."""
+    """Clip an interval of an edge [m] to where a function linear along the edge is positive."""
     if at_start < 0.0 and at_end < 0.0:
         return 0.0, 0.0
     if at_start < 0.0:
@@ -219,14 +218,15 @@ def through_facet(
 ) -> int:
     """Find the receivers that see an image through a facet's bounding rectangle.
 
-    Most candidates end here, so this and `over_edge` use only few scalars, which stay in registers.
+    Most candidates are rejected here, so this and `over_edge` use few scalars, which stay in
+    registers.
 
     Args:
-        planes: of `Surfaces`.
+        planes: `Surfaces.planes`.
         facet: row of `planes`.
         image: (3,) image of the device in the facet [m].
         receiver_m: (n, 3) positions [m].
-        spheres: of `spheres_around` these.
+        spheres: `spheres_around` the receivers.
         possible: (n,) output: rows of the receivers.
 
     Returns:
@@ -243,8 +243,8 @@ def through_facet(
     behind_m = offset_m - (nx * ix + ny * iy + nz * iz)
     image_u = (ix - ox) * ux + (iy - oy) * uy + (iz - oz) * uz
     image_v = (ix - ox) * vx + (iy - oy) * vy + (iz - oz) * vz
-    # Planes through the image and the rectangle's sides; a sphere is outside where its centre lies
-    # below one of them by more than its radius
+    # Planes through the image and the rectangle's sides; a sphere is outside if its centre is more
+    # than its radius below one of them
     low_u, high_u = np.sqrt(image_u ** 2 + behind_m ** 2), \
         np.sqrt((size_u - image_u) ** 2 + behind_m ** 2)
     low_v, high_v = np.sqrt(image_v ** 2 + behind_m ** 2), \
@@ -288,25 +288,25 @@ def over_edge(
     source_m: np.ndarray, receiver_m: np.ndarray, spheres: np.ndarray, frame: np.ndarray,
     possible: np.ndarray,
 ) -> int:
-    """Find the receivers that a ray over the lit part of an edge may reach.
+    """Find the receivers that a ray diffracted at the lit part of an edge may reach.
 
     Args:
-        planes: of `Surfaces`.
-        edges: of `Surfaces`.
+        planes: `Surfaces.planes`.
+        edges: `Surfaces.edges`.
         edge: row of `edges`.
         after: facets after the edge.
-        window: (4,) of `open_window`, narrowed to all facets.
+        window: (4,) window narrowed to all facets, see `open_window`.
         source_m: (2,) position of the source along the edge, and distance from its line [m].
         receiver_m: (n, 3) positions [m].
-        spheres: of `spheres_around` these.
-        frame: (3, 4) is overwritten.
+        spheres: `spheres_around` the receivers.
+        frame: (3, 4) working memory.
         possible: (n,) output: rows of the receivers.
 
     Returns:
         The number of rows in `possible`.
     """
-    # All in metres from the edge's start. A receiver's image in the facets is an affine map of it.
-    # Nothing is allocated here: that would take longer than the geometry.
+    # All in metres from the edge's start. A receiver's image in the facets is an affine function of
+    # its position. Allocating arrays would take longer than the geometry.
     for i in range(3):
         for j in range(3):
             frame[i, j] = 1.0 if i == j else 0.0
@@ -325,7 +325,7 @@ def over_edge(
     ax, ay, az = edges[edge, ALONG:ALONG + 3]
     nx, ny, nz = edges[edge, NORMAL_0:NORMAL_0 + 3]
     mx, my, mz = edges[edge, NORMAL_N:NORMAL_N + 3]
-    # The first facet after the edge; where there is none, facet 0 stands in and is not used
+    # The first facet after the edge; if there is none, facet 0 as an unused placeholder
     facet = after[0] if len(after) else 0
     sided = len(after) > 0 and facet < len(planes) - 1
     fx, fy, fz = planes[facet, NORMAL:NORMAL + 3]

@@ -1,8 +1,8 @@
-"""Facets and edges in arrays for compiled code; the last facet is the flat ground, all of z = 0.
+"""Surfaces: facets and edges of a map as arrays for compiled code, and their basic geometry.
 
-On a terrain its triangles are facets like any other, and nothing lies above the last one.
-Products of vectors of three numbers return tuples: to allocate an array takes longer than to
-compute what is in it.
+The last facet is the flat ground, the plane z = 0. On a terrain, its triangles are facets like any
+other, and no point lies above the last facet. Vector products return tuples of three numbers:
+allocating an array takes longer than the computation.
 """
 
 from typing import Any, NamedTuple
@@ -11,12 +11,11 @@ import numpy as np
 
 from radiotwin.runtime.compiled import njit
 
-ON_PLANE_M = 1e-4  # [m], a point this close to a plane is on neither side of it
-GROUND_MATERIAL = -1  # last row of `Slabs`; of flat ground, and of the triangles of a terrain
+ON_PLANE_M = 1e-4  # a point this close to a plane counts as on it [m]
+GROUND_MATERIAL = -1  # last row of `Slabs`: flat ground, and the triangles of a terrain
 
-# First columns of what is in `Surfaces.planes` and `Surfaces.edges`. Numba counts references to
-# each array that a function is given; with an array for each field, that would take longer than
-# the geometry.
+# First columns of the fields of `Surfaces.planes` and `Surfaces.edges`. Numba counts references to
+# each array argument; with an array for each field, that would take longer than the geometry.
 NORMAL, OFFSET, ORIGIN, AXIS_U, AXIS_V, SIZE, FULL, FIRST, END, MATERIAL = (
     0, 3, 4, 7, 10, 13, 15, 16, 17, 18)
 START, ALONG, LENGTH, TANGENT, NORMAL_0, NORMAL_N, EXTERIOR, MATERIAL_0, MATERIAL_N = (
@@ -27,22 +26,21 @@ Vector = np.ndarray | Triple
 
 
 class Surfaces(NamedTuple):
-    """Facets, with the ground after the last one, and the convex edges between two of them.
+    """f facets, then the ground, and e convex edges between two facets.
 
-    Where a building leans on a higher one without sharing its corners, the edge of its roof in
-    that wall is listed, too; it lies inside the other building, so no ray reaches it. A half plane
-    sweeps the open space of an edge when it is turned from face 0 by the exterior angle, π to 2 π,
-    towards the normal of face 0.
+    If a building leans on a higher one without shared corners, the edge of its roof in that wall is
+    an edge here, too; it lies inside the higher building, so no ray reaches it. The exterior angle
+    of an edge, π to 2 π, is that of the open space, from face 0 towards the normal of face 0.
 
     Attributes:
         planes: (f + 1, 19) outward unit normal, distance of the plane from the origin [m], a corner
             of the bounding rectangle [m], unit vectors u and v along its sides, u × v = normal,
-            their lengths [m], whether the facet fills it, its first triangle and the one after its
-            last, row of the city's materials.
+            lengths of the sides [m], 1 if the facet fills the rectangle, its first triangle and the
+            one after its last, row of the city's materials.
         triangle_uv_m: (t, 6) corners u, v, u, v, u, v of the triangles in the plane [m].
-        edges: (e, 19) start [m], unit vector to the end, length [m], unit vector in face 0, at
-            right angles to the edge, into the face, outward normals of face 0 and face n, exterior
-            angle [rad], materials of face 0 and face n.
+        edges: (e, 19) start [m], unit vector to the end, length [m], unit vector in face 0 at right
+            angles to the edge, outward normals of face 0 and face n, exterior angle [rad],
+            materials of face 0 and face n.
     """
 
     planes: np.ndarray
@@ -61,7 +59,7 @@ def height(planes: np.ndarray, facet: int, x: float, y: float, z: float) -> floa
 def within(
     planes: np.ndarray, triangle_uv_m: np.ndarray, facet: int, x: float, y: float, z: float
 ) -> bool:
-    """Return whether a point in the plane of a facet is on the facet."""
+    """Return True if a point in the plane of a facet lies on the facet."""
     if facet == len(planes) - 1:
         return True
     x = x - planes[facet, ORIGIN]
@@ -89,7 +87,7 @@ def within(
 
 @njit(cache=True)
 def _side(ax: float, ay: float, bx: float, by: float, x: float, y: float) -> float:
-    """Return twice the area of a, b, (x, y): positive where the point is left of a to b."""
+    """Return twice the signed area of a, b, (x, y): positive if the point is left of a to b."""
     return (bx - ax) * (y - ay) - (by - ay) * (x - ax)
 
 
@@ -105,7 +103,7 @@ def mirrored(
 
 @njit(cache=True)
 def dot(a: Vector, b: Vector) -> Any:
-    """Return the product a · b without conjugation, complex where one of the vectors is."""
+    """Return the product a · b without conjugation; complex if a or b is."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

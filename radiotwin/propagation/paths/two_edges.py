@@ -1,14 +1,14 @@
-"""Diffraction at two edges, one after the other: over two roofs, or round a corner and over a roof.
+"""Double diffraction: paths over two edges, such as two roofs, or a corner and a roof.
 
 It is for links that no other path reaches. The first edge is one that the device sees; the second
-is at a facet that rays from the first one hit, so that it is found from either end.
+borders a facet that rays from the first edge hit, so the pair is found from either end.
 
-The field is that of two wedges in sequence. For parallel edges the distances in the coefficients
-and the spreading are those of Kouyoumjian and Pathak's theory with an edge as the second source,
-and equal those of the first of ITU-R P.526-15's methods for two isolated edges (section 4.4.1:
-Epstein and Peterson's with Millington's correction). For others the curvatures of the wave at the
-edges depend on the angle between them. Terms of the field's slope are left out: over the two edges
-of one flat roof, along which the field vanishes, nothing is found.
+The field is that of two wedges in sequence. For parallel edges, distances and spreading are those
+of Kouyoumjian and Pathak with the first edge as a line source; they equal those of the first method
+of ITU-R P.526-15 for two isolated edges (section 4.4.1: Epstein-Peterson with Millington's
+correction). For other edges, the curvature of the wave depends on the angle between them. Slope
+diffraction is left out, so the two edges of one flat roof, along which the field vanishes, carry no
+power.
 """
 
 from typing import NamedTuple
@@ -30,8 +30,8 @@ from radiotwin.propagation.paths.surfaces import (
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
-STEPS = 30  # of the search for the points on two edges; it mostly takes five
-PRECISION_M = 1e-6  # [m], of these points
+STEPS = 30  # most Newton steps to find the points on two edges; five are typical
+PRECISION_M = 1e-6  # of these points
 
 
 class EdgePairs(NamedTuple):
@@ -49,12 +49,12 @@ class EdgePairs(NamedTuple):
 
 
 class EdgePairsToTry(NamedTuple):
-    """Edges that a device sees, and those that may come after each.
+    """First edges that a device sees, and second edges that a path may take after each.
 
     Attributes:
-        edge: (s,) rows of the edges.
-        second: (m,) edges after them, those of the first one first.
-        first: (s + 1,) first row in `second` of each edge.
+        edge: (s,) rows of the first edges.
+        second: (m,) rows of the second edges, grouped by first edge.
+        first: (s + 1,) first row in `second` for each first edge.
     """
 
     edge: np.ndarray
@@ -66,7 +66,7 @@ def paths_over_two_edges(
     city: CityMap, surfaces: Surfaces, to_try: EdgePairsToTry, device_m: np.ndarray,
     receiver_m: np.ndarray,
 ) -> EdgePairs:
-    """Find the paths from a device (3,) to receivers (n, 3) [m] over two edges."""
+    """Find the unblocked paths from a device (3,) to receivers (n, 3) [m] over two edges."""
     tried = _possible(surfaces.edges, to_try, device_m, receiver_m)
     points_m, possible = _solve(surfaces.edges, tried, device_m, receiver_m)
     tried, points_m = tried[possible], points_m[possible]
@@ -84,13 +84,13 @@ def paths_over_two_edges(
 def _possible(
     edges: np.ndarray, to_try: EdgePairsToTry, device_m: np.ndarray, receiver_m: np.ndarray
 ) -> np.ndarray:
-    """Return the receivers and pairs of edges, (t, 3), that Keller's cones do not rule out."""
+    """Return (t, 3) receiver, first and second edge that Keller's cones do not rule out."""
     n, seen = len(receiver_m), len(to_try.edge)
     end_m = np.empty((len(edges), 2, 3))
     for k in range(len(edges)):
         end_m[k, 0] = edges[k, START:START + 3]
         end_m[k, 1] = end_m[k, 0] + edges[k, LENGTH] * edges[k, ALONG:ALONG + 3]
-    # Whether rays from the device over a first edge meet a second one does not depend on receivers
+    # Rays from the device over a first edge meet a second edge or not, for any receiver.
     meets = np.empty(len(to_try.second), dtype=np.bool_)
     for j in range(seen):
         for row in range(to_try.first[j], to_try.first[j + 1]):
@@ -116,17 +116,16 @@ def _possible(
 
 @njit(cache=True, error_model="numpy")
 def _cone_meets(edges: np.ndarray, edge: int, from_m: np.ndarray, end_m: np.ndarray) -> bool:
-    """Return whether rays from a point over an edge may meet a segment (2, 3) [m].
+    """Return False if no ray from a point (3,) over an edge meets a segment (2, 3) [m].
 
-    They leave the edge where (q - s) d = (t - s) (d + r), see `pruning.narrow`; True may be
-    wrong, False never is.
+    Rays leave the edge where (q - s) d = (t - s) (d + r), see `pruning.narrow`. True may be wrong.
     """
     _, s, d = around_edge(edges, edge, from_m[0], from_m[1], from_m[2])
     low_m, high_m, most_m = np.inf, -np.inf, 0.0
     for end in range(2):
         _, q, r = around_edge(edges, edge, end_m[end, 0], end_m[end, 1], end_m[end, 2])
         low_m, high_m, most_m = min(low_m, q), max(high_m, q), max(most_m, r)
-    if low_m > s:  # r is at most that of an end, and at least 0
+    if low_m > s:  # r lies between 0 and the larger one of the ends
         low_m = s + (low_m - s) * d / (d + most_m)
     if high_m < s:
         high_m = s + (high_m - s) * d / (d + most_m)
@@ -137,7 +136,7 @@ def _cone_meets(edges: np.ndarray, edge: int, from_m: np.ndarray, end_m: np.ndar
 def _solve(
     edges: np.ndarray, tried: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the shortest paths (t, 4, 3) over pairs of edges, and the rows where there is one."""
+    """Return the shortest paths (t, 4, 3) [m] over pairs of edges, and the rows that have one."""
     points_m, possible = np.empty((len(tried), 4, 3)), np.empty(len(tried), dtype=np.int64)
     count = 0
     for i in range(len(tried)):
@@ -162,19 +161,24 @@ def _solve(
 def shortest(
     one: np.ndarray, other: np.ndarray, from_m: np.ndarray, to_m: np.ndarray
 ) -> tuple[float, float]:
-    """Return where the shortest way over two edges' lines crosses them (Fermat's principle).
+    """Find the shortest path between two points over the lines of two edges (Fermat's principle).
 
     The length is convex in both positions; Newton's method with halved steps finds its minimum,
-    where the angles of the ray to each edge are equal before and after it (Keller's law). Edges are
-    rows of `Surfaces.edges`, the way's ends (3,) [m].
+    where Keller's law holds at both edges.
+
+    Args:
+        one: first edge, a row of `Surfaces.edges`.
+        other: second edge.
+        from_m: (3,) start of the path [m].
+        to_m: (3,) end of the path [m].
 
     Returns:
-        Positions along the edges from their starts [m]; -1 where the way goes through the point in
-        which the edges meet.
+        Positions along the edges from their starts [m]; -1 if the path passes the intersection of
+        the edges.
     """
     a, b = one[ALONG:ALONG + 3], other[ALONG:ALONG + 3]
     apart = other[START:START + 3] - one[START:START + 3]
-    # Lengths and slopes follow from these and the positions alone
+    # Lengths and slopes depend on these products and the positions only.
     cosine, apart2, apart_a, apart_b = dot(a, b), dot(apart, apart), dot(apart, a), dot(apart, b)
     start, end = from_m - one[START:START + 3], to_m - other[START:START + 3]
     start_at, end_at = dot(start, a), dot(end, b)
@@ -216,19 +220,19 @@ def shortest(
 def wave_at_edge(
     near_m: float, between_m: float, far_m: float, sine2: float
 ) -> tuple[float, float]:
-    """Return what the wave from one edge is at another edge.
+    """Compute the distance parameter at one of two edges, for the wave diffracted by the other.
 
     Args:
-        near_m: length of the leg on the other side of the edge in question [m].
-        between_m: length between the edges [m].
-        far_m: length of the leg beyond the first edge [m].
-        sine2: squared sine of the angle between the planes that the ray between the edges forms
-            with the one and with the other.
+        near_m: length of the leg from this edge to the nearer end of the path [m].
+        between_m: length of the leg between the edges [m].
+        far_m: length of the leg from the other edge to its end of the path [m].
+        sine2: squared sine of the angle between the two planes that the ray between the edges
+            spans with either edge.
 
     Returns:
-        Distance in the transition function of the edge in question, over sin² of the angle between
-        ray and edge [m] (Kouyoumjian and Pathak, eq. 33), and the length [m] that together with
-        `near_m` gives this distance as s s' / (s + s').
+        Distance in this edge's transition function, over sin² of the angle between ray and edge [m]
+        (Kouyoumjian and Pathak, eq. 33), and the length s' [m] for which s s' / (s + s') with
+        s = `near_m` is that distance.
     """
     curvature = (1.0 - sine2) / (between_m + far_m) + sine2 / between_m
     distance_m = near_m * (1.0 + near_m * curvature) * between_m * (between_m + far_m) \
@@ -240,9 +244,9 @@ def wave_at_edge(
 def two_edge_gains(
     surfaces: Surfaces, wave_number: float, slabs: Slabs, edge: np.ndarray, points_m: np.ndarray,
 ) -> np.ndarray:
-    """Return the power gains (p,), linear, of paths over two edges, (p, 2) as in `EdgePairs`.
+    """Compute the power gains (p,), linear, of paths over two edges, see `EdgePairs`.
 
-    The other arguments are those of `radiotwin.propagation.paths.fields.path_gains`.
+    The other arguments are those of `radiotwin.propagation.paths.fields.buffer_gains`.
     """
     gain = np.empty(len(edge))
     direction, field = np.empty((3, 3)), np.empty(3, dtype=np.complex128)
@@ -266,7 +270,7 @@ def two_edge_gains(
 
 @njit(cache=True, error_model="numpy")
 def _twist(one: np.ndarray, other: np.ndarray, ray: np.ndarray) -> float:
-    """Return the squared sine of the angle between the planes of a ray and either edge."""
+    """Return the squared sine of the angle between the planes that a ray spans with two edges."""
     across, to = cross(one, ray), cross(other, ray)
     size2 = dot(across, across) * dot(to, to)
     return 0.0 if size2 < 1e-12 else max(1.0 - dot(across, to) ** 2 / size2, 0.0)

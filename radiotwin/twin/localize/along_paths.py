@@ -460,7 +460,7 @@ class _Search:
         return ResidualView(links, problem.residual_db(likelihood.fit), reading.scale_db,
                             reading.mean_db, likelihood.fit.model.level_at)
 
-    def _radius_m(self, best: _Place, links_as_one: float) -> float:
+    def _radius_m(self, best: _Place, design_effect: float) -> float:
         """Return the radius of a circle that holds 90 % of the probability of what was tried [m].
 
         Each position stands for the ground that is nearer to it than to others.
@@ -468,7 +468,7 @@ class _Search:
         positions_m, values = np.array(list(self.tried)), np.array(list(self.tried.values()))
         apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=2)
         area = np.where(apart_m > 0, apart_m, np.inf).min(axis=1) ** 2
-        share = area * np.exp((values.min() - values) / links_as_one)
+        share = area * np.exp((values.min() - values) / design_effect)
         from_best_m = np.linalg.norm(positions_m - best, axis=1)
         order = np.argsort(from_best_m)
         held = np.searchsorted(np.cumsum(share[order]) / share.sum(), CREDIBLE)

@@ -39,11 +39,11 @@ def test_what_is_stored_predicts_the_same(grown):
 
 
 @pytest.mark.parametrize("change, message", [
-    (lambda arrays: arrays["left"].__setitem__(1, 0), "circle"),
+    (lambda arrays: arrays["left"].__setitem__(1, 0), "cycle"),
     (lambda arrays: arrays["feature"].__setitem__(0, WIDTH), "feature holds"),
     (lambda arrays: arrays["value"].__setitem__(3, np.nan), "value holds"),
     (lambda arrays: arrays.pop("right"), "missing"),
-    (lambda arrays: arrays.update(root=arrays["root"] + 0.5), "whole numbers|root holds"),
+    (lambda arrays: arrays.update(root=arrays["root"] + 0.5), "integers|root holds"),
     (lambda arrays: arrays["root"].__setitem__(0, 10**6), "root holds")])
 def test_damaged_trees_are_refused(grown, change, message):
     arrays, settings = grown[2].state()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from radiotwin.propagation.paths.candidates import CandidateSearch
-from radiotwin.propagation.paths.fields import path_gains
+from radiotwin.propagation.paths.fields import buffer_gains
 from radiotwin.propagation.paths.images import Candidates, PathBuffer, find_paths
 from radiotwin.propagation.paths.interactions import slabs_of
 from radiotwin.propagation.paths.surfaces import ALONG, NORMAL, OFFSET, ORIGIN, START
@@ -26,7 +26,7 @@ def solve(search, before, edge, after, device_m, receiver_m):
     candidates = Candidates(np.array([before]), np.array([edge]), np.array([after]))
     buffer = PathBuffer.allocate(5)
     found, _ = find_paths(search.surfaces, candidates, np.array(device_m), np.array([receiver_m]), 0, buffer)
-    gain = path_gains(search.surfaces, candidates, WAVE_NUMBER, SLABS, buffer, np.arange(found))
+    gain = buffer_gains(search.surfaces, candidates, WAVE_NUMBER, SLABS, buffer, np.arange(found))
     return [buffer.points_m[i, :buffer.count[i]] for i in range(found)], gain
 
 
