@@ -27,7 +27,7 @@ from radiotwin.io.array_file import pack_arrays, parse_arrays
 from radiotwin.io.budgets import CHECKPOINT_BYTES
 from radiotwin.io.files import atomic_file
 from radiotwin.io.inputs import parse_json, read_bytes
-from radiotwin.links.cell_limits import MAX_LEVEL_DB
+from radiotwin.links.plausible import MAX_LEVEL_DB
 from radiotwin.maps.survey import HOVER_COST
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin

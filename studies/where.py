@@ -26,7 +26,7 @@ from radiotwin.closeloop.run import fit_base
 from radiotwin.closeloop.scan import Anomaly, scan
 from radiotwin.closeloop.scan import compare as compare_groups
 from radiotwin.links import prepare_links
-from radiotwin.links.checks import stand_anchors
+from radiotwin.links.checks import move_anchors_out
 from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.evidence import thin_links
 from radiotwin.links.limits import limits_to_explain
@@ -88,7 +88,7 @@ def hidden_case(settings: dict) -> tuple[Measurements, Scene, list[dict], list[n
 
 def base_of(measurements: Measurements, scene: Scene, seed: int) -> CrossFit:
     """Return the base that `close_loop` takes."""
-    links = stand_anchors(prepare_links(measurements, scene), scene)
+    links = move_anchors_out(prepare_links(measurements, scene), scene)
     links = limits_to_explain(thin_links(links, seed))
     return fit_base(links, scene, make_folds(links, seed), seed=seed)[2]
 

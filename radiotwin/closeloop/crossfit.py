@@ -25,7 +25,7 @@ from radiotwin.inference.held_out import deal_groups
 from radiotwin.inference.student import mean_if_detected
 from radiotwin.links import Links, with_evidence
 from radiotwin.links.correlation import moving_end_m
-from radiotwin.links.evidence import fitting_width_m
+from radiotwin.links.evidence import evidence_width_m
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
 from radiotwin.scene import Scene
@@ -103,7 +103,7 @@ def _blocks(links: Links) -> np.ndarray:
     Where `BLOCK_M` is too wide for `MIN_BLOCKS`, squares are smaller. Clusters of positions that no
     square parts are held out as they are; where there are too few of them, stretches are.
     """
-    width_m = fitting_width_m(links, BLOCK_M, MIN_BLOCKS)
+    width_m = evidence_width_m(links, BLOCK_M, MIN_BLOCKS)
     cell = np.floor(moving_end_m(links)[:, :2] / width_m).astype(np.int64)
     block = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
     if block.max() + 1 >= MIN_CLUSTERS:

@@ -54,7 +54,7 @@ from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, prepare_links
 from radiotwin.links.alignment import as_measurements
-from radiotwin.links.checks import stand_anchors
+from radiotwin.links.checks import move_anchors_out
 from radiotwin.links.evidence import MAX_LINKS, SAMPLE_LINKS, thin_links
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.links.measurements import Measurements
@@ -245,7 +245,7 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
     criteria = criteria or SelectionCriteria()
     all_links = prepare_links(measurements, scene)
     if scene is not None:  # the log-distance law needs no line of sight
-        all_links = stand_anchors(all_links, scene, refuse=base != LogDistanceBase.name)
+        all_links = move_anchors_out(all_links, scene, refuse=base != LogDistanceBase.name)
     links = limits_to_explain(thin_links(all_links, seed))
     folds = make_folds(links, seed, hold_out)
     links, fitted, model = fit_base(links, scene, folds, base, seed, on_progress)

@@ -40,7 +40,7 @@ from radiotwin.inference.groups import (
     subtract_end_levels,
     subtract_unit_errors,
 )
-from radiotwin.links.sites import never_part
+from radiotwin.links.sites import inseparable_pairs
 
 # Spread of levels of peers. Of ends it is that of instruments, antennas and cables. By direction,
 # place, distance and height every base errs.
@@ -432,7 +432,7 @@ def _anomaly(found: _Found, readings: Readings) -> Anomaly:
     if compared.family.name in ENDS:  # another end that has the same links may be meant
         labels = {end: getattr(readings, end) for end in ENDS}
         for other in (end for end in ENDS if end != compared.family.name):
-            same = never_part(labels[compared.family.name], labels[other])
+            same = inseparable_pairs(labels[compared.family.name], labels[other])
             if found.group in same:
                 members = {**members, other: (readings.names[other][same[found.group]],)}
     value, distance = found.size, compared.distance

@@ -11,9 +11,9 @@ from radiotwin.display import some
 from radiotwin.errors import BadInput
 from radiotwin.geo import read_frame
 from radiotwin.importing.read_source import Expected, read_source
-from radiotwin.links.cell_limits import far_notes, high_notes
 from radiotwin.links.declared import Radio, radios_of
 from radiotwin.links.measurements import RADIO, read_antenna_files
+from radiotwin.links.plausible import far_notes, high_notes
 from radiotwin.links.site_table import SiteTable, is_site_table, read_site_table
 from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna, parse_pattern

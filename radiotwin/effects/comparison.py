@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from radiotwin.effects.base import ResidualView
 from radiotwin.inference.gaussian import robust_sd
 from radiotwin.links import Links, correlation_length_m
-from radiotwin.links.correlation import devices_move, step_m
+from radiotwin.links.correlation import devices_move, median_step_m
 
 NEIGHBOURS = 24  # nearest links that are looked at, of which some are of other flights
 MIN_OTHERS = 2  # links of other flights, for a comparison
@@ -30,7 +30,8 @@ def compared_db(view: ResidualView) -> np.ndarray:
     correlation length of the residual. NaN where no other flight was.
     """
     links, z = view.links, view.residual_db / view.scale_db
-    reach_m = min(max(correlation_length_m(links, z), MIN_STEPS * step_m(links)), MAX_REACH_M)
+    reach_m = min(max(correlation_length_m(links, z), MIN_STEPS * median_step_m(links)),
+                  MAX_REACH_M)
     end_m = np.nan_to_num(links.device_m)[links.device] if devices_move(links) \
         else links.receiver_m
     fixed = links.receiver if devices_move(links) else links.device

@@ -20,8 +20,8 @@ from radiotwin.importing.source import Source, Tally, are_few
 from radiotwin.importing.units import ISO, seconds
 from radiotwin.io.cells import shown
 from radiotwin.io.forms import MAX_POSITION_M, Origin
-from radiotwin.links.cell_limits import FAR_M, READS, distances_m, far_notes, unmatched_notes
 from radiotwin.links.measurements import DEVICE_OPTIONAL
+from radiotwin.links.plausible import FAR_M, READS, distances_m, far_notes, unmatched_notes
 from radiotwin.links.site_table import SiteTable, is_site_table, local_positions, read_site_table
 
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined

@@ -45,7 +45,7 @@ from radiotwin.importing.units import (
 from radiotwin.io.budgets import ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, shown
 from radiotwin.io.forms import name_fault
-from radiotwin.links.cell_limits import LIMITS_DEG, READS, no_height, refuse_limits
+from radiotwin.links.plausible import MAX_DEGREES, READS, height_placeholders, refuse_implausible
 from radiotwin.links.site_table import HEIGHTS, METRES
 
 ANGLES = ("heading", "pitch", "roll")
@@ -209,8 +209,8 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
             links = tally.drop(links, links[name] == "", f"no {name}",
                                _spec(settings, level, name), source.where)
     for prefix in ("", "device_"):
-        if {prefix + name for name in LIMITS_DEG} <= set(links):
-            for name in LIMITS_DEG:
+        if {prefix + name for name in MAX_DEGREES} <= set(links):
+            for name in MAX_DEGREES:
                 links = _without_no_degrees(source, links, prefix, name,
                                             _spec(settings, level, prefix + name), tally)
             no_fix = (links[prefix + "latitude"] == 0) & (links[prefix + "longitude"] == 0)
@@ -220,8 +220,9 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
         for name in HEIGHTS:
             column = prefix + name.removesuffix("_m")
             if column in links:
-                links = tally.drop(links, no_height(links[column].to_numpy()), "impossible height",
-                                   _spec(settings, level, column), source.where)
+                links = tally.drop(links, height_placeholders(links[column].to_numpy()),
+                                   "impossible height", _spec(settings, level, column),
+                                   source.where)
     return links
 
 
@@ -232,7 +233,7 @@ def _names_a_column(source: Source, level: LevelColumn, spec: str) -> bool:
 
 def _is_length(name: str, settings: Settings) -> bool:
     base = name.removeprefix("device_")
-    return base in QUANTITIES and base not in LIMITS_DEG and not (settings.crs and base in "xy")
+    return base in QUANTITIES and base not in MAX_DEGREES and not (settings.crs and base in "xy")
 
 
 def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.ndarray:
@@ -242,8 +243,9 @@ def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.nd
     numbers = source.numbers(spec, name)
     if _is_length(name, settings):
         return in_metres(numbers, settings.length_unit, f"{source.path}: column {spec}")
-    refuse_limits(lambda bad, reason: source.refuse(spec, source.cells(spec, name), bad, reason),
-                  f"{name}_deg" if name in ANGLES else name, numbers)
+    refuse_implausible(
+        lambda bad, reason: source.refuse(spec, source.cells(spec, name), bad, reason),
+        f"{name}_deg" if name in ANGLES else name, numbers)
     return numbers
 
 
@@ -337,12 +339,12 @@ def _spec(settings: Settings, level: LevelColumn, name: str) -> str:
 def _without_no_degrees(source: Source, links: pd.DataFrame, prefix: str, name: str, spec: str,
                         tally: Tally) -> pd.DataFrame:
     """Return links without the few whose latitude or longitude is none; many are refused."""
-    limit = LIMITS_DEG[name]
+    limit = MAX_DEGREES[name]
     bad = links[prefix + name].abs() > limit
     if not are_few(bad.sum(), len(bad)):
         longitude = links[prefix + "longitude"].abs()
         swapped = (name == "latitude" and bad.mean() > 0.5
-                   and (longitude <= LIMITS_DEG["latitude"]).all())
+                   and (longitude <= MAX_DEGREES["latitude"]).all())
         hint = "; are latitude and longitude swapped in the mapping?" if swapped else ""
         source.refuse(spec, links[prefix + name], bad,
                       f"is no {name}; allowed are -{limit:g} to {limit:g} degrees{hint}")

@@ -25,9 +25,9 @@ from radiotwin.importing.units import clock_notes
 from radiotwin.io.files import atomic_folder, require_folder
 from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
-from radiotwin.links.cell_limits import FAR_M
 from radiotwin.links.link_table import OPTIONAL, REQUIRED
 from radiotwin.links.measurements import Measurements, read_antenna_files, read_measurements
+from radiotwin.links.plausible import FAR_M
 
 SCHEMA = "radiotwin.import/2"
 UNITS = {"_m": "m", "_deg": "°", "_s": "s", "_dbm": "dBm", "_db": "dB"}

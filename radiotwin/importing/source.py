@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from radiotwin.errors import BadInput
 from radiotwin.io.cells import as_numbers, as_text, listed, refuse, shown
 from radiotwin.io.forms import name_fault
-from radiotwin.links.cell_limits import LIMITS_DEG
-from radiotwin.links.site_table import degrees
+from radiotwin.links.plausible import MAX_DEGREES
+from radiotwin.links.site_table import dms_degrees
 
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
@@ -186,9 +186,9 @@ class Source:
                 text = as_text(cells.iloc[rows])
                 numbers[rows] = as_numbers(text)
                 quantity = purpose.removeprefix("device_")
-                if quantity in LIMITS_DEG:
+                if quantity in MAX_DEGREES:
                     odd = start + np.flatnonzero(np.isnan(numbers[rows]) & (text != ""))
-                    numbers[odd] = [degrees(text.iloc[row - start], quantity) for row in odd]
+                    numbers[odd] = [dms_degrees(text.iloc[row - start], quantity) for row in odd]
                 wrong[rows] = np.isnan(numbers[rows]) & (text != "")
             if wrong.any():
                 self.refuse(spec, as_text(cells), wrong, "is not a number")

@@ -1,4 +1,4 @@
-"""Measurements in the frame of a scene: converted where both are known, checked where not."""
+"""Convert measurements to the frame of a scene, or check that they are in it already."""
 
 import os
 import warnings
@@ -12,55 +12,61 @@ from scipy.ndimage import gaussian_filter
 from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, origin_text
 from radiotwin.io.forms import MAX_POSITION_M, Origin
-from radiotwin.links.checks import SURE, chance_inside, map_corners_m, outside_map
+from radiotwin.links.checks import (
+    MAX_OUTSIDE,
+    SURE,
+    chance_inside,
+    map_corners_m,
+    outside_map,
+)
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.scene.footing import MAX_SDS, WALL_SD_M
 
-MAX_MISPLACED = 0.05  # share of the links inside buildings, or outside the map, that may be right
-SEARCHED_M, COARSE_M, FINE_M = 500.0, 10.0, 2.0  # translations that are tried, along each axis
-MAX_POINTS = 4_000  # receiver positions that are tried
-MAX_CELLS = 4_000_000  # of the grid of what is built; bounds the memory
-AROUND_M = 30.0  # standard deviation of the surroundings that a position is compared with
-AGREE_M = MAX_SDS * WALL_SD_M  # a translation that errors of a map and of positions explain
-MAX_OUTSIDE = 0.5  # share of the receivers off the map, after a translation that the user gives
-MIN_CONTRAST = 5.0  # standard deviations, from which a translation is proposed
-CLEAR = 2.0  # from which receivers keep clear of buildings
+MAX_MISPLACED = 0.05  # largest plausible share of receivers inside buildings, or off the map
+SEARCHED_M, COARSE_M, FINE_M = 500.0, 10.0, 2.0  # range and steps of the search, along x and y
+MAX_POINTS = 4_000  # receiver positions in the search; bounds the time
+MAX_CELLS = 4_000_000  # of the grid of building density; bounds the memory
+DENSITY_SD_M = 30.0  # Gaussian smoothing of the building density
+TOLERANCE_M = MAX_SDS * WALL_SD_M  # offset that errors of the map and of positions explain
+MIN_CONTRAST = 5.0  # standard deviations; a translation with less is not proposed
+MIN_CONTRAST_UNMOVED = 2.0  # standard deviations; receivers with more avoid buildings as they are
 
 
 def in_scene_frame(measurements: Measurements, scene: Scene | Path | str,
                    shift_m: tuple[float, float] | None = None) -> Measurements:
-    """Return measurements in the frame of a scene.
+    """Return measurements in the local frame of a scene.
 
-    Where both say where on the earth they lie, what differs is converted exactly. Where one does
-    not, the frames are taken for the same if the receivers fit: few inside buildings, few outside
-    the map, or no translation fits better than one within the errors of a map and of positions.
+    If both have an origin, positions are converted exactly. If one has none, the frames are assumed
+    to be the same, provided that the receivers fit the map: few are inside buildings and few off
+    the map, or no translation of the receivers fits clearly better.
 
     Args:
         measurements: with or without an origin.
         scene: with or without an origin.
-        shift_m: to add to x and y after that [m]; (0, 0) says that the frames are the same.
+        shift_m: east and north translation [m] that is added after the conversion; (0, 0) states
+            that the frames are the same, and skips the check.
 
     Warns:
         Positions were converted, with how far they moved; or many receivers are inside buildings,
         and no translation fits clearly better than none.
 
     Raises:
-        BadInput: the frames cannot be related and the receivers do not fit; with the translation
-            that makes them fit best. Or the given translation is impossible, or heights are given
-            twice, see `Measurements.on_ground`.
+        BadInput: an origin is missing and the receivers do not fit the map (the message proposes
+            the best translation); the given translation is impossible; or a height is given twice,
+            see `Measurements.on_ground`.
     """
     scene = Scene.of(scene)
-    there = scene.config.origin
-    related = shift_m is not None or (measurements.origin is not None and there is not None)
-    measurements = in_known_frame(measurements, there, "the scene")
+    scene_origin = scene.config.origin
+    related = shift_m is not None or None not in (measurements.origin, scene_origin)
+    measurements = in_known_frame(measurements, scene_origin, "the scene")
     if shift_m is not None:
         if not max(map(abs, shift_m)) <= MAX_POSITION_M:
             raise BadInput(f"a shift by {shift_m[0]:g}, {shift_m[1]:g} m is not possible; allowed "
                            f"are -{MAX_POSITION_M:g} to {MAX_POSITION_M:g} m: give the metres "
                            "from the frame of the measurements to the scene's")
         offset_m = np.array([*shift_m, 0.0])
-        measurements = measurements.moved(lambda position_m: position_m + offset_m, there)
+        measurements = measurements.moved(lambda position_m: position_m + offset_m, scene_origin)
     measurements = measurements.on_ground(
         scene.city.ground_height_m if scene.city.terrain is not None else None)
     if not related:
@@ -72,13 +78,17 @@ def in_scene_frame(measurements: Measurements, scene: Scene | Path | str,
 
 def as_measurements(given: Measurements | pd.DataFrame | Path | str,
                     scene: Scene | None) -> Measurements:
-    """Return measurements, also of a file or a data frame, in the frame of a scene.
+    """Return measurements in the frame of a scene, from an object, a file or a data frame.
 
-    Those of a file or a data frame are checked against it, as commands do. `Measurements` are
-    converted where both say where on the earth they lie.
+    A file or a data frame is also checked against the map, see `in_scene_frame`. `Measurements` are
+    only converted, if both origins are known.
+
+    Args:
+        given: measurements, a data frame of links, or the path of a file.
+        scene: None: positions stay as they are.
 
     Raises:
-        BadInput: they are none of these, as of their reader, or as of `in_scene_frame`.
+        BadInput: `given` is none of these, cannot be read, or does not fit the scene.
     """
     if isinstance(given, Measurements):
         return in_known_frame(given, None if scene is None else scene.config.origin, "the scene")
@@ -92,29 +102,31 @@ def as_measurements(given: Measurements | pd.DataFrame | Path | str,
     return given.on_ground(None) if scene is None else in_scene_frame(given, scene)
 
 
-def in_known_frame(measurements: Measurements, there: Origin | None, what: str) -> Measurements:
-    """Return measurements in the frame about an origin; as they are where either is unknown.
+def in_known_frame(measurements: Measurements, origin: Origin | None, owner: str) -> Measurements:
+    """Convert measurements to the frame about an origin, if that and their own origin are known.
 
-    `what` they are used with is for the message.
+    Args:
+        measurements: returned unchanged if an origin is unknown or both are the same.
+        origin: of the target frame.
+        owner: what that frame belongs to, for the warning.
 
     Warns:
         Positions were converted, with how far they moved.
     """
-    here = measurements.origin
-    if here is None or there is None or is_same_frame(here, there):
+    old = measurements.origin
+    if old is None or origin is None or is_same_frame(old, origin):
         return measurements
-    converted = measurements.in_frame(there)
+    converted = measurements.in_frame(origin)
     moved_m = np.nanmedian(converted.receiver_m - measurements.receiver_m, axis=0)
-    warnings.warn(f"the measurements are in the frame about {origin_text(here)}, {what} in that "
-                  f"about {origin_text(there)}: positions are converted (moved by "
-                  f"{moved_m[0]:+.1f} m east, "
-                  f"{moved_m[1]:+.1f} m north)", stacklevel=3)
+    warnings.warn(f"the measurements are in the frame about {origin_text(old)}, {owner} in that "
+                  f"about {origin_text(origin)}: positions are converted (moved by "
+                  f"{moved_m[0]:+.1f} m east, {moved_m[1]:+.1f} m north)", stacklevel=3)
     return converted
 
 
 def _refuse_off_map(measurements: Measurements, scene: Scene,
                     shift_m: tuple[float, float]) -> None:
-    """Raise BadInput where a translation takes most receivers off the map."""
+    """Raise BadInput if most receivers are off the map after a translation that the user gave."""
     low_m, high_m = map_corners_m(scene)
     outside = outside_map(measurements.receiver_m, scene)
     if len(outside) and outside.mean() > MAX_OUTSIDE:
@@ -125,14 +137,16 @@ def _refuse_off_map(measurements: Measurements, scene: Scene,
 
 
 def _require_fit(measurements: Measurements, scene: Scene) -> None:
-    """Warn where receivers fit badly; raise BadInput where a translation would make them fit."""
+    """Check receivers against the map: warn if they fit badly, raise BadInput if they do not fit.
+
+    The message proposes the translation that fits best.
+    """
     receiver_m = measurements.receiver_m
     receiver_m = receiver_m[np.isfinite(receiver_m).all(axis=1)]
     if not len(receiver_m):
         return
     if len(receiver_m) > MAX_POINTS:
-        every = np.linspace(0, len(receiver_m) - 1, MAX_POINTS).astype(int)
-        receiver_m = receiver_m[every]
+        receiver_m = receiver_m[np.linspace(0, len(receiver_m) - 1, MAX_POINTS).astype(int)]
     inside = scene.city.inside(receiver_m).mean()
     outside = outside_map(receiver_m, scene).mean()
     if inside <= MAX_MISPLACED and outside <= MAX_MISPLACED:
@@ -162,50 +176,51 @@ def _require_fit(measurements: Measurements, scene: Scene) -> None:
 
 
 @dataclass(frozen=True)
-class Search:
-    """Translations of receivers over a map, by how they keep clear of the buildings.
+class ShiftSearch:
+    """Result of a search over translations of the receivers.
 
-    A contrast is the number of receivers in buildings less what the density of buildings around
-    each of them lets expect, in standard deviations.
+    The contrast of a translation is the number of receivers inside buildings minus the number that
+    the local building density predicts, in standard deviations. Receivers in streets have a
+    negative one.
 
     Attributes:
-        best_m: x and y of the translation with the least contrast [m].
-        best: its contrast.
-        near: the least contrast within `AGREE_M` of no translation.
+        best_m: east and north translation with the lowest contrast [m].
+        best_contrast: of that translation.
+        unmoved_contrast: lowest contrast of translations up to `TOLERANCE_M`.
         tried: number of translations.
     """
 
     best_m: tuple[float, float]
-    best: float
-    near: float
+    best_contrast: float
+    unmoved_contrast: float
     tried: int
 
     @property
     def proposed(self) -> tuple[float, float] | None:
-        """The best translation; None where it does not stand out."""
-        return self.best_m if self.best <= -MIN_CONTRAST else None
+        """The best translation [m]; None if its contrast may be chance."""
+        return self.best_m if self.best_contrast <= -MIN_CONTRAST else None
 
     @property
     def agrees(self) -> bool:
-        """Whether receivers keep clear as they are, and the best of many tried does by chance."""
-        return self.near <= -CLEAR and (self.best**2 - self.near**2) / 2 < np.log(self.tried)
+        """Whether receivers avoid buildings as they are, and the best translation is no better."""
+        gain_nats = (self.best_contrast**2 - self.unmoved_contrast**2) / 2
+        return self.unmoved_contrast <= -MIN_CONTRAST_UNMOVED and gain_nats < np.log(self.tried)
 
 
-def search_shift(scene: Scene, receiver_m: np.ndarray) -> Search | None:
-    """Search the translation that takes receivers out of buildings and onto the map.
+def search_shift(scene: Scene, receiver_m: np.ndarray) -> ShiftSearch | None:
+    """Search the horizontal translation that moves receivers out of buildings and onto the map.
 
-    Receivers follow streets, so at the right place far fewer of them are in buildings than the
-    density of buildings around each of them lets expect; over open ground few are anywhere. Of all
-    translations on a grid, at the receivers' median height above the ground, that with the largest
-    such contrast is taken (28,682 readings of a real drive test, moved by 94 to 316 m: found again
-    within 2 m).
+    Receivers follow streets: in the right frame far fewer are inside buildings than the building
+    density around them predicts. The search covers a grid of translations, at the receivers' median
+    height above the ground. 28,682 readings of a real drive test, moved by 94 to 316 m, were moved
+    back within 2 m.
 
     Args:
         scene: the 3D map.
         receiver_m: (n, 3) [m].
 
     Returns:
-        the best translation [m] and its contrast; None where none takes receivers onto the map.
+        the search result; None if no translation in range moves the receivers onto the map.
     """
     (low_m, high_m), reach_m = map_corners_m(scene), SEARCHED_M + 2 * COARSE_M
     low_m = np.maximum(low_m, receiver_m[:, :2].min(axis=0) - reach_m)
@@ -218,7 +233,7 @@ def search_shift(scene: Scene, receiver_m: np.ndarray) -> Search | None:
     above_m = np.median(receiver_m[:, 2] - scene.city.ground_height_m(*receiver_m[:, :2].T))
     height_m = scene.city.ground_height_m(*grid_m.T) + above_m
     built = scene.city.inside(np.column_stack([grid_m, height_m])).reshape(len(x_m), len(y_m))
-    expected = gaussian_filter(built.astype(float), AROUND_M / cell_m)
+    expected = gaussian_filter(built.astype(float), DENSITY_SD_M / cell_m)
 
     def contrast(east_m: float, north_m: float) -> float:
         column = np.rint((receiver_m[:, 0] + east_m - x_m[0]) / cell_m).astype(int)
@@ -229,14 +244,14 @@ def search_shift(scene: Scene, receiver_m: np.ndarray) -> Search | None:
         excess = built[cells].sum() - density.sum() + (~on_map).sum()
         return float(excess / np.sqrt((density * (1 - density)).sum() + 1.0))
 
-    def least(centre_m: tuple[float, float], around_m: float, step_m: float
-              ) -> tuple[float, tuple[float, float]]:
-        steps_m = np.arange(-around_m, around_m + step_m, step_m).tolist()
+    def lowest(centre_m: tuple[float, float], reach_m: float, step_m: float
+               ) -> tuple[float, tuple[float, float]]:
+        steps_m = np.arange(-reach_m, reach_m + step_m, step_m).tolist()
         shifts = [(centre_m[0] + east_m, centre_m[1] + north_m)
                   for east_m in steps_m for north_m in steps_m]
         return min((contrast(*shift_m), shift_m) for shift_m in shifts)
 
-    near, _ = least((0.0, 0.0), AGREE_M, FINE_M)
-    _, coarse_m = least((0.0, 0.0), SEARCHED_M, COARSE_M)
-    best, best_m = least(coarse_m, 2 * COARSE_M, FINE_M)
-    return Search(best_m, best, near, int(2 * SEARCHED_M / COARSE_M + 1) ** 2)
+    unmoved, _ = lowest((0.0, 0.0), TOLERANCE_M, FINE_M)
+    _, coarse_m = lowest((0.0, 0.0), SEARCHED_M, COARSE_M)
+    best, best_m = lowest(coarse_m, 2 * COARSE_M, FINE_M)
+    return ShiftSearch(best_m, best, unmoved, int(2 * SEARCHED_M / COARSE_M + 1) ** 2)

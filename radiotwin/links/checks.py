@@ -1,8 +1,7 @@
-"""Checks of measured data: levels, names, units, positions and heights that are probably not meant.
+"""Checks of measured data: implausible levels, names, units, positions and heights.
 
-A height may count from another zero: the sea's, or the ground's. A position inside a wall may be
-that of a phone on the pavement, and one on the pavement that of a phone behind the wall. So where
-positions come from satellites, a line on the map does not decide, but a probability does.
+A height may be measured from another zero: the sea level, or the ground. Satellite positions are
+off by metres, so a receiver close to a wall is inside the building with a probability.
 """
 
 from collections.abc import Sequence
@@ -15,36 +14,35 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, origin_text
 from radiotwin.io.texts import percent
 from radiotwin.links.links import Links
-from radiotwin.links.measurements import MAX_APART_M, Measurements
+from radiotwin.links.measurements import Measurements
+from radiotwin.links.plausible import HIGH_M, MAX_APART_M
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.footing import MAX_SDS, WALL_SD_M, footing
 
 MAX_FLOWN_M = 500.0  # above the ground: more than three times what UAVs may (120 m, EU 2019/947)
-HIGH_M = 200.0  # above the ground, from which altitudes above the sea are suspected
-_NEARLY_ALL = 0.95  # of the receivers
+_NEARLY_ALL = 0.95  # share of the receivers
 POSITION_SD_M = 4.0
-"""Of a phone's position, in x and in y: phones are right within 4.9 m under open sky (van Diggelen
-and Enge 2015, 'The world's first GPS MOOC and worldwide laboratory using smartphones', ION GNSS+),
-and somewhat less so between buildings."""
-RINGS, DIRECTIONS = 4, 8  # of equally probable places around a position
-SURE = 0.9  # probability from which on a receiver is taken to be inside
-MIN_LINKS = 60  # that anything can be learnt from; half of them detected
+"""Standard deviation of a phone's position, in x and in y: 4.9 m under open sky (van Diggelen and
+Enge 2015, 'The world's first GPS MOOC and worldwide laboratory using smartphones', ION GNSS+)."""
+RINGS, DIRECTIONS = 4, 8  # of sample points around a position, equally probable
+SURE = 0.9  # probability above which a receiver counts as inside
+MIN_LINKS = 60  # of a campaign; at least half of them detected
 MIN_LINKS_OF_RECEIVER = 5
-CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions so close to each other are hardly in metres
-MIN_HEAP, HEAP_RATIO = 10, 5  # equal levels that no tail has, and how far above the next values
-MAX_OUTSIDE = 0.5  # share of the links
-ELSEWHERE_M = 50_000.0  # of receivers from a map: no mistake of frames or units within one place
-GROUND_M, ROOFS = 0.5, 0.95  # above it something is built; share of its corners that are roofs
+CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions within so few metres are in another unit
+MIN_HEAP, HEAP_RATIO = 10, 5  # equal levels, and their ratio to the next values, beyond any tail
+MAX_OUTSIDE = 0.5  # largest share of links with the receiver off the map
+ELSEWHERE_M = 50_000.0  # between receivers and map: the map is of another place
+GROUND_M, ROOFS = 0.5, 0.95  # height [m] above which a vertex is built; quantile of roof heights
 BURIED = "its height, or that of the map's ground, is off; z counts from the scene's datum"
 COPIED = "they are in the file twice"
 INDOORS = "it was indoors (see building_entry), or its position or the wall is off by metres"
 
 
 def height_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
-    """Return a note where heights look as if they counted from another zero than the scene's.
+    """Note heights that seem to be measured from another zero than the datum of the scene.
 
-    Receivers (n, 3) have z above the datum of the scene [m], NaN where unknown.
+    Receivers are (n, 3) [m], with z above that datum; NaN: unknown.
     """
     known = np.isfinite(receiver_m).all(axis=1)
     if not known.any():
@@ -74,12 +72,16 @@ def height_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
 
 def chance_inside(city: CityMap, position_m: np.ndarray,
                   sd_m: float = POSITION_SD_M) -> np.ndarray:
-    """Return the probability (n,) that ends of links are inside buildings.
+    """Return the probability (n,) that a link's end is inside a building.
 
-    It is the share that is inside of equally probable places around where they are said to be (n,
-    3) [m]: rings of a normal distribution, with the same standard deviation [m] in x and in y.
+    The error of its position is normal, and sampled on rings of equal probability.
+
+    Args:
+        city: 3D map.
+        position_m: (n, 3) reported positions [m].
+        sd_m: standard deviation of their errors in x and in y [m].
     """
-    places_m, own = np.unique(position_m, axis=0, return_inverse=True)
+    places_m, place = np.unique(position_m, axis=0, return_inverse=True)
     share = (np.arange(RINGS) + 0.5) / RINGS
     radius_m = sd_m * np.sqrt(-2 * np.log1p(-share))  # quantiles of the Rayleigh distribution
     low = np.flatnonzero(places_m[:, 2] < city.vertices[:, 2].max(initial=-np.inf))
@@ -88,15 +90,11 @@ def chance_inside(city: CityMap, position_m: np.ndarray,
         for turn in (np.arange(DIRECTIONS) + ring / RINGS) * (2 * np.pi / DIRECTIONS):
             shift_m = radius_m[ring] * np.array([np.cos(turn), np.sin(turn), 0.0])
             chance[low] += city.inside(places_m[low] + shift_m)
-    return chance[own.ravel()] / (RINGS * DIRECTIONS)
+    return chance[place.ravel()] / (RINGS * DIRECTIONS)
 
 
 def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
-    """Check that levels (n,) of a column hold something to explain.
-
-    Raises:
-        BadInput: nothing was detected, or all levels are equal.
-    """
+    """Raise BadInput if nothing was detected in levels (n,) [dB], or all of them are equal."""
     if not np.isfinite(level_db).any():
         raise BadInput(f"nothing was detected: {column} is empty in all {len(level_db):,} rows, "
                        f"and at least {MIN_LINKS // 2} links need a level. Check that column, and "
@@ -107,30 +105,23 @@ def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
 
 
 def copied_rows(table: pd.DataFrame) -> np.ndarray:
-    """Return which rows (n,) repeat an earlier one: the file was put together twice.
-
-    Without a time, equal rows may be equal measurements.
-    """
+    """Return which rows (n,) with a time repeat an earlier row: the data was joined twice."""
     if "time_s" not in table:
         return np.zeros(len(table), dtype=bool)
     return table.duplicated().to_numpy() & table["time_s"].notna().to_numpy()
 
 
 def require_one_frame(measurements: Measurements, scene: Scene | None) -> None:
-    """Check that measurements and scene are not known to be in different frames.
-
-    Raises:
-        BadInput: they are.
-    """
-    here, there = measurements.origin, None if scene is None else scene.config.origin
-    if here is not None and there is not None and not is_same_frame(here, there):
-        raise BadInput(f"the measurements are in the frame about {origin_text(here)}, the scene is "
-                       f"in that about {origin_text(there)}; convert them with "
+    """Raise BadInput if measurements and scene have different origins."""
+    origin, of_scene = measurements.origin, None if scene is None else scene.config.origin
+    if origin is not None and of_scene is not None and not is_same_frame(origin, of_scene):
+        raise BadInput(f"the measurements are in the frame about {origin_text(origin)}, the scene "
+                       f"is in that about {origin_text(of_scene)}; convert them with "
                        "radiotwin.links.alignment.in_scene_frame")
 
 
 def check_names(measurements: Measurements) -> list[str]:
-    """Return a note on each set of names that are probably not meant."""
+    """Note names that differ in upper and lower case only, and devices without a link."""
     notes = []
     for what, names in (("receivers", measurements.table["receiver"].unique()),
                         ("devices", measurements.devices["device"]),
@@ -149,16 +140,16 @@ def check_names(measurements: Measurements) -> list[str]:
 
 def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
                     scene: Scene | None) -> list[str]:
-    """Return a note on each set of positions that are probably in another unit or frame.
+    """Note positions that are probably in another unit or frame.
 
     Args:
         receiver_m: (n, 3) [m].
         device_m: (k, 3) [m].
-        scene: the 3D map, if there is one.
+        scene: with the 3D map; None: positions are not compared with one.
 
     Raises:
-        BadInput: all receivers and devices are within millimetres, or most receivers are outside
-            the map.
+        BadInput: all receivers and devices are within `CLOSE_M`, or most receivers are outside the
+            map.
     """
     both = "receivers and devices"
     notes = {}
@@ -179,11 +170,7 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
 
 
 def require_on_map(receiver_m: np.ndarray, scene: Scene) -> np.ndarray:
-    """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool, of which few may be.
-
-    Raises:
-        BadInput: most are.
-    """
+    """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool; BadInput if most are."""
     outside = outside_map(receiver_m, scene)
     if outside.mean() > MAX_OUTSIDE:
         low_m, high_m = map_corners_m(scene)
@@ -200,10 +187,10 @@ def require_on_map(receiver_m: np.ndarray, scene: Scene) -> np.ndarray:
 
 
 def unmapped_ends(receiver_m: np.ndarray, device_m: np.ndarray, scene: Scene) -> np.ndarray:
-    """Return which links (n,) end off the 3D map and below its roofs.
+    """Return which links (n,) have an end off the 3D map and below its roofs.
 
-    Whether such a link has line of sight is not known. What ends above the roofs has a free way
-    there, wherever it is. Both ends are (n, 3) [m]; NaN where unknown.
+    Their line of sight is unknown. An end above the roofs needs no map around it. Both ends are
+    (n, 3) [m]; NaN: unknown.
     """
     low_m, high_m = map_corners_m(scene)
     roof_m = _roof_m(scene)
@@ -212,13 +199,13 @@ def unmapped_ends(receiver_m: np.ndarray, device_m: np.ndarray, scene: Scene) ->
 
 
 def map_corners_m(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the 3D map in the south-west and the north-east, (2,) each [m]."""
+    """Return the south-west and the north-east corner of the 3D map, (2,) each [m]."""
     corners_m = scene.city.vertices[:, :2]
     return corners_m.min(axis=0), corners_m.max(axis=0)
 
 
 def _roof_m(scene: Scene) -> float:
-    """Return the height that nearly all roofs of the map are below [m]."""
+    """Return the `ROOFS` quantile of roof heights of the map [m]."""
     vertices_m = scene.city.vertices
     built_m = vertices_m[vertices_m[:, 2] > GROUND_M, 2]
     if scene.city.terrain is not None:
@@ -233,7 +220,7 @@ def outside_map(receiver_m: np.ndarray, scene: Scene) -> np.ndarray:
 
 
 def receiver_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
-    """Return a note on receivers (n, 3) [m] inside buildings, below the ground, or too high."""
+    """Note receivers (n, 3) [m] inside buildings, below the ground, or implausibly high."""
     known = np.isfinite(receiver_m).all(axis=1)
     inside, below = np.zeros((2, len(receiver_m)), dtype=bool)
     inside[known] = scene.city.inside(receiver_m[known])
@@ -248,19 +235,18 @@ def receiver_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
             if odd.any()] + height_notes(receiver_m, scene)
 
 
-def stand_anchors(links: Links, scene: Scene, refuse: bool = True) -> Links:
-    """Return links with anchors outside the buildings and above the ground of the map.
+def move_anchors_out(links: Links, scene: Scene, refuse: bool = True) -> Links:
+    """Move anchors out of buildings and above the ground of the map, with a note.
 
-    One that is inside by no more than roofs, walls and the ground of a map are off is moved to
-    where it can stand, with a note; see `radiotwin.scene.footing`.
+    An anchor is moved only within the errors of a map, see `radiotwin.scene.footing`.
 
     Args:
         links: over the map of the scene.
-        scene: the 3D map.
-        refuse: whether one that no error of a map explains is bad input; else it stays inside.
+        scene: with the 3D map.
+        refuse: raise for an anchor that is too deep inside a building; else it stays there.
 
     Raises:
-        BadInput: an anchor is far from the receivers, or no error of a map explains where it is.
+        BadInput: an anchor is far from the receivers, or too deep inside a building.
     """
     anchors = np.array(sorted(links.anchors), dtype=int)
     anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
@@ -293,14 +279,17 @@ def stand_anchors(links: Links, scene: Scene, refuse: bool = True) -> Links:
         f"no more than a map is off: moved {move}" for move, names in moved.items()))
 
 
-def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,
+def uninformative_receivers(table: pd.DataFrame, level_db: np.ndarray,
                       keep: np.ndarray) -> list[tuple[np.ndarray, str]]:
-    """Return links of receivers that say nothing, and why: masks (n,), each with its reason.
+    """Find receivers that never detect, always read one level, or have too few links.
 
     Args:
         table: n measurements.
         level_db: (n,) [dB]; NaN = not detected.
-        keep: (n,) bool, links that count.
+        keep: (n,) bool, links that are used so far.
+
+    Returns:
+        for each of the three, a mask (n,) of their links, and the reason to leave them out.
     """
     end, names = pd.factorize(table["receiver"], sort=True)
     links = np.bincount(end[keep], minlength=len(names))
@@ -323,11 +312,17 @@ def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,
 
 def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
                     keep: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return links of devices that nobody detected although many tried, and a note on them.
+    """Find devices that were never detected on at least `MIN_LINKS` links, and may be off.
 
-    A device that is off would pass for one with a huge loss. One with few links may be a position
-    of a device that moves, and then its blanks are as good as any. Arguments as of
-    `useless_receivers`.
+    A device with fewer links may be one position of a moving device: its blanks are kept.
+
+    Args:
+        table: n measurements.
+        level_db: (n,) [dB]; NaN = not detected.
+        keep: (n,) bool, links that are used so far.
+
+    Returns:
+        a mask (n,) of their links, and the reason to leave them out.
     """
     end, names = pd.factorize(table["device"], sort=True)
     links, heard = (np.bincount(end[rows], minlength=len(names))
@@ -339,10 +334,12 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
 
 
 def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
-    """Return the lowest of levels (n,) and its share, where it means "not detected".
+    """Find the level that a receiver writes in place of "not detected", if there is one.
 
-    It occurs far more often than a tail would have it, and with a gap, or a heap, that no tail has.
-    None where there is no such value.
+    It is the lowest level (n,) [dB], far below the next ones or far more frequent.
+
+    Returns:
+        that level [dB], None if there is none, and its share of all readings.
     """
     seen = level_db[np.isfinite(level_db)]
     if len(seen) < MIN_LINKS:
@@ -356,7 +353,7 @@ def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
 
 
 def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarray) -> list[str]:
-    """Return a note where receivers read no more than some level: their highest value is a heap.
+    """Note receivers that saturate: their highest value is far more frequent than the next ones.
 
     Args:
         receiver: (n,) index of each link's receiver.
@@ -375,10 +372,10 @@ def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarr
 
 
 def _is_heap(counts: np.ndarray) -> bool:
-    """Return whether the first of counts (m,) of neighbouring values is more than a tail has."""
+    """Return whether the first value is far more frequent than its neighbours, by counts (m,)."""
     return bool(counts[0] >= MIN_HEAP and counts[0] > HEAP_RATIO * counts[1:6].max())
 
 
 def _named(noun: str, names: Sequence[object] | np.ndarray | pd.Series) -> str:
-    """Return names with what they are of: receiver a, receivers a, b."""
+    """Return a noun with names: receiver a, receivers a, b."""
     return f"{noun}{'s' if len(names) > 1 else ''} {some(names)}"

@@ -1,14 +1,14 @@
 """Correlation length of a residual: the distance over which errors of links are correlated.
 
 It is estimated from the robust variogram (Cressie and Hawkins 1980, 'Robust estimation of the
-variogram', Math. Geology 12) over the positions of the end that moves, within each device, receiver
-and flight, so that errors of a whole device or receiver do not count. The level of each flight and
-the trends of each pair of ends are removed before. Detrending removes long shadows, too: a model
-variogram that ignored it would be biased to short lengths, by half for flights of a few lengths. So
-the model is an exponential field with a nugget (Gudmundson 1991, 'Correlation model for shadow
-fading in mobile radio systems') after the same projection, that of generalised increments
-(Kitanidis 1983, 'Statistical estimation of polynomial generalized covariance functions', Water
-Resources Research 19), fitted by weighted least squares (Cressie 1985, Math. Geology 17).
+variogram', Math. Geology 12) over the positions of the moving end. Pairs of links share device,
+receiver and flight, so that offsets of a device or receiver do not count. The level of each flight
+and the trends of each device and receiver are removed first. That also removes part of the long
+shadows, which would halve the length on flights of a few lengths. The model is therefore an
+exponential field with a nugget (Gudmundson 1991, 'Correlation model for shadow fading in mobile
+radio systems') after the same projection (generalised increments; Kitanidis 1983, 'Statistical
+estimation of polynomial generalized covariance functions', Water Resources Research 19), fitted by
+weighted least squares (Cressie 1985, Math. Geology 17).
 """
 
 from __future__ import annotations
@@ -24,29 +24,30 @@ from scipy.spatial.distance import cdist
 
 from radiotwin.links.links import Links
 
-MAX_LINKS = 20_000  # a sample of more has pairs enough
-NEIGHBOURS = 8  # nearest, of each link: the short distances
-LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144)  # along a track: the longer ones
-BINS, MIN_PAIRS = 16, 40  # of distances; and pairs in each
-MIN_BINS = 3  # that tell nugget, sill and length
-MIN_TREND_LINKS = 60  # of a pair of ends, for its trends
-MIN_CORRELATED = 0.1  # share of the variance that is correlated, below which there is no length
-NODES = 400  # links of a pair of ends that stand for all in the projection of a field
-MAX_PAIRS = 5_000  # of links of a pair of ends, that stand for all of them
-MIN_SINGULAR = 1e-9  # singular value of a trend over the greatest: less is linearly dependent
-MIN_SERIES = 3  # mean readings of a device by a receiver on a flight, to be a series
-MAX_STEPS = 5_000  # places whose nearest one is looked up
+MAX_LINKS = 20_000  # larger campaigns are sampled
+NEIGHBOURS = 8  # nearest links that each link is paired with, for short distances
+LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144)  # links along a track, for longer distances
+BINS, MIN_PAIRS = 16, 40  # distance bins; smallest number of pairs in a bin
+MIN_BINS = 3  # for nugget, sill and length
+MIN_TREND_LINKS = 60  # of a device and receiver, to fit trends beyond the levels of flights
+MIN_CORRELATED = 0.1  # smallest correlated share of the variance; with less there is no length
+NODES = 400  # links that sample a device and receiver in the projection of a field
+MAX_PAIRS = 5_000  # pairs that sample those of a device and receiver
+MIN_SINGULAR = 1e-9  # relative singular value below which trends are linearly dependent
+MIN_SERIES = 3  # readings of a device by a receiver on a flight, in the mean, if devices stand
+MAX_STEPS = 5_000  # sampled places whose nearest neighbour is searched
 MAX_Z = 4.0  # residuals are clipped to this many scales
-LENGTHS = 24  # tried, evenly on a logarithmic scale
-EXTENT_SHARE = 0.25  # of the extent: a longer correlation looks like a trend
-MIN_STEP_M = 0.1
-REMEMBERED = 8  # sets of links: of a model and its folds
+LENGTHS = 24  # candidate lengths, evenly spaced on a logarithmic scale
+EXTENT_SHARE = 0.25  # longest length over the extent; longer correlation looks like a trend
+MIN_STEP_M = 0.1  # closer positions count as one place
+REMEMBERED = 8  # cached variograms: a model and its folds
 
 
 def pairs_of_links(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows (p,) and rows (p,) of pairs of links of one series: neighbours, and along tracks.
+    """Return first and second rows (p,) of pairs of links: near neighbours, and lags along tracks.
 
-    A place is (n, d) of both ends; its last column separates series.
+    Only links of one series are paired. Places (n, d) [m] hold both ends; their last coordinate
+    separates the series, see `_separated_places`.
     """
     n = len(place)
     every = np.arange(n) if n <= MAX_LINKS else np.sort(
@@ -66,14 +67,14 @@ def pairs_of_links(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """Trends of a pair of ends, which are removed before correlation is estimated.
+    """Trends of one device and receiver, which are removed before correlation is estimated.
 
-    A level for each flight, a slope over log-distance, and two harmonics of azimuth: errors of the
-    base and of antennas that are common to the whole campaign, and no shadows.
+    They are a level for each flight, a slope over log-distance, and two harmonics of azimuth:
+    errors of the base model and of antennas, which are not shadowing.
 
     Attributes:
-        rows: (m,) of the links, ascending.
-        basis: (m, q) orthonormal.
+        rows: (m,) rows of the links, ascending.
+        basis: (m, q) orthonormal basis of the trends.
     """
 
     rows: np.ndarray
@@ -81,9 +82,9 @@ class Trend:
 
     @classmethod
     def of(cls, links: Links, rows: np.ndarray, series: np.ndarray) -> Trend:
-        """Return the trend of some rows (m,) of links (n,), with the series (n,) of each link."""
-        own = series[rows]
-        columns = (own[:, None] == np.unique(own)).astype(float)
+        """Build the basis for rows (m,) of links, of which `series` (n,) labels the flights."""
+        label = series[rows]
+        columns = (label[:, None] == np.unique(label)).astype(float)
         if len(rows) >= MIN_TREND_LINKS:
             azimuth = np.radians(links.azimuth_deg[rows])
             columns = np.column_stack([columns, np.log(links.distance_m[rows]), np.cos(azimuth),
@@ -91,56 +92,56 @@ class Trend:
         left, singular, _ = np.linalg.svd(columns, full_matrices=False)
         return cls(rows, left[:, singular > MIN_SINGULAR * singular[0]])
 
-    def taken_from(self, z: np.ndarray) -> np.ndarray:
-        """Return the detrended residuals (m,) of its rows, from all residuals (n,)."""
-        own = z[self.rows]
-        return own - self.basis @ (self.basis.T @ own)
+    def detrended(self, z: np.ndarray) -> np.ndarray:
+        """Select the residuals (m,) of this device and receiver from all (n,), and detrend them."""
+        part = z[self.rows]
+        return part - self.basis @ (self.basis.T @ part)
 
-    def left_of(self, position_m: np.ndarray, i: np.ndarray, j: np.ndarray,
+    def semivariances(self, position_m: np.ndarray, i: np.ndarray, j: np.ndarray,
                 lengths_m: np.ndarray) -> np.ndarray:
-        """Return the semivariance of fields of unit variance after detrending.
+        """Return the semivariances of detrended fields of unit variance for pairs of links.
 
         Args:
-            position_m: (n, d) of the links [m].
-            i: (p,) of its rows: first links.
-            j: (p,) second links.
+            position_m: (n, d) positions of all links [m].
+            i: (p,) first link of each pair, an index into `rows`.
+            j: (p,) second link, likewise.
             lengths_m: (k,) correlation lengths [m].
 
         Returns:
-            (1 + k, p), of white noise and of an exponential field of each length.
+            (1 + k, p): of white noise, and of an exponential field of each length.
         """
         used, place = np.unique(np.concatenate([i, j]), return_inverse=True)
         a, b = place.reshape(2, -1)
-        own_m, count = position_m[self.rows], len(self.rows)
+        part_m, count = position_m[self.rows], len(self.rows)
         nodes = np.arange(0, count, -(-count // NODES))  # evenly along all tracks
         weight = count / len(nodes)
         turn = self.basis[i] - self.basis[j]
-        left = [1 - 0.5 * (turn * turn).sum(axis=1)]
-        # In single precision, which is good to a few millionths here and takes a third of the time.
-        to_nodes_m, between_m = (cdist(each, own_m[nodes]).astype(np.float32)
-                                 for each in (own_m[used], own_m[nodes]))
-        basis, apart_m = self.basis[nodes].astype(np.float32), _apart_m(own_m, i, j)
+        found = [1 - 0.5 * (turn * turn).sum(axis=1)]
+        # Single precision is accurate to a few millionths here, in a third of the time.
+        to_nodes_m, between_m = (cdist(each, part_m[nodes]).astype(np.float32)
+                                 for each in (part_m[used], part_m[nodes]))
+        basis, distance_m = self.basis[nodes].astype(np.float32), _distance_m(part_m, i, j)
         for length_m in lengths_m.astype(np.float32):
             common = np.exp(to_nodes_m / -length_m) @ basis * weight
             both = basis.T @ np.exp(between_m / -length_m) @ basis
-            left.append(1 - np.exp(-apart_m / length_m)
-                        - (turn * (common[a] - common[b])).sum(axis=1)
-                        + 0.5 * weight**2 * ((turn @ both) * turn).sum(axis=1))
-        return np.array(left)
+            found.append(1 - np.exp(-distance_m / length_m)
+                         - (turn * (common[a] - common[b])).sum(axis=1)
+                         + 0.5 * weight**2 * ((turn @ both) * turn).sum(axis=1))
+        return np.array(found)
 
 
 @dataclass(frozen=True, eq=False)
 class Variogram:
-    """Model variograms of some links: all that depends on nothing but where they are.
+    """Model variograms of n links; they depend on the positions only.
 
     Attributes:
-        trends: of each pair of ends; each of n links belongs to one.
-        first: (p,) rows of first links.
-        second: (p,) of second ones, of the same pair of ends and flight.
-        index: (p,) bin of each pair's distance.
+        trends: one for each device and receiver; together they cover all n links.
+        first: (p,) first link of each pair, a row.
+        second: (p,) second link, of the same device, receiver and flight.
+        index: (p,) distance bin of each pair.
         fields: (1 + k, bins) semivariances of detrended white noise, and of a field of each length;
             NaN in a bin without a sampled pair.
-        lengths_m: (k,) that are tried, ascending [m].
+        lengths_m: (k,) candidate correlation lengths, ascending [m].
     """
 
     trends: list[Trend]
@@ -153,24 +154,23 @@ class Variogram:
     @classmethod
     def of(cls, position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
            lengths_m: np.ndarray) -> Variogram:
-        """Return that of n links with both ends at (n, d) [m]; other arguments as of the class."""
-        distance_m, least_m = _apart_m(position_m, first, second), float(lengths_m[0])
+        """Compute the model variograms of links with both ends at (n, d) [m]."""
+        distance_m, least_m = _distance_m(position_m, first, second), float(lengths_m[0])
         edges = np.geomspace(least_m, max(float(distance_m.max(initial=0)), 2 * least_m), BINS)
         index = np.searchsorted(edges, distance_m)
         return cls(trends, first, second, index,
                    _fields(position_m, trends, first, second, index, lengths_m), lengths_m)
 
     def length_m(self, z: np.ndarray) -> float:
-        """Return the correlation length whose field, with a nugget, is nearest to a residual's.
+        """Fit the correlation length [m] to the variogram of scaled residuals (n,).
 
-        The residuals (n,) are over their scale. The first of `lengths_m` stands for a residual that
-        is not correlated, or says too little.
+        It is the first of `lengths_m` if they are uncorrelated, or too few bins have enough pairs.
         """
-        rest = np.empty(len(z))
+        detrended = np.empty(len(z))
         for trend in self.trends:
-            rest[trend.rows] = trend.taken_from(z)
+            detrended[trend.rows] = trend.detrended(z)
         pairs = np.bincount(self.index, minlength=BINS + 1)
-        root = np.sqrt(np.abs(rest[self.first] - rest[self.second]))
+        root = np.sqrt(np.abs(detrended[self.first] - detrended[self.second]))
         mean = np.bincount(self.index, weights=root, minlength=BINS + 1) / np.maximum(pairs, 1)
         gamma = 0.5 * mean**4 / (0.457 + 0.494 / np.maximum(pairs, 1))  # Eq. 2.14
         used = (pairs >= MIN_PAIRS) & np.isfinite(self.fields).all(axis=0)
@@ -181,15 +181,15 @@ class Variogram:
 
 def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
             index: np.ndarray, lengths_m: np.ndarray) -> np.ndarray:
-    """Return the mean semivariance (1 + k, bins) of detrended fields; NaN in a bin without a pair.
+    """Average the semivariances of detrended fields in distance bins: `Variogram.fields`.
 
-    Arguments as of `Variogram`, and the positions (n, d) of both ends [m].
+    Positions (n, d) [m] hold both ends; the other arguments are those of `Variogram`.
     """
-    owner = np.empty(len(position_m), dtype=int)
+    trend_of = np.empty(len(position_m), dtype=int)
     for number, trend in enumerate(trends):
-        owner[trend.rows] = number
-    order = np.argsort(owner[first], kind="stable")
-    ends = np.searchsorted(owner[first][order], np.arange(len(trends) + 1))
+        trend_of[trend.rows] = number
+    order = np.argsort(trend_of[first], kind="stable")
+    ends = np.searchsorted(trend_of[first][order], np.arange(len(trends) + 1))
     sums, weights = np.zeros((1 + len(lengths_m), BINS + 1)), np.zeros(BINS + 1)
     for number, trend in enumerate(trends):
         pairs = order[ends[number]:ends[number + 1]]
@@ -198,20 +198,23 @@ def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, seco
         sampled = pairs[::-(-len(pairs) // MAX_PAIRS)]
         weight = len(pairs) / len(sampled)
         i, j = (np.searchsorted(trend.rows, rows[sampled]) for rows in (first, second))
-        left = trend.left_of(position_m, i, j, lengths_m)
-        sums += [np.bincount(index[sampled], weights=weight * each, minlength=BINS + 1)
-                 for each in left]
+        sums += [np.bincount(index[sampled], weights=weight * gamma, minlength=BINS + 1)
+                 for gamma in trend.semivariances(position_m, i, j, lengths_m)]
         weights += weight * np.bincount(index[sampled], minlength=BINS + 1)
     return np.where(weights > 0, sums / np.maximum(weights, 1e-9), np.nan)
 
 
 def _nearest(gamma: np.ndarray, pairs: np.ndarray, fields: np.ndarray,
              lengths_m: np.ndarray) -> float:
-    """Return the length [m] whose field and nugget are nearest to a variogram (b,) of pairs (b,).
+    """Fit nugget and sill for each length, and return the length [m] of the best fit.
 
-    Fields (1 + k, b) are semivariances of white noise, and of a field of each length (k,).
+    Args:
+        gamma: (b,) empirical semivariances in bins.
+        pairs: (b,) number of pairs in them.
+        fields: (1 + k, b) semivariances of white noise, and of a field of each length.
+        lengths_m: (k,) [m].
     """
-    # Bins are dependent: beyond some hundreds, more pairs do not make one more certain.
+    # Bins are dependent: beyond some hundreds of pairs, more make a bin no more certain.
     weight = np.sqrt(np.minimum(pairs, 500)) / np.maximum(gamma, 0.05 * gamma.max(initial=1e-9))
     best, found = nnls((weight * fields[0])[:, None], weight * gamma)[1], float(lengths_m[0])
     for length_m, field in zip(lengths_m.tolist(), fields[1:], strict=True):
@@ -222,56 +225,62 @@ def _nearest(gamma: np.ndarray, pairs: np.ndarray, fields: np.ndarray,
     return found
 
 
-def _apart_m(position_m: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _distance_m(position_m: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the distance (p,) between pairs of rows of positions (n, d) [m]."""
     return np.linalg.norm(position_m[first] - position_m[second], axis=1)
 
 
 def devices_move(links: Links) -> bool:
-    """Return whether devices are positions of a moving device: receivers read most of them once."""
+    """Return whether devices are positions of one moving device: most were read once only."""
     series = pd.DataFrame({"device": links.device, "receiver": links.receiver,
                            "flight": links.flight})
     return len(series.drop_duplicates()) > len(links) / MIN_SERIES
 
 
 def moving_end_m(links: Links) -> np.ndarray:
-    """Return the positions (n, 3) of the end that moves [m]; 0 where unknown."""
+    """Return the positions (n, 3) [m] of the receivers, or of the devices if those move.
+
+    An unknown position is 0.
+    """
     if devices_move(links):
         return np.nan_to_num(links.device_m[links.device])
     return links.receiver_m
 
 
-def pair_of_ends(links: Links) -> np.ndarray:
-    """Return a label (n,) of each link's device and receiver; of the receiver if devices move."""
+def pair_label(links: Links) -> np.ndarray:
+    """Label each link's pair of device and receiver, (n,); the receiver only if devices move."""
     if devices_move(links):
         return links.receiver
     return links.receiver * len(links.device_names) + links.device
 
 
 def extent_m(position_m: np.ndarray) -> float:
-    """Return the diagonal of the box that holds 96 % of positions (n, 2 or 3) in x and in y [m]."""
+    """Return the diagonal [m] of the box around the central 96 % of positions (n, 2 or 3) [m]."""
     low, high = np.quantile(position_m[:, :2], [0.02, 0.98], axis=0)
     return float(np.hypot(*(high - low)))
 
 
-def step_m(links: Links) -> float:
-    """Return the median distance between neighbouring places of a device and receiver [m]."""
-    place, offset_m = _apart(links, pair_of_ends(links))
+def median_step_m(links: Links) -> float:
+    """Return the median distance [m] between neighbouring positions of one device and receiver."""
+    place, offset_m = _separated_places(links, pair_label(links))
     places = pd.DataFrame(np.round(place / MIN_STEP_M)).drop_duplicates().to_numpy() * MIN_STEP_M
     if len(places) < 2:
         return 0.0
-    some = places[::-(-len(places) // MAX_STEPS)]
-    nearest = cKDTree(places).query(some, 2)[0][:, 1]
-    nearest = nearest[nearest < offset_m / 2]  # of the same pair
-    return float(np.median(nearest)) if len(nearest) else 0.0
+    sampled = places[::-(-len(places) // MAX_STEPS)]
+    nearest_m = cKDTree(places).query(sampled, 2)[0][:, 1]
+    nearest_m = nearest_m[nearest_m < offset_m / 2]  # of the same device and receiver
+    return float(np.median(nearest_m)) if len(nearest_m) else 0.0
 
 
 def correlation_length_m(links: Links, z: np.ndarray) -> float:
-    """Return the distance over which the correlation of a residual falls to 1/e [m].
+    """Return the distance [m] over which the correlation of a residual falls to 1/e.
 
-    It is at least the usual step between places, which an uncorrelated residual gives, and at most
-    a quarter of the extent of the campaign. Residuals (n,) are divided by their scale; blank links
-    do not count.
+    It lies between the median step between positions, which an uncorrelated residual gives, and a
+    quarter of the extent of the campaign.
+
+    Args:
+        links: n links; those not detected are ignored.
+        z: (n,) residuals, divided by their scale.
     """
     seen = np.isfinite(links.level_db) & np.isfinite(z)
     least_m, rows, variogram = _variogram(links, seen.tobytes())
@@ -280,33 +289,35 @@ def correlation_length_m(links: Links, z: np.ndarray) -> float:
 
 @lru_cache(maxsize=REMEMBERED)
 def _variogram(links: Links, seen: bytes) -> tuple[float, np.ndarray, Variogram | None]:
-    """Return the least length [m], rows (m,) of the detected links, and their model variogram.
+    """Return the shortest length [m], the rows (m,) of detected links, and their model variogram.
 
-    It is cached: every effect and every step needs it for the same links, and it is slow.
+    `seen` is the mask of detected links as bytes. The result is cached: it is slow, and every
+    effect and every step needs it for the same links.
     """
-    least_m, most_m = step_m(links), EXTENT_SHARE * extent_m(moving_end_m(links))
+    least_m, most_m = median_step_m(links), EXTENT_SHARE * extent_m(moving_end_m(links))
     rows = np.flatnonzero(np.frombuffer(seen, dtype=bool))
     if least_m <= 0 or most_m <= least_m or len(rows) < MIN_PAIRS:
         return least_m, rows, None
     part = links.select(rows)
-    pair = pair_of_ends(part)
+    pair = pair_label(part)
     order = np.lexsort((np.arange(len(rows)), part.time_s, part.flight, pair))
     part, pair = part.select(order), pair[order]
     series = pd.factorize(pair * (part.flight.max() + 2) + part.flight)[0]
-    place, borders = _apart(part, series)[0], np.flatnonzero(np.diff(pair)) + 1
-    trends = [Trend.of(part, each, series)
-              for each in np.split(np.arange(len(pair)), borders)]
+    place, borders = _separated_places(part, series)[0], np.flatnonzero(np.diff(pair)) + 1
+    trends = [Trend.of(part, pair_rows, series)
+              for pair_rows in np.split(np.arange(len(pair)), borders)]
     first, second = pairs_of_links(place)
-    near = np.linalg.norm(place[first] - place[second], axis=1) < 2 * most_m  # the rest is trends
+    near = _distance_m(place, first, second) < 2 * most_m  # farther pairs only show trends
     return least_m, rows[order], Variogram.of(
         place[:, :-1], trends, first[near], second[near],
         np.geomspace(least_m, most_m, LENGTHS))
 
 
-def _apart(links: Links, label: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return places (n, 7) [m] and the distance between labels in the last coordinate [m].
+def _separated_places(links: Links, label: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the positions of both ends, and a coordinate that separates labels (n,).
 
-    A place is the positions of both ends and a coordinate that keeps different labels (n,) apart.
+    Returns:
+        (n, 7) [m], and the distance between labels in the last coordinate [m].
     """
     ends_m = np.column_stack([links.receiver_m, np.nan_to_num(links.device_m[links.device])])
     offset_m = 4.0 * float(np.ptp(ends_m, axis=0).max(initial=0.0)) + 1.0

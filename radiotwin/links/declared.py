@@ -1,8 +1,8 @@
-"""Declared radios of devices: power, cable loss, antenna and carrier, and their share of a level.
+"""Declared radios of devices: power, cable loss, antenna and carrier frequency.
 
-A channel model knows gains between isotropic antennas at one frequency. The level of a link is that
-gain, and the power that its device feeds to its antenna, the antenna's gain in the direction of the
-receiver, and 20 lg of the carriers' ratio (Friis 1946, 'A note on a simple transmission formula').
+A channel model predicts gains between isotropic antennas at one frequency. The level of a link adds
+the power that the device feeds to its antenna, the antenna gain towards the receiver, and 20 lg of
+the frequency ratio (Friis 1946, 'A note on a simple transmission formula').
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from radiotwin.scene.antennas import Antenna, Pattern
 if TYPE_CHECKING:
     from radiotwin.scene import Scene
 
-MAX_EIRP_APART_DB = 0.5  # between a declared EIRP and that of power, cable and antenna
+MAX_EIRP_APART_DB = 0.5  # rounding between a declared EIRP and that of power, cable and antenna
 MAX_NAMED = 6  # devices in a message
 
 
@@ -32,9 +32,9 @@ class Radio:
 
     Attributes:
         tx_power_dbm: at the output of the transmitter [dBm]; None: not known.
-        cable_loss_db: between that and the antenna [dB].
-        antenna: None: isotropic, or a part of what is learnt of the levels.
-        frequency_hz: None: that of the scene.
+        cable_loss_db: between transmitter and antenna [dB].
+        antenna: None: isotropic, or unknown and learnt as part of the levels.
+        frequency_hz: carrier [Hz]; None: that of the scene.
     """
 
     tx_power_dbm: float | None = None
@@ -44,16 +44,15 @@ class Radio:
 
     @property
     def fed_dbm(self) -> float:
-        """Power at the antenna's input [dBm]; of 0 dBm if the transmit power is not known."""
+        """Power at the antenna's input [dBm]; an unknown transmit power counts as 0 dBm."""
         return (self.tx_power_dbm or 0.0) - self.cable_loss_db
 
 
 def tx_power_dbm(device: str, power_dbm: float | None, eirp_dbm: float | None,
                  cable_loss_db: float, antenna: Antenna | None) -> float | None:
-    """Return the transmit power [dBm] of a device whose power or EIRP, or both, are declared.
+    """Return the transmit power [dBm] from a declared power or EIRP; None if both are unknown.
 
-    EIRP is the power, less the loss of the cable, and the antenna's greatest gain (ITU-R V.573-6,
-    A43).
+    EIRP is the power minus the cable loss plus the antenna's peak gain (ITU-R V.573-6, A43).
 
     Raises:
         BadInput: both are declared, and contradict each other.
@@ -76,13 +75,13 @@ def tx_power_dbm(device: str, power_dbm: float | None, eirp_dbm: float | None,
 
 @dataclass(frozen=True, eq=False)
 class Declared:
-    """Declared radios of k devices, as they are in the levels of their links.
+    """Declared radios of k devices, and what they add to the levels of links.
 
     Attributes:
-        radios: of each device; empty: nothing is declared.
-        frequency_hz: that channel models compute at [Hz]; NaN where it is not known.
-        has_power: whether levels are received powers, with the transmit power in them.
-        receiver_antenna: of all receivers; None: isotropic, or a part of what is learnt.
+        radios: one for each device; empty: nothing is declared.
+        frequency_hz: at which channel models predict [Hz]; NaN if unknown.
+        has_power: whether levels are received powers, which include the transmit power.
+        receiver_antenna: of all receivers; None: isotropic, or learnt as part of the levels.
     """
 
     radios: tuple[Radio, ...]
@@ -92,7 +91,7 @@ class Declared:
 
     @cached_property
     def fed_db(self) -> np.ndarray:
-        """Share of a level that is the same in all directions (k,) [dB]: power, cable, carrier."""
+        """(k,) part of a device's levels that no direction changes [dB]: power, cable, carrier."""
         fed_db = np.zeros(len(self.radios))
         for number, radio in enumerate(self.radios):
             fed_db[number] = radio.fed_dbm if self.has_power else -radio.cable_loss_db
@@ -102,7 +101,7 @@ class Declared:
 
     @property
     def description(self) -> str:
-        """Summary of the declared values, in a few words."""
+        """The declared values in a few words."""
         known = [radio.tx_power_dbm for radio in self.radios if radio.tx_power_dbm is not None]
         parts = [f"tx_power_dbm {min(known):g} to {max(known):g}"] if known else []
         for name, empty in (("cable_loss_db", 0.0), ("antenna", None), ("frequency_hz", None)):
@@ -112,42 +111,42 @@ class Declared:
 
     @property
     def usual_db(self) -> float:
-        """The median of `fed_db` [dB]; 0 where nothing is declared."""
+        """Median of `fed_db` over the devices [dB]; 0 if nothing is declared."""
         return float(np.median(self.fed_db)) if self.radios else 0.0
 
     @cached_property
     def antennas(self) -> list[tuple[Antenna, np.ndarray]]:
-        """Each antenna, and which devices (k,) have it."""
-        own = [radio.antenna for radio in self.radios]
-        every = {id(antenna): antenna for antenna in own if antenna is not None}
-        return [(antenna, np.array([each is antenna for each in own]))
-                for antenna in every.values()]
+        """Each different antenna, with a mask (k,) of the devices that have it."""
+        all_antennas = [radio.antenna for radio in self.radios]
+        different = {id(antenna): antenna for antenna in all_antennas if antenna is not None}
+        return [(antenna, np.array([each is antenna for each in all_antennas]))
+                for antenna in different.values()]
 
     @property
     def has_antennas(self) -> bool:
-        """Whether any antenna is declared, at either end."""
+        """Whether the antenna of any device, or of the receivers, is declared."""
         return bool(self.antennas) or self.receiver_antenna is not None
 
     @property
     def knows_powers(self) -> bool:
-        """Whether levels are received powers, and all transmit powers are known."""
+        """Whether levels are received powers and all transmit powers are known."""
         return self.has_power and bool(self.radios) and all(
             radio.tx_power_dbm is not None for radio in self.radios)
 
     @cached_property
     def adds_nothing(self) -> bool:
-        """Whether all levels are gains between isotropic antennas, as far as is declared."""
+        """Whether the declared radios leave all levels as they are (`added_db` is 0)."""
         return not self.fed_db.any() and not self.has_antennas
 
     def added_db(self, device: np.ndarray, ray_m: np.ndarray) -> np.ndarray | float:
-        """Return what the radios add to the gains of links between isotropic antennas (n,) [dB].
+        """Return what the radios add to the isotropic gains of links, along the straight line.
 
         Args:
             device: (n,) index of each link's device.
-            ray_m: (n, 3) from the device to the receiver [m]; NaN where the device may be anywhere.
+            ray_m: (n, 3) from the device to the receiver [m]; NaN if the device may be anywhere.
 
         Returns:
-            along the straight line; 0 where nothing is declared.
+            (n,) [dB]; the number 0 if nothing is declared.
         """
         if self.adds_nothing:
             return 0.0
@@ -160,33 +159,34 @@ class Declared:
         return added_db
 
     def anew(self, radios: dict[int, Radio]) -> Declared:
-        """Return the same where some devices, by their numbers, declare something else by now.
+        """Return a copy with newly declared values of some devices.
 
         Args:
-            radios: what they do not declare is as it was, and so are powers that were not known.
+            radios: device index -> new radio. A value that it leaves open keeps the old one; a
+                transmit power that was unknown stays unknown.
         """
         if not self.radios:
             return self
-        now = list(self.radios)
+        updated = list(self.radios)
         for number, radio in radios.items():
-            old = now[number]
-            now[number] = Radio(
+            old = updated[number]
+            updated[number] = Radio(
                 old.tx_power_dbm if None in (old.tx_power_dbm, radio.tx_power_dbm)
                 else radio.tx_power_dbm,
                 radio.cable_loss_db or old.cable_loss_db, radio.antenna or old.antenna,
                 radio.frequency_hz or old.frequency_hz)
-        return replace(self, radios=tuple(now))
+        return replace(self, radios=tuple(updated))
 
     def of_devices(self, index: np.ndarray) -> Declared:
-        """Return the same of other devices: those of the radios (j,) with these numbers.
+        """Select and reorder the radios.
 
         Args:
-            index: (j,) of `radios`; -1: nothing is declared.
+            index: (j,) into `radios`, for each new device; -1: nothing is declared of it.
         """
         if self.adds_nothing:
             return NOTHING
-        every = *self.radios, Radio()
-        return replace(self, radios=tuple(every[number] for number in index))
+        with_default = *self.radios, Radio()
+        return replace(self, radios=tuple(with_default[number] for number in index))
 
 
 NOTHING = Declared((), np.nan, False)
@@ -194,20 +194,18 @@ NOTHING = Declared((), np.nan, False)
 
 def radios_of(devices: pd.DataFrame, patterns: dict[str, Pattern], scene: Scene | None
               ) -> tuple[Radio, ...]:
-    """Return what a table of devices, and the scene, declare of each device's radio.
-
-    An antenna that the table does not name is the one that the scene declares for that device.
+    """Read each device's radio from a table of devices; antennas also from the scene.
 
     Args:
-        devices: k rows as of `Measurements.devices`.
-        patterns: of the antennas, by the file's name in the table.
-        scene: if there is one.
+        devices: k rows, see `Measurements.devices`.
+        patterns: file name in the column `antenna` -> pattern.
+        scene: gives the antenna of a device if the table names none; None: no scene.
 
     Returns:
-        of k devices; empty: nothing is declared.
+        k radios; empty if nothing is declared.
 
     Raises:
-        BadInput: powers that contradict each other.
+        BadInput: a power contradicts an EIRP, or a pattern is missing.
     """
     of_scene: dict[str, Antenna | None] = {}
     if scene is not None:
@@ -239,13 +237,16 @@ def radios_of(devices: pd.DataFrame, patterns: dict[str, Pattern], scene: Scene 
 
 def complete(names: Sequence[str], radios: tuple[Radio, ...], has_power: bool,
              scene: Scene | None) -> tuple[tuple[Radio, ...], list[str]]:
-    """Return the radios with a power each where any has one, and notes on what is assumed.
+    """Fill in missing transmit powers if any device declares one, and note every assumption.
 
     Args:
         names: of k devices.
-        radios: of these; empty: nothing is declared.
+        radios: k radios; empty: nothing is declared.
         has_power: whether levels are received powers.
-        scene: whose declared power is the one of devices that declare none.
+        scene: its declared power is assumed first, else the median of the other devices.
+
+    Returns:
+        the completed radios, and notes.
     """
     notes: list[str] = []
     known_dbm = [radio.tx_power_dbm for radio in radios if radio.tx_power_dbm is not None]
@@ -263,12 +264,7 @@ def complete(names: Sequence[str], radios: tuple[Radio, ...], has_power: bool,
 
 def antenna_of_uavs(scene: Scene | None, receivers: Sequence[str]
                     ) -> tuple[Antenna | None, list[str]]:
-    """Return the antenna that a scene declares for its UAVs if they are the receivers, and notes.
-
-    Args:
-        scene: if there is one.
-        receivers: names.
-    """
+    """Return the scene's antenna of its UAVs, if all receivers (names) are such UAVs, and notes."""
     if scene is None or scene.uav_antenna is None:
         return None, []
     others = sorted(set(receivers) - {each.uav for each in scene.config.uavs})
@@ -278,15 +274,21 @@ def antenna_of_uavs(scene: Scene | None, receivers: Sequence[str]
                   f"what is learnt: receivers {some(others, MAX_NAMED)} are none of its UAVs"]
 
 
-def as_learnt(names: Sequence[str], declared: Declared, learnt: Declared, scene: Scene | None
+def match_learnt_law(names: Sequence[str], declared: Declared, learnt: Declared, scene: Scene | None
               ) -> tuple[Declared, list[str]]:
-    """Return what is declared of devices for a law that was learnt from others, and notes.
+    """Adapt the radios of new devices to a channel law that was learnt from other devices.
+
+    If the law excludes transmit powers, missing ones are assumed; if it includes them, declared
+    ones are dropped.
 
     Args:
-        names: of k devices.
-        declared: of these.
-        learnt: of the devices that the law was learnt from.
-        scene: whose declared power is the one of devices that declare none.
+        names: of k new devices.
+        declared: radios of the new devices.
+        learnt: radios of the devices that the law was learnt from.
+        scene: its declared power is assumed first, else the median of the learnt devices.
+
+    Returns:
+        the adapted radios, and notes.
     """
     notes: list[str] = []
     radios = declared.radios or tuple(Radio() for _ in names)
@@ -310,14 +312,14 @@ def as_learnt(names: Sequence[str], declared: Declared, learnt: Declared, scene:
 
 def _with_powers(names: Sequence[str], radios: tuple[Radio, ...], known_dbm: list[float],
                  whose: str, scene: Scene | None) -> tuple[tuple[Radio, ...], list[str]]:
-    """Return radios with a power each, and a note on what is assumed where none is declared.
+    """Fill in missing transmit powers, with a note.
 
     Args:
-        names: of the devices.
-        radios: of these.
-        known_dbm: powers whose median is assumed, unless the scene declares one [dBm].
-        whose: that median is, in words.
-        scene: if there is one.
+        names: of k devices.
+        radios: k radios.
+        known_dbm: powers whose median is assumed, unless the scene declares a power [dBm].
+        whose: what that median is called in the note.
+        scene: None: no scene.
     """
     usual_dbm = float(np.median(known_dbm))
     if scene is not None and scene.config.radio.declares_power:
@@ -330,5 +332,6 @@ def _with_powers(names: Sequence[str], radios: tuple[Radio, ...], known_dbm: lis
 
 def _missing(names: Sequence[str], radios: tuple[Radio, ...], lacks: Callable[[Radio], bool],
              text: str) -> list[str]:
+    """Return the note `text` with the names of the radios that lack a value; empty if none does."""
     missing = [name for name, radio in zip(names, radios, strict=True) if lacks(radio)]
     return [text.format(some(missing, MAX_NAMED))] if missing else []

@@ -1,4 +1,4 @@
-"""Links that err alike: pieces of evidence, how many links count as one, and which to leave out."""
+"""Links with correlated errors: pieces of evidence, the design effect, and thinning of links."""
 
 from __future__ import annotations
 
@@ -7,41 +7,39 @@ import pandas as pd
 
 from radiotwin.links.correlation import (
     correlation_length_m,
+    median_step_m,
     moving_end_m,
-    pair_of_ends,
-    step_m,
+    pair_label,
 )
 from radiotwin.links.links import Links
 
-LENGTHS = 1.0  # side of a piece over the correlation length
-# Side of a place over it: a square of the area over which exp(-d/L) adds up to 1, 2 pi L².
+# Side of a place in correlation lengths L: a square with the integral of exp(-d/L), 2 pi L².
 PLACE_LENGTHS = 2.5
-UNKNOWN_M = 100.0  # side of a piece while no residual has been looked at
-MIN_PLACES = 6  # that the ground of a campaign is cut into, where it is wide enough
-NARROWER = 0.8  # from one width that is tried to the next
-LITTLE = 30  # places: fewer are little evidence
-PLACE_M = 5.0  # side of a square of ground that counts as one place
-PILE, MIN_PILE = 5, 20  # times the usual number of readings at one place is a pile; and at least
-MIN_SURPLUS = 0.05  # share of all links in piles, to thin them
-MAX_LINKS = 120_000  # up to which all are used
-SAMPLE_LINKS = 60_000  # of more: takes minutes
+UNKNOWN_M = 100.0  # side of a piece before the correlation length is known
+MIN_PLACES = 6  # squares that a campaign is divided into, if it is wide enough
+NARROWER = 0.8  # ratio of one trial width to the one before
+FEW_SQUARES = 30  # a campaign over fewer squares gets a note
+PLACE_M = 5.0  # side of the squares in which readings are counted for thinning
+PILE, MIN_PILE = 5, 20  # readings at one place, over the median and at least, that make a pile
+MIN_SURPLUS = 0.05  # surplus of all piles over the number of links, below which none is thinned
+MAX_LINKS = 120_000  # larger campaigns are sampled
+SAMPLE_LINKS = 60_000  # links in the sample; the loop takes minutes on them
 
 
 def evidence_blocks(links: Links) -> np.ndarray:
-    """Return the piece of evidence (n,) that each link belongs to, an integer.
+    """Return the piece of evidence (n,) of each link, an index; links of one piece count as one.
 
-    Links of one device and receiver that are close to each other on the ground and in one flight
-    have nearly the same shadowing, and count as one. How close, `with_evidence` has found out; on
-    links that it has not seen, the pieces are `UNKNOWN_M` wide.
+    They share device, receiver and flight, and a square of ground as wide as the correlation length
+    that `with_evidence` estimated, or `UNKNOWN_M` before that.
     """
     return _evidence(links)[:, 0]
 
 
 def places(links: Links) -> np.ndarray:
-    """Return the place (n,) of each link, an integer: squares of ground that both its ends are in.
+    """Return the place (n,) of each link, an index: the squares of ground of both its ends.
 
-    What stands beside a way shadows every flight that comes along it again, whatever the receiver,
-    so that more flights over the same ground tell no more of what belongs to a device.
+    An obstacle beside a route shadows every flight along it, with any receiver. Further flights
+    over the same ground are therefore no new evidence about a device.
     """
     return _evidence(links)[:, 1]
 
@@ -49,50 +47,55 @@ def places(links: Links) -> np.ndarray:
 def _evidence(links: Links) -> np.ndarray:
     if links.evidence is not None:
         return links.evidence
-    width_m = fitting_width_m(links, UNKNOWN_M)
+    width_m = evidence_width_m(links, UNKNOWN_M)
     return _pieces(links, width_m, width_m)
 
 
 def with_evidence(links: Links, z: np.ndarray) -> Links:
-    """Return links with pieces of evidence as wide as a residual (n,) is correlated, with notes.
+    """Divide links into pieces of evidence as wide as a residual's correlation length.
 
-    The residual is that of the base, divided by its scale: all later scores use the same pieces.
+    Args:
+        links: n links.
+        z: (n,) residuals of the base model, divided by their scale.
+
+    Returns:
+        the links with pieces, which all later scores use, and a note if there are few.
     """
     length_m = correlation_length_m(links, z)
-    width_m = fitting_width_m(links, LENGTHS * length_m)
-    pieces = _pieces(links, width_m, fitting_width_m(links, PLACE_LENGTHS * length_m))
-    squares, notes = _occupied(moving_end_m(links), width_m), []
-    if squares < LITTLE:
+    width_m = evidence_width_m(links, length_m)
+    pieces = _pieces(links, width_m, evidence_width_m(links, PLACE_LENGTHS * length_m))
+    squares, notes = _squares_occupied(moving_end_m(links), width_m), []
+    if squares < FEW_SQUARES:
         notes.append(f"links within {width_m:.0f} m of each other err alike, and the campaign has "
                      f"been at {squares} such places only, so evidence is little")
     return links.with_columns(evidence=pieces).with_notes(*notes)
 
 
-def fitting_width_m(links: Links, wanted_m: float, places: int = MIN_PLACES) -> float:
-    """Return the side of the squares that the ground is cut into [m].
+def evidence_width_m(links: Links, wanted_m: float, places: int = MIN_PLACES) -> float:
+    """Return the side [m] of the squares that the ground is divided into.
 
-    It is `wanted_m`, or less if the end that moves would then be in fewer than `places` squares; at
-    least the usual step between its positions.
+    It is `wanted_m`, reduced until the moving end occupies at least `places` squares, but not below
+    the median step between its positions.
     """
-    position_m, least_m = moving_end_m(links), max(step_m(links), 0.1)
+    position_m, least_m = moving_end_m(links), max(median_step_m(links), 0.1)
     width_m = max(wanted_m, least_m)
-    while width_m > least_m and _occupied(position_m, width_m) < places:
+    while width_m > least_m and _squares_occupied(position_m, width_m) < places:
         width_m = max(NARROWER * width_m, least_m)
     return float(width_m)
 
 
-def _occupied(position_m: np.ndarray, width_m: float) -> int:
-    """Return the number of squares of ground with positions (n, 3) in them."""
+def _squares_occupied(position_m: np.ndarray, width_m: float) -> int:
+    """Count the squares of ground that contain positions (n, 3) [m]."""
     return len(np.unique(np.floor(position_m[:, :2] / width_m), axis=0))
 
 
 def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
-    """Return labels (n, 2): squares of one pair of ends and flight, and larger ones of all."""
+    """Return the indices (n, 2) of each link's piece of evidence and place, of these widths."""
     pieces, squares = (np.column_stack([np.floor(end[:, :2] / side_m).astype(np.int64) for end in
                                         (links.receiver_m,
                                          np.nan_to_num(links.device_m[links.device]))])
                        for side_m in (width_m, place_m))
-    pieces = np.column_stack([pieces, pair_of_ends(links), links.flight])
+    pieces = np.column_stack([pieces, pair_label(links), links.flight])
     return np.column_stack([pd.DataFrame(keys).groupby(list(range(keys.shape[1]))).ngroup()
                             for keys in (pieces, squares)])
 
@@ -100,8 +103,12 @@ def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
 def design_effect(block: np.ndarray, z: np.ndarray, max_z: float = 4.0) -> float:
     """Return the design effect: how many links count as one (Kish 1965, 'Survey sampling', 5.4).
 
-    It is the variance of the means of blocks (n,) over that of independent links, at least 1.
-    Residuals (n,) are divided by their scale, and clipped to `max_z`.
+    It is the variance of block means over that of independent links, at least 1.
+
+    Args:
+        block: (n,) index of each link's block.
+        z: (n,) residuals, divided by their scale.
+        max_z: residuals are clipped to this.
     """
     z = np.clip(z, -max_z, max_z)
     size = np.bincount(block)
@@ -111,34 +118,34 @@ def design_effect(block: np.ndarray, z: np.ndarray, max_z: float = 4.0) -> float
 
 
 def thin_piles(links: Links) -> Links:
-    """Return links of which no place has far more than the others have, with a note.
+    """Thin the links of hovering receivers, with a note.
 
-    A receiver that hovers reads one and the same error many times. What a place (of one pair of
-    ends, on one flight) has beyond `PILE` times the usual number is left out, evenly in time.
+    A receiver that hovers repeats one shadowing error. At each place of one device, receiver and
+    flight, at most `PILE` times the median number of links is kept, evenly in time.
     """
     cell = np.floor(moving_end_m(links)[:, :2] / PLACE_M).astype(np.int64)
-    keys = np.column_stack([cell, pair_of_ends(links), links.flight])
+    keys = np.column_stack([cell, pair_label(links), links.flight])
     order = np.lexsort((np.arange(len(links)), links.time_s, *keys.T))
     starts = np.flatnonzero(np.r_[True, np.diff(keys[order], axis=0).any(axis=1)])
     count = np.diff(np.r_[starts, len(links)])
-    most = max(PILE * float(np.median(count)), MIN_PILE)
-    if np.maximum(count - most, 0).sum() < MIN_SURPLUS * len(links):
+    max_count = max(PILE * float(np.median(count)), MIN_PILE)
+    if np.maximum(count - max_count, 0).sum() < MIN_SURPLUS * len(links):
         return links
-    share = np.repeat(np.minimum(most / count, 1.0), count)
+    share = np.repeat(np.minimum(max_count / count, 1.0), count)
     place = np.arange(len(links)) - np.repeat(starts, count)
     kept = np.sort(order[np.floor((place + 1) * share) > np.floor(place * share)])
-    note = (f"receivers stayed at {(count > most).sum():,} places, where "
+    note = (f"receivers stayed at {(count > max_count).sum():,} places, where "
             f"{len(links) - len(kept):,} of {len(links):,} links are left out, evenly in time: "
-            f"readings at one place err alike and count as one; {most:.0f} of them are used")
+            f"readings at one place err alike and count as one; {max_count:.0f} of them are used")
     return links.select(kept).with_notes(note)
 
 
 def thin_links(links: Links, seed: int) -> Links:
-    """Return the links, or a sample of very many, with a note that says so.
+    """Thin hovering receivers, and sample the links of a campaign that is too large, with notes.
 
-    The links of each flight, device and receiver are taken in the order of their times, and of as
-    many as go into the sample once, one is drawn. So all flights, devices, receivers, times and
-    blanks have the share that they have of all links, and means over the sample are not biased.
+    Links are ordered by flight, device, receiver and time, and one is drawn at random from each of
+    `SAMPLE_LINKS` equal groups. Every flight, device, receiver and time keeps its share, so means
+    over the sample are unbiased.
     """
     links = thin_piles(links)
     n = len(links)

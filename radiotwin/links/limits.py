@@ -23,36 +23,41 @@ from radiotwin.links.links import Links
 SLOPE_DB, SLOPE_SD_DB = -30.0, 10.0  # prior per decade of distance: path-loss exponent 2 to 4
 END_SD_DB = 8.0  # prior spread of the levels of devices, and of receivers
 MIN_LINKS = 5  # of a device or receiver, to estimate a level for it
-LEVEL_ROUNDS = 8  # of expectation and maximisation
-FIRST_SD_DB, MIN_SD_DB = 8.0, 6.0
+LEVEL_ROUNDS = 8  # EM iterations
+FIRST_SD_DB, MIN_SD_DB = 8.0, 6.0  # first and smallest standard deviation of crude predictions
 LOST = 0.02  # probability that a link is blank although its level is above the limit
-FIRST_BELOW_DB = 3.0  # first guess of how far a blank lies below its limit
-MIN_READINGS, MIN_BLANKS = 30, 10  # of a receiver, to have a limit estimated
+FIRST_BELOW_DB = 3.0  # first guess of how far a blank is below its limit
+MIN_READINGS, MIN_BLANKS = 30, 10  # of a receiver, to estimate its limit
 BIN_DB, FINE_DB = 0.5, 0.05  # rounding of predicted levels, and of readings, to save time
 WIDTHS_DB = (0.2, 0.7, 1.5, 3.0)  # of the transition from never to always detected
 WIDTH_SHARES = (0.4, 0.3, 0.2, 0.1)  # prior of these: most transitions are sharp
 LOST_SHARES = (1e-3, 0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)  # of the blanks
-ODD = 1e-3  # probability of an outlier below the limit
-ODD_SHARE = 2e-3  # share of the lowest readings that may be outliers
-STEP_DB, MAX_STEPS = 0.25, 160  # of the limits that are tried
-BELOW_DB, HIGHEST = 8.0, 0.3  # first limit below the lowest reading; quantile of the last one
-SD_SHARE = np.sqrt((DOF - 2) / DOF)  # of the scale of a t distribution in its standard deviation
+OUTLIER = 1e-3  # probability of a reading below the limit
+OUTLIER_SHARE = 2e-3  # share of the lowest readings that may be outliers
+STEP_DB, MAX_STEPS = 0.25, 160  # grid of candidate limits
+BELOW_DB, HIGHEST = 8.0, 0.3  # lowest candidate below the readings; quantile of the highest one
+SD_SHARE = np.sqrt((DOF - 2) / DOF)  # scale of a t distribution over its standard deviation
 MIN_NATS = 5.0  # evidence for a limit, or against a declared one: odds of 150 to 1
-RISE_DB, FALL_DB = 2.0, 1.0  # above and below a declared limit: agrees with it
+RISE_DB, FALL_DB = 2.0, 1.0  # an estimate so far above or below a declared limit agrees with it
 SURE_SDS = 3.0  # standard deviations beyond that interval, to overrule a declared limit
 ROUNDS = 2  # alternate estimates of levels and of limits
-QUANTILE_90 = 1.645  # of the normal distribution
+QUANTILE_90 = 1.645  # half a 90 % interval of a normal distribution, in standard deviations
 MIN_OFF_DB = 0.5  # a declared limit that is off by less is used
 MIN_BELOW, BELOW_SHARE = 3, 0.002  # readings below a declared limit that contradict it
 FAR_DB = 20.0  # a declared limit so far below all readings is ignored
 DIFFER_DB = 3.0  # difference between receivers that a note reports
-DEAF_DB, DEAF_SDS = 6.0, 4.5  # above the usual limit: an insensitive receiver
-MAX_NAMED = 5
+DEAF_DB, DEAF_SDS = 6.0, 4.5  # excess over the usual limit of an insensitive receiver
+MAX_NAMED = 5  # receivers in a note
 
 
 @dataclass(frozen=True, eq=False)
 class CrudeLevel:
-    """Predicted levels (n,) [dB], and the standard deviation of their errors [dB]."""
+    """Crude predictions of n levels.
+
+    Attributes:
+        mean_db: (n,) predicted levels [dB].
+        sd_db: standard deviation of their errors [dB].
+    """
 
     mean_db: np.ndarray
     sd_db: float
@@ -60,17 +65,17 @@ class CrudeLevel:
 
 def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarray,
                 device: np.ndarray, receiver: np.ndarray) -> CrudeLevel:
-    """Predict levels from distance and both ends, with blanks below a limit.
+    """Fit a slope over distance and a level of each device and receiver to censored levels.
 
-    Expectation and maximisation for censored normal levels (Dempster, Laird and Rubin 1977,
-    'Maximum likelihood from incomplete data via the EM algorithm', JRSS B 39, Sec. 4.2).
+    EM for censored normal levels (Dempster, Laird and Rubin 1977, 'Maximum likelihood from
+    incomplete data via the EM algorithm', JRSS B 39, Sec. 4.2).
 
     Args:
         level_db: (n,) readings [dB]; NaN: not detected.
-        limit_db: (n,) below which a link is blank [dB]; -inf where that is unknown.
-        distance_m: (n,) [m]; NaN where unknown.
-        device: (n,) index of one end.
-        receiver: (n,) index of the other.
+        limit_db: (n,) limits of detection [dB]; -inf: unknown.
+        distance_m: (n,) [m]; NaN: unknown.
+        device: (n,) index of each link's device.
+        receiver: (n,) index of each link's receiver.
     """
     blank = np.isnan(level_db)
     limited = blank & np.isfinite(limit_db)
@@ -87,24 +92,25 @@ def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarr
     slope_db, sd_db, variance = SLOPE_DB, FIRST_SD_DB, np.zeros(len(level_db))
     for _ in range(LEVEL_ROUNDS):
         for number, end in enumerate(ends):
-            rest = filled_db - slope_db * distance - end_db[1 - number][ends[1 - number]]
-            rest = rest - rest[counted].mean()
-            sums = np.bincount(end[counted], rest[counted], len(end_db[number]))
+            residual_db = filled_db - slope_db * distance - end_db[1 - number][ends[1 - number]]
+            residual_db = residual_db - residual_db[counted].mean()
+            sums = np.bincount(end[counted], residual_db[counted], len(end_db[number]))
             count = np.bincount(end[counted], minlength=len(end_db[number]))
             end_db[number] = sums / (count + (sd_db / END_SD_DB) ** 2)
-        rest = filled_db - sum(own[end] for own, end in zip(end_db, ends, strict=True))
-        x, y = distance[counted], rest[counted] - rest[counted].mean()
+        residual_db = filled_db - sum(each_db[end] for each_db, end in
+                                      zip(end_db, ends, strict=True))
+        x, y = distance[counted], residual_db[counted] - residual_db[counted].mean()
         x = x - x.mean()
         weight = (sd_db / SLOPE_SD_DB) ** 2
         slope_db = float((x @ y + weight * SLOPE_DB) / (x @ x + weight))
-        rest = rest - slope_db * distance
-        mean_db = rest[counted].mean() + filled_db - rest
+        residual_db = residual_db - slope_db * distance
+        mean_db = residual_db[counted].mean() + filled_db - residual_db
         error = ((filled_db - mean_db) ** 2 + variance)[counted]
         sd_db = max(float(np.sqrt(error.mean())), MIN_SD_DB)
         z = (limit - mean_db) / sd_db
         ratio = np.exp(-0.5 * z * z - 0.5 * np.log(2 * np.pi) - log_ndtr(z))
         below = (1 - LOST) * ndtr(z)
-        below = below / (below + LOST)  # probability that it was too weak, and not lost
+        below = below / (below + LOST)  # probability that a blank was too weak, and not lost
         shift = np.where(limited, below * -ratio, 0.0)
         filled_db = np.where(blank, mean_db + sd_db * shift, level_db)
         variance = np.where(limited, sd_db**2 * np.clip(1 - ratio * (ratio + z), 0, 1), 0.0)
@@ -112,20 +118,20 @@ def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarr
 
 
 def _frequent(label: np.ndarray) -> np.ndarray:
-    """Return labels (n,) renumbered from 1; label 0 for all with fewer than `MIN_LINKS` links."""
+    """Renumber labels (n,) from 1; labels of fewer than `MIN_LINKS` links share the number 0."""
     frequent = np.bincount(label) >= MIN_LINKS
     return np.where(frequent, np.cumsum(frequent), 0)[label]
 
 
 @dataclass(frozen=True)
 class LimitEstimate:
-    """Limit of detection of one receiver.
+    """Estimated limit of detection of one receiver.
 
     Attributes:
-        limit_db: mean of its posterior under a flat prior [dB].
-        sd_db: standard deviation of that [dB].
-        nats: log odds of a limit against links that are lost whatever their level.
-        over_declared_nats: log-likelihood gain over the declared limit; 0 without one.
+        limit_db: posterior mean under a flat prior [dB].
+        sd_db: posterior standard deviation [dB].
+        nats: log odds of a limit against blanks that do not depend on the level.
+        over_declared_nats: log-likelihood ratio to the declared limit; 0 without one.
     """
 
     limit_db: float
@@ -135,7 +141,7 @@ class LimitEstimate:
 
     @property
     def is_sure(self) -> bool:
-        """Whether a limit explains the blanks better than lost links do."""
+        """Whether a limit explains the blanks clearly better than lost links do."""
         return self.nats > MIN_NATS
 
 
@@ -147,38 +153,38 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarr
         level_db: (n,) readings [dB]; NaN: not detected.
         mean_db: (n,) predicted levels [dB].
         scale_db: (n,) scale of their errors, Student-t with `DOF` degrees of freedom [dB].
-        as_one: number of links that count as one, as of `design_effect`.
+        as_one: number of links that count as one, see `design_effect`.
         declared_db: declared limit to compare with [dB]; -inf: none.
     """
     blank = np.isnan(level_db)
     read_db = np.sort(level_db[~blank])
     if len(read_db) < MIN_READINGS or blank.sum() < MIN_BLANKS:
         return None
-    low_db = read_db[int(ODD_SHARE * len(read_db))]
+    low_db = read_db[int(OUTLIER_SHARE * len(read_db))]
     high_db = max(np.quantile(read_db, HIGHEST), low_db + BELOW_DB)
     count = min(int((high_db - low_db + BELOW_DB) / STEP_DB) + 2, MAX_STEPS)
     tried_db = np.append(np.linspace(low_db - BELOW_DB, high_db, count),
                          declared_db if np.isfinite(declared_db) else low_db)
-    nats, none = _nats(tried_db, read_db, mean_db[blank], scale_db[blank], as_one)
+    nats, no_limit_nats = _limit_nats(tried_db, read_db, mean_db[blank], scale_db[blank], as_one)
     nats, declared = nats[:-1], nats[-1]
     weight = np.exp(nats - nats.max())
     weight /= weight.sum()
     limit_db = float(weight @ tried_db[:-1])
     variance = float(weight @ (tried_db[:-1] - limit_db) ** 2) + (tried_db[1] - tried_db[0])**2 / 12
-    lead = float(nats.max() - declared) if np.isfinite(declared_db) else 0.0
-    return LimitEstimate(limit_db, float(np.sqrt(variance)),
-                         float(logsumexp(nats) - np.log(len(nats)) - none), lead)
+    over_declared = float(nats.max() - declared) if np.isfinite(declared_db) else 0.0
+    odds = float(logsumexp(nats) - np.log(len(nats)) - no_limit_nats)
+    return LimitEstimate(limit_db, float(np.sqrt(variance)), odds, over_declared)
 
 
-def _nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray,
-          as_one: float) -> tuple[np.ndarray, float]:
-    """Return the log-likelihood of limits (k,), and that of no limit [nats].
+def _limit_nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray,
+                scale_db: np.ndarray, as_one: float) -> tuple[np.ndarray, float]:
+    """Return the log-likelihood [nats] of candidate limits (k,), and that of no limit.
 
     Args:
-        tried_db: (k,) limits [dB].
+        tried_db: (k,) candidate limits [dB].
         read_db: readings in ascending order [dB].
         mean_db: (m,) predicted levels of the blanks [dB].
-        scale_db: (m,) scale of the errors of these [dB].
+        scale_db: (m,) scale of their errors [dB].
         as_one: number of links that count as one.
     """
     readings, blanks = len(read_db), len(mean_db)
@@ -192,7 +198,7 @@ def _nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray, scale_
     near, times = np.unique(np.round(read_db[read_db < tried_db.max() + 4 * max(WIDTHS_DB)]
                                      / FINE_DB) * FINE_DB, return_counts=True)
     of_readings = np.array([
-        np.log(ODD + (1 - ODD) * ndtr((near - tried_db[:, None]) / width)) @ times
+        np.log(OUTLIER + (1 - OUTLIER) * ndtr((near - tried_db[:, None]) / width)) @ times
         for width in WIDTHS_DB])
     both = (of_readings[:, None] + of_blanks) / as_one
     prior = np.array(WIDTH_SHARES)[:, None, None] / len(lost)
@@ -204,48 +210,48 @@ def estimate_limits(links: Links, declared_db: float | None) -> tuple[np.ndarray
     """Estimate the limit of detection of each receiver, and test a declared one.
 
     Args:
-        links: n links; limits that they have are ignored.
+        links: n links; their present limits are ignored.
         declared_db: limit that the scene declares [dB]; None: it declares none.
 
     Returns:
-        (n,) limit of each link [dB], -inf where neither the readings nor a declared limit give one;
+        (n,) limit of each link [dB], -inf if neither the readings nor a declared limit give one;
         and notes, a sentence each.
     """
     declared = -np.inf if declared_db is None else declared_db
-    apart = _says_nothing(links, declared)
-    if apart is not None:
+    ignored = _reason_to_ignore(links, declared)
+    if ignored is not None:
         declared = -np.inf
     count = np.bincount(links.receiver, minlength=len(links.receiver_names))
     rows = np.split(np.argsort(links.receiver, kind="stable"), np.cumsum(count)[:-1])
-    found, together = _estimates(links, rows, declared)
-    usual_db = _usual_db(links, rows, found, together, declared)
+    found, pooled = _estimates(links, rows, declared)
+    usual_db = _usual_db(links, rows, found, pooled, declared)
     limits_db, lost = np.full(len(rows), -np.inf), []
     for receiver, part in enumerate(rows):
-        each, level_db = found[receiver], links.level_db[part]
+        estimate, level_db = found[receiver], links.level_db[part]
         read_db = level_db[np.isfinite(level_db)]
         trusted = np.isfinite(declared) and not contradict_limit(read_db, declared)
-        if each is not None and each.is_sure:
-            near = abs(each.limit_db - declared) < MIN_OFF_DB  # whatever is odd in it
-            trusted = near or trusted and not _overrules(each, read_db, declared)
-            limits_db[receiver] = declared if trusted else each.limit_db
+        if estimate is not None and estimate.is_sure:
+            near = abs(estimate.limit_db - declared) < MIN_OFF_DB  # despite outliers below it
+            trusted = near or trusted and not _overrules(estimate, read_db, declared)
+            limits_db[receiver] = declared if trusted else estimate.limit_db
         elif len(read_db) == len(level_db):
             limits_db[receiver] = declared if trusted and usual_db == declared else -np.inf
         elif usual_db is not None and not contradict_limit(read_db, usual_db - RISE_DB):
-            limits_db[receiver] = usual_db  # its blanks do not determine one
+            limits_db[receiver] = usual_db  # too few blanks for an estimate
         else:
             lost.append(receiver)
     notes = _notes(links, rows, limits_db, found, declared, lost)
-    if apart is not None:
+    if ignored is not None:
         used = _used_instead(links, limits_db, found, list(range(len(rows))))
-        notes.insert(0, f"{apart}. {used}")
+        notes.insert(0, f"{ignored}. {used}")
     return limits_db[links.receiver], notes
 
 
-def _says_nothing(links: Links, declared_db: float) -> str | None:
+def _reason_to_ignore(links: Links, declared_db: float) -> str | None:
     """Return why a declared limit is ignored, a sentence; None if it may be right.
 
-    Received levels vary continuously: where some links are too weak, others are just strong enough.
-    A limit far below all readings means "not known"; no blank could lie below it.
+    Received levels vary continuously: if some links are too weak, others are just strong enough. A
+    limit far below all readings is a placeholder.
     """
     readings, lowest_db = int(np.isfinite(links.level_db).sum()), _lowest_db(links.level_db)
     blanks = len(links) - readings
@@ -253,42 +259,42 @@ def _says_nothing(links: Links, declared_db: float) -> str | None:
         return None
     if lowest_db - declared_db < FAR_DB:
         return None
-    return (f"{_declared(links, declared_db)} is not used: but for odd ones, the weakest of "
+    return (f"{_declared_text(links, declared_db)} is not used: but for odd ones, the weakest of "
             f"{readings:,} readings is {lowest_db:g} {links.level_unit}, far above it, though "
             f"{blanks:,} links are blank")
 
 
-def _declared(links: Links, declared_db: float) -> str:
-    """Return the text of a declared limit: its value, and where it is declared."""
+def _declared_text(links: Links, declared_db: float) -> str:
+    """Return words for a declared limit: its value, and where it is declared."""
     of = "sensitivity_dbm less tx_power_dbm" if links.is_gain else "sensitivity_dbm"
     return (f"the declared limit of detection, {declared_db:g} {links.level_unit} ({of} of "
             "scene.toml; the default, if nobody set it),")
 
 
 def _usual_db(links: Links, rows: list[np.ndarray], found: list[LimitEstimate | None],
-              together: LimitEstimate | None, declared_db: float) -> float | None:
-    """Return the limit of receivers whose links do not determine it [dB]; None if unknown.
+              pooled: LimitEstimate | None, declared_db: float) -> float | None:
+    """Return the limit [dB] for receivers without an estimate of their own; None if unknown.
 
-    It is the declared limit, unless most other receivers, or all links together, overrule it. If
-    none is declared: the median of the other receivers, else the estimate from all links, else the
-    lowest reading.
+    It is the declared limit, unless most estimates, or that from all links, overrule it. If none is
+    declared it is the median of the receivers with an estimate, else the estimate from all links,
+    else the lowest reading.
     """
     sure = [(each, part) for each, part in zip(found, rows, strict=True) if each and each.is_sure]
     if np.isfinite(declared_db):
-        asked = sure or ([(together, np.arange(len(links)))] if together else [])
+        estimates = sure or ([(pooled, np.arange(len(links)))] if pooled else [])
         against = sum(_overrules(each, np.sort(links.level_db[part]), declared_db)
-                      for each, part in asked)
-        if 2 * against <= len(asked):
+                      for each, part in estimates)
+        if 2 * against <= len(estimates):
             return declared_db
     if sure:
-        return lower_median([each.limit_db for each, _ in sure])
-    if together is None:
+        return float(np.quantile([each.limit_db for each, _ in sure], 0.5, method="lower"))
+    if pooled is None:
         return float(np.nanmin(links.level_db))
-    return together.limit_db if together.is_sure else None
+    return pooled.limit_db if pooled.is_sure else None
 
 
 def contradict_limit(read_db: np.ndarray, limit_db: float) -> bool:
-    """Return whether more readings (n,) [dB] lie below a limit than outliers would."""
+    """Return whether more readings (n,) [dB] are below a limit than outliers explain."""
     below = np.count_nonzero(read_db < limit_db - FALL_DB)
     return bool(below >= max(MIN_BELOW, BELOW_SHARE * len(read_db)))
 
@@ -296,7 +302,7 @@ def contradict_limit(read_db: np.ndarray, limit_db: float) -> bool:
 def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) -> bool:
     """Return whether an estimate from readings (n,) [dB] overrules the declared limit.
 
-    It does not if the receiver reads levels down to the declared limit, however few.
+    It does not if a few readings reach down to the declared limit.
     """
     rise_db = found.limit_db - declared_db
     off_db = max(rise_db - RISE_DB, -rise_db - FALL_DB)
@@ -307,7 +313,7 @@ def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) ->
 
 def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
                ) -> tuple[list[LimitEstimate | None], LimitEstimate | None]:
-    """Return the estimate for each receiver, and that from all links together."""
+    """Return the estimate for each receiver, and that from all links."""
     blank = np.isnan(links.level_db)
     if not blank.any():
         return [None] * len(rows), None
@@ -319,7 +325,7 @@ def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
                             links.device, links.receiver)
         z = np.where(blank, 0.0, (links.level_db - crude.mean_db) / crude.sd_db)
         as_one, scale_db = design_effect(block, z), np.full(len(links), SD_SHARE * crude.sd_db)
-        *found, together = [
+        *found, pooled = [
             receiver_limit(links.level_db[part], crude.mean_db[part], scale_db[part], as_one,
                            declared_db) for part in (*rows, np.arange(len(links)))]
         before_db, limits_db = limits_db, np.array([
@@ -327,18 +333,18 @@ def _estimates(links: Links, rows: list[np.ndarray], declared_db: float,
             for each, limit_db in zip(found, limits_db, strict=True)])
         if np.abs(limits_db - before_db).max() < STEP_DB:
             break
-    return found, together
+    return found, pooled
 
 
 def _lowest_db(level_db: np.ndarray) -> float:
-    """Return the lowest of levels (n,) [dB] above the share of outliers; inf without a reading."""
+    """Return the lowest level [dB] that is no outlier, of levels (n,); inf without a reading."""
     read_db = np.sort(level_db[np.isfinite(level_db)])
-    return float(read_db[int(ODD_SHARE * len(read_db))]) if len(read_db) else np.inf
+    return float(read_db[int(OUTLIER_SHARE * len(read_db))]) if len(read_db) else np.inf
 
 
 def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
            found: list[LimitEstimate | None], declared_db: float, lost: list[int]) -> list[str]:
-    """Return notes on the limits of receivers (r,), a sentence each."""
+    """Note limits that differ from the declared one or between receivers, and lost links."""
     unit, notes = links.level_unit, []
     other = [r for r, limit_db in enumerate(limits_db)
              if np.isfinite(declared_db) and limit_db != declared_db]
@@ -351,7 +357,7 @@ def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
         if below:
             lie = (f"{below:,} of {len(read_db):,} readings ({percent(below / len(read_db))}) lie "
                    f"below it, down to {read_db.min():g}")
-        notes.append(f"{_declared(links, declared_db)} is not that of the readings: {lie}. "
+        notes.append(f"{_declared_text(links, declared_db)} is not that of the readings: {lie}. "
                      f"{_used_instead(links, limits_db, found, other)}")
     elif len(known_db) and np.ptp(known_db) > DIFFER_DB:
         low, high = (links.receiver_names[int(np.flatnonzero(limits_db == end)[0])]
@@ -370,44 +376,37 @@ def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
 
 def _used_instead(links: Links, limits_db: np.ndarray, found: list[LimitEstimate | None],
                   receivers: list[int]) -> str:
-    used = "; ".join(_used(links.receiver_names[r], limits_db[r], found[r], links.level_unit)
+    """Return a sentence with the limits of the first receivers that replace a declared one."""
+    used = "; ".join(_limit_text(links.receiver_names[r], limits_db[r], found[r], links.level_unit)
                      for r in receivers[:MAX_NAMED])
     more = len(receivers) - MAX_NAMED
     return f"Used instead: {used}" + f" and {more:,} more" * (more > 0)
 
 
-def _used(name: str, limit_db: float, found: LimitEstimate | None, unit: str) -> str:
+def _limit_text(name: str, limit_db: float, found: LimitEstimate | None, unit: str) -> str:
+    """Return words for a receiver's limit, with half its 90 % interval if it was estimated."""
     if np.isinf(limit_db):
         return f"none for {name}, as no blank shows one"
-    own = found is not None and limit_db == found.limit_db
-    how = f" ± {QUANTILE_90 * found.sd_db:.1f}" if found is not None and own else ""
+    estimated = found is not None and limit_db == found.limit_db
+    how = f" ± {QUANTILE_90 * found.sd_db:.1f}" if found is not None and estimated else ""
     return f"{limit_db:.1f}{how} {unit} for {name}"
 
 
-def lower_median(values: np.ndarray | list[float]) -> float:
-    """Return the median; the lower of the two middle values if their number is even."""
-    return float(np.sort(values)[(len(values) - 1) // 2])
-
-
 def limits_to_explain(links: Links) -> Links:
-    """Return links with the limits of receivers without a fault, so that effects explain blanks.
+    """Replace the limits of faulty receivers by the usual one, so that effects explain blanks.
 
-    A receiver that is clearly less sensitive than most gets the usual limit. One whose links are
-    blank at any level gets at most the usual limit, or the lowest reading of all.
+    A faulty receiver is clearly less sensitive than most, or is blank at any level. If no limit is
+    known, the lowest reading is used for all.
     """
     usual_db = links.usual_limit_db
-    known = np.isfinite(links.limit_db)
-    limit_db = links.limit_db.copy()
     if usual_db is None:
-        blank = np.isnan(links.level_db)
-        if blank.any():
-            limit_db[:] = np.nanmin(links.level_db)
-        return links.with_columns(limit_db=limit_db)
-    limits_db = links.receiver_limits_db
-    off_db = limits_db - usual_db
-    finite = np.isfinite(limits_db)
-    scatter_db = 1.48 * lower_median(np.abs(off_db[finite]))
+        if not np.isnan(links.level_db).any():
+            return links
+        lowest_db = np.full(len(links), np.nanmin(links.level_db))
+        return links.with_columns(limit_db=lowest_db)
+    off_db = links.receiver_limits_db - usual_db
+    scatter_db = 1.48 * np.quantile(np.abs(off_db[np.isfinite(off_db)]), 0.5, method="lower")
     deaf = off_db > max(DEAF_DB, DEAF_SDS * scatter_db)
     shift_db = np.where(deaf, off_db, 0.0)[links.receiver]
-    limit_db = np.where(known, limit_db - shift_db, usual_db)
-    return links.with_columns(limit_db=limit_db)
+    return links.with_columns(limit_db=np.where(
+        np.isfinite(links.limit_db), links.limit_db - shift_db, usual_db))

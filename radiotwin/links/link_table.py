@@ -1,4 +1,4 @@
-"""The table of links: its columns, checked, of a file or of a data frame in memory."""
+"""Read and check the table of links, from a file or a data frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import median_origin
 from radiotwin.io.cells import as_numbers, listed, read_cells, refuse
 from radiotwin.io.forms import Origin, name_fault
-from radiotwin.links.cell_limits import LEVELS, refuse_limits
+from radiotwin.links.plausible import LEVELS, refuse_implausible
 from radiotwin.links.site_table import SiteTable, read_site_table
 
 NAMES = ("flight", "receiver", "device")
@@ -28,16 +28,12 @@ FRAME = "the data frame"  # in messages
 
 
 def read_links(path: Path) -> pd.DataFrame:
-    """Read a table of links.
-
-    Raises:
-        BadInput: names file, row and column of the first value that cannot be used.
-    """
+    """Read `measurements.csv`; BadInput names file, row and column of the first bad value."""
     return _checked(path, read_cells(path, REQUIRED, OPTIONAL + LEVELS), refuse)
 
 
 def is_table_of_links(frame: pd.DataFrame) -> bool:
-    """Return whether a data frame has all columns of a table of links, in their types."""
+    """Return whether a data frame has all columns of `measurements.csv`, in their types."""
     return set(REQUIRED) <= set(frame) and all(
         (name in NAMES) != (frame[name].dtype.kind in "fiu")
         for name in frame if name in {*REQUIRED, *OPTIONAL, *LEVELS})
@@ -45,23 +41,22 @@ def is_table_of_links(frame: pd.DataFrame) -> bool:
 
 def links_of_frame(frame: pd.DataFrame, origin: Origin | None
                    ) -> tuple[pd.DataFrame, Origin | None, tuple[str, ...]]:
-    """Return the table of links of a data frame of another layout.
+    """Convert a data frame of another layout to a table of links.
 
-    Positions of receivers have any of the names that tables of sites may have, such as `lat` and
-    `lon`. Without columns of them, all links are of one flight and one receiver.
+    Receiver positions may be in any columns that a table of sites may have, such as `lat` and
+    `lon`. Without a column `flight` or `receiver`, all links are of one.
 
     Args:
-        frame: with a level, a device and a position in each row.
-        origin: of the frame of x and y; None: that is not known, and the middle of latitudes and
+        frame: with a level, a device and a receiver position in each row.
+        origin: of the local frame of x and y; None: unknown, and the middle of latitudes and
             longitudes becomes the origin.
 
     Returns:
-        the table, with the other columns as they are; its origin; and notes on columns that were
-        not used.
+        the table, with other columns unchanged; its origin; and notes on columns that were not
+        used.
 
     Raises:
-        BadInput: says which column is missing, or names row and column of the first value that
-            cannot be used.
+        BadInput: a column is missing, or a value cannot be used (with row and column).
     """
     table, notes = frame.reset_index(drop=True), tuple[str, ...]()
     require_level(FRAME, table)
@@ -88,11 +83,7 @@ def links_of_frame(frame: pd.DataFrame, origin: Origin | None
 
 
 def receivers_of_frame(frame: pd.DataFrame) -> SiteTable:
-    """Read the positions of the receivers in a data frame, by the names of tables of sites.
-
-    Raises:
-        BadInput: as of `read_site_table`.
-    """
+    """Read receiver positions from a data frame; BadInput: see `read_site_table`."""
     taken = {*NAMES, *OPTIONAL, *LEVELS} - {ABOVE_GROUND}
     others = [name for name in frame if name not in taken and not str(name).startswith("device")]
     if len(frame) and not others:
@@ -103,11 +94,7 @@ def receivers_of_frame(frame: pd.DataFrame) -> SiteTable:
 
 
 def require_level(source: object, table: pd.DataFrame) -> None:
-    """Check that a table has one column of levels.
-
-    Raises:
-        BadInput: it has none, or both.
-    """
+    """Raise BadInput unless a table has exactly one of the columns `LEVELS`."""
     levels = [name for name in LEVELS if name in table]
     if len(levels) != 1:
         rename = f"; rename the one that holds levels (it has {listed(table)}): gains in dB, or " \
@@ -117,26 +104,26 @@ def require_level(source: object, table: pd.DataFrame) -> None:
 
 
 def _checked(source: Path | str, table: pd.DataFrame, refuse: Callable[..., None]) -> pd.DataFrame:
-    """Return the columns of a table, names as texts and all others as numbers, NaN where empty."""
+    """Convert the columns of a table in place: names to texts, others to numbers (NaN: empty)."""
     for name in table.columns:
         cells = table[name]
         if name in NAMES:
             table[name] = _names(source, name, cells, refuse)
         else:
             table[name] = _numbers(source, name, cells, name in MAY_BE_EMPTY, refuse)
-            refuse_limits(partial(refuse, source, name, cells), name, table[name].to_numpy())
+            refuse_implausible(partial(refuse, source, name, cells), name, table[name].to_numpy())
     return table
 
 
 def _names(path: Path | str, name: str, column: pd.Series,
            refuse: Callable[..., None]) -> pd.Series:
-    """Return the names in a column without spaces around them."""
+    """Convert a column of names to stripped texts; BadInput on one that cannot be a name."""
     try:
         codes, known = pd.factorize(column)
     except TypeError:
         raise BadInput(f"{path}: column {name} holds lists or records; it needs one name in each "
                        "row") from None
-    # A column of whole numbers of which some are missing is one of floating ones
+    # pandas reads a column of whole numbers with missing ones as floats.
     texts = [str(int(each) if isinstance(each, float) and each.is_integer() else each).strip()
              for each in known.tolist()]
     names = pd.Series(np.array([*texts, ""], dtype=object)[codes], column.index, dtype=str)
@@ -148,7 +135,7 @@ def _names(path: Path | str, name: str, column: pd.Series,
 
 def _numbers(path: Path | str, name: str, column: pd.Series, may_be_empty: bool,
              refuse: Callable[..., None]) -> pd.Series:
-    """Convert the cells of a column, NaN where empty."""
+    """Convert a column to finite numbers, NaN where empty; BadInput on any other cell."""
     needed = "every row needs one: fill it in, or leave the row out"
     if column.dtype.kind in "fiu":
         numbers, empty = column.astype(float), column.isna()

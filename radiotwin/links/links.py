@@ -1,7 +1,7 @@
-"""Measured links as arrays: what was read, both ends, map and radio; and their predicted levels.
+"""Links as arrays: readings, both ends, map and radio; and the levels predicted for them.
 
-`LinkGeometry` is the part that a channel model may see. Whether the times of different flights can
-be compared is told from the tracks of their receivers.
+`LinkGeometry` is the part that a channel model sees. Clocks that restart in each flight are found
+by comparing the tracks of receivers.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from radiotwin.scene.citymap import CityMap
 
 Value = TypeVar("Value")
 Tracks = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
-"""(receiver, flight) -> times (t,) in order [s] and positions (t, 3) then [m]."""
-ELSEWHERE_M = 20.0  # a receiver is not at two places so far apart at one time
-MIN_ELSEWHERE = 0.5  # share of the common times of two flights
-SAME_START_S = 1.0  # flights that all begin within it begin when their clock does
-MIN_FLIGHT_S = 10.0  # shorter ones may begin together by chance
-MAX_FLIGHTS = 40  # of a receiver, of which neighbours are compared
+"""(receiver, flight) -> sorted times (t,) [s], and positions (t, 3) [m] at these times."""
+ELSEWHERE_M = 20.0  # positions of a receiver that are farther apart are two places
+MIN_ELSEWHERE = 0.5  # share of the common times at which a receiver would be at two places
+SAME_START_S = 1.0  # flights that start so close together started their clock anew
+MIN_FLIGHT_S = 10.0  # shorter flights may start together by chance
+MAX_FLIGHTS = 40  # of a receiver; later ones are not compared
 RESTART_NOTE = ("time_s begins anew in each flight (flights of one receiver overlap): only times "
                 "within a flight are compared, and no change from flight to flight is looked for")
-REFERENCE_DISTANCE_M = 1.0  # of the log-distance law; shorter links count as this long
-ROOF_SAMPLES = 60  # points along a link at which the roofs below it are looked up
-ROOF_CHUNK = 5000  # links a time: bounds the memory of that to 10 MB
+REFERENCE_DISTANCE_M = 1.0  # of the log-distance law; the smallest distance of a link
+ROOF_SAMPLES = 60  # points along a link at which the roof height is looked up
+ROOF_CHUNK = 5000  # links per batch; bounds the memory of these points to 10 MB
 
 
 def clocks_restart(tracks: Tracks) -> bool:
-    """Return whether some receiver's clock begins anew in each flight.
+    """Return whether a receiver's clock restarts in each flight.
 
-    Then two of its flights begin at one time, or it would be at two places at once.
+    Then its flights start at one time, or two of them put it at two places at once.
     """
     by_receiver: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     for (receiver, _), track in tracks.items():
@@ -47,7 +47,7 @@ def clocks_restart(tracks: Tracks) -> bool:
 
 
 def _restarts(flights: list[tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Return whether flights of one receiver, by their start, are of a clock that begins anew."""
+    """Return whether the clock restarts between the flights of one receiver, sorted by start."""
     starts_s = np.array([time_s[0] for time_s, _ in flights])
     lengths_s = np.array([time_s[-1] - time_s[0] for time_s, _ in flights])
     if np.ptp(starts_s) <= SAME_START_S and (lengths_s > MIN_FLIGHT_S).all():
@@ -57,29 +57,30 @@ def _restarts(flights: list[tuple[np.ndarray, np.ndarray]]) -> bool:
 
 def _at_two_places(one: tuple[np.ndarray, np.ndarray],
                    other: tuple[np.ndarray, np.ndarray]) -> bool:
+    """Return whether two tracks of one receiver overlap in time and are at different places."""
     (time_s, position_m), (other_s, other_m) = one, other
-    both = (time_s >= other_s[0]) & (time_s <= other_s[-1])
-    if both.sum() < 2:
+    common = (time_s >= other_s[0]) & (time_s <= other_s[-1])
+    if common.sum() < 2:
         return False
-    there_m = np.column_stack([np.interp(time_s[both], other_s, axis_m) for axis_m in other_m.T])
-    apart_m = np.linalg.norm(position_m[both] - there_m, axis=1)
+    other_m = np.column_stack([np.interp(time_s[common], other_s, axis_m) for axis_m in other_m.T])
+    apart_m = np.linalg.norm(position_m[common] - other_m, axis=1)
     return bool((apart_m > ELSEWHERE_M).mean() > MIN_ELSEWHERE)
 
 
 @dataclass(frozen=True, eq=False)
 class LinkGeometry:
-    """n links between a device and a receiver: all that a channel model may depend on.
+    """Both ends of n links: everything that a channel model may depend on.
 
-    It is asked for links that nobody measured, too: from candidates for the position of a device,
-    or from the other end. So it takes both ends of each link rather than `Links`.
+    Models also predict links that nobody measured, such as those of candidate device positions, so
+    they take this view in place of `Links`.
 
     Attributes:
         device_m: (n, 3) position of each link's device [m].
         receiver_m: (n, 3) position of each link's receiver [m].
         los: (n,) bool, line of sight.
-        device: (n,) int, identity of the device for models that keep something per device.
+        device: (n,) index of each link's device, for models with parameters of each device.
         city: 3D map that `los` was taken from; None without one.
-        frequency_hz: of the radio [Hz]; NaN where it is unknown.
+        frequency_hz: of the radio [Hz]; NaN: unknown.
         estimated: (n,) bool, whether the device's position is an estimate; None: all are declared.
     """
 
@@ -128,20 +129,17 @@ class LinkGeometry:
 
 def link_geometry(device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray,
                   city: CityMap | None, frequency_hz: float = np.nan) -> LinkGeometry:
-    """Return links between listed devices and receivers, with line of sight from the map.
+    """Make links between listed devices and receivers, with line of sight from the map.
 
     Args:
         device_m: (k, 3) positions of all devices [m].
         receiver_m: (n, 3) positions of the receivers [m].
         device: (n,) row of each link's device in `device_m`.
         city: 3D map; without one every link has line of sight.
-        frequency_hz: of the radio [Hz]; NaN where it is unknown.
-
-    Returns:
-        n links.
+        frequency_hz: of the radio [Hz]; NaN: unknown.
 
     Raises:
-        BadInput: a position that is used is not finite, or `device` points outside `device_m`.
+        BadInput: the position of an end is not finite, or `device` points outside `device_m`.
     """
     device_m, receiver_m = np.asarray(device_m, float), np.asarray(receiver_m, float)
     device = np.asarray(device, np.int64)
@@ -167,22 +165,24 @@ def link_geometry(device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarr
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Columns:
-    """What was measured of each of n links.
+    """Measured values of n links.
 
     Attributes:
         level_db: (n,) measured gain [dB] or power [dBm]; NaN = not detected.
-        limit_db: (n,) level below which the link's receiver does not detect [dB]; -inf where it is
-            unknown, and a blank says nothing of the level.
+        limit_db: (n,) limit of detection of the link's receiver [dB]; -inf: unknown, and a blank
+            does not bound the level.
         receiver_m: (n, 3) positions of the receivers [m].
-        device, receiver, flight: (n,) index into the names of the ends.
-        time_s: (n,) NaN where unknown.
-        heading_deg: (n,) clockwise from north; NaN where unknown.
-        pitch_deg, roll_deg: (n,) nose up, and right side down, are positive; None if unknown.
-        quality: (n,) as the receiver reports it; None if it does not.
-        known_los: (n,) bool, line of sight where it is known already; None: from the map.
-        time_in_flight_s: (n,) since the first measurement of the track [s]; None: from these links.
+        device, receiver, flight: (n,) index into the names in `Ends`.
+        time_s: (n,) time [s]; NaN: unknown.
+        heading_deg: (n,) clockwise from north [deg]; NaN: unknown.
+        pitch_deg, roll_deg: (n,) positive with the nose up, and right side down [deg]; None:
+            unknown.
+        quality: (n,) as the receiver reports it; None: not reported.
+        known_los: (n,) bool, line of sight; None: it is looked up in the map.
+        time_in_flight_s: (n,) since the first measurement of the track [s]; None: it is computed
+            from these links.
         evidence: (n, 2) piece of evidence and place of each link, see
-            `radiotwin.links.with_evidence`; None before a residual has been looked at.
+            `radiotwin.links.with_evidence`; None before that.
     """
 
     level_db: np.ndarray
@@ -212,12 +212,12 @@ class Columns:
     @classmethod
     def unmeasured(cls, receiver_m: np.ndarray, device: np.ndarray,
                    limit_db: float | None = None) -> Columns:
-        """Return n links that nobody measured: receiver, flight, time and heading are unset.
+        """Make n links for a prediction, without receiver, flight, time and heading.
 
         Args:
             receiver_m: (n, 3) positions of the receivers [m].
             device: (n,) index of each link's device.
-            limit_db: level below which receivers do not detect [dB]; None where it is unknown.
+            limit_db: limit of detection of all receivers [dB]; None: unknown.
         """
         n = len(receiver_m)
         unset, unknown = np.full(n, -1), np.full(n, np.nan)
@@ -227,7 +227,7 @@ class Columns:
 
     @cached_property
     def track(self) -> np.ndarray:
-        """(n,) index of the flight of a receiver that a link was measured on."""
+        """(n,) index of the track, one receiver on one flight, that a link was measured on."""
         key = self.flight * (self.receiver.max() + 1) + self.receiver
         return np.unique(key, return_inverse=True)[1]
 
@@ -240,13 +240,13 @@ class Columns:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Flown:
-    """When and where receivers measured, in all the data: it stays when links are selected.
+    """Tracks of the receivers in all the data; a selection of links keeps them whole.
 
     Attributes:
         first_s, last_s: time of the first and the last measurement [s]; NaN without times.
-        tracks: where each receiver was in each flight; only links with a time count.
-        time_restarts: whether clocks begin anew in each flight, so that `time_s` orders readings
-            within a flight only.
+        tracks: times and positions of each receiver on each flight, from links with a time.
+        time_restarts: whether clocks restart in each flight, so that times of different flights
+            cannot be compared.
     """
 
     first_s: float = np.nan
@@ -256,7 +256,7 @@ class Flown:
 
     @classmethod
     def of(cls, columns: Columns) -> Flown:
-        """Return the tracks of links."""
+        """Collect the tracks from measured links."""
         timed = np.flatnonzero(np.isfinite(columns.time_s))
         if not len(timed):
             return cls()
@@ -275,18 +275,18 @@ class Flown:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Ends:
-    """The devices, receivers and flights that links have by their index.
+    """The k devices, and the receivers and flights, that links refer to by index.
 
     Attributes:
         device_names, receiver_names, flight_names: the names.
-        device_m: (k, 3) positions of the devices as far as they are known [m]; NaN where not.
+        device_m: (k, 3) positions of the devices [m]; NaN: unknown.
         anchors: indices of the devices whose positions are declared.
         boresight_deg: (k,) declared azimuth of each device's antenna, clockwise from north [deg];
-            NaN where none is, and where None is given.
+            NaN: not declared. None sets all to NaN.
         tilt_deg: (k,) declared tilt of each device's antenna, upwards [deg]; likewise.
-        declared: what is declared of the devices' powers, cables, antennas and carriers.
-        reads: (k,) bool, devices at which levels are read, as by a gateway; None: none.
-        flown: when and where receivers measured.
+        declared: the devices' powers, cables, antennas and carriers.
+        reads: (k,) bool, devices at which levels are read, such as gateways; None: none.
+        flown: tracks of the receivers.
     """
 
     device_names: list[str]
@@ -308,10 +308,10 @@ class Ends:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class World:
-    """What all links share.
+    """The map and the radio of all links.
 
     Attributes:
-        frequency_hz: of the radio [Hz]; NaN where unknown.
+        frequency_hz: of the radio [Hz]; NaN: unknown.
         city: 3D map; None without a scene.
         is_gain: whether the level is a gain rather than a power.
     """
@@ -321,8 +321,8 @@ class World:
     is_gain: bool
 
 
-class _Of(Generic[Value]):
-    """An attribute of a part of links, under its name there."""
+class _FromPart(Generic[Value]):
+    """Descriptor: an attribute of one part of `Links`, such as `columns`, under the same name."""
 
     def __init__(self, part: str) -> None:
         self._part = part
@@ -336,15 +336,15 @@ class _Of(Generic[Value]):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Links:
-    """n links, as arrays; made by `radiotwin.links.prepare_links` from measurements.
+    """n links as arrays; made by `radiotwin.links.prepare_links` from measurements.
 
-    What the parts hold is read under the same name here: `links.level_db`, `links.device_m`.
+    Attributes of the parts are also attributes of the links: `links.level_db`, `links.device_m`.
 
     Attributes:
-        columns: what was measured of each link.
+        columns: measured values of each link.
         ends: the devices, receivers and flights.
         world: the 3D map and the radio.
-        notes: what the data's checks found and did about it, a sentence each.
+        notes: findings of the data checks, a sentence each.
     """
 
     columns: Columns
@@ -352,66 +352,69 @@ class Links:
     world: World
     notes: tuple[str, ...] = ()
 
-    level_db = _Of[np.ndarray]("columns")
-    limit_db = _Of[np.ndarray]("columns")
-    receiver_m = _Of[np.ndarray]("columns")
-    device = _Of[np.ndarray]("columns")
-    receiver = _Of[np.ndarray]("columns")
-    flight = _Of[np.ndarray]("columns")
-    time_s = _Of[np.ndarray]("columns")
-    heading_deg = _Of[np.ndarray]("columns")
-    pitch_deg = _Of[np.ndarray | None]("columns")
-    roll_deg = _Of[np.ndarray | None]("columns")
-    quality = _Of[np.ndarray | None]("columns")
-    known_los = _Of[np.ndarray | None]("columns")
-    time_in_flight_s = _Of[np.ndarray]("columns")
-    evidence = _Of[np.ndarray | None]("columns")
-    track = _Of[np.ndarray]("columns")
-    device_names = _Of[list[str]]("ends")
-    receiver_names = _Of[list[str]]("ends")
-    flight_names = _Of[list[str]]("ends")
-    device_m = _Of[np.ndarray]("ends")
-    anchors = _Of[frozenset[int]]("ends")
-    boresight_deg = _Of[np.ndarray]("ends")
-    tilt_deg = _Of[np.ndarray]("ends")
-    declared = _Of[Declared]("ends")
-    reads = _Of[np.ndarray | None]("ends")
-    first_s = _Of[float]("ends.flown")
-    last_s = _Of[float]("ends.flown")
-    tracks = _Of[Tracks]("ends.flown")
-    time_restarts = _Of[bool]("ends.flown")
-    frequency_hz = _Of[float]("world")
-    city = _Of[CityMap | None]("world")
-    is_gain = _Of[bool]("world")
+    level_db = _FromPart[np.ndarray]("columns")
+    limit_db = _FromPart[np.ndarray]("columns")
+    receiver_m = _FromPart[np.ndarray]("columns")
+    device = _FromPart[np.ndarray]("columns")
+    receiver = _FromPart[np.ndarray]("columns")
+    flight = _FromPart[np.ndarray]("columns")
+    time_s = _FromPart[np.ndarray]("columns")
+    heading_deg = _FromPart[np.ndarray]("columns")
+    pitch_deg = _FromPart[np.ndarray | None]("columns")
+    roll_deg = _FromPart[np.ndarray | None]("columns")
+    quality = _FromPart[np.ndarray | None]("columns")
+    known_los = _FromPart[np.ndarray | None]("columns")
+    time_in_flight_s = _FromPart[np.ndarray]("columns")
+    evidence = _FromPart[np.ndarray | None]("columns")
+    track = _FromPart[np.ndarray]("columns")
+    device_names = _FromPart[list[str]]("ends")
+    receiver_names = _FromPart[list[str]]("ends")
+    flight_names = _FromPart[list[str]]("ends")
+    device_m = _FromPart[np.ndarray]("ends")
+    anchors = _FromPart[frozenset[int]]("ends")
+    boresight_deg = _FromPart[np.ndarray]("ends")
+    tilt_deg = _FromPart[np.ndarray]("ends")
+    declared = _FromPart[Declared]("ends")
+    reads = _FromPart[np.ndarray | None]("ends")
+    first_s = _FromPart[float]("ends.flown")
+    last_s = _FromPart[float]("ends.flown")
+    tracks = _FromPart[Tracks]("ends.flown")
+    time_restarts = _FromPart[bool]("ends.flown")
+    frequency_hz = _FromPart[float]("world")
+    city = _FromPart[CityMap | None]("world")
+    is_gain = _FromPart[bool]("world")
 
     def __len__(self) -> int:
         return len(self.level_db)
 
     @cached_property
     def geometry(self) -> LinkGeometry:
-        """The links as channel models see them."""
+        """Both ends of the links, as channel models take them."""
         estimated = ~np.isin(self.device, sorted(self.anchors))
         return LinkGeometry(self.device_m[self.device], self.receiver_m, self.los, self.device,
                             self.city, self.frequency_hz, estimated)
 
     @cached_property
     def declared_db(self) -> np.ndarray | float:
-        """What is declared of the devices, in the levels (n,) [dB], see `Declared.added_db`."""
+        """(n,) declared power, cable, antenna and carrier in the levels [dB]; or the number 0.
+
+        See `Declared.added_db`.
+        """
         return self.declared.added_db(self.device, self.offset_m)
 
     def gains(self, declared_db: np.ndarray | float | None = None
               ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
-        """Return what a channel learns from: the links, their gains and limits of these (n,) [dB].
+        """Return the input of channel learning: ends, isotropic gains and their limits (n,) [dB].
 
         Args:
-            declared_db: (n,) what of the levels is declared [dB]; None: `declared_db`.
+            declared_db: (n,) declared part that is subtracted [dB]; None: `Links.declared_db`.
         """
-        taken_db = self.declared_db if declared_db is None else declared_db
-        return self.geometry, self.level_db - taken_db, self.limit_db - taken_db
+        part_db = self.declared_db if declared_db is None else declared_db
+        return self.geometry, self.level_db - part_db, self.limit_db - part_db
 
     @cached_property
     def receiver_limits_db(self) -> np.ndarray:
-        """(r,) limit of detection of each receiver [dB], the median over its links; else -inf."""
+        """(r,) limit of detection of each receiver, median over its links [dB]; -inf: unknown."""
         limits_db = pd.Series(self.limit_db).groupby(self.receiver).median()
         return limits_db.reindex(range(len(self.receiver_names)), fill_value=-np.inf).to_numpy()
 
@@ -422,14 +425,14 @@ class Links:
 
     @property
     def has_gains(self) -> bool:
-        """Whether gains between antennas are known: levels are, or the devices' powers are."""
+        """Whether channel gains are known: levels are gains, or the devices' powers are known."""
         return self.is_gain or self.declared.knows_powers
 
     @property
     def usual_limit_db(self) -> float | None:
-        """The limit of detection of most receivers [dB]: the median; None where none is known."""
-        known_db = np.sort(self.receiver_limits_db[np.isfinite(self.receiver_limits_db)])
-        return float(known_db[(len(known_db) - 1) // 2]) if len(known_db) else None
+        """Median limit of detection of the receivers [dB]; None if none is known."""
+        known_db = self.receiver_limits_db[np.isfinite(self.receiver_limits_db)]
+        return float(np.quantile(known_db, 0.5, method="lower")) if len(known_db) else None
 
     @property
     def has_boresights(self) -> bool:
@@ -443,7 +446,7 @@ class Links:
 
     @cached_property
     def distance_m(self) -> np.ndarray:
-        """(n,) at least `REFERENCE_DISTANCE_M` [m]."""
+        """(n,) distance between the ends [m], at least `REFERENCE_DISTANCE_M`."""
         return np.maximum(np.linalg.norm(self.offset_m, axis=1), REFERENCE_DISTANCE_M)
 
     @cached_property
@@ -493,7 +496,7 @@ class Links:
 
     @cached_property
     def diffraction_parameter(self) -> np.ndarray:
-        """(n,) the greatest ν (ITU-R P.526-15, Eq. 26) over the roofs; NaN without a map."""
+        """(n,) largest ν over the roofs (ITU-R P.526-15, Eq. 26); NaN without a map."""
         greatest = np.full(len(self), np.nan)
         if self.city is None or np.isnan(self.frequency_hz):
             return greatest
@@ -515,34 +518,34 @@ class Links:
         return replace(self, columns=replace(self.columns, known_los=self.los).select(rows))
 
     def with_columns(self, **columns: Any) -> Links:
-        """Return the same links with other values (n,) of some `Columns`."""
+        """Return a copy with other values (n,) of some `Columns`."""
         return replace(self, columns=replace(self.columns, **columns))
 
     def with_receivers(self, receiver_m: np.ndarray) -> Links:
-        """Return the same links with the receivers at (n, 3) [m]."""
+        """Return a copy with the receivers at (n, 3) [m]."""
         return self.with_columns(receiver_m=receiver_m, known_los=None)
 
     def with_los(self, los: np.ndarray) -> Links:
-        """Return the same links with lines of sight (n,) other than the map's."""
+        """Return a copy with given lines of sight (n,), bool, in place of the map's."""
         return self.with_columns(known_los=los)
 
     def with_ends(self, **ends: Any) -> Links:
-        """Return the same links with other values of some `Ends`, at the same positions."""
+        """Return a copy with other values of some `Ends`; for positions see `with_devices`."""
         return replace(self, ends=replace(self.ends, **ends))
 
     def with_devices(self, device_m: np.ndarray) -> Links:
-        """Return the same links with the devices at (k, 3) [m]."""
+        """Return a copy with the devices at (k, 3) [m]."""
         return self.with_ends(device_m=device_m).with_columns(known_los=None)
 
     def of_devices(self, device: np.ndarray, device_m: np.ndarray, names: list[str],
                    anchors: frozenset[int]) -> Links:
-        """Return the same links as those of other devices.
+        """Return a copy in which the links belong to other devices, such as candidate positions.
 
         Args:
-            device: (n,) index of each link's device.
-            device_m: (k, 3) positions of the devices [m].
+            device: (n,) index of each link's new device; it keeps the old device's radio.
+            device_m: (k, 3) positions of the new devices [m].
             names: k names.
-            anchors: indices of the devices whose positions are declared.
+            anchors: indices of the new devices whose positions are declared.
         """
         radio = np.full(len(names), -1)
         radio[device] = self.device
@@ -552,33 +555,33 @@ class Links:
                                declared=self.declared.of_devices(radio), reads=reads)
 
     def located(self, device_m: np.ndarray) -> Links:
-        """Return the links of devices that have a position in (k, 3) [m], there; NaN: none."""
+        """Place the devices at (k, 3) [m], and drop the links of those at NaN."""
         rows = np.isfinite(device_m).all(axis=1)[self.device]
         return self.with_devices(np.nan_to_num(device_m)).select(rows)
 
     def since(self, first_s: float) -> Links:
-        """Return the same links, with times that count from another first measurement [s]."""
+        """Return a copy with another time of the first measurement [s], see `Flown`."""
         return self.with_ends(flown=replace(self.ends.flown, first_s=first_s))
 
     def with_city(self, city: CityMap | None) -> Links:
-        """Return the same links over another map."""
+        """Return a copy over another map; None: without one."""
         links = self.with_columns(known_los=None)
         return replace(links, world=replace(self.world, city=city))
 
     def with_notes(self, *notes: str) -> Links:
-        """Return the same links with more notes."""
+        """Return a copy with further notes."""
         return replace(self, notes=(*self.notes, *notes))
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Expected levels of n links.
+    """Predicted levels of n links.
 
     Attributes:
-        mean_db: (n,) mean gain [dB] or power [dBm], also below what can be detected.
+        mean_db: (n,) mean gain [dB] or power [dBm], which may be below the limit of detection.
         sd_db: (n,) standard deviation [dB].
-        detection_probability: (n,) that the link is detected.
-        reading_db: (n,) mean of a detected level: above `mean_db` near the limit of detection.
+        detection_probability: (n,) probability that the link is detected.
+        reading_db: (n,) mean level given that it is detected: above `mean_db` near the limit.
     """
 
     mean_db: np.ndarray
@@ -588,6 +591,6 @@ class Prediction:
 
     @classmethod
     def concatenate(cls, parts: list[Prediction]) -> Prediction:
-        """Return the predictions of several sets of links, one after the other."""
+        """Join the predictions of several sets of links."""
         arrays = zip(*(vars(each).values() for each in parts))
         return cls(*map(np.concatenate, arrays))

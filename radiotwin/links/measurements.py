@@ -1,4 +1,4 @@
-"""Measured levels of links, and their devices: two tables, checked when they are read."""
+"""`Measurements`: a table of links and a table of devices, read, checked and written."""
 
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -48,7 +48,6 @@ from radiotwin.io.cells import (
 from radiotwin.io.files import atomic_path
 from radiotwin.io.forms import MAX_POSITION_M, Origin, as_origin
 from radiotwin.io.inputs import is_within, read_bytes, require_within
-from radiotwin.links.cell_limits import LEVELS, READS
 from radiotwin.links.link_table import (
     DEVICE_POSITION,
     FRAME,
@@ -60,6 +59,7 @@ from radiotwin.links.link_table import (
     read_links,
     require_level,
 )
+from radiotwin.links.plausible import LEVELS, MAX_APART_M, READS
 from radiotwin.links.site_table import read_site_table, unused_columns
 from radiotwin.links.view import links_dataset, links_table, of_device, plot_links
 from radiotwin.scene.antennas import Pattern, parse_pattern
@@ -71,12 +71,11 @@ if TYPE_CHECKING:
     from radiotwin.scene import Scene
 
 DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
-# What is declared of a device's radio, besides its antenna.
+# Declared radio of a device, besides its antenna.
 RADIO = ["tx_power_dbm", "eirp_dbm", "cable_loss_db", "frequency_hz", "azimuth_deg", "tilt_deg"]
 DEVICE_OPTIONAL = [*RADIO, "above_ground_m", READS]
 ROLES = ("anchor", "unknown")
 _DEVICE_POSITION = ["x_m", "y_m", "z_m"]
-MAX_APART_M = 1e6  # between an anchor and the receivers' middle: no radio link is so long
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,18 +83,18 @@ class Measurements(Summarised):
     """Levels of links between devices and receivers.
 
     Data frames of other layouts are converted: `Measurements(frame)`, or `Measurements(frame,
-    devices, origin)`. Each row of `frame` needs `gain_db` or `rssi_dbm`, a `device` and a position
-    of the receiver, such as `latitude, longitude, height_m`; `flight` and `receiver` may be left
-    out. `devices` needs the device and, of those with a known position, that. Without it, positions
-    are those of columns `device_x_m, device_y_m, device_z_m`, or are to be found.
+    devices, origin)`. Each row of `frame` needs `gain_db` or `rssi_dbm`, a `device` and a receiver
+    position, such as `latitude, longitude, height_m`; `flight` and `receiver` are optional.
+    `devices` needs the column `device`, and positions of the anchors. Without `devices`, positions
+    are taken from columns `device_x_m, device_y_m, device_z_m`, or are unknown.
 
     Attributes:
         table: one row per link, columns as in `measurements.csv`; NaN level = not detected.
-        devices: one row per device, columns as in `devices.csv`; NaN x, y where unknown.
-        origin: of the local frame of both, or its latitude and longitude; None where it is not
-            known. Then the middle of latitudes and longitudes becomes the origin.
-        antenna_files: content of the devices' antenna files, by their names in `devices`.
-        notes: on columns of the files that are not used, and values that are probably not meant.
+        devices: one row per device, columns as in `devices.csv`; NaN x, y: unknown.
+        origin: of the local frame of both tables, or its latitude and longitude; None: unknown, and
+            the middle of latitudes and longitudes becomes the origin.
+        antenna_files: name in the column `antenna` of `devices` -> content of the file.
+        notes: on unused columns and implausible values.
         files: names of both tables, for messages.
     """
 
@@ -156,11 +155,7 @@ class Measurements(Summarised):
 
     @cached_property
     def patterns(self) -> dict[str, Pattern]:
-        """Patterns of the devices' antennas, by the files' names in `devices`.
-
-        Raises:
-            BadInput: a file holds no pattern.
-        """
+        """Antenna patterns, by file name in `devices`; BadInput if a file holds none."""
         return {name: parse_pattern(Path(name), content)
                 for name, content in self.antenna_files.items()}
 
@@ -180,13 +175,10 @@ class Measurements(Summarised):
         return list(dict.fromkeys(self.table["flight"]))
 
     def select(self, mask: np.ndarray) -> "Measurements":
-        """Return a selection of the links, with all devices.
-
-        Args:
-            mask: (n,) bool, such as `measurements.table["flight"] == "f1"`.
+        """Select links by a mask (n,), bool; all devices stay.
 
         Raises:
-            BadInput: it is no such mask.
+            BadInput: the argument is not such a mask.
         """
         mask = np.asarray(mask)
         if mask.dtype != bool or mask.shape != (len(self),):
@@ -196,18 +188,18 @@ class Measurements(Summarised):
 
     def moved(self, position_m: Callable[[np.ndarray], np.ndarray],
               origin: Origin | None) -> "Measurements":
-        """Return the same links in another frame.
+        """Move all positions to another frame.
 
         Args:
-            position_m: converts (n, 3) positions [m] to that frame; NaN where unknown.
-            origin: of that frame.
+            position_m: function that converts positions (n, 3) [m]; NaN: unknown.
+            origin: of the new frame; None: unknown.
         """
         return replace(
             self, table=map_positions(self.table, RECEIVER_POSITION, position_m),
             devices=map_positions(self.devices, _DEVICE_POSITION, position_m), origin=origin)
 
     def on_ground(self, ground_height_m: GroundHeight | None) -> "Measurements":
-        """Return the same links with all heights above the datum; see `with_datum_heights`."""
+        """Convert heights above the ground to heights above the datum, see `with_datum_heights`."""
         if "receiver_above_ground_m" not in self.table and "above_ground_m" not in self.devices:
             return self
         table, devices = (with_datum_heights(rows, name, position, ground_height_m)
@@ -217,13 +209,10 @@ class Measurements(Summarised):
         return replace(self, table=table, devices=devices)
 
     def in_frame(self, origin: Origin) -> "Measurements":
-        """Return the same links in the frame about another origin, converted exactly.
-
-        Args:
-            origin: of that frame.
+        """Convert all positions exactly to the frame about another origin.
 
         Raises:
-            BadInput: the origin of the links' own frame is not known.
+            BadInput: the origin of the present frame is not known.
         """
         here = self.origin
         if here is None:
@@ -349,7 +338,7 @@ class Measurements(Summarised):
                 ("origin", "not known" if self.origin is None else origin_text(self.origin))))
 
     def _check_frame(self, folder: Path) -> None:
-        """Refuse a folder whose tables are in another frame."""
+        """Raise BadInput if the folder's `frame.toml` declares another frame."""
         there = read_frame(folder)
         if there is not None and (self.origin is None or not is_same_frame(there, self.origin)):
             raise BadInput(f"{folder / FRAME_FILE} says that tables of this folder are in the "
@@ -358,7 +347,7 @@ class Measurements(Summarised):
                               "in one of unknown origin") + "; choose another output folder")
 
     def _check_replaceable(self, path: Path) -> None:
-        """Allow replacing a table of the same devices only; another one may be the only copy."""
+        """Raise BadInput if `path` exists and is not a table of the same devices."""
         if not os.path.exists(path):  # False, not an error, of a name that no file can have
             return
         try:
@@ -372,15 +361,15 @@ class Measurements(Summarised):
 
 
 def read_measurements(path: Path | str, devices_path: Path | str | None = None) -> Measurements:
-    """Read links and devices.
+    """Read a table of links and a table of devices.
 
     Args:
         path: `.csv`, `.csv.gz` or `.parquet` with the columns of `REQUIRED` and one of `LEVELS`.
         devices_path: table of the devices; by default `devices.csv` in the same folder.
 
     Returns:
-        links and devices in the frame that the `frame.toml` beside the links declares; devices of
-        another folder are converted from theirs.
+        links and devices in the frame of the `frame.toml` beside the links. Devices of another
+        folder are converted from the frame declared there.
 
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.
@@ -433,12 +422,12 @@ def read_devices(path: Path | str) -> pd.DataFrame:
 
 def _read_devices(path: Path, origin: Origin | None,
                   own: Origin | None) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Return devices in the frame about an origin, and notes; `own` is that of the table's x, y."""
+    """Read devices, converted from the frame about `own` to that about `origin`, and notes."""
     return _devices(path, read_cells(path), origin, own, lambda row: f"row {row + 2}")
 
 
 def _devices_of_links(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the devices of a table of links, where its columns say that they are."""
+    """Make the table of devices from columns `device_x_m, …` of a table of links."""
     first = table.drop_duplicates("device").reset_index(drop=True)
     position_m = first.reindex(columns=DEVICE_POSITION).astype(float).to_numpy()
     placed = np.isfinite(position_m[:, :2]).all(axis=1)
@@ -448,7 +437,7 @@ def _devices_of_links(table: pd.DataFrame) -> pd.DataFrame:
 
 def _devices(path: Path | str, cells: pd.DataFrame, origin: Origin | None, own: Origin | None,
              where: Callable[[int], str]) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Return the devices in cells of a table of sites; see `_read_devices`."""
+    """Convert cells of a table of sites to a table of devices, and notes; see `_read_devices`."""
     sites = read_site_table(path, cells, where, "device", [*DEVICE_OPTIONAL, "antenna", "role"])
     names, values = sites.names, sites.values
     sites.refuse("device", names.duplicated(),
@@ -470,15 +459,18 @@ def _devices(path: Path | str, cells: pd.DataFrame, origin: Origin | None, own: 
 
 def read_antenna_files(path: Path, names: Iterable[str], are_rows: bool = True
                        ) -> dict[str, bytes]:
-    """Read the antenna files below a table's folder that its column `antenna` names, by that name.
+    """Read the antenna files that a table names in its column `antenna`.
 
     Args:
-        path: of the table.
-        names: in the column; empty where a device has none.
-        are_rows: whether they are in the order of its rows.
+        path: of the table; the files are in or below its folder.
+        names: cells of the column; empty: no file.
+        are_rows: whether there is one name for each row, so that messages can name the row.
+
+    Returns:
+        name -> content.
 
     Raises:
-        BadInput: a file that is missing, elsewhere, or no pattern.
+        BadInput: a file is missing, outside the folder, or no antenna pattern.
     """
     files = {}
     for row, name in enumerate(names):
@@ -496,9 +488,9 @@ def read_antenna_files(path: Path, names: Iterable[str], are_rows: bool = True
 
 def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,
                   devices: pd.DataFrame) -> None:
-    """Refuse an anchor that is too far away for any link.
+    """Raise BadInput about an anchor that is too far away for any link.
 
-    Where all are, receivers and devices have different frames, which is found where it matters.
+    If all anchors are, the frames differ: the scene, where there is one, is checked later.
     """
     middle_m = table[["receiver_x_m", "receiver_y_m"]].median().to_numpy()
     anchor = (devices["role"] == "anchor").to_numpy()

@@ -1,11 +1,10 @@
-"""Measurements joined with devices, 3D map and radio: checked, and without what cannot be used."""
+"""Join measurements with devices, 3D map and radio; check them and leave out unusable links."""
 
 import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.io.texts import percent
-from radiotwin.links.cell_limits import READS, high_notes
 from radiotwin.links.checks import (
     COPIED,
     MIN_LINKS,
@@ -19,33 +18,31 @@ from radiotwin.links.checks import (
     require_on_map,
     require_one_frame,
     unheard_devices,
+    uninformative_receivers,
     unmapped_ends,
-    useless_receivers,
 )
 from radiotwin.links.correlation import devices_move
 from radiotwin.links.declared import Declared, Radio, antenna_of_uavs, complete, radios_of
 from radiotwin.links.limits import estimate_limits
 from radiotwin.links.links import RESTART_NOTE, Columns, Ends, Flown, Links, World
 from radiotwin.links.measurements import Measurements
+from radiotwin.links.plausible import FAR_M, READS, high_notes
 from radiotwin.links.sites import end_notes
 from radiotwin.scene import Scene
 
-MAX_EXTENT_M = 100_000.0  # farther apart, two ends are not of one campaign and frame
-MAX_OTHER_FREQUENCY = 0.1  # share; levels by frequency differ by 1 dB and less then
-ASSUMED_HEIGHT_M = 1.5  # of an end whose height is blank: a hand-held phone's
+MAX_FREQUENCY_OFF = 0.1  # relative; the level changes by less than 1 dB
+ASSUMED_HEIGHT_M = 1.5  # of an end without a height: a hand-held phone
 
 
 def join_links(measurements: Measurements, scene: Scene) -> Links:
-    """Join all measurements with a scene as they are: nothing is left out.
-
-    Only the limit of detection that the scene declares is compared with the readings.
+    """Join all measurements with a scene, without leaving out any.
 
     Args:
         measurements: n links.
-        scene: the 3D map, the radio and the receivers' sensitivity.
+        scene: gives 3D map, radio and the receivers' sensitivity.
 
     Returns:
-        n links; positions of unknown devices are NaN in x and y, whatever the file gives.
+        n links, with estimated limits of detection; x and y of unknown devices are NaN.
 
     Raises:
         BadInput: measurements and scene are in different frames, or most receivers off the map.
@@ -66,21 +63,21 @@ def join_links(measurements: Measurements, scene: Scene) -> Links:
 
 def prepare_links(measurements: Measurements, scene: Scene | None,
                   to_locate: bool = False) -> Links:
-    """Join measurements with a scene, leave out what cannot be used, and note what was left out.
+    """Join measurements with a scene, and leave out unusable links, with notes.
 
     Args:
         measurements: links.
-        scene: the 3D map and the radio, if there is one.
-        to_locate: whether devices are to be located and nothing is to be learnt. Then unknown
-            devices are kept where there is no scene, and so are few links, and receivers that heard
-            nothing: that constrains a position, too.
+        scene: gives 3D map and radio; None: no map, and every link has line of sight.
+        to_locate: prepare for locating devices, not for learning. Unknown devices without a scene,
+            few links, and receivers that detected nothing are kept then, as they constrain
+            positions.
 
     Returns:
-        the links that can be used; their `notes` say what was found odd, a sentence each.
+        the usable links; their `notes` say what was left out or odd, a sentence each.
 
     Raises:
-        BadInput: nothing that can be used is left, or positions or levels that cannot be what they
-            are said to be, or measurements and scene are in different frames.
+        BadInput: too few links are usable, positions or levels are implausible, or measurements and
+            scene are in different frames.
     """
     table = measurements.table.reset_index(drop=True)
     level_db, receiver_m = measurements.level_db, measurements.receiver_m
@@ -107,10 +104,10 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
               if not any(told.endswith(note) for told in notes)]
     notes += check_positions(receiver_m, device_m, scene)
     from_middle_m = np.abs(receiver_m[:, :2] - np.median(receiver_m[:, :2], axis=0)).max(axis=1)
-    leave_out(from_middle_m > MAX_EXTENT_M,
-              f"their receiver is more than {MAX_EXTENT_M / 1000:.0f} km from the others")
+    leave_out(from_middle_m > FAR_M,
+              f"their receiver is more than {FAR_M / 1000:.0f} km from the others")
     from_device_m = np.abs(receiver_m[:, :2] - device_m[device_index, :2]).max(axis=1)
-    leave_out(from_device_m > MAX_EXTENT_M, f"their receiver is more than {MAX_EXTENT_M / 1000:.0f}"
+    leave_out(from_device_m > FAR_M, f"their receiver is more than {FAR_M / 1000:.0f}"
               " km from the device; both need one frame, in metres")
     leave_out(copied_rows(table), COPIED)
     low_z = np.isnan(receiver_m[:, 2])
@@ -132,7 +129,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     placed = np.asarray(np.isfinite(device_m).all(axis=1) | (scene is not None) | to_locate)
     leave_out(~placed[device_index],
               "without a scene, devices of unknown position cannot be located")
-    for bad, why in [] if to_locate else useless_receivers(table, level_db, keep):
+    for bad, why in [] if to_locate else uninformative_receivers(table, level_db, keep):
         leave_out(bad, why)
     fill_db, share = find_fill_value(level_db[keep])
     if fill_db is not None:
@@ -156,9 +153,9 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
 
 def _clearance_m(declared_z_m: np.ndarray, device_m: np.ndarray, receiver_m: np.ndarray,
                  scene: Scene | None) -> np.ndarray:
-    """Return the heights (k,) of devices above the ground [m], or above the lowest receiver.
+    """Return heights (k,) [m] of devices above the ground; without a map above the lowest receiver.
 
-    NaN where a height or, over a 3D map, a place is not declared.
+    NaN if the height, or the position over a map, is not declared.
     """
     if scene is not None:
         return declared_z_m - _ground_m(scene, device_m, receiver_m)
@@ -168,9 +165,9 @@ def _clearance_m(declared_z_m: np.ndarray, device_m: np.ndarray, receiver_m: np.
 
 
 def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:
-    """Return the height of the ground (k,) below devices [m].
+    """Return the ground height (k,) [m] below devices.
 
-    Of one of unknown position, that of most of the ground that was measured over.
+    For a device of unknown position it is the median below the receivers.
     """
     city, unknown = scene.city, np.isnan(device_m[:, 0])
     below_m = np.zeros(len(device_m))
@@ -184,7 +181,19 @@ def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.
 def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
           level_db: np.ndarray, receiver_m: np.ndarray, device_m: np.ndarray, device: np.ndarray,
           kept_devices: np.ndarray, notes: list[str]) -> Links:
-    """Join rows that are kept already; `kept_devices` (k,) are rows of the table of devices."""
+    """Make links from selected rows and devices, and estimate their limits of detection.
+
+    Args:
+        measurements: all of them.
+        table: the n selected rows.
+        scene: None: no scene.
+        level_db: (n,) [dB]; NaN = not detected.
+        receiver_m: (n, 3) [m].
+        device_m: (k, 3) positions of the selected devices [m]; NaN: unknown.
+        device: (n,) index of each link's device among these.
+        kept_devices: (k,) rows of the selected devices in `measurements.devices`.
+        notes: so far.
+    """
     receiver, receiver_names = pd.factorize(table["receiver"], sort=True)
     flight, flight_names = pd.factorize(table["flight"])
     heading_deg = _column(table, "heading_deg")
@@ -209,7 +218,7 @@ def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
         device=device, receiver=receiver, flight=flight, time_s=_column(table, "time_s"),
         heading_deg=heading_deg % 360, pitch_deg=_column(table, "pitch_deg"),
         roll_deg=_column(table, "roll_deg"), quality=_column(table, "quality"))
-    # A pattern that is known in all directions is no sector of which only the azimuth is declared.
+    # A device with a declared pattern needs no estimated sector about its azimuth.
     of_sector = np.array([radio.antenna is None for radio in radios]) if radios else True
     ends = Ends(
         device_names=list(devices["device"]), receiver_names=list(receiver_names),
@@ -231,6 +240,7 @@ def _join(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
 
 
 def _frequency_hz(measurements: Measurements, scene: Scene | None) -> float:
+    """Return the frequency of the scene, else the median of the devices, else NaN [Hz]."""
     if scene is not None:
         return scene.config.radio.frequency_hz
     if "frequency_hz" in measurements.devices:
@@ -239,8 +249,8 @@ def _frequency_hz(measurements: Measurements, scene: Scene | None) -> float:
 
 
 def _other_frequencies(declared_hz: np.ndarray, frequency_hz: float) -> list[str]:
-    """Return a note where devices (k,) work at other frequencies than what is computed at."""
-    other = np.abs(declared_hz / frequency_hz - 1) > MAX_OTHER_FREQUENCY
+    """Note devices (k,) whose declared frequency differs from that of the predictions."""
+    other = np.abs(declared_hz / frequency_hz - 1) > MAX_FREQUENCY_OFF
     if not other.any():
         return []
     known_ghz = np.unique(declared_hz[np.isfinite(declared_hz)]) / 1e9
@@ -252,4 +262,5 @@ def _other_frequencies(declared_hz: np.ndarray, frequency_hz: float) -> list[str
 
 
 def _column(table: pd.DataFrame, name: str) -> np.ndarray:
+    """Return a column as numbers (n,); NaN if the table lacks it."""
     return table[name].to_numpy(dtype=float) if name in table else np.full(len(table), np.nan)

@@ -1,9 +1,8 @@
-"""One reader for all tables of sites: devices, receivers and transmitters, of every command.
+"""Read tables of sites: devices, receivers and transmitters, for every command.
 
-A column is known by the usual names of its quantity, with its unit at the end: `azimuth`,
-`Antenna Height (ft)`. What a command does not use is reported, and a column that is nearly a known
-one is refused, as a quantity that is dropped is wrong physics. What cannot be meant, such as a
-slipped decimal, is found here, for all commands.
+A column is recognised by a usual name of its quantity and its unit at the end: `azimuth`, `Antenna
+Height (ft)`. Unused columns are noted. A column whose name is nearly a known one is refused, since
+dropping a quantity would give wrong physics. Implausible values are refused or noted.
 """
 
 import re
@@ -21,21 +20,21 @@ from radiotwin.geo import between_frames, is_same_frame, to_local
 from radiotwin.io.budgets import DEVICES, ROWS
 from radiotwin.io.cells import as_numbers, as_text, listed, refuse, shown
 from radiotwin.io.forms import Origin, name_fault
-from radiotwin.links.cell_limits import (
+from radiotwin.links.plausible import (
     HEIGHTS_M,
-    LIMITS_DEG,
+    MAX_DEGREES,
+    height_placeholders,
     high_notes,
-    no_height,
-    refuse_limits,
+    refuse_implausible,
     tilt_notes,
 )
 
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
 HEIGHTS = ("altitude", "height", "z", "above_ground_m")
 METRES = {"m": 1.0, "ft": 0.3048}  # the international foot, exact since 1959
-ERP_DB = 2.15  # EIRP less ERP, which refers to a half-wave dipole (ITU-R V.573-6, A43)
-MAX_TWICE_APART_M = 1.0  # between two positions of a site in a table, rounded to 1e-5 degrees
-_MIN_LETTERS, _LONG = 5, 9  # of a name of which one letter, or two, may be mistaken
+ERP_DB = 2.15  # EIRP minus ERP, which refers to a half-wave dipole (ITU-R V.573-6, A43)
+MAX_TWICE_APART_M = 1.0  # between x, y and latitude, longitude of a site, rounded to 1e-5 degrees
+_MIN_LETTERS, _LONG = 5, 9  # letters of a name in which one, or two, may be wrong
 
 Convert = Callable[[np.ndarray], np.ndarray]
 
@@ -105,13 +104,14 @@ _QUANTITIES: dict[str, tuple[Mapping[str, Convert], str]] = {
     "antenna": (_NO_UNIT, "antenna, antenna file, antenna pattern, pattern file"),
     "role": (_NO_UNIT, "role"), "reads_levels": (_NO_UNIT, "reads levels"),
     "since": (_NO_UNIT, "since"), "until": (_NO_UNIT, "until")}
-"""Quantity -> units, and names in the order in which they count."""
+"""Quantity -> its units, and its column names in order of preference."""
 _TEXTS = ("antenna", "role", "since", "until")
-_TURNED = ("downtilt", "mechanicaltilt", "mechtilt", "tiltmech", "tiltmechanical", "mtilt", "dtilt")
-"""Names of tilts that count downwards, as planning programs do."""
+_DOWNTILTS = ("downtilt", "mechanicaltilt", "mechtilt", "tiltmech", "tiltmechanical", "mtilt",
+              "dtilt")
+"""Column names of tilts that are positive downwards, as in planning programs."""
 _ENDS = ("device", "site", "cell", "sector", "antenna", "ant", "tx", "transmitter", "gateway",
          "station", "bs", "node", "receiver", "rx")
-"""What may stand before the name of a position or a direction."""
+"""Prefixes of column names of positions, directions and frequencies, `_OF_ENDS`."""
 _OF_ENDS = ("latitude", "longitude", "x", "y", "z", "height", "altitude", "azimuth_deg", "tilt_deg",
             "frequency_hz")
 _UNUSED = {"electricaltilt": "it is in the pattern of the antenna",
@@ -121,7 +121,7 @@ _UNUSED = {"electricaltilt": "it is in the pattern of the antenna",
            "gain": "give an EIRP, or the pattern of the antenna",
            "antennagain": "give an EIRP, or the pattern of the antenna",
            "groundelevation": "of the ground", "siteelevation": "of the ground"}
-"""Names of columns that look as if they were used -> why they are not."""
+"""Names of columns that a user may expect to be used -> why they are not."""
 _ANY_NAME = ("name, id, label, site, site id, site name, station, station id, station name, node, "
              "node id")
 _NAMES = {
@@ -144,7 +144,7 @@ _PROJECTED = {"x": "easting, utm x, utm easting, utm e",
 
 
 def _plain(name: str) -> str:
-    """Return a name in lower case without what separates its words, its unit at the end."""
+    """Return a column name in lower case without separators, with its unit at the end."""
     name = _UNIT_AND_ZERO.sub(r" \2\1", name.casefold())
     return re.sub(r"[\W_]+", "", name)
 
@@ -155,7 +155,7 @@ def _words(names: str) -> list[str]:
 
 @dataclass(frozen=True)
 class _Known:
-    """What a name of a column stands for: a quantity, how much it comes first, and its unit."""
+    """Meaning of a column name: quantity, preference (0 is best), and conversion of its unit."""
 
     quantity: str
     rank: int
@@ -164,16 +164,19 @@ class _Known:
 
 @cache
 def _known_names(projected: bool) -> dict[str, _Known]:
-    """Return all names of columns; `convert` is None where a name needs a unit and has none."""
+    """Return the meaning of all known column names; `convert` is None if the unit is missing.
+
+    With `projected`, names of projected coordinates such as `easting` are included.
+    """
     found: dict[str, _Known] = {}
 
     def add(quantity: str, words: Sequence[str]) -> None:
         for rank, word in enumerate(words):
-            turn = (lambda values: values + ERP_DB) if "erp" in word else \
-                np.negative if word.endswith(_TURNED) else None
+            adjust = (lambda values: values + ERP_DB) if "erp" in word else \
+                np.negative if word.endswith(_DOWNTILTS) else None
             for unit, convert in {"": None, **_QUANTITIES[quantity][0]}.items():
-                if convert is not None and turn is not None:
-                    convert = _then(convert, turn)
+                if convert is not None and adjust is not None:
+                    convert = _then(convert, adjust)
                 found.setdefault(word + unit, _Known(quantity, rank, convert))
 
     for quantity, (_, names) in _QUANTITIES.items():
@@ -191,24 +194,25 @@ def _then(first: Convert, second: Convert) -> Convert:
 
 
 def misspelt(name: str, known: Iterable[str]) -> str | None:
-    """Return the known name that a name is nearly: one letter is wrong, or two of a long one.
+    """Return the known name of which a name is a misspelling; None if there is none.
 
-    Digits count: `latitude2` is another column. Names are as of `_plain`.
+    One letter may be wrong, or two in a long name; digits must be equal. Names are in the form of
+    `_plain`.
     """
     if len(name) < _MIN_LETTERS:
         return None
     for other in known:
-        most = 2 if min(len(name), len(other)) >= _LONG else 1
-        if (len(other) >= _MIN_LETTERS and abs(len(name) - len(other)) <= most
-                and len(set(name) ^ set(other)) <= 2 * most
+        max_edits = 2 if min(len(name), len(other)) >= _LONG else 1
+        if (len(other) >= _MIN_LETTERS and abs(len(name) - len(other)) <= max_edits
+                and len(set(name) ^ set(other)) <= 2 * max_edits
                 and re.sub(r"\D", "", name) == re.sub(r"\D", "", other)
-                and _edits(name, other) <= most):
+                and _edits(name, other) <= max_edits):
             return other
     return None
 
 
 def _edits(one: str, other: str) -> int:
-    """Return the fewest letters to add, drop, replace or swap with the next (Damerau 1964)."""
+    """Count the letters to add, drop, replace or swap between two words (Damerau 1964)."""
     before: list[int] = []
     last, row = before, list(range(len(other) + 1))
     for i, letter in enumerate(one, start=1):
@@ -222,17 +226,17 @@ def _edits(one: str, other: str) -> int:
 
 @dataclass(frozen=True, eq=False)
 class SiteTable:
-    """Sites of a table, one a row.
+    """k sites of a table, one a row.
 
     Attributes:
         path: of the file, for messages.
-        names: (k,) of the sites; its index is that of the cells.
-        values: columns by quantity: degrees, metres and the units of `devices.csv`, NaN or `""`
-            where empty; x and y of a projected system in its own unit.
-        columns: quantity -> column of the file; the end, such as `device` -> that of the names.
-        cells: of the file.
-        where: row -> `row 7`, as the file's user counts.
-        notes: on what was not used, and on what is probably not meant.
+        names: (k,) names of the sites; indexed like the cells.
+        values: one column per quantity, in degrees, metres and the units of `devices.csv`; NaN or
+            `""`: empty. x and y of a projected system stay in its unit.
+        columns: quantity -> column of the file; `device` or `receiver` -> the column of names.
+        cells: of the file, without blank rows.
+        where: index of a row -> `row 7`, as in the file.
+        notes: on unused columns and implausible values.
     """
 
     path: Path | str
@@ -244,12 +248,11 @@ class SiteTable:
     notes: tuple[str, ...] = ()
 
     def refuse(self, quantity: str, bad: ArrayLike, reason: str) -> None:
-        """Raise BadInput about the first bad cell (k,) of a quantity, if there is one."""
-        name = self.columns[quantity]
-        _refuse(self, name, bad, reason)
+        """Raise BadInput about the first bad cell of a quantity, if the mask (k,) has any."""
+        _refuse(self, self.columns[quantity], bad, reason)
 
     def refuse_rows(self, bad: ArrayLike, reason: Callable[[int], str]) -> None:
-        """Raise BadInput about the first bad row (k,); the reason is made of its number."""
+        """Raise BadInput about the first bad row of a mask (k,); `reason` takes its position."""
         rows = np.flatnonzero(bad)
         if len(rows):
             first = int(rows[0])
@@ -257,15 +260,15 @@ class SiteTable:
                            + (f" ({len(rows)} such rows)" if len(rows) > 1 else ""))
 
     def local_m(self, origin: Origin | None, own: Origin | None, what: str) -> np.ndarray:
-        """Return positions (k, 3) in a frame [m]; NaN where empty, or where z is above the ground.
+        """Return positions (k, 3) [m] in a local frame; NaN: empty, or z is above the ground.
 
         Args:
-            origin: of that frame; None where it is not known.
-            own: of the frame that x and y are in; None: the same.
-            what: has that frame, for messages.
+            origin: of the target frame; None: unknown.
+            own: origin of the frame of the columns x and y; None: the target frame.
+            what: the target frame belongs to, for messages.
 
         Raises:
-            BadInput: latitudes without an origin, or a site far outside the frame.
+            BadInput: latitudes without an origin, or x, y that contradict latitude and longitude.
         """
         if "latitude" in self.values and origin is None and "x" not in self.values:
             raise BadInput(f"{self.path}: latitude and longitude need the origin of the frame of "
@@ -285,6 +288,7 @@ class SiteTable:
 
 
 def _refuse(table: SiteTable, column: str, bad: ArrayLike, reason: str) -> None:
+    """Raise BadInput about the first bad cell of a column, if the mask (k,) has any."""
     cells = table.cells[column]
     refuse(table.path, column, as_text(cells), bad, reason,
            lambda row: table.where(cells.index[row]))
@@ -299,29 +303,29 @@ def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int]
     Args:
         path: of the file, for messages.
         cells: of the file: texts, or typed columns.
-        where: index of a row -> its place in the file.
-        end: `device` or `receiver`: the column of the names; None: points without names.
-        uses: other quantities than positions that the command uses.
-        length_unit: of columns without one in their name; without one such are refused. None where
-            a command has no setting for it.
+        where: index of a row -> its place in the file, for messages.
+        end: kind of the sites, `device` or `receiver`; None: points without names.
+        uses: quantities that the command uses besides positions.
+        length_unit: of length columns whose name has no unit; `""`: they are refused; None: as
+            `""`, for a command without such a setting.
         crs: whether x and y are of a projected system, in its unit.
-        prefers_globe: whether x and y are not used where there are latitude and longitude.
-        names: that are expected; of several columns of names that with most of them counts.
+        prefers_globe: ignore x and y if latitude and longitude are given.
+        names: expected names; they decide between several columns of names.
 
     Raises:
-        BadInput: names file, row and column of the first that cannot be used, or a column that is
-            nearly a known one.
+        BadInput: names file, row and column of the first value that cannot be used, or a column
+            whose name is nearly a known one.
     """
     if cells.empty:
         raise BadInput(f"{path}: has no rows; it needs one for each {end or 'point'}")
     (ROWS if end is None else DEVICES).check(len(cells), path)
     header = list(map(str, cells.columns))
     columns, unused = _columns(path, header, crs)
-    for quantity in _unneeded_place(columns.keys(), crs, prefers_globe):
+    for quantity in _redundant_position(columns.keys(), crs, prefers_globe):
         unused[columns.pop(quantity)] = "the position is known already"
     key = None
     if end is not None:
-        key, others = _key(path, cells, end, names, set(columns.values()))
+        key, others = _name_column(path, cells, end, names, set(columns.values()))
         unused = {name: why for name, why in unused.items() if name != key} | others
         cells = _without_blank_rows(cells, key)
     used = {*POSITION, "above_ground_m", *uses}
@@ -352,7 +356,7 @@ def read_site_table(path: Path | str, cells: pd.DataFrame, where: Callable[[int]
 
 
 def is_site_table(header: Iterable[str]) -> bool:
-    """Return whether a table with these columns has places."""
+    """Return whether columns of these names hold positions."""
     known = _known_names(True)
     given = {known[_plain(str(name))].quantity for name in header if _plain(str(name)) in known}
     return {"latitude", "longitude"} <= given or {"x", "y"} <= given
@@ -360,10 +364,10 @@ def is_site_table(header: Iterable[str]) -> bool:
 
 def unused_columns(path: Path | str, header: Iterable[str], used: Collection[str],
                    known: Collection[str]) -> list[str]:
-    """Return a note on the columns of a table of fixed names that are not used.
+    """Note the unused columns of a table with fixed column names.
 
     Raises:
-        BadInput: one is nearly a known name that the table does not have.
+        BadInput: an unused column is nearly a known name that the table lacks.
     """
     unused = {name: "" for name in header if name not in used}
     plain = {_plain(name): name for name in known if name not in used}
@@ -376,6 +380,7 @@ def unused_columns(path: Path | str, header: Iterable[str], used: Collection[str
 
 
 def _unused_note(path: Path | str, unused: Mapping[str, str]) -> list[str]:
+    """Note unused columns, with the reason if there is one."""
     if not unused:
         return []
     reasons = {name: why or next((why for word, why in _UNUSED.items() if re.fullmatch(
@@ -385,8 +390,8 @@ def _unused_note(path: Path | str, unused: Mapping[str, str]) -> list[str]:
     return [f"{Path(path).name}: column{'s' * (len(unused) > 1)} not used: {columns}"]
 
 
-def _unneeded_place(given: Collection[str], crs: bool, prefers_globe: bool) -> tuple[str, ...]:
-    """Return the quantities of the position that is not used of two."""
+def _redundant_position(given: Collection[str], crs: bool, prefers_globe: bool) -> tuple[str, ...]:
+    """Return the coordinates to ignore if a table has both latitude, longitude and x, y."""
     if not {"latitude", "x"} <= set(given) or not (crs or prefers_globe):
         return ()
     pair = ("latitude", "longitude") if crs else ("x", "y")
@@ -395,7 +400,7 @@ def _unneeded_place(given: Collection[str], crs: bool, prefers_globe: bool) -> t
 
 def _columns(path: Path | str, header: Sequence[str],
              crs: bool) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the column of each quantity, and the others with the reason why they are not used."""
+    """Return the column of each quantity, and the unused columns with the reason."""
     known = _known_names(crs)
     by_rank = sorted((name for name in header if _plain(name) in known),
                      key=lambda name: known[_plain(name)].rank)
@@ -423,9 +428,9 @@ def _columns(path: Path | str, header: Sequence[str],
     return found, unused
 
 
-def _key(path: Path | str, cells: pd.DataFrame, end: str, names: Collection[str],
-         taken: set[str]) -> tuple[str, dict[str, str]]:
-    """Return the column of the names, and other ones that could be it."""
+def _name_column(path: Path | str, cells: pd.DataFrame, end: str, names: Collection[str],
+                 taken: set[str]) -> tuple[str, dict[str, str]]:
+    """Return the column of the sites' names, and further columns of names with the reason."""
     words = _words(_NAMES[end])
     found = sorted((name for name in map(str, cells)
                     if _plain(name) in words and name not in taken),
@@ -440,7 +445,7 @@ def _key(path: Path | str, cells: pd.DataFrame, end: str, names: Collection[str]
 
 def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_unit: str | None,
              crs: bool) -> np.ndarray:
-    """Return the numbers (k,) of a quantity in its unit; NaN where empty."""
+    """Convert the cells of a quantity to numbers (k,) in its unit; NaN: empty."""
     name = table.columns[quantity]
     cells = table.cells[name]
     if cells.dtype.kind in "fiu":
@@ -450,9 +455,9 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
     else:
         text = as_text(cells)
         numbers = as_numbers(text)
-    if quantity in LIMITS_DEG:
+    if quantity in MAX_DEGREES:
         for i in np.flatnonzero(np.isnan(numbers) & (text != "")):
-            numbers[i] = degrees(text.iloc[i], quantity)
+            numbers[i] = dms_degrees(text.iloc[i], quantity)
     with_unit = np.isnan(numbers) & (text != "").to_numpy()
     by_cell = np.full(len(numbers), np.nan)
     for i in np.flatnonzero(with_unit):
@@ -483,60 +488,61 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
             "is no power above zero")
     is_projected = crs and quantity in "xy"
     is_length = _QUANTITIES[quantity][0] is _LENGTHS and not is_projected
-    refuse_limits(partial(_refuse, table, name),
+    refuse_implausible(partial(_refuse, table, name),
                   f"{quantity.removesuffix('_m')}_m" if is_length else quantity, numbers)
     if quantity in HEIGHTS:
-        _refuse(table, name, no_height(numbers), "is no height; allowed are "
+        _refuse(table, name, height_placeholders(numbers), "is no height; allowed are "
                 f"{HEIGHTS_M[0]:,.0f} to {HEIGHTS_M[1]:,.0f} m; leave the cell empty where it is "
                 "not known")
     return numbers
 
 
 def _number_with_unit(text: str, name: str, quantity: str, crs: bool) -> tuple[float, float]:
-    """Return the number of a cell such as `30 m`, `100'`, `20 W` in the quantity's unit; or NaN.
+    """Read a cell with a unit, such as `30 m`, `100'`, `20 W`.
 
-    A column whose name has a unit may repeat it in its cells: then the number is the second one, in
-    that unit. Another unit contradicts it.
+    Returns:
+        the number in the quantity's unit, or NaN; and the number in the unit of the column's name,
+        if the cell repeats that, or NaN. Both are NaN for a cell that cannot be read.
     """
     found = _WITH_UNIT.fullmatch(text) if len(text) <= _DMS_CHARACTERS else None
     nothing = (np.nan, np.nan)
-    if found is None or quantity in LIMITS_DEG or found[2] == "MW":  # mW, or megawatts?
+    if found is None or quantity in MAX_DEGREES or found[2] == "MW":  # mW, or megawatts?
         return nothing
     number, unit = float(found[1]), _UNIT_SIGNS.get(found[2], found[2].casefold())
     known, plain = _known_names(crs), _plain(name)
-    own = max((end for end in _QUANTITIES[quantity][0] if end and plain.endswith(end)
-               and plain.removesuffix(end) in known), key=len, default="")
-    if own:
-        return (np.nan, number) if own == unit else nothing
+    column_unit = max((end for end in _QUANTITIES[quantity][0] if end and plain.endswith(end)
+                       and plain.removesuffix(end) in known), key=len, default="")
+    if column_unit:
+        return (np.nan, number) if column_unit == unit else nothing
     convert = known[plain + unit].convert if plain + unit in known else None
     return nothing if convert is None else (float(convert(np.array([number]))[0]), np.nan)
 
 
 def _without_blank_rows(cells: pd.DataFrame, key: str) -> pd.DataFrame:
-    """Return the rows of a table without those that are empty in all columns, as a sheet's end."""
+    """Drop rows that are empty in all columns, as at the end of a sheet."""
     nameless = cells[(as_text(cells[key]) == "").to_numpy()]
     if nameless.empty:
         return cells
     return cells.drop(index=nameless.index[(nameless.apply(as_text) == "").all(axis=1)])
 
 
-def degrees(text: str, quantity: str) -> float:
-    """Return an angle in degrees, minutes and seconds, such as `48°06'12.5"N`; NaN of none."""
+def dms_degrees(text: str, quantity: str) -> float:
+    """Convert an angle such as `48°06'12.5"N` to degrees; NaN if it is none."""
     found = _DMS.fullmatch(text.upper()) if len(text) <= _DMS_CHARACTERS else None
     if found is None:
         return np.nan
     before, *parts, after = found.groups()
-    whole, minutes, seconds = (float(part or 0) for part in parts)
-    end = before or after or ""
-    ends = "NS" if quantity == "latitude" else "EW"
-    if minutes >= 60 or seconds >= 60 or (before and after) or end not in ("", *ends):
+    whole_deg, minutes, seconds = (float(part or 0) for part in parts)
+    letter = before or after or ""
+    letters = "NS" if quantity == "latitude" else "EW"
+    if minutes >= 60 or seconds >= 60 or (before and after) or letter not in ("", *letters):
         return np.nan
-    sign = -1.0 if end == ends[1] or parts[0].startswith("-") else 1.0
-    return sign * (abs(whole) + minutes / 60 + seconds / 3600)
+    sign = -1.0 if letter == letters[1] or parts[0].startswith("-") else 1.0
+    return sign * (abs(whole_deg) + minutes / 60 + seconds / 3600)
 
 
 def _check_positions(table: SiteTable) -> None:
-    """Check that sites have a place in one form, and one height at most."""
+    """Raise BadInput unless all sites have a position and at most one height, within range."""
     given = table.columns.keys()
     for pair in (("latitude", "longitude"), ("x", "y")):
         if len(given & set(pair)) == 1:
@@ -549,7 +555,7 @@ def _check_positions(table: SiteTable) -> None:
     table.refuse_rows(table.values[list(heights)].notna().sum(axis=1) > 1, lambda row: (
         f"{table.names.iloc[row]!r} has several heights, {' and '.join(heights.values())}; leave "
         "one empty, or a column out"))
-    for name, limit in LIMITS_DEG.items():
+    for name, limit in MAX_DEGREES.items():
         if name not in given:
             continue
         bad = table.values[name].abs() > limit
@@ -560,6 +566,7 @@ def _check_positions(table: SiteTable) -> None:
 
 
 def _implausible(table: SiteTable) -> list[str]:
+    """Note implausible tilts and heights above the ground."""
     notes = []
     if "tilt_deg" in table.values:
         notes += tilt_notes(table.values["tilt_deg"].to_numpy())
@@ -569,9 +576,9 @@ def _implausible(table: SiteTable) -> list[str]:
 
 
 def local_positions(values: pd.DataFrame, origin: Origin | None) -> np.ndarray:
-    """Convert columns of `POSITION` [degrees, m] to x, y, z (k, 3) [m] about an origin.
+    """Convert columns of `POSITION` [deg, m] to x, y, z (k, 3) [m] about an origin.
 
-    NaN stands for unknown; without an origin all positions are local already.
+    NaN is unknown. Without an origin, latitude and longitude are ignored, and altitudes are z.
     """
     places_m = np.full((len(values), 3), np.nan)
     for axis, name in enumerate("xy"):

@@ -1,8 +1,8 @@
-"""Links that share a place: devices on one mast, and receivers that were at the same places.
+"""Devices on one mast, repeated readings at one place, and receivers compared at shared places.
 
-Where two receivers read one device at the same place, distance, walls and device are the same, so
-the difference of their levels is the receivers'. A regression over all links separates it less
-clearly: receivers that were at different places also differ by the model's errors there.
+Two receivers that read one device at the same place share path and device, so their levels differ
+by the receivers' errors only. A regression over all links separates these less clearly, since the
+model also errs differently at places that one receiver visited alone.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from radiotwin.inference.gaussian import MAD_SD
 from radiotwin.links.correlation import devices_move
 from radiotwin.links.links import Links
 
-SAME_SITE_M = 1.0  # apart at most: sectors of one mast; declared positions are good to that
+SAME_SITE_M = 1.0  # largest distance of sectors on one mast: accuracy of declared positions
 OTHER_END = {"device": "receiver", "receiver": "device"}
-SAME_DIRECTION_DEG = 5.0  # azimuths within it are of one antenna, or of two side by side
-MIN_REPEATS = 20  # of a device, to tell how they scatter
-SHARED_DB, SHARED_RATIO = 3.0, 2.0  # scatter that is of two transmitters, also over that of others
+SAME_DIRECTION_DEG = 5.0  # azimuths this close belong to one antenna, or two side by side
+MIN_REPEATS = 20  # of a device, to estimate its scatter
+SHARED_DB, SHARED_RATIO = 3.0, 2.0  # scatter of two transmitters: least, and over that of others
 MAX_NAMED = 4  # pairs in a note
-MAX_RELATIVES = 4  # more tell nothing new
-SAME_M = 3.0  # a phone's position is known no better outdoors
-PLACE_M = 30.0  # readings so close to each other err alike: the median of a square counts as one
-MIN_PAIRS, MIN_PLACES = 30, 6  # to say anything
-MIN_DEVICES = 3  # of which differences may scatter, too
-MAX_RECEIVERS = 40  # bounds the number of differences to 780
-ABOVE_LIMIT_DB = 10.0  # pairs are this far above the limits, in the mean: so blanks choose none
-MAX_Z = 3.0  # places farther off count as this many robust standard deviations
+MAX_RELATIVES = 4  # further ones add little
+SAME_M = 3.0  # accuracy of a phone's position outdoors
+PLACE_M = 30.0  # side of squares with correlated errors, in which the median difference is taken
+MIN_PAIRS, MIN_PLACES = 30, 6  # for a comparison of two receivers
+MIN_DEVICES = 3  # for an interval that is clustered by device
+MAX_RECEIVERS = 40  # limits the comparisons to 780
+ABOVE_LIMIT_DB = 10.0  # mean level of a pair above the limits, so that censoring selects none
+MAX_Z = 3.0  # differences are clipped to this many robust standard deviations
 MIN_SD_DB = 0.1
 QUANTILE = 0.95  # upper end of a 90 % interval
 
 
 def site_of(links: Links, device: int) -> list[int]:
-    """Return the device and the anchors that share its mast, in order."""
+    """Return the indices of a device and of the anchors on its mast, ascending."""
     apart_m = np.linalg.norm(links.device_m - links.device_m[device], axis=1)
     return [int(other) for other in np.flatnonzero(apart_m <= SAME_SITE_M)
             if other == device or other in links.anchors]
 
 
 def antenna_of(links: Links, device: int) -> list[int]:
-    """Return the device and those on its mast with the same declared azimuth, in order.
+    """Return a device and those on its mast with the same declared azimuth, ascending.
 
-    They are carriers through one antenna, or through antennas side by side.
+    They are carriers of one antenna, or of antennas side by side.
     """
     found, mast = {device}, np.array(site_of(links, device))
-    for _ in mast:  # what is near a member is one, too, so that the groups of a mast are disjoint
+    for _ in mast:  # neighbours of a member are members, so that the groups of a mast are disjoint
         apart_deg = np.abs((links.boresight_deg[mast, None] - links.boresight_deg[sorted(found)]
                             + 180) % 360 - 180)
         found |= set(mast[(apart_deg <= SAME_DIRECTION_DEG).any(axis=1)].tolist())
@@ -60,10 +60,17 @@ def antenna_of(links: Links, device: int) -> list[int]:
 
 
 def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
-    """Return devices whose signals reach a receiver along nearly the same paths as a device's.
+    """Return detected devices with nearly the same paths to a receiver as a given device.
 
-    They are the other devices of its antenna that were detected, else those of its mast; at most
-    `MAX_RELATIVES`.
+    They are the other devices of its antenna, else those of its mast.
+
+    Args:
+        links: with the positions and azimuths of all devices.
+        device: index.
+        heard: indices of the detected devices.
+
+    Returns:
+        at most `MAX_RELATIVES` indices.
     """
     others = ([other for other in group if other != device and other in heard]
               for group in (antenna_of(links, device), site_of(links, device)))
@@ -72,11 +79,11 @@ def relatives_of(links: Links, device: int, heard: set[int]) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """Scatter of repeated readings, which should be equal, by device.
+    """Scatter of repeated readings, which should be equal, for each device.
 
     Attributes:
-        squares_db2: (k,) sum of squares about the means [dB²].
-        freedom: (k,) readings less means.
+        squares_db2: (k,) sum of squares about the group means [dB²].
+        freedom: (k,) degrees of freedom: readings minus group means.
     """
 
     squares_db2: np.ndarray
@@ -84,14 +91,14 @@ class Repeats:
 
     @classmethod
     def of(cls, links: Links, *same: np.ndarray) -> Repeats:
-        """Group readings by receiver, device and the other labels (n, …)."""
+        """Group readings by device, receiver and further labels (n, …), and sum their squares."""
         seen = np.isfinite(links.level_db)
         label = np.column_stack([links.device, links.receiver, *same])[seen]
         group = np.unique(label, axis=0, return_inverse=True)[1].ravel()
         level_db, count = links.level_db[seen], np.bincount(group)
-        rest_db = level_db - (np.bincount(group, level_db) / count)[group]
+        residual_db = level_db - (np.bincount(group, level_db) / count)[group]
         devices, device = len(links.device_names), links.device[seen]
-        return cls(np.bincount(device, rest_db**2, devices),
+        return cls(np.bincount(device, residual_db**2, devices),
                    np.bincount(device, 1 - 1 / count[group], devices))
 
     def sd_db(self) -> np.ndarray:
@@ -100,44 +107,48 @@ class Repeats:
         return np.where(few, np.nan, np.sqrt(self.squares_db2 / np.maximum(self.freedom, 1)))
 
     def without(self, devices: Sequence[int]) -> Repeats:
-        """Return the same without some devices."""
+        """Drop some devices (indices)."""
         return Repeats(*(np.delete(each, devices) for each in (self.squares_db2, self.freedom)))
 
 
 def repeats_at_places(links: Links) -> Repeats:
-    """Return the scatter of readings at one place, within a decimetre."""
+    """Return the scatter of readings at the same place, rounded to a decimetre."""
     return Repeats.of(links, np.round(links.receiver_m, 1))
 
 
 def shared_names(links: Links) -> dict[int, str]:
-    """Return devices that may be two transmitters with one name, and why.
+    """Find devices that may be two transmitters with one name, such as carriers of a cell.
 
-    Cells may share an identity, or the carriers of a cell a name. Then a receiver reads two levels
-    at one time, or at one place, that differ by more than readings of other devices do.
+    A receiver then reads two levels at one time, or at one place, which scatter more than those of
+    other devices.
+
+    Returns:
+        device index -> the reason, for a note.
     """
     found: dict[int, str] = {}
     timed = links.select(np.isfinite(links.time_s))
     for when, repeats in (("at one time", Repeats.of(timed, timed.time_s)),
                           ("at one place", repeats_at_places(links))):
-        own_db = repeats.sd_db()
-        for device in np.flatnonzero(own_db > SHARED_DB):
-            others_db = np.delete(own_db, device)
+        sd_db = repeats.sd_db()
+        for device in np.flatnonzero(sd_db > SHARED_DB):
+            others_db = np.delete(sd_db, device)
             usual_db = float(np.median(others_db[np.isfinite(others_db)])) \
                 if np.isfinite(others_db).any() else np.nan
-            if own_db[device] > SHARED_RATIO * usual_db:
+            if sd_db[device] > SHARED_RATIO * usual_db:
                 found.setdefault(int(device), f"its readings {when} scatter by "
-                                 f"{own_db[device]:.1f} dB, those of others by {usual_db:.1f} dB")
+                                 f"{sd_db[device]:.1f} dB, those of others by {usual_db:.1f} dB")
     return found
 
 
-def never_part(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
-    """Return pairs of labels, one of each end, that have exactly the same links.
-
-    An error of one of the two cannot be separated from an error of the other.
+def inseparable_pairs(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
+    """Find pairs of labels with exactly the same links, whose errors cannot be separated.
 
     Args:
-        one: (n,) index of one end of each link, such as its device.
-        other: (n,) index of another, such as its receiver or flight.
+        one: (n,) label of each link, such as its device.
+        other: (n,) another label, such as its receiver or flight.
+
+    Returns:
+        label of the first kind -> label of the second.
     """
     code, links = np.unique(one * (int(other.max(initial=0)) + 1) + other, return_counts=True)
     first, second = np.divmod(code, int(other.max(initial=0)) + 1)
@@ -145,18 +156,26 @@ def never_part(one: np.ndarray, other: np.ndarray) -> dict[int, int]:
     return dict(zip(first[same].tolist(), second[same].tolist(), strict=True))
 
 
-def never_apart_from(links: Links, end: str, members: set[int]) -> str | None:
-    """Return the other of `device` and `receiver` if a member shares all its links with one there.
+def inseparable_end(links: Links, end: str, members: set[int]) -> str | None:
+    """Return the other end if the error of a member cannot be separated from one of that end.
 
-    Only detected links count.
+    A member and one of the other end then share all their detected links.
+
+    Args:
+        links: n links.
+        end: `device` or `receiver`.
+        members: indices at that end.
+
+    Returns:
+        `receiver` or `device`, the other end; None if all errors can be separated.
     """
     other, heard = OTHER_END[end], np.isfinite(links.level_db)
-    together = never_part(getattr(links, end)[heard], getattr(links, other)[heard])
+    together = inseparable_pairs(getattr(links, end)[heard], getattr(links, other)[heard])
     return other if members & together.keys() else None
 
 
 def end_notes(links: Links) -> list[str]:
-    """Return notes on ends that share all their links, and on devices that are probably two."""
+    """Note devices that may be two transmitters, and devices with all links to one receiver."""
     notes = [f"device {links.device_names[device]} may be two transmitters of one name, such as "
              f"cells of one identity or carriers of a cell: {why}; if so, give each its name"
              for device, why in shared_names(links).items()]
@@ -164,7 +183,7 @@ def end_notes(links: Links) -> list[str]:
     for end in ("receiver", "flight"):
         names = getattr(links, f"{end}_names")
         pairs = [f"{links.device_names[device]} and {names[member]}" for device, member
-                 in never_part(links.device[heard], getattr(links, end)[heard]).items()]
+                 in inseparable_pairs(links.device[heard], getattr(links, end)[heard]).items()]
         if pairs:
             notes.append(f"device and {end} are never apart ({some(pairs, MAX_NAMED)}): what one "
                          f"of the two has wrong, an offset or a drift, may be the other's; let "
@@ -174,14 +193,14 @@ def end_notes(links: Links) -> list[str]:
 
 @dataclass(frozen=True)
 class ReceiverDifference:
-    """How much more one receiver reads than another where both have been.
+    """Mean difference between the readings of two receivers at shared places.
 
     Attributes:
         first, second: indices of the receivers.
         difference_db: reading of the second minus that of the first [dB].
-        low_db, high_db: 90 % interval [dB]; of the widest of places and devices that err alike.
-        pairs: number of readings of the first that have one of the second beside them.
-        places: number of squares of ground they lie in, each device counted by itself.
+        low_db, high_db: 90 % interval [dB], the wider of those clustered by place and by device.
+        pairs: number of readings of the first with one of the second beside them.
+        places: number of squares of ground with pairs, summed over the devices.
     """
 
     first: int
@@ -197,8 +216,8 @@ def receiver_differences(links: Links) -> list[ReceiverDifference]:
     """Compare every two receivers that read the same devices at the same places.
 
     Returns:
-        the differences that at least `MIN_PAIRS` pairs at `MIN_PLACES` places tell; none where
-        devices move, as receivers then stand apart, or of more than `MAX_RECEIVERS` receivers.
+        the differences with at least `MIN_PAIRS` pairs at `MIN_PLACES` places. None are compared if
+        devices move, since the receivers are fixed then, or with more than `MAX_RECEIVERS`.
     """
     members = np.unique(links.receiver[np.isfinite(links.level_db)])
     if not 2 <= len(members) <= MAX_RECEIVERS or devices_move(links):
@@ -209,33 +228,38 @@ def receiver_differences(links: Links) -> list[ReceiverDifference]:
 
 
 def _difference(links: Links, first: int, second: int) -> ReceiverDifference | None:
+    """Compare two receivers; None if they share too few readings or places."""
     pairs = _pairs(links, first, second)
     if len(pairs) < MIN_PAIRS:
         return None
     places = pairs.groupby(["device", "x", "y"], as_index=False)["difference_db"].median()
     if len(places) < MIN_PLACES:
         return None
-    each_db = places["difference_db"].to_numpy()
-    middle_db = np.median(each_db)
-    most_db = MAX_Z * max(MAD_SD * np.median(np.abs(each_db - middle_db)), MIN_SD_DB)
-    each_db = np.clip(each_db, middle_db - most_db, middle_db + most_db)
-    mean_db = float(each_db.mean())
+    place_db = places["difference_db"].to_numpy()
+    median_db = np.median(place_db)
+    clip_db = MAX_Z * max(MAD_SD * np.median(np.abs(place_db - median_db)), MIN_SD_DB)
+    place_db = np.clip(place_db, median_db - clip_db, median_db + clip_db)
+    mean_db = float(place_db.mean())
     squares = places.groupby(["x", "y"]).ngroup().to_numpy()
     clusterings = [squares]
     if places["device"].nunique() >= MIN_DEVICES:
         clusterings.append(pd.factorize(places["device"])[0])
-    half_db = max(_half_db(each_db - mean_db, label) for label in clusterings)
+    half_db = max(_half_interval_db(place_db - mean_db, label) for label in clusterings)
     return ReceiverDifference(first, second, mean_db, mean_db - half_db, mean_db + half_db,
                               len(pairs), len(places))
 
 
 def _pairs(links: Links, first: int, second: int) -> pd.DataFrame:
-    """Pair each reading of the first receiver with the nearest one of the second, by device."""
+    """Pair each reading of the first receiver with the nearest one of the second, per device.
+
+    Returns:
+        columns device, x and y of the square of ground, and the difference of levels [dB].
+    """
     read = np.isfinite(links.level_db)
     parts = []
     for device in np.unique(links.device):
-        of_device = read & (links.device == device)
-        first_rows, second_rows = (np.flatnonzero(of_device & (links.receiver == each))
+        device_links = read & (links.device == device)
+        first_rows, second_rows = (np.flatnonzero(device_links & (links.receiver == each))
                                    for each in (first, second))
         if not (len(first_rows) and len(second_rows)):
             continue
@@ -254,8 +278,8 @@ def _pairs(links: Links, first: int, second: int) -> pd.DataFrame:
     return pd.concat(parts) if parts else pd.DataFrame()
 
 
-def _half_db(error_db: np.ndarray, label: np.ndarray) -> float:
-    """Return half the 90 % interval of a mean of errors (n,) that are correlated in clusters (n,).
+def _half_interval_db(error_db: np.ndarray, label: np.ndarray) -> float:
+    """Return half the 90 % interval [dB] of the mean of errors (n,), correlated in clusters (n,).
 
     Liang and Zeger 1986, 'Longitudinal data analysis using generalized linear models', Biometrika
     73, with the t quantile of the number of clusters.

@@ -1,4 +1,4 @@
-"""What a residual may depend on, of a link, and inputs of a regression without physics."""
+"""Variables that a link's residual may depend on, and inputs of regressions without physics."""
 
 from __future__ import annotations
 
@@ -8,27 +8,31 @@ import numpy as np
 
 from radiotwin.links.links import Links
 
-CELL_M = 60.0  # side of the cells of ground that positions are sorted into
-MAX_LABELS = 40  # devices or receivers that get a column each; more are told by their positions
-OF_GEOMETRY, OF_BORESIGHT = 14, 2  # columns
-NO_EDGE = -10.0  # stands for a diffraction parameter without a map: far from any edge
+CELL_M = 60.0  # side of the squares of ground
+MAX_LABELS = 40  # more devices or receivers get no column each; their positions identify them
+GEOMETRY_COLUMNS, BORESIGHT_COLUMNS = 14, 2  # of `link_features`
+NO_EDGE = -10.0  # diffraction parameter without a map: far above any edge
 
 
 def residual_variables(links: Links, mean_db: np.ndarray) -> dict[str, np.ndarray]:
-    """Return every variable (n,) that a residual may depend on, by name.
+    """Compute all variables (n,) that a residual may depend on, by name.
 
-    Integers are labels without an order, NaN is unknown. Predicted levels are (n,) [dB].
+    Integers are labels without an order; NaN is unknown.
+
+    Args:
+        links: n links.
+        mean_db: (n,) predicted levels [dB].
     """
     return {name: variable(links, mean_db) for name, variable in VARIABLES.items()}
 
 
 def residual_variable(name: str, links: Links, mean_db: np.ndarray) -> np.ndarray:
-    """Return one of `residual_variables`, without the time that others take."""
+    """Compute one of `residual_variables` only, which takes less time."""
     return VARIABLES[name](links, mean_db)
 
 
 def _cells(position_m: np.ndarray) -> np.ndarray:
-    """Return the number (n,) of the square of ground that each position (n, 3) is in."""
+    """Return the index (n,) of the square of ground that each position (n, 3) [m] is in."""
     squares = np.floor(position_m[:, :2] / CELL_M).astype(np.int64)
     return np.unique(squares, axis=0, return_inverse=True)[1].ravel()
 
@@ -59,28 +63,30 @@ VARIABLES: dict[str, Callable[[Links, np.ndarray], np.ndarray]] = {
 
 
 def feature_count(devices: int, declared: bool) -> int:
-    """Return the number of columns of `link_features` without receivers, for so many devices.
+    """Return the number of columns of `link_features(links, receivers=False)`.
 
-    It depends on whether the azimuth of any is declared.
+    Args:
+        devices: number of devices.
+        declared: whether the azimuth of any antenna is declared.
     """
     labels = devices if 1 < devices <= MAX_LABELS else 0
-    return OF_GEOMETRY + OF_BORESIGHT * declared + labels
+    return GEOMETRY_COLUMNS + BORESIGHT_COLUMNS * declared + labels
 
 
 def link_features(links: Links, receivers: bool = True) -> np.ndarray:
-    """Return position, geometry and angles, and which device and receiver it is, as numbers.
+    """Compute the inputs of a regression: geometry, angles, and one-hot device and receiver.
 
-    Neither time nor columns that the receiver reports beside the level: a map has none.
+    Times, and columns that the receiver reports beside the level, are left out: a map has none.
 
     Args:
         links: n links.
-        receivers: whether to say which receiver it is; a map's is none of them.
+        receivers: whether to include the receiver; the receiver of a map is none of them.
 
     Returns:
-        (n, p): both positions [m], distance [m], its logarithm, elevation [deg], sine and cosine of
-        the azimuth at the device, line of sight, metres inside buildings, diffraction parameter;
-        where azimuths of devices are declared the cosine of the angle off them and the sine's size,
-        0 where one is not; then a 0 or 1 for each device and for each receiver.
+        (n, p): both positions [m], distance [m] and its logarithm, elevation [deg], sine and cosine
+        of the azimuth at the device, line of sight, metres inside buildings, diffraction parameter;
+        if any azimuth is declared, cosine and magnitude of the sine of the angle off boresight (0
+        for a device without one); then 0 or 1 for each device and for each receiver.
     """
     azimuth = np.radians(links.azimuth_deg)
     columns = [*links.receiver_m.T, *links.device_m[links.device].T, links.distance_m,

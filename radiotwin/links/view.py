@@ -1,4 +1,4 @@
-"""Draw values of links over the end that moves, and give links to GIS programs."""
+"""Draw values of links at their moving end, and export links as a Dataset or GeoDataFrame."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ _UNITS = {"_m": "m", "_db": "dB", "_dbm": "dBm", "_s": "s", "_deg": "degree", "_
 
 
 def moving_end(table: pd.DataFrame) -> str:
-    """Return `receiver`, or `device` where devices are at more positions than receivers."""
+    """Return `device` if devices are at more positions than receivers, else `receiver`."""
     receivers, devices = (len(table[[f"{end}_x_m", f"{end}_y_m"]].dropna().drop_duplicates())
                           for end in ENDS)
     return ENDS[int(devices > receivers)]
 
 
 def of_device(table: pd.DataFrame, device: str | None) -> pd.DataFrame:
-    """Return the links of a device; of all where it is None. BadInput: none is to such a device."""
+    """Select the links of a device (None: all links); BadInput if it has none."""
     if device is None:
         return table
     part = table[table["device"] == device]
@@ -51,17 +51,17 @@ def of_device(table: pd.DataFrame, device: str | None) -> pd.DataFrame:
 
 def plot_links(table: pd.DataFrame, values: np.ndarray, ax: Axes, frame: PlotFrame,
                scene: Scene | None, label: str, strongest_last: bool, **look: Any) -> None:
-    """Draw a value of each link at its moving end, and the ends that do not move.
+    """Draw a value of each link at its moving end, and the fixed ends.
 
     Args:
         table: n links, with positions of both ends.
-        values: (n,) of them; NaN is drawn as not detected.
-        ax: to draw into.
+        values: (n,) values; NaN is drawn as not detected.
+        ax: axes to draw into.
         frame: of the axes.
-        scene: whose buildings are outlined; None: none are.
+        scene: whose buildings are outlined; None: no outlines.
         label: of the colour bar.
         strongest_last: draw large values over small ones; else large magnitudes over small ones.
-        look: of `Axes.scatter`.
+        look: further arguments of `Axes.scatter`.
     """
     end = moving_end(table)
     other = ENDS[1 - ENDS.index(end)]
@@ -86,7 +86,7 @@ def plot_links(table: pd.DataFrame, values: np.ndarray, ax: Axes, frame: PlotFra
 
 
 def links_dataset(table: pd.DataFrame, origin: Origin | None) -> xr.Dataset:
-    """Return the columns of a table as variables over the dimension `link`, with units."""
+    """Convert the columns of a table to variables over the dimension `link`, with units."""
     variables = {}
     for name in table:
         unit = next((unit for ending, unit in _UNITS.items() if str(name).endswith(ending)), None)
@@ -98,11 +98,7 @@ def links_dataset(table: pd.DataFrame, origin: Origin | None) -> xr.Dataset:
 
 
 def links_table(table: pd.DataFrame, origin: Origin | None) -> GeoDataFrame:
-    """Return the links with a point at the end that moves.
-
-    Raises:
-        BadInput: GeoPandas is not installed.
-    """
+    """Return the links with a point at their moving end; BadInput without GeoPandas."""
     end = moving_end(table)
     position_m = table[[f"{end}_x_m", f"{end}_y_m"]].to_numpy(dtype=float)
     return geo_data_frame(table.reset_index(drop=True), origin, position_m=position_m)

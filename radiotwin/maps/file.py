@@ -25,7 +25,7 @@ from radiotwin.io.budgets import DEVICES, MAP_AXIS, MAP_STREAM_VALUES, MAP_VALUE
 from radiotwin.io.files import atomic_file, atomic_folder, require_folder, require_writable
 from radiotwin.io.forms import MAX_NAME, MAX_POSITION_M, Origin
 from radiotwin.io.inputs import open_input, parse_json
-from radiotwin.links.cell_limits import MAX_LEVEL_DB
+from radiotwin.links.plausible import MAX_LEVEL_DB
 from radiotwin.runtime.console import progress
 from radiotwin.scene.lattice import Lattice
 

@@ -15,8 +15,8 @@ from radiotwin.links.alignment import as_measurements
 from radiotwin.links.checks import (
     COPIED,
     copied_rows,
+    move_anchors_out,
     refuse_empty_levels,
-    stand_anchors,
 )
 from radiotwin.links.measurements import Measurements
 from radiotwin.propagation.laws import channel_named
@@ -92,7 +92,7 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
     if not along_paths:
         _check_heights(measurements)
     links = (prepare_links if along_paths else join_links)(measurements, scene)
-    links = stand_anchors(links, scene)
+    links = move_anchors_out(links, scene)
     for note in links.notes:
         warnings.warn(note, stacklevel=2)
     if links.has_boresights:

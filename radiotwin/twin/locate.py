@@ -15,7 +15,7 @@ from radiotwin.io.cells import listed, read_cells
 from radiotwin.io.forms import Origin
 from radiotwin.links import Links, link_geometry, prepare_links
 from radiotwin.links.alignment import as_measurements, in_known_frame
-from radiotwin.links.declared import as_learnt
+from radiotwin.links.declared import match_learnt_law
 from radiotwin.links.measurements import Measurements
 from radiotwin.links.site_table import read_site_table
 from radiotwin.runtime.console import progress
@@ -80,7 +80,7 @@ def locate_devices(measurements: Measurements | pd.DataFrame | Path | str, twin:
         raise BadInput(f"the measurements have {unknown.level_column}, the twin is of "
                        f"{twin.level}; both need the same")
     links = prepare_links(unknown, scene, to_locate=True)
-    declared, assumed = as_learnt(links.device_names, links.declared, twin.declared, scene)
+    declared, assumed = match_learnt_law(links.device_names, links.declared, twin.declared, scene)
     links = links.with_ends(declared=declared).with_notes(*assumed)
     alone = twin.fitted.is_channel_alone or twin.channel.follows_paths
     model = _by_channel(twin, links) if alone else twin.fitted.for_positions()

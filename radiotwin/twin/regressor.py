@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from radiotwin.errors import BadInput
 from radiotwin.io.forms import Origin
-from radiotwin.links.cell_limits import LEVELS
 from radiotwin.links.measurements import Measurements
+from radiotwin.links.plausible import LEVELS
 from radiotwin.scene import Scene
 from radiotwin.twin.fit import fit_twin
 

@@ -20,15 +20,15 @@ from radiotwin.errors import BadInput
 from radiotwin.io.files import require_folder
 from radiotwin.io.forms import MAX_POSITION_M, Origin, Real
 from radiotwin.io.inputs import parse_json
-from radiotwin.links.cell_limits import (
+from radiotwin.links.declared import NOTHING, Declared, Radio
+from radiotwin.links.links import Columns, Ends, Flown, Links, World
+from radiotwin.links.plausible import (
     FREQUENCIES_HZ,
     MAX_ANGLE_DEG,
     MAX_CABLE_LOSS_DB,
-    MAX_POWER_DBM,
+    MAX_LEVEL_DB,
     MAX_TILT_DEG,
 )
-from radiotwin.links.declared import NOTHING, Declared, Radio
-from radiotwin.links.links import Columns, Ends, Flown, Links, World
 from radiotwin.propagation.laws import ChannelModel
 from radiotwin.propagation.laws.base import MAX_DB, MAX_SD_DB, require_array, require_names
 from radiotwin.propagation.laws.registry import BUILT_IN, decode_both, encode_channel
@@ -110,7 +110,7 @@ class AntennaRecord(_Strict):
 class RadioRecord(_Strict):
     """Declared radio of a device."""
 
-    tx_power_dbm: Annotated[float, Field(ge=-2 * MAX_POWER_DBM, le=2 * MAX_POWER_DBM)] | None
+    tx_power_dbm: Annotated[float, Field(ge=-2 * MAX_LEVEL_DB, le=2 * MAX_LEVEL_DB)] | None
     cable_loss_db: Annotated[float, Field(ge=0, le=MAX_CABLE_LOSS_DB)]
     antenna: AntennaRecord | None
     frequency_hz: Annotated[float, Field(ge=FREQUENCIES_HZ[0], le=FREQUENCIES_HZ[1])] | None

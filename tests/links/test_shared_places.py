@@ -8,7 +8,7 @@ from radiotwin.closeloop.verdict.residual_tests import noise_floor_db
 from radiotwin.effects.catalogue.gain_drift import DeviceDrift, Drift, ReceiverDrift
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.effects.params import Parameter
-from radiotwin.links.sites import end_notes, never_part, receiver_differences, shared_names
+from radiotwin.links.sites import end_notes, inseparable_pairs, receiver_differences, shared_names
 from tests.worlds import synthetic_links
 
 OFFSET_DB, SQUARE_M = -4.0, 100.0
@@ -82,7 +82,7 @@ def test_receivers_that_never_met_are_not_compared():
 def test_ends_that_never_part_are_said_to_be_one():
     """d2 and r2 are read by nobody else; d0 and d1 share r0 and r1. A blank of r0 tells nothing of d2."""
     device, receiver = (np.repeat(each, 40) for each in ([0, 0, 1, 1, 2, 2], [0, 1, 0, 1, 2, 0]))
-    assert never_part(device[:200], receiver[:200]) == {2: 2} and never_part(device, receiver) == {}
+    assert inseparable_pairs(device[:200], receiver[:200]) == {2: 2} and inseparable_pairs(device, receiver) == {}
     level_db = np.where(np.arange(240) < 200, -90.0, np.nan)
     links = synthetic_links([[0.0, 0, 10], [90.0, 0, 10], [0.0, 90, 10]], device, np.tile([50.0, 50.0, 1.5], (240, 1)),
                             level_db=level_db, receiver=receiver)

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.links.cell_limits import far_notes, tilt_notes, unmatched_notes
+from radiotwin.links.plausible import far_notes, tilt_notes, unmatched_notes
 from radiotwin.links.site_table import read_site_table
 
 ALL = ("above_ground_m", "tx_power_dbm", "eirp_dbm", "cable_loss_db", "frequency_hz", "azimuth_deg", "tilt_deg",

@@ -25,7 +25,7 @@ def test_what_is_left_of_a_field_is_what_its_covariance_says():
     place_m, links, series = tracks(0)
     trend = Trend.of(links, np.arange(len(series)), series)
     i, j = np.array([0, 5, 100, 200]), np.array([3, 60, 101, 239])
-    left = trend.left_of(place_m, i, j, np.array([15.0, 60.0]))
+    left = trend.semivariances(place_m, i, j, np.array([15.0, 60.0]))
     minus = np.eye(len(series)) - trend.basis @ trend.basis.T
     for found, covariance in zip(left, (np.eye(len(series)), *(np.exp(-cdist(place_m, place_m) / length_m)
                                                                for length_m in (15.0, 60.0))), strict=True):
@@ -37,16 +37,16 @@ def test_some_links_stand_for_many(monkeypatch):
     place_m, links, series = tracks(1, slots=400)
     trend = Trend.of(links, np.arange(len(series)), series)
     i = np.arange(0, 1590, 30)
-    exact = Trend.left_of(trend, place_m, i, i + 9, np.array([10.0, 100.0]))
+    exact = Trend.semivariances(trend, place_m, i, i + 9, np.array([10.0, 100.0]))
     monkeypatch.setattr(variogram, "NODES", 10_000)
-    np.testing.assert_allclose(exact, trend.left_of(place_m, i, i + 9, np.array([10.0, 100.0])), atol=0.02)
+    np.testing.assert_allclose(exact, trend.semivariances(place_m, i, i + 9, np.array([10.0, 100.0])), atol=0.02)
 
 
 def test_levels_of_flights_and_trends_are_nothing_of_a_residual():
     _, links, series = tracks(2)
     trend = Trend.of(links, np.arange(len(series)), series)
     common = 5.0 * series + 3.0 * np.log(links.distance_m) - 2.0 * np.cos(np.radians(links.azimuth_deg))
-    np.testing.assert_allclose(trend.taken_from(common), 0.0, atol=1e-9)
+    np.testing.assert_allclose(trend.detrended(common), 0.0, atol=1e-9)
 
 
 @pytest.mark.seconds

@@ -27,7 +27,7 @@ from radiotwin.effects.params import (
 )
 from radiotwin.effects.patterns import Pattern, timed_members
 from radiotwin.links import Links
-from radiotwin.links.sites import never_apart_from
+from radiotwin.links.sites import inseparable_end
 
 MIN_LINKS = 60  # of a receiver or device, with a time
 MIN_FLIGHTS = 3  # that a device was heard on: within a flight, time and position change together
@@ -181,7 +181,7 @@ class _GainDrift(GainEffect):
 
     @override
     def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
-        other = never_apart_from(links, self.end, set(self.drifts()))
+        other = inseparable_end(links, self.end, set(self.drifts()))
         return [] if other is None else [self.name.replace(self.end, other)]
 
     @override

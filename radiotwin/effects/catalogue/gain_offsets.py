@@ -24,7 +24,7 @@ from radiotwin.effects.params import (
 )
 from radiotwin.effects.patterns import Pattern, members
 from radiotwin.links import Links
-from radiotwin.links.sites import never_apart_from
+from radiotwin.links.sites import inseparable_end
 
 PRIOR_SD_DB = 10.0  # wide: an error of a cable, a connector or a declared power
 MIN_LINKS = 30  # of a member; fewer do not outweigh shadowing
@@ -94,7 +94,7 @@ class _GainOffset(GainEffect):
         names = getattr(links, f"{self.end}_names")
         largest = max(self.params.members,
                       key=lambda each: abs(parameters[f"offset_db[{names[each]}]"].value))
-        other = never_apart_from(links, self.end, {largest})
+        other = inseparable_end(links, self.end, {largest})
         return [] if other is None else [self.name.replace(self.end, other)]
 
     @override

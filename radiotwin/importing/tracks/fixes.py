@@ -6,7 +6,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.source import are_few
-from radiotwin.links.cell_limits import LIMITS_DEG, no_height
+from radiotwin.links.plausible import MAX_DEGREES, height_placeholders
 
 ANGLES = ("heading_deg", "pitch_deg", "roll_deg")
 COLUMNS = ("latitude", "longitude", "altitude", *ANGLES)
@@ -62,7 +62,7 @@ def make_fixes(source: object, time_s: np.ndarray, values: dict[str, np.ndarray]
     """
     known = np.isfinite(time_s) & np.isfinite(values["latitude"]) & np.isfinite(values["longitude"])
     known &= (values["latitude"] != 0) | (values["longitude"] != 0)
-    for name, limit in LIMITS_DEG.items():
+    for name, limit in MAX_DEGREES.items():
         wrong = known & (np.abs(values[name]) > limit)
         if wrong.any():
             text = f"{values[name][wrong][0]:g} is no {name}"
@@ -71,7 +71,7 @@ def make_fixes(source: object, time_s: np.ndarray, values: dict[str, np.ndarray]
                                f"({wrong.sum()} such positions)")
             notes = (*notes, f"{source}: {wrong.sum()} positions left out: {text}")
             known &= ~wrong
-    if "altitude" in values and (wrong := known & no_height(values["altitude"])).any():
+    if "altitude" in values and (wrong := known & height_placeholders(values["altitude"])).any():
         notes = (*notes, f"{source}: {wrong.sum()} altitudes left out, such as "
                          f"{values['altitude'][wrong][0]:g} m")
         values = {**values, "altitude": np.where(wrong, np.nan, values["altitude"])}

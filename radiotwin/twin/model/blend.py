@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from radiotwin.inference.held_out import combine
 from radiotwin.inference.student import sd_of_scale
 from radiotwin.links import Links
-from radiotwin.links.cell_limits import MAX_ANGLE_DEG
+from radiotwin.links.plausible import MAX_ANGLE_DEG
 from radiotwin.links.variables import feature_count, link_features
 from radiotwin.propagation.laws.base import (
     MAX_POSITION_M,

@@ -1,7 +1,7 @@
-"""What cannot be meant in measurements and in tables of sites, or hardly.
+"""Plausibility of values in measurements and tables of sites: ranges, placeholders, slips, names.
 
-Values beyond limits, in their columns' units, placeholders, places far away, and names that nearly
-match.
+Values outside the range of their column are refused. Odd values, sites far away, and names that
+nearly match give notes.
 """
 
 import re
@@ -16,24 +16,21 @@ from radiotwin.io.forms import MAX_POSITION_M
 
 LEVELS = ["gain_db", "rssi_dbm"]
 READS = "reads_levels"  # 1: levels are read at the device, as by a gateway, of what receivers send
-# Limits that no measurement exceeds: what lies beyond them is another unit or a placeholder.
-MAX_LEVEL_DB = 300.0
-FREQUENCIES_HZ = (1e6, 450e9)  # as of a scene; materials of ITU-R P.2040 end at 450 GHz
-MAX_TIME_S = 1e11  # the year 5138; milliseconds since 1970 lie beyond
-MAX_SPAN_S = 3.2e9  # a century, the longest campaign
+# A measured value outside these ranges is in another unit, or a placeholder.
+MAX_LEVEL_DB = 300.0  # magnitude of levels [dB] and powers [dBm]
+FREQUENCIES_HZ = (1e6, 450e9)  # same as in a scene; materials of ITU-R P.2040 end at 450 GHz
+MAX_TIME_S = 1e11  # the year 5138; milliseconds since 1970 exceed it
+MAX_SPAN_S = 3.2e9  # a century, longer than any campaign
 MAX_TILT_DEG = 90.0
-MAX_AZIMUTH_DEG = 720.0  # of an antenna that stands; 999 and 65535 are placeholders
-MAX_ANGLE_DEG = 1e6  # thousands of turns in one direction, which some compasses count
-MAX_POWER_DBM = 300.0  # as of a level
+MAX_AZIMUTH_DEG = 720.0  # of a fixed antenna; 999 and 65535 are placeholders
+MAX_ANGLE_DEG = 1e6  # some compasses count thousands of turns
 MAX_CABLE_LOSS_DB = 100.0
-MAX_QUALITY = 1e15  # whole numbers are exact up to there
-LIMITS_DEG = {"latitude": 90.0, "longitude": 360.0}
-FAR_M, MAX_APART_M = 100_000.0, 1e6  # from what is measured or mapped: odd, longer than any link
+MAX_QUALITY = 1e15  # floats are exact whole numbers up to there
+MAX_DEGREES = {"latitude": 90.0, "longitude": 360.0}
+FAR_M, MAX_APART_M = 100_000.0, 1e6  # from the readings: noted; refused, as no link is so long
 HEIGHTS_M = (-3_000.0, 60_000.0)  # about the deepest mine (Kidd), the highest balloon (JAXA 2013)
-HIGH_M = 200.0  # above the ground: an altitude above the sea is suspected; masts are lower
+HIGH_M = 200.0  # above the ground: higher than masts, so probably an altitude above the sea
 _EARTH_M = 6_371_008.8  # mean radius (Moritz 2000, GRS80)
-_NAMED = 5  # names in a message
-
 
 _RANGES: dict[str, tuple[float, float, str]] = {
     **dict.fromkeys(LEVELS, (-MAX_LEVEL_DB, MAX_LEVEL_DB, "is no level; allowed are {} to {}")),
@@ -49,19 +46,19 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "_m": (-MAX_POSITION_M, MAX_POSITION_M,
            "is too far away; allowed are {} to {} m in the scene's frame"),
     **{ending: (-limit, limit, "is out of range; allowed are {} to {}") for ending, limit in (
-        ("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM), ("eirp_dbm", MAX_POWER_DBM),
+        ("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_LEVEL_DB), ("eirp_dbm", MAX_LEVEL_DB),
         ("quality", MAX_QUALITY))}}
-"""Name of a column, or its end -> least and greatest value, and the reason to refuse others."""
+"""Column, or the end of its name -> smallest and largest value, and why others are refused."""
 
 
-def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
+def refuse_implausible(refuse: Callable[[np.ndarray, str], None], name: str,
                   numbers: np.ndarray) -> None:
-    """Refuse numbers of a column that can only be mistakes, such as a wrong unit.
+    """Refuse values outside the plausible range of their column, such as those in a wrong unit.
 
     Args:
-        refuse: called with (n,) bool and the reason; raises where one is true.
-        name: of the column, as in `measurements.csv` or `devices.csv`.
-        numbers: (n,) in its unit; NaN where empty.
+        refuse: called with a mask (n,) of bad values and the reason; raises if any is true.
+        name: column of `measurements.csv` or `devices.csv`.
+        numbers: (n,) in the column's unit; NaN: empty.
     """
     for ending, (low, high, reason) in _RANGES.items():
         if name == ending or name.endswith(ending):
@@ -79,13 +76,13 @@ def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
                "is neither 0 (levels are read at the receiver) nor 1 (at the device)")
 
 
-def no_height(height_m: np.ndarray) -> np.ndarray:
-    """Return which heights (k,) are placeholders, such as -9999 and 99999 [m]."""
+def height_placeholders(height_m: np.ndarray) -> np.ndarray:
+    """Return which heights (k,) [m] are placeholders, such as -9999 and 99999."""
     return (height_m < HEIGHTS_M[0]) | (height_m > HEIGHTS_M[1])
 
 
 def tilt_notes(tilt_deg: np.ndarray) -> list[str]:
-    """Return a note where antennas (k,) are said to look upwards, and downtilts are meant."""
+    """Note tilts (k,) [deg, upwards] that are probably downtilts: some above zero, none below."""
     up, known = tilt_deg > 0, np.isfinite(tilt_deg)
     if not up.any() or (tilt_deg < 0).any():
         return []
@@ -94,7 +91,7 @@ def tilt_notes(tilt_deg: np.ndarray) -> list[str]:
 
 
 def high_notes(above_ground_m: np.ndarray) -> list[str]:
-    """Return a note where all sites (k,) are higher above the ground than masts are [m]."""
+    """Note heights above the ground (k,) [m] that are probably altitudes above the sea."""
     known_m = above_ground_m[np.isfinite(above_ground_m)]
     if not len(known_m) or known_m.min() < HIGH_M:
         return []
@@ -105,20 +102,20 @@ def high_notes(above_ground_m: np.ndarray) -> list[str]:
 
 def far_notes(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str],
               where: Callable[[int], str], what: str) -> list[str]:
-    """Return a note on sites that are odd distances away.
+    """Note sites that are more than `FAR_M` from the readings or the map.
 
     Args:
-        place: (k, 2) latitude and longitude [degrees], or x and y [m], of sites; NaN where unknown.
-        middle: (2,) of what they belong to.
-        axes: names of the two.
-        where: row -> the file and the site, for messages.
-        what: they belong to, such as `the readings`.
+        place: (k, 2) latitude and longitude [deg], or x and y [m], of the sites; NaN: unknown.
+        middle: (2,) middle of the readings or of the map.
+        axes: names of the two coordinates.
+        where: row -> file and site, for messages.
+        what: `middle` is the middle of, such as `the readings`.
 
     Raises:
-        BadInput: one is farther away than any link is long, or where a slip explains it: swapped
-            coordinates, a wrong sign, a decimal point at a wrong place.
+        BadInput: the farthest site is farther away than any link is long, or a slip explains its
+            position: swapped coordinates, a wrong sign, a shifted decimal point.
     """
-    apart_m = _apart_m(place, middle, axes)
+    apart_m = _distance_m(place, middle, axes)
     far = np.flatnonzero(apart_m > FAR_M)  # not of NaN
     if not len(far):
         return []
@@ -133,9 +130,10 @@ def far_notes(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str],
 
 
 def _slip(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> str:
-    """Return the slip that brings a place (2,) to where it belongs, or `""`.
+    """Return the slip that explains a far position (2,), as a question; `""` if none does.
 
-    Of local metres none is known: every decimal point that slips brings a place near the origin.
+    Slips of the decimal point are not tried around the origin of a local frame: dividing any x and
+    y by ten often enough would bring them there.
     """
     if "latitude" not in axes and np.linalg.norm(middle) <= FAR_M:
         return ""
@@ -151,55 +149,56 @@ def _slip(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> str:
             tries.append((moved, f"has a decimal point slipped ({moved[0]:.10g}, "
                                  f"{moved[1]:.10g})?"))
     return next((text for moved, text in tries
-                 if _apart_m(moved[None], middle, axes)[0] <= FAR_M), "")
+                 if _distance_m(moved[None], middle, axes)[0] <= FAR_M), "")
 
 
-def _apart_m(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> np.ndarray:
+def _distance_m(place: np.ndarray, middle: np.ndarray, axes: tuple[str, str]) -> np.ndarray:
+    """Return the distance (k,) [m] of positions (k, 2) from one, on the globe or in a plane."""
     if "latitude" in axes:
         return distances_m(place, middle)
     return np.linalg.norm(place - middle, axis=1)
 
 
 def distances_m(place_deg: np.ndarray, middle_deg: np.ndarray) -> np.ndarray:
-    """Return distances (k,) on the sphere of latitudes and longitudes (k, 2) from one [m].
+    """Return great-circle distances (k,) [m] of latitudes and longitudes (k, 2) [deg] from one.
 
-    They are infinite where a latitude is none.
+    A latitude beyond 90 degrees is infinitely far away.
     """
     (north, east), (middle_north, middle_east) = np.radians(place_deg).T, np.radians(middle_deg)
     chord = (np.sin((north - middle_north) / 2)**2
              + np.cos(north) * np.cos(middle_north) * np.sin((east - middle_east) / 2)**2)
     apart_m = 2 * _EARTH_M * np.arcsin(np.sqrt(np.clip(chord, 0, 1)))
-    return np.where(np.abs(place_deg[:, 0]) > LIMITS_DEG["latitude"], np.inf, apart_m)
+    return np.where(np.abs(place_deg[:, 0]) > MAX_DEGREES["latitude"], np.inf, apart_m)
 
 
-def unmatched_notes(path: Path | str, names: Iterable[str], others: Collection[str], end: str,
+def unmatched_notes(path: Path | str, names: Iterable[str], read: Collection[str], end: str,
                     what: str) -> list[str]:
-    """Return notes on names of a table that occur in no row of something, and those that it lacks.
+    """Note names that only a table of sites has, and names that only the readings have.
 
     Args:
         path: of the table.
         names: in the table.
-        others: names that occur.
-        end: what they are of, such as `device`.
-        what: they occur in, such as `the log`.
+        read: names in the readings.
+        end: `device` or `receiver`.
+        what: the readings are called in the note, such as `the log`.
     """
-    idle = list(dict.fromkeys(name for name in names if name not in others))
-    lacking = sorted(set(others) - set(names))
+    idle = list(dict.fromkeys(name for name in names if name not in read))
+    lacking = sorted(set(read) - set(names))
     notes, file = [], Path(path).name
     if idle:
         loose = {_loosely(name): name for name in lacking}
         pairs = [f"{name} ({loose[_loosely(name)]} there)" for name in idle
                  if _loosely(name) in loose]
         notes.append(f"{file}: {len(idle)} of {len(set(names)):,} names occur in no row of {what}: "
-                     f"{some(pairs or idle, _NAMED)}"
+                     f"{some(pairs or idle)}"
                      + ("; names are compared letter by letter: make them equal" if pairs else ""))
     if lacking and idle:
-        notes.append(f"{file}: {len(lacking)} of {len(others):,} {end}s of {what} are not in it: "
-                     f"{some(lacking, _NAMED)}")
+        notes.append(f"{file}: {len(lacking)} of {len(read):,} {end}s of {what} are not in it: "
+                     f"{some(lacking)}")
     return notes
 
 
 def _loosely(name: str) -> tuple[str, ...]:
-    """Return a name without case, marks, zeros before its numbers, and decimals that are zero."""
+    """Return the words and numbers of a name, without case, punctuation and leading zeros."""
     parts = re.findall(r"\d+|[^\W\d_]+", re.sub(r"(?<=\d)\.0+$", "", name.casefold()))
     return tuple(part.lstrip("0") or "0" if part.isdigit() else part for part in parts)
