@@ -23,7 +23,7 @@ from radiotwin.importing import import_files, read_settings
 from radiotwin.links.alignment import in_scene_frame
 from radiotwin.links.measurements import read_measurements
 from radiotwin.scene.build import BuildOptions
-from radiotwin.scene.readers import MapOptions, build_scene_from_map
+from radiotwin.scene.readers import build_scene_from_map
 from studies.closeloop import counted, summary
 from studies.closeloop_real import (
     AZIMUTHS_DEG,
@@ -83,8 +83,8 @@ def campus(heights: bool = True) -> Iterator[tuple[Measurements, Scene]]:
         import_files(folder / "raw.csv", read_settings(folder / "import.toml", {}, folder),
                     folder / "measured")
         build_scene_from_map(folder / "map.osm", folder / "scene",
-                             MapOptions(BBOX_DEG, HEIGHT_DEFAULT_M),
-                             BuildOptions(frequency_hz=FREQUENCY_HZ))
+                             BuildOptions(frequency_hz=FREQUENCY_HZ, bbox=BBOX_DEG,
+                                          default_height_m=HEIGHT_DEFAULT_M))
         scene = Scene.load(folder / "scene")
         measured = in_scene_frame(read_measurements(folder / "measured" / "measurements.csv"),
                                   scene)

@@ -21,7 +21,7 @@ from shapely.geometry import Point, Polygon, box, mapping
 import radiotwin as rt
 from radiotwin.geo import to_geographic
 from radiotwin.io.forms import Origin
-from radiotwin.scene.readers import MapOptions, build_scene_from_map
+from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.trace.run import trace_gains
 
 ORIGIN = Origin(latitude_deg=47.05, longitude_deg=8.30, altitude_m=0.0)
@@ -50,7 +50,7 @@ def main(folder: Path, seed: int = 7) -> None:
     node_m = np.array([[x, y, NODE_HEIGHT_M] for x, y in NODES.values()])
     with tempfile.TemporaryDirectory() as name:
         write_map([*town, (NEW_BUILDING, NEW_HEIGHT_M)], Path(name) / "truth.geojson")
-        build_scene_from_map(Path(name) / "truth.geojson", Path(name) / "truth", MapOptions(),
+        build_scene_from_map(Path(name) / "truth.geojson", Path(name) / "truth",
                              rt.BuildOptions(frequency_hz=FREQUENCY_HZ, origin=ORIGIN))
         gain_db = trace_gains(rt.Scene.load(Path(name) / "truth"), node_m, position_m,
                               rt.SolverSettings.of_quality("default"))

@@ -1,6 +1,6 @@
-"""Any Mitsuba or Sionna RT city into a checked scene folder that needs nothing outside itself.
+"""Build a self-contained scene folder from a city model, and report on it.
 
-What was found and written is a report, which can be printed.
+`BuildOptions`, `finish_scene` and the report are shared with `radiotwin.scene.readers`, for maps.
 """
 
 from collections import Counter
@@ -45,7 +45,13 @@ from radiotwin.scene.folder import (
     write_city,
 )
 from radiotwin.scene.importer import ImportedCity, import_city
-from radiotwin.scene.materials import Names, constants, traceable_materials
+from radiotwin.scene.materials import (
+    STANDARD,
+    MaterialTable,
+    Names,
+    constants,
+    traceable_materials,
+)
 from radiotwin.scene.placement import (
     BuiltGrid,
     building_bounds,
@@ -70,15 +76,15 @@ MIN_STEP_M = 0.01  # of a lattice
 
 @dataclass(frozen=True)
 class MaterialUse:
-    """A material at the scene's frequency.
+    """A material of a scene, for the report.
 
     Attributes:
         name: Name in `city.xml`.
         kind: `ITU` of that name, `ITU concrete`, or `own constants`.
         shapes: Number of shapes made of it.
-        relative_permittivity: At the scene's frequency.
-        conductivity_s_per_m: At the scene's frequency [S/m].
-        in_range: False where the ITU table does not cover the frequency.
+        relative_permittivity: Real part at the scene's frequency.
+        conductivity_s_per_m: Conductivity at the scene's frequency [S/m].
+        in_range: Whether the ITU table covers the frequency.
     """
 
     name: str
@@ -91,11 +97,11 @@ class MaterialUse:
 
 @dataclass(frozen=True)
 class BuildReport:
-    """Result of `build_scene`. Only counts and problems are set where tracing would fail.
+    """Report of `build_scene`. Only counts and problems are set if tracing would fail.
 
     Attributes:
-        source: As given.
-        folder: Folder of the scene; None where it was only checked.
+        source: Source of the city as the user gave it.
+        folder: Scene folder; None if it was only checked.
         frequency_hz: Frequency of the scene [Hz].
         shapes, triangles: Numbers written.
         extent_m: (x_min, x_max, y_min, y_max) of the lattice [m].
@@ -105,11 +111,11 @@ class BuildReport:
         altitudes_m: Altitudes of the lattice [m].
         devices, uavs: Numbers placed.
         materials: Materials in use.
-        problems: Errors first.
-        facts: More lines, as (subject, finding).
+        problems: Problems, errors first.
+        facts: More lines of the report, (subject, finding).
         step_m: Step of the lattice [m].
-        altitudes_given: Whether the altitudes were asked for.
-        altitudes_above: What the lattice's altitudes are above: `datum` or `ground`.
+        altitudes_given: Whether the user chose the altitudes.
+        altitudes_above: Reference of the lattice's altitudes: `datum` or `ground`.
     """
 
     source: str
@@ -149,12 +155,7 @@ class BuildReport:
 
 
 def print_report(report: BuildReport, console: Console) -> None:
-    """Print the report as tables, the problems last.
-
-    Args:
-        report: Report to print.
-        console: Where to print it.
-    """
+    """Print a report as tables, the problems last."""
     facts = Table(title="Scene from " + escape(report.source), show_header=False, **_TITLE)
     facts.add_column()
     facts.add_column(overflow="fold")
@@ -187,6 +188,7 @@ def print_report(report: BuildReport, console: Console) -> None:
 
 
 def _problem_table(report: BuildReport) -> Table:
+    """Return the table of a report's problems."""
     table = Table(title="Problems", show_header=False, show_lines=True, **_TITLE)
     table.add_column()
     table.add_column(overflow="fold")
@@ -197,6 +199,7 @@ def _problem_table(report: BuildReport) -> Table:
 
 
 def _material_table(report: BuildReport) -> Table:
+    """Return the table of a report's materials."""
     table = Table(title=f"Materials at {report.frequency_hz / 1e9:g} GHz", **_TITLE)
     table.add_column("material", overflow="fold")
     table.add_column("kind", overflow="fold")
@@ -211,32 +214,36 @@ def _material_table(report: BuildReport) -> Table:
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """Options for reading a city and adding to it.
+    """How to read a city model or a map, and what to add to it.
 
     Attributes:
         frequency_hz: Frequency of the scene's radio [Hz].
-        materials: Name of a material in the file -> ITU material to use for it.
-        scale: Factor from the file's unit to metres; None: metres, with a warning if it seems to
-            be another.
-        up: Axis of the file that points up, "x", "y" or "z"; None: z, with an error if it seems to
-            be another.
-        bbox: (x_min, y_min, x_max, y_max) [m] in the file's frame, after `scale` and `up`: only
-            shapes that reach into it are kept, and it becomes the extent.
+        materials: Name of a material in the file -> ITU material; of a map as `with_materials`.
+        bbox: Part to keep, which becomes the extent: (x_min, y_min, x_max, y_max) [m] in the file's
+            frame, after `scale` and `up`; of a map (south, west, north, east) [degrees].
         devices: Number of devices to place on free ground.
         uavs: Number of UAVs to place near the middle.
         seed: Seed of the placement.
-        origin: Where on the earth the scene's x = y = 0 lies: of a map, where to put it (None: its
-            middle); of a city model, where its file has it (None: unknown).
-        extent_m: (x_min, x_max, y_min, y_max) of the lattice [m], in the file's frame as `bbox`; of
-            a map, from its origin. None: around the buildings, or `bbox`.
-        step_m: of the lattice [m]; None: chosen by the extent.
-        altitudes_m: of the lattice [m]; None: chosen by the roofs.
+        origin: WGS84 position of x = y = 0; None: the middle of a map, unknown for a city model.
+        extent_m: (x_min, x_max, y_min, y_max) of the lattice [m], in the file's frame; of a map,
+            from its origin. None: `bbox`, or around the buildings.
+        step_m: Step of the lattice [m]; None: chosen by the extent.
+        altitudes_m: Altitudes of the lattice [m]; None: chosen by the roofs.
+        scale: City model: factor from the file's unit to metres; None: metres, with a warning if it
+            seems to be another unit.
+        up: City model: axis of the file that points up, "x", "y" or "z"; None: z, with an error if
+            it seems to be another.
+        default_height_m: Map: height of buildings without one [m]; None: 10, with a warning.
+        height_column, ground_column: Map: columns of heights, `NAME[:UNIT]`, and of the ground's
+            elevation, which is subtracted.
+        material_table: Map: materials by tag.
+        terrain, terrain_unit: Map: GeoTIFF of the ground's heights; their unit if it names none.
+        crs: Map: coordinate reference system of a file that names none.
+        layers: Map: layers to read; empty: those with buildings.
     """
 
     frequency_hz: float = 2.4e9
     materials: Mapping[str, str] | None = None
-    scale: float | None = None
-    up: str | None = None
     bbox: tuple[float, float, float, float] | None = None
     devices: int = 0
     uavs: int = 3
@@ -245,9 +252,19 @@ class BuildOptions:
     extent_m: tuple[float, float, float, float] | None = None
     step_m: float | None = None
     altitudes_m: tuple[float, ...] | None = None
+    scale: float | None = None
+    up: str | None = None
+    default_height_m: float | None = None
+    height_column: str | None = None
+    ground_column: str | None = None
+    material_table: MaterialTable = STANDARD
+    terrain: Path | str | None = None
+    terrain_unit: str | None = None
+    crs: str | None = None
+    layers: tuple[str, ...] = ()
 
     def check(self) -> None:
-        """Raise BadInput for an impossible value."""
+        """Raise BadInput for an impossible value of those that maps and city models share."""
         if self.scale is not None and not 0 < self.scale < float("inf"):
             raise BadInput(f"scale {self.scale:g} is not possible; give a positive factor (feet: "
                            "0.3048)")
@@ -263,9 +280,6 @@ class BuildOptions:
             if not (np.isfinite(self.bbox).all() and x_min < x_max and y_min < y_max):
                 raise BadInput(f"bbox {self.bbox} is not possible; give x_min,y_min,x_max,y_max in "
                                "metres, the minimum below the maximum")
-        self._check_lattice()
-
-    def _check_lattice(self) -> None:
         if self.extent_m is not None:
             x_min, x_max, y_min, y_max = self.extent_m
             if not (np.isfinite(self.extent_m).all() and x_min < x_max and y_min < y_max):
@@ -274,16 +288,14 @@ class BuildOptions:
         if self.step_m is not None and not MIN_STEP_M <= self.step_m <= MAX_COORDINATE_M:
             raise BadInput(f"a step of {self.step_m:g} m is not possible; give {MIN_STEP_M:g} to "
                            f"{MAX_COORDINATE_M:g} m")
-        altitudes_m = self.altitudes_m
-        if altitudes_m is not None:
-            if not altitudes_m or not all(0 < each <= MAX_COORDINATE_M for each in altitudes_m):
-                raise BadInput(f"altitudes of {', '.join(f'{each:g}' for each in altitudes_m)} m "
-                               f"are not possible; give some above 0 and at most "
-                               f"{MAX_COORDINATE_M:g} m")
-            if len(set(altitudes_m)) < len(altitudes_m):
-                raise BadInput(f"an altitude is given twice in "
-                               f"{', '.join(f'{each:g}' for each in altitudes_m)} m; every one "
-                               "must be unique")
+        if self.altitudes_m is not None:
+            given = ", ".join(f"{altitude_m:g}" for altitude_m in self.altitudes_m)
+            if not given or not all(0 < altitude_m <= MAX_COORDINATE_M
+                                    for altitude_m in self.altitudes_m):
+                raise BadInput(f"altitudes of {given} m are not possible; give some above 0 and at "
+                               f"most {MAX_COORDINATE_M:g} m")
+            if len(set(self.altitudes_m)) < len(self.altitudes_m):
+                raise BadInput(f"an altitude is given twice in {given} m; every one must be unique")
 
 
 def build_scene(source: Path | str, out_folder: Path | str, options: BuildOptions = BuildOptions(),
@@ -293,7 +305,7 @@ def build_scene(source: Path | str, out_folder: Path | str, options: BuildOption
     Args:
         source: Path of a Mitsuba or Sionna RT XML file, or `sionna:NAME`.
         out_folder: Scene folder to write; a scene that is already in it is replaced.
-        options: How to read the city, and what to add to it.
+        options: How to read the city, and what to add to it; without those for maps.
         check_only: Write nothing, and return errors in the report instead of raising them.
 
     Returns:
@@ -334,17 +346,17 @@ def build_scene(source: Path | str, out_folder: Path | str, options: BuildOption
 
 @dataclass(frozen=True)
 class Declared:
-    """Declarations of a scene besides its geometry.
+    """What a scene declares besides its geometry.
 
     Attributes:
-        source: Origin of the city.
+        source: Source of the city.
         name: Name of the scene.
         extent: Extent of the lattice; None: chosen around the buildings.
-        origin: WGS84 position of the frame's origin, where it is known.
+        origin: WGS84 position of the frame's origin; None: unknown.
         provenance: Entries for `scene.toml`.
         facts: More lines for the report.
-        vegetation: Volumes of it.
-        terrain: Ground that is not flat; None: it is, at z = 0.
+        vegetation: Areas of vegetation.
+        terrain: Ground that is not flat; None: flat ground at z = 0.
         streets_m: (n, 2) corners of each street [m].
     """
 
@@ -361,13 +373,13 @@ class Declared:
 
 def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, options: BuildOptions,
                  check_only: bool, buildings: pd.DataFrame | None = None) -> BuildReport:
-    """Write the scene folder of a city without errors, and report on it.
+    """Place devices and UAVs in a city, write its scene folder, and report on it.
 
     Args:
-        city: City in the scene's frame; its list of problems grows.
+        city: City in the scene's frame without errors; problems of materials are appended.
         declared: Declarations besides the geometry.
         out_folder: Scene folder to write; a scene that is already in it is replaced.
-        options: Frequency, devices, UAVs and seed.
+        options: Frequency, lattice, devices, UAVs and seed.
         check_only: Write nothing.
         buildings: Table for `buildings.csv`.
 
@@ -405,6 +417,7 @@ def write_scene(folder: Path, shapes: list[CityShape], config: SceneConfig,
 
 def _city_shapes(city: ImportedCity, frequency_hz: float
                  ) -> tuple[list[CityShape], list[Problem]]:
+    """Return the shapes of a city with materials that Sionna RT accepts, and problems with them."""
     assert city.surfaces is not None  # without an error among the problems
     materials = [material for material in city.materials if material is not None]
     taken = Names(name.lower() for name in city.names)
@@ -425,12 +438,11 @@ def _plan(city: ImportedCity, declared: Declared, options: BuildOptions
         extent = choose_extent(bounds)
     else:
         bounds, extent = declared.extent.bounds, declared.extent
-    buildings, ground = (CityMap(surfaces.vertices, surfaces.faces[faces]) if faces.any() else None
-                         for faces in (solid, city.ground))
     on_terrain = declared.terrain is not None
-    if on_terrain:
-        ground = CityMap(surfaces.vertices, surfaces.faces[city.ground],
-                         terrain=np.ones(np.count_nonzero(city.ground), dtype=bool))
+    buildings, ground = (
+        CityMap(surfaces.vertices, surfaces.faces[faces],
+                terrain=np.full(np.count_nonzero(faces), is_terrain)) if faces.any() else None
+        for faces, is_terrain in ((solid, False), (city.ground, on_terrain)))
     tops_m, heights_m = building_tops(surfaces, solid, ground)
     highest = int(heights_m.argmax())
     lattice = LatticeConfig(
@@ -458,6 +470,7 @@ def _plan(city: ImportedCity, declared: Declared, options: BuildOptions
 
 
 def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[str, str]:
+    """Return `[provenance]` of a city model's scene: source, seed, and options that were given."""
     known = {"source": source_text(source), "seed": str(options.seed)}
     if any(city.moved_m):
         known["moved_m"] = ", ".join(f"{value:.3f}" for value in city.moved_m)
@@ -470,16 +483,18 @@ def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[
 
 def _materials_in_use(city: ImportedCity, shapes: list[CityShape],
                       frequency_hz: float) -> tuple[MaterialUse, ...]:
+    """Return the materials of a city for the report, the most frequent first."""
     uses, declared = [], dict(zip((shape.material for shape in shapes), city.materials))
     for material, count in Counter(shape.material for shape in shapes).most_common():
-        before = declared[material]
-        assert before is not None
-        kind = ("own constants" if before.itu is None else
-                "ITU" if before.itu == material.name else f"ITU {before.itu}")
-        uses.append(MaterialUse(material.name, kind, count, *constants(before, frequency_hz)))
+        original = declared[material]
+        assert original is not None
+        kind = ("own constants" if original.itu is None else
+                "ITU" if original.itu == material.name else f"ITU {original.itu}")
+        uses.append(MaterialUse(material.name, kind, count, *constants(original, frequency_hz)))
     return tuple(uses)
 
 
 def _by_severity(problems: list[Problem]) -> tuple[Problem, ...]:
+    """Return problems, errors first."""
     order = ("error", "warning", "fixed")
     return tuple(sorted(problems, key=lambda problem: order.index(problem.severity)))

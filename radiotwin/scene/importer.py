@@ -273,7 +273,8 @@ def _joined(names: list[str], materials: list[Material | None], surfaces: Surfac
             buildings.append(meshes[members[0]])
             continue
         mesh: Any = trimesh.util.concatenate(
-            [trimesh.Trimesh(*meshes[index], process=False) for index in members])
+            [trimesh.Trimesh(meshes[index][0], meshes[index][1], process=False)
+             for index in members])
         buildings.append(clean(mesh.vertices, mesh.faces)[:2])
     joined = fixed(f"{surfaces.shapes - len(buildings)} mesh(es) were joined to others of the same "
                    "material, roofs to walls, so that the edge between them diffracts")

@@ -31,7 +31,7 @@ from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.folder import CityShape, write_city
 from radiotwin.scene.materials import STANDARD, itu_material, with_materials
 from radiotwin.scene.plot import draw_preview
-from radiotwin.scene.readers import MapOptions, build_scene_from_map
+from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.trace import SolverSettings, trace_gains
 from tests.terrains import incline, terrain_map
 
@@ -105,7 +105,7 @@ def test_roofs_that_are_off_are_raised_and_lowered_and_the_table_follows(tmp_pat
         for east, height in ((8.0, 12), (8.001, 20), (8.002, None))]}))
     materials = STANDARD if roof == "default" else with_materials(STANDARD, {"roof": roof})
     build_scene_from_map(tmp_path / "town.geojson", tmp_path / "scene",
-                         MapOptions(default_height_m=9.0, materials=materials), BuildOptions())
+                         BuildOptions(default_height_m=9.0, material_table=materials))
     scene = Scene.load(tmp_path / "scene")
     centres_m = buildings(scene.city)[1]
     by_height = {round(height_m): number for number, (_, _, height_m) in enumerate(centres_m)}

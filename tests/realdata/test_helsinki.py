@@ -28,7 +28,7 @@ MAX_S = 300.0
 @pytest.fixture(scope="module")
 def helsinki(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("helsinki") / "scene"
-    report = build_scene_from_map(folder("helsinki_osm") / "helsinki.osm.pbf", out, None,
+    report = build_scene_from_map(folder("helsinki_osm") / "helsinki.osm.pbf", out,
                                   BuildOptions(altitudes_m=(1.5,), step_m=5.0))
     return Scene.load(out), report
 

@@ -8,7 +8,7 @@ import pytest
 from radiotwin.io.forms import Origin
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
-from radiotwin.scene.readers import MapOptions, build_scene_from_map
+from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.trace import SolverSettings
 from radiotwin.trace.run import read_points, trace_points, warn_of_terrain
 from tests.scene.readers.conftest import Map
@@ -25,8 +25,8 @@ def scenes(tmp_path_factory):
     drawn = Map().box(240, -90, 250, -80, height="4").box(-240, 80, -230, 90, height="4").write(folder / "a.osm")
     for name, crest_m in (("ridge", 60.0), ("plain", 0.0)):
         dem = write_dem(folder / f"{name}.tif", ridge(crest_m), half_m=600, pixel_m=5)
-        build_scene_from_map(drawn, folder / name, MapOptions(terrain=dem),
-                             BuildOptions(origin=Origin(latitude_deg=10, longitude_deg=20), uavs=0))
+        build_scene_from_map(drawn, folder / name,
+                             BuildOptions(terrain=dem, origin=Origin(latitude_deg=10, longitude_deg=20), uavs=0))
         with (folder / name / "scene.toml").open("a") as file:
             file.write('\n[[devices]]\ndevice = "d"\nx_m = -150.0\ny_m = 0.0\nabove_ground_m = 5.0\n')
         built.append(Scene.load(folder / name))

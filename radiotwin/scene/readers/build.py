@@ -1,8 +1,7 @@
-"""Scene folders from maps with footprints, with a table of all buildings (`buildings.csv`)."""
+"""Build a scene folder from a map, with a table of all buildings (`buildings.csv`)."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +20,12 @@ from radiotwin.scene.folder import scene_name, source_text
 from radiotwin.scene.importer import ImportedCity
 from radiotwin.scene.materials import (
     RESERVED_NAMES,
-    STANDARD,
     Material,
     MaterialTable,
     Names,
     itu_material,
     safe_name,
+    with_materials,
 )
 from radiotwin.scene.placement import choose_extent, make_extent
 from radiotwin.scene.readers.citygml import read_citygml
@@ -49,10 +48,12 @@ from radiotwin.scene.readers.gis_files import (
 )
 from radiotwin.scene.readers.heights import (
     KNOWN,
+    MAX_HEIGHT_M,
     READ_COLUMNS,
     HeightColumn,
     check_declared,
     column_name,
+    declared_column,
     height_sds_m,
     listed_names,
     no_height_text,
@@ -75,7 +76,6 @@ from radiotwin.scene.readers.terrain import Ground, make_ground, stand_on
 from radiotwin.scene.readers.vegetation import make_vegetation, vegetation_fact
 from radiotwin.scene.streets import cut_streets
 from radiotwin.scene.surfaces import Surfaces
-from radiotwin.scene.vegetation import VegetationConfig
 
 OSM_SUFFIXES = (".osm", ".osm.pbf")
 READERS: dict[str, Callable[[Path, str | None], MapFile]] = {
@@ -87,9 +87,9 @@ READERS: dict[str, Callable[[Path, str | None], MapFile]] = {
     **dict.fromkeys((".city.json", ".city.json.gz", ".json", ".json.gz", ".cityjson",
                      ".geojson.gz", *LINES), read_json_map),
     ".gml": read_citygml, ".citygml": read_citygml}
-LAYERED = {".gpkg": read_geopackage, ".zip": read_shapefile}  # those that may have layers
-GROUND = "ground"  # name of its shape
-GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent
+LAYERED = {".gpkg": read_geopackage, ".zip": read_shapefile}  # files that may have layers
+GROUND = "ground"  # name of the ground's shape
+GROUND_MARGIN_M = 100.0  # [m], the ground extends this far beyond buildings and extent
 MAX_WIDTH_M = 50e3  # [m], chosen so that a plane and single precision are good enough
 ORIGIN_DECIMALS = 6  # of latitude and longitude [degrees]: a decimetre
 DEFAULT_HEIGHT_M = 10.0  # [m], about three storeys
@@ -98,12 +98,16 @@ Bounds = tuple[float, float, float, float]
 
 def _building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
                    on_terrain: bool = False) -> pd.DataFrame:
-    """Return the table of buildings, with one row a prism, and its shape by its index.
+    """Return the table of buildings, one row per prism.
 
     Columns are building, shape, x_m, y_m (a point inside), area_m2, on terrain ground_m (the lowest
-    ground under the building), bottom_m and top_m (as ground_m above the datum), height_from,
-    height_sd_m (see `height_sds_m`), unusable (tags that were skipped), material and
-    material_from.
+    ground under the building), bottom_m and top_m (above the datum), height_from, height_sd_m (see
+    `height_sds_m`), unusable (tags that were skipped), material and material_from.
+
+    Args:
+        prisms: prisms of all buildings.
+        shape_of: index of a prism -> name of its shape.
+        on_terrain: whether the ground is a terrain.
     """
     rows, heights_sd_m = [], height_sds_m(
         np.array([prism.height.top_m - prism.ground_m for prism in prisms]),
@@ -123,45 +127,35 @@ def _building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
     return pd.DataFrame(rows)
 
 
-@dataclass(frozen=True)
-class MapOptions:
-    """How to read a map: arguments of `radiotwin.build_scene` of the same names.
+def check_map_options(options: BuildOptions) -> None:
+    """Raise BadInput for a value that is impossible for a map."""
+    with_materials(options.material_table, options.materials or {})
+    height_m = options.default_height_m
+    if height_m is not None and not 0 < height_m <= MAX_HEIGHT_M:
+        raise BadInput(f"a default height of {height_m:g} m is not possible; give more than 0 and "
+                       f"at most {MAX_HEIGHT_M:g} m")
+    if options.crs is not None:
+        check_declared_system(options.crs)
+    if options.terrain_unit not in (None, "m", "ft"):
+        raise BadInput(f"--terrain-unit {options.terrain_unit!r} is not possible; give m or ft")
+    if options.terrain_unit is not None and options.terrain is None:
+        raise BadInput("--terrain-unit is that of a terrain; give one with --terrain FILE.tif")
+    if options.bbox is not None:
+        south, west, north, east = options.bbox
+        if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
+            raise BadInput(f"bbox {options.bbox} is not possible; give SOUTH,WEST,NORTH,EAST in "
+                           "degrees, the south below the north and the west below the east")
+    options.check()
 
-    Attributes:
-        bbox_deg: (south, west, north, east) [degrees]; `bbox` there.
-        materials: by tag; `material_table` and `materials` there.
-    """
 
-    bbox_deg: Bounds | None = None
-    default_height_m: float | None = None
-    materials: MaterialTable = STANDARD
-    height_column: HeightColumn | None = None
-    terrain: Path | None = None
-    crs: str | None = None
-    layers: tuple[str, ...] = ()
-    terrain_unit: str | None = None
-
-    @property
-    def height_m(self) -> float:
-        """Height of buildings whose tags give none [m]."""
-        return DEFAULT_HEIGHT_M if self.default_height_m is None else self.default_height_m
-
-    def check(self) -> None:
-        """Raise BadInput for an impossible value."""
-        if not 0 < self.height_m <= 1000:
-            raise BadInput(f"a default height of {self.height_m:g} m is not possible; give "
-                           "more than 0 and at most 1000 m")
-        if self.crs is not None:
-            check_declared_system(self.crs)
-        if self.terrain_unit not in (None, "m", "ft"):
-            raise BadInput(f"--terrain-unit {self.terrain_unit!r} is not possible; give m or ft")
-        if self.terrain_unit is not None and self.terrain is None:
-            raise BadInput("--terrain-unit is that of a terrain; give one with --terrain FILE.tif")
-        if self.bbox_deg is not None:
-            south, west, north, east = self.bbox_deg
-            if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
-                raise BadInput(f"bbox {self.bbox_deg} is not possible; give SOUTH,WEST,NORTH,EAST "
-                               "in degrees, the south below the north and the west below the east")
+def _declared_column(options: BuildOptions) -> HeightColumn | None:
+    """Return the column of heights that the user named; None if there is none."""
+    if options.height_column is not None:
+        return declared_column(options.height_column, options.ground_column)
+    if options.ground_column is not None:
+        raise BadInput("--ground-column is subtracted from the column of roofs; name that with "
+                       "--height-column, too")
+    return None
 
 
 def map_suffix(source: Path | str) -> str | None:
@@ -181,17 +175,16 @@ def map_name(source: Path | str) -> str:
 
 
 def build_scene_from_map(
-    source: Path | str, out_folder: Path | str, map_options: MapOptions | None = None,
-    options: BuildOptions | None = None, check_only: bool = False,
+    source: Path | str, out_folder: Path | str, options: BuildOptions | None = None,
+    check_only: bool = False,
 ) -> BuildReport:
     """Read footprints, extrude them, and write a scene folder with a table of all buildings.
 
     Args:
-        source: a file with one of the endings of `READERS`.
+        source: file with one of the endings of `READERS`.
         out_folder: scene folder to write; a scene in it is replaced.
-        map_options: how to read the map; None: the defaults.
-        options: frequency, devices, UAVs, seed, origin and lattice; `bbox`, `scale`, `up`,
-            `materials` are for city models. None: the defaults.
+        options: how to read the map, and what to add to it, without `scale` and `up`; None: the
+            defaults.
         check_only: write nothing.
 
     Raises:
@@ -199,48 +192,48 @@ def build_scene_from_map(
             impossible.
     """
     path, out_folder = Path(source), Path(out_folder)
-    map_options, options = map_options or MapOptions(), options or BuildOptions()
-    map_options.check()
-    options.check()
+    options = options or BuildOptions()
+    check_map_options(options)
+    height_column = _declared_column(options)
+    materials = with_materials(options.material_table, options.materials or {})
+    default_m = options.default_height_m or DEFAULT_HEIGHT_M
     if not check_only:
         check_target(out_folder, source=path)
     check_input(path, f"map ({', '.join(READERS)})")
     suffix = map_suffix(path)
     if suffix is None:
         raise BadInput(f"{path} is not a map; allowed are {', '.join(READERS)}")
-    if map_options.crs is not None and suffix in OSM_SUFFIXES:
+    if options.crs is not None and suffix in OSM_SUFFIXES:
         raise BadInput(f"{path} is in longitude and latitude, as all of OpenStreetMap; leave --crs "
                        "out")
     if suffix in LAYERED:
-        found = LAYERED[suffix](path, map_options.crs, map_options.layers)
-    elif map_options.layers:
+        found = LAYERED[suffix](path, options.crs, options.layers)
+    elif options.layers:
         raise BadInput(f"{path} has no layers; leave --layer out (it is for {', '.join(LAYERED)})")
     else:
-        found = READERS[suffix](path, map_options.crs)
+        found = READERS[suffix](path, options.crs)
     FEATURES.check(len(found.features), path)
-    left_out = left_out_problems(found.left_out, map_options.bbox_deg)
+    left_out = left_out_problems(found.left_out, options.bbox)
     if not found.features:
         raise BadInput("\n".join([
             f"{path} holds no buildings (closed ways or multipolygons with the tag building or "
             "building:part; of a table polygons); export an area or a layer that has some",
             *(problem.message for problem in [*found.problems, *left_out])]))
-    features = _within(found.features, map_options.bbox_deg, path)
+    features = _within(found.features, options.bbox, path)
     SHAPES.check(len(features), path)
     check_crowding(shapely.bounds([feature.area for feature in features]), path)
-    origin = options.origin or _origin(features, map_options.bbox_deg)
+    origin = options.origin or _origin(features, options.bbox)
     _check_sizes(features, origin, path)
-    if map_options.height_column is not None:
-        check_declared(map_options.height_column, [one.tags for one in features], path)
+    if height_column is not None:
+        check_declared(height_column, [one.tags for one in features], path)
     flat, shells = ([one for one in features if (one.shell is not None) == has_shell]
                     for has_shell in (False, True))
-    prisms, problems = make_prisms(flat, origin, map_options.materials, map_options.height_m,
-                                   map_options.height_column)
-    bodies, found_in_bodies = make_shell_prisms(shells, origin, map_options.materials)
+    prisms, problems = make_prisms(flat, origin, materials, default_m, height_column)
+    bodies, body_problems = make_shell_prisms(shells, origin, materials)
     prisms += bodies
-    problems += found_in_bodies
-    _check_unit(prisms, found.plan_m, map_options.height_column, path)
-    problems = (found.problems + left_out + problems
-                + _without_height(prisms, features, map_options, path)
+    _check_unit(prisms, found.plan_m, height_column, path)
+    problems = (found.problems + left_out + problems + body_problems
+                + _without_height(prisms, features, options.default_height_m, path)
                 + implausible_heights([(prism.name, prism.height, prism.site or prism.area)
                                        for prism in prisms],
                                       {feature.name: feature.tags for feature in features}))
@@ -248,54 +241,47 @@ def build_scene_from_map(
         raise BadInput("\n".join([f"{path}: none of its {len(features)} buildings can be used; "
                                   "correct what is wrong with them:",
                                   *(problem.message for problem in problems)]))
-    around = choose_extent(_bounds_m(prisms, origin, map_options.bbox_deg))
+    around = choose_extent(_bounds_m(prisms, origin, options.bbox))
     extent = around if options.extent_m is None else make_extent(options.extent_m)
     _check_width(max(np.ptp(extent.bounds[:2]), np.ptp(extent.bounds[2:])), MAX_WIDTH_M)
-    ground = make_ground(map_options.terrain, origin, _ground_box(prisms, extent.bounds), GROUND,
-                         map_options.terrain_unit)
+    ground = make_ground(None if options.terrain is None else Path(options.terrain), origin,
+                         _ground_box(prisms, extent.bounds), GROUND, options.terrain_unit)
     if ground.config is not None:
         origin = origin.model_copy(update={"altitude_m": ground.config.datum_m})
         prisms = stand_on(prisms, ground)
     contacts = find_contacts(prisms)
     problems += [*_overlaps(prisms, contacts), *ground.problems]
-    city, shape_of = _city(prisms, contacts, ground, map_options.materials, problems)
+    city, shape_of = _city(prisms, contacts, ground, materials, problems)
     table = _building_table(prisms, shape_of, ground.config is not None)
     counts = Counter(table.drop_duplicates(["building", "height_from"])["height_from"])
-    vegetation, unusable = make_vegetation(found.vegetation, origin,
-                                           _enclosing(around.bounds, extent.bounds))
+    box_m = _enclosing(around.bounds, extent.bounds)
+    vegetation, unusable = make_vegetation(found.vegetation, origin, box_m)
     city.problems.extend(unusable)
-    streets_m = cut_streets(found.streets, origin, _enclosing(around.bounds, extent.bounds))
-    declared = Declared(str(source), map_name(source), extent, origin,
-                        _provenance(str(source), counts, map_options, options),
-                        _facts(table["building"].nunique(), len(set(shape_of.values())), counts,
-                               origin, map_options, vegetation, shells, ground)
-                        + _not_used(found, features, map_options), vegetation,
-                        ground.config, streets_m)
+    heights = [f"{height_text(key, height_column)}: {number:,}" for key, number in counts.items()
+               if key != "default"]
+    heights.append(f"default: {counts['default']:,} ({default_m:g} m)")
+    facts = (
+        ("buildings", f"{table['building'].nunique():,} in {len(set(shape_of.values())):,} blocks"),
+        ("heights from", ", ".join(heights)),
+        *([("elevations", elevation_fact(shells))] if shells else []),
+        ("ground", ground.fact),
+        *([("vegetation", vegetation_fact(vegetation))] if vegetation else []),
+        ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"),
+        *_not_used(found, features, materials, height_column))
+    provenance = {"source": source_text(source), "seed": str(options.seed),
+                  "height_default_m": f"{default_m:g}",
+                  "heights_from": ", ".join(f"{key} {number}" for key, number in counts.items())}
+    if options.bbox is not None:
+        provenance["bbox_deg"] = ", ".join(map(repr, options.bbox))
+    declared = Declared(str(source), map_name(source), extent, origin, provenance, facts,
+                        vegetation, ground.config, cut_streets(found.streets, origin, box_m))
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
 
-def _facts(
-    buildings: int, blocks: int, counts: dict[str, int], origin: Origin, map_options: MapOptions,
-    vegetation: list[VegetationConfig], shells: list[Feature], ground: Ground,
-) -> tuple[tuple[str, str], ...]:
-    """Return lines for the report."""
-    heights = ", ".join(
-        [f"{height_text(key, map_options.height_column)}: {number:,}"
-         for key, number in counts.items() if key != "default"]
-        + [f"default: {counts.get('default', 0):,}"])
-    return (("buildings", f"{buildings:,} in {blocks:,} blocks"),
-            ("heights from", f"{heights} ({map_options.height_m:g} m)"),
-            *([("elevations", elevation_fact(shells))] if shells else []),
-            ("ground", ground.fact),
-            *([("vegetation", vegetation_fact(vegetation))] if vegetation else []),
-            ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"))
-
-
-def _not_used(found: MapFile, features: list[Feature],
-              map_options: MapOptions) -> tuple[tuple[str, str], ...]:
+def _not_used(found: MapFile, features: list[Feature], materials: MaterialTable,
+              declared: HeightColumn | None) -> tuple[tuple[str, str], ...]:
     """Return the report's line on tags, columns and layers that are not used."""
-    declared = map_options.height_column
-    used = READ_COLUMNS | READ_TAGS | set(map_options.materials.by_tag) | (
+    used = READ_COLUMNS | READ_TAGS | set(materials.by_tag) | (
         {declared.name, declared.ground} if declared else set())
     names = {key for feature in features for key in feature.tags} | {
         column_name(name) for name in found.columns}
@@ -304,44 +290,32 @@ def _not_used(found: MapFile, features: list[Feature],
     return (("not used", "; ".join(unused)),) if unused else ()
 
 
-def _provenance(
-    source: str, counts: dict[str, int], map_options: MapOptions, options: BuildOptions
-) -> dict[str, str]:
-    """Return `[provenance]` of `scene.toml`."""
-    known = {"source": source_text(source), "seed": str(options.seed),
-             "height_default_m": f"{map_options.height_m:g}",
-             "heights_from": ", ".join(f"{key} {number}" for key, number in counts.items())}
-    if map_options.bbox_deg is not None:
-        known["bbox_deg"] = ", ".join(map(repr, map_options.bbox_deg))
-    return known
-
-
-def _without_height(prisms: list[Prism], features: list[Feature], map_options: MapOptions,
+def _without_height(prisms: list[Prism], features: list[Feature], default_height_m: float | None,
                     path: Path) -> list[Problem]:
-    """Return a warning if the default height was taken though nobody declared one.
+    """Return a warning if buildings have the default height, and the user did not give one.
 
     Raises:
-        BadInput: it was taken for every building of a table that has other columns of numbers.
+        BadInput: all buildings of a table have it, though the table has other numeric columns.
     """
     buildings = {prism.name for prism in prisms}
     guessed = {prism.name for prism in prisms if prism.height.source == "default"}
-    if not guessed or map_options.default_height_m is not None:
+    if not guessed or default_height_m is not None:
         return []
     text = no_height_text([feature.tags for feature in features])
     if guessed == buildings and text and map_suffix(path) not in OSM_SUFFIXES:
         raise BadInput(f"{path}: {text}")
     return problems_of(
         sorted(guessed), f"of {len(buildings):,} building(s) have no height in the map: "
-        f"{map_options.height_m:g} m was taken for them. Give the height of such buildings with "
+        f"{DEFAULT_HEIGHT_M:g} m was taken for them. Give the height of such buildings with "
         "--height-default M, or name a column with --height-column")
 
 
 def _check_unit(prisms: list[Prism], plan_m: float, declared: HeightColumn | None,
                 path: Path) -> None:
-    """Raise BadInput if a plan is in feet, and heights may be in feet or metres."""
-    silent = {column.name for column in KNOWN if column.unit == "m" and not column.ground
+    """Raise BadInput if the plan is in feet, and heights of a column may be in feet or metres."""
+    unit_unknown = {column.name for column in KNOWN if column.unit == "m" and not column.ground
               and not column.name.endswith("_m")} - ({declared.name} if declared else set())
-    used = sorted({prism.height.source for prism in prisms} & silent)
+    used = sorted({prism.height.source for prism in prisms} & unit_unknown)
     if used and plan_m != 1.0:
         raise BadInput(f"{path}: its plan is in feet or another unit ({plan_m:.7g} m), and nothing "
                        f"says that of the column {used[0]!r}; say --height-column {used[0]}:ft or "
@@ -349,8 +323,12 @@ def _check_unit(prisms: list[Prism], plan_m: float, declared: HeightColumn | Non
 
 
 def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
-    """Return the features that reach into the box, of 3D models with all parts of the building."""
-    bounds_deg = np.array([feature.area.bounds for feature in features])  # NaN of an empty area
+    """Return the features that reach into the box; of a 3D model, with all parts of the building.
+
+    Raises:
+        BadInput: coordinates that are no degrees, too intricate outlines, or none in the box.
+    """
+    bounds_deg = np.array([feature.area.bounds for feature in features])  # empty area: NaN
     for feature, bounds in zip(features, bounds_deg):
         if (np.abs(bounds) > (180, 90, 180, 90)).any():
             raise BadInput(f"{path}: {feature.name} lies at {bounds[0]:g}, {bounds[1]:g}, which is "
@@ -370,8 +348,8 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
     kept = [feature for feature in near if shapely.intersects(
         shapely.make_valid(shapely.get_parts(feature.area)), box).any()]
     if not kept:
-        west_, south_ = np.nanmin(bounds_deg[:, :2], axis=0)
-        east_, north_ = np.nanmax(bounds_deg[:, 2:], axis=0)
+        file_west, file_south = np.nanmin(bounds_deg[:, :2], axis=0)
+        file_east, file_north = np.nanmax(bounds_deg[:, 2:], axis=0)
         swapped = ((bounds_deg[:, 1] <= east) & (bounds_deg[:, 3] >= west)
                    & (bounds_deg[:, 0] <= north) & (bounds_deg[:, 2] >= south)).any()
         hint = ("; latitude and longitude seem to be swapped: --bbox is "
@@ -379,7 +357,7 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
                 ) if swapped else ""
         raise BadInput(f"{path}: no building reaches into --bbox "
                        f"{south:g},{west:g},{north:g},{east:g}; the file's lie in "
-                       f"{south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} "
+                       f"{file_south:.5f},{file_west:.5f},{file_north:.5f},{file_east:.5f} "
                        f"(south,west,north,east){hint}")
     chosen, models = set(kept), {one.name for one in kept if one.shell is not None}
     return [one for one in features
@@ -387,7 +365,7 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
 
 
 def _origin(features: list[Feature], bbox_deg: Bounds | None) -> Origin:
-    """Return the middle of the box, or of the buildings."""
+    """Return the middle of the box (south, west, north, east) [degrees], or of the buildings."""
     if bbox_deg is None:
         bounds = np.array([feature.area.bounds for feature in features])
         finite = np.isfinite(bounds)
@@ -420,7 +398,7 @@ def _enclosing(one_m: Bounds, other_m: Bounds) -> Bounds:
 
 
 def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:
-    """Raise BadInput if a building, or all together, are so wide that no projection is good."""
+    """Raise BadInput if a building, or the whole map, is too wide for a plane."""
     bounds = np.array([feature.area.bounds for feature in features])
     middle = [origin.longitude_deg, origin.latitude_deg]
     bounds = np.where(np.isfinite(bounds), bounds, [middle * 2])
@@ -430,12 +408,13 @@ def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:
     if not widths_m[widest] <= MAX_WIDTH_M:
         raise BadInput(f"{path}: {features[widest].name} is {widths_m[widest] / 1000:.0f} km wide, "
                        "as no building is; correct or remove it")
-    # From the middle: across the antimeridian all may lie close together, on the earth's other side
+    # Measured from the origin: features that lie close together may still be far away from it
     _check_width(2 * float(np.abs(corners).max()), 10 * MAX_WIDTH_M)
 
 
-def _check_width(width_m: float, most_m: float) -> None:
-    if not width_m <= most_m:  # NaN, too
+def _check_width(width_m: float, max_m: float) -> None:
+    """Raise BadInput if an area is wider than allowed [m]."""
+    if not width_m <= max_m:  # also for NaN
         raise BadInput(f"the area is {width_m / 1000:.0f} km wide, {MAX_WIDTH_M / 1000:g} km are "
                        "allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
 
@@ -448,7 +427,7 @@ def _overlaps(prisms: list[Prism], contacts: Contacts) -> list[Problem]:
 
 
 def _ground_box(prisms: list[Prism], extent_m: Bounds) -> Bounds:
-    """Return (x_min, x_max, y_min, y_max) of the ground, beyond buildings and extent [m]."""
+    """Return (x_min, x_max, y_min, y_max) [m] of the ground: buildings and extent with a margin."""
     bounds = np.array([prism.area.bounds for prism in prisms])
     x0, y0 = np.minimum(bounds[:, :2].min(axis=0), extent_m[::2]) - GROUND_MARGIN_M
     x1, y1 = np.maximum(bounds[:, 2:].max(axis=0), extent_m[1::2]) + GROUND_MARGIN_M
@@ -459,7 +438,7 @@ def _city(
     prisms: list[Prism], contacts: Contacts, ground: Ground, table: MaterialTable,
     problems: list[Problem],
 ) -> tuple[ImportedCity, dict[int, str]]:
-    """Return the city with its ground, and the name of the shape of each prism."""
+    """Return the city with its ground, and index of a prism -> name of its shape."""
     names, meshes = [GROUND], [(ground.vertices, ground.faces)]
     materials: list[Material | None] = [itu_material(table.ground)]
     taken = Names({*RESERVED_NAMES, GROUND})

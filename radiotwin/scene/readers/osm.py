@@ -1,8 +1,8 @@
-"""OpenStreetMap: areas of buildings and vegetation, and streets, from files.
+"""Reader of OpenStreetMap files: areas of buildings and vegetation, and streets.
 
 A closed way is an area, and so is a relation of type multipolygon whose ways form closed rings [1];
-rings of role `inner` are courtyards. Where a ring has no role, those within an odd number of others
-are. `.osm` files are the XML of OpenStreetMap's API, of Overpass and of JOSM; the first two also
+rings of role `inner` are courtyards. Without roles, rings within an odd number of others are.
+`.osm` files are the XML of OpenStreetMap's API, of Overpass and of JOSM; the first two also
 answer in JSON [3]. `.osm.pbf` files are read with libosmium [2] in several passes that keep only
 what is needed, so that an extract of a whole region needs little memory.
 
@@ -42,25 +42,27 @@ INCOMPLETE = ("building(s) lack nodes or ways, as where an extract was cut off: 
               "larger extract, or ask Overpass for `out geom;`")
 UNCLOSED = "building(s) have an outline that is not closed: left out"
 NO_VEGETATION = "area(s) of vegetation are incomplete, not closed or too intricate: left out"
-_MADE_UP = -(2**60)  # ids of nodes that have none
-_PLACE_NODES = 1000  # that say where something lies: many relations may name one long way
+_MADE_UP = -(2**60)  # first id of nodes that have none in the file
+_PLACE_NODES = 1000  # enough to locate a relation; many relations may share one long way
 MIN_RING_NODES = 4  # a triangle, with the first node again at the end
 STREETS = ("motorway", "trunk", "primary", "secondary", "tertiary", "unclassified", "residential",
            "living_street", "pedestrian", "motorway_link", "trunk_link", "primary_link",
            "secondary_link", "tertiary_link")  # values of highway that pictures show
-MAX_STREET_NODES = 1_000_000  # of an .osm.pbf file, in 200 MB; with more it is read without streets
-_IDS_PER_BLOCK = 100  # elements: 40 kB of the filter for each that is looked for
+MAX_STREET_NODES = 1_000_000  # of an .osm.pbf file, 200 MB; with more, its streets are not read
+# pyosmium's filter by id takes 4 MiB for each block of 2^25 ids in which there is one: it is used
+# if a block has this many on average, so for at most 40 kB an id
+_IDS_PER_BLOCK = 100
 REMARKED = ("Overpass added a remark to its answer, as where it ran out of time or memory: "
             "buildings may be missing; ask for a smaller area, or more time ([timeout:600])")
 
 
 @dataclass
 class Way:
-    """A polyline.
+    """A polyline, or an area if it is closed.
 
     Attributes:
-        nodes: ids, in order.
-        tags: of the way.
+        nodes: ids of its nodes, in order.
+        tags: tags of the way.
     """
 
     nodes: list[int]
@@ -72,8 +74,8 @@ class Relation:
     """A group of ways.
 
     Attributes:
-        members: id of a way, and its role.
-        tags: of the relation.
+        members: id and role of each way.
+        tags: tags of the relation.
     """
 
     members: list[tuple[int, str]] = field(default_factory=list)
@@ -88,8 +90,8 @@ class OsmElements:
         positions: node -> longitude and latitude [degrees].
         ways: at least the buildings, and the ways of relations that are buildings.
         relations: at least those of type multipolygon.
-        nodes_at: place -> node, of places that stand in ways and relations.
-        remarked: whether Overpass remarks something, as where it ran out of time.
+        nodes_at: (longitude, latitude) -> node, of positions that are in ways and relations.
+        remarked: whether Overpass added a remark, e.g. that it ran out of time.
     """
 
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -99,15 +101,19 @@ class OsmElements:
     remarked: bool = False
 
     def node_at(self, place: tuple[float, float], number: int | None = None) -> int:
-        """Return the node at a place, with that number, or one that is made up."""
+        """Add a node at a position; without a number, return the node there, or make one up."""
         known = self.nodes_at.setdefault(
             place, _MADE_UP - len(self.nodes_at) if number is None else number)
         known = known if number is None else number
         self.positions[known] = place
         return known
 
+    def has_positions(self, nodes: Iterable[int]) -> bool:
+        """Return whether the positions of all nodes are known."""
+        return all(node in self.positions for node in nodes)
+
     def add(self, number: int, element: Way | Relation) -> None:
-        """Add a way or relation; Overpass may give one twice, once without its tags."""
+        """Add a way or relation; Overpass may return one twice, once without its tags."""
         if isinstance(element, Way):
             known = self.ways.get(number, element)
             self.ways[number] = Way(element.nodes or known.nodes, element.tags or known.tags)
@@ -147,9 +153,9 @@ def assemble(elements: OsmElements) -> MapFile:
             continue
         if below := hidden(f"way/{number}", way.tags, None):
             left_out.append(replace(below, place=_place(way, elements)))
-        elif not way.nodes or any(node not in elements.positions for node in way.nodes):
+        elif not way.nodes or not elements.has_positions(way.nodes):
             left_out.append(LeftOut(f"way/{number}", INCOMPLETE, _place(way, elements)))
-        elif len(way.nodes) < MIN_RING_NODES or way.nodes[0] != way.nodes[-1]:
+        elif not _is_ring(way.nodes):
             left_out.append(LeftOut(f"way/{number}", UNCLOSED, _place(way, elements)))
         else:
             OUTLINE_CORNERS.check(len(way.nodes), f"way/{number}")
@@ -170,7 +176,7 @@ def _streets(elements: OsmElements) -> list[np.ndarray]:
 
 
 def _place(element: Way | Relation, elements: OsmElements) -> BaseGeometry:
-    """Return the first points that are known of a way, or of the ways of a relation."""
+    """Return the first known points of a way, or of a relation's ways, to locate it."""
     ways = [element] if isinstance(element, Way) else [
         elements.ways[number] for number, _ in element.members if number in elements.ways]
     nodes = islice((node for way in ways for node in way.nodes), _PLACE_NODES)
@@ -179,7 +185,7 @@ def _place(element: Way | Relation, elements: OsmElements) -> BaseGeometry:
 
 
 def _vegetation(elements: OsmElements) -> tuple[list[Feature], list[LeftOut]]:
-    """Return areas of vegetation and rows of trees, and those that are unusable."""
+    """Return areas of vegetation and rows of trees, and the unusable ones."""
     found: list[Feature] = []
     unusable: list[LeftOut] = []
     budget = OutlineBudget("the map")
@@ -206,10 +212,10 @@ def _vegetation(elements: OsmElements) -> tuple[list[Feature], list[LeftOut]]:
 
 def _way_area(name: str, way: Way, kind: str,
               elements: OsmElements) -> BaseGeometry | Literal["incomplete"]:
-    closed = len(way.nodes) >= MIN_RING_NODES and way.nodes[0] == way.nodes[-1]
-    complete = all(node in elements.positions for node in way.nodes)
+    """Return the polygon of a way of vegetation; of a row of trees, the line."""
     OUTLINE_CORNERS.check(len(way.nodes), name)
-    if not complete or not (closed or (kind == "tree_row" and len(way.nodes) > 1)):
+    if not elements.has_positions(way.nodes) or not (
+            _is_ring(way.nodes) or (kind == "tree_row" and len(way.nodes) > 1)):
         return "incomplete"
     if kind == "tree_row":
         return shapely.LineString([elements.positions[node] for node in way.nodes])
@@ -217,7 +223,10 @@ def _way_area(name: str, way: Way, kind: str,
 
 
 def _relation_tags(relation: Relation, elements: OsmElements) -> dict[str, str] | None:
-    """Return the tags of a building, in old maps those of its outer ways; None: not a building."""
+    """Return the tags of a relation that is a building, else None.
+
+    In old maps the tags are those of the outer ways.
+    """
     if relation.tags.get("type") != "multipolygon":
         return None
     outer = [elements.ways[way].tags for way, role in relation.members
@@ -237,14 +246,14 @@ def _relation_tags(relation: Relation, elements: OsmElements) -> dict[str, str] 
 def _relation_area(
     name: str, relation: Relation, elements: OsmElements, budget: OutlineBudget
 ) -> BaseGeometry | Literal["incomplete", "open"]:
-    """Return the area, or that ways or nodes are missing, or that the ways do not close."""
+    """Return the area of a multipolygon; `incomplete`: ways or nodes lack; `open`: no rings."""
     chains: dict[bool, list[Sequence[int]]] = {True: [], False: []}
     corners, named = 0, True
     for number, role in relation.members:
         way = elements.ways.get(number)
         corners += len(way.nodes) if way is not None else 0
         OUTLINE_CORNERS.check(corners, name)
-        if way is None or any(node not in elements.positions for node in way.nodes):
+        if way is None or not elements.has_positions(way.nodes):
             return "incomplete"
         chains[role != "inner"].append(way.nodes)
         named &= role in ("outer", "inner")
@@ -260,8 +269,8 @@ def _relation_area(
 
 
 def _is_courtyard(way: Way, area: BaseGeometry, elements: OsmElements) -> bool:
-    """Return whether what is just inside of a way is not in an area."""
-    if len(way.nodes) < MIN_RING_NODES or way.nodes[0] != way.nodes[-1]:
+    """Return whether a way is the border of a hole: a point just inside it is not in the area."""
+    if not _is_ring(way.nodes):
         return False
     outline = shapely.make_valid(_polygon(way.nodes, elements))
     rim = outline.difference(outline.buffer(-1e-3 * math.sqrt(outline.area)))
@@ -269,16 +278,25 @@ def _is_courtyard(way: Way, area: BaseGeometry, elements: OsmElements) -> bool:
 
 
 def _union(polygons: list[shapely.Polygon]) -> BaseGeometry:
+    """Unite polygons that may cross themselves."""
     return shapely.union_all([shapely.make_valid(polygon) for polygon in polygons])
 
 
-def stitch(chains: list[Sequence[int]]) -> list[list[int]] | None:
-    """Join ways, by their nodes' ids, that meet at their ends to closed rings.
+def _is_ring(nodes: Sequence[int]) -> bool:
+    """Return whether a way is closed, and has at least three corners."""
+    return len(nodes) >= MIN_RING_NODES and nodes[0] == nodes[-1]
 
-    The first node of a ring stands again at its end. None if an end remains open.
+
+def stitch(chains: list[Sequence[int]]) -> list[list[int]] | None:
+    """Join ways that meet at their ends to closed rings.
+
+    Args:
+        chains: ids of the nodes of each way.
+
+    Returns:
+        ids of the nodes of each ring, the first again at the end; None if a ring cannot be closed.
     """
-    rings = [list(chain) for chain in chains
-             if len(chain) >= MIN_RING_NODES and chain[0] == chain[-1]]
+    rings = [list(chain) for chain in chains if _is_ring(chain)]
     loose = {number: list(chain) for number, chain in enumerate(chains)
              if len(chain) > 1 and chain[0] != chain[-1]}
     at_node: dict[int, deque[int]] = {}
@@ -301,6 +319,7 @@ def stitch(chains: list[Sequence[int]]) -> list[list[int]] | None:
 
 
 def _polygon(nodes: Sequence[int], elements: OsmElements) -> shapely.Polygon:
+    """Return the polygon of a ring of nodes, in longitude and latitude [degrees]."""
     return shapely.Polygon([elements.positions[node] for node in nodes])
 
 
@@ -311,22 +330,21 @@ def read_osm_xml(path: Path) -> OsmElements:
         BadInput: no such file, malformed XML, not a map of OpenStreetMap, or an impossible value;
             with file and line.
     """
-    reader = _Reader(path)
+    reader = _XmlReader(path)
     parse_elements(path, reader.start, reader.end)
     return reader.elements
 
 
-class _Reader:
-    """Callbacks of the XML parser that collect the elements of one file."""
+class _XmlReader:
+    """Callbacks of the XML parser: ways and relations are collected in the form of OSM JSON."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.elements = OsmElements()
         self.depth = 0
-        self.most = VERTICES.limit  # read once: there are millions of nodes
-        self.open: Way | Relation | None = None
-        self.number = 0  # of the one that is open
-        self.member: Way | None = None  # of the relation that is open
+        self.max_nodes = VERTICES.limit  # looked up once: there are millions of nodes
+        self.open: dict[str, Any] | None = None  # way or relation
+        self.subject = ""  # its file and line
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         self.depth += 1
@@ -337,51 +355,40 @@ class _Reader:
         if self.depth == 2:
             if attributes.get("action") != "delete" and attributes.get("visible") != "false":
                 self._element(tag, attributes, line)
-        elif self.depth == 3 and self.open is not None:
-            self._content(tag, attributes, line)
-        elif self.depth == 4 and tag == "nd" and self.member is not None:  # of `out geom;`
-            self.member.nodes.append(self.elements.node_at(self._place(attributes, line)))
-
-    def end(self, tag: str) -> None:
-        self.depth -= 1
-        if self.depth == 2 and self.member is not None and isinstance(self.open, Relation):
-            if self.member.nodes:
-                self.elements.ways.setdefault(self.open.members[-1][0], self.member)
-            self.member = None
-        if self.depth == 1 and self.open is not None:
-            self.elements.add(self.number, self.open)
-            self.open = None
+        elif self.open is None:
+            return
+        elif self.depth == 4 and tag == "nd" and self.open["members"]:  # of `out geom;`
+            self.open["members"][-1]["geometry"].append(attributes)
+        elif self.depth == 3 and tag == "tag":
+            self.open["tags"][attributes.get("k", "")] = attributes.get("v", "")
+        elif self.depth == 3 and tag == "nd" and self.open["type"] == "way":
+            self.open["nodes"].append(self._integer(attributes, "ref", line))
+            self.open["geometry"].append(attributes if "lat" in attributes else None)
+        elif self.depth == 3 and tag == "member":
+            is_way = attributes.get("type") == "way"
+            self.open["members"].append({
+                "type": attributes.get("type"), "role": attributes.get("role", ""), "geometry": [],
+                "ref": self._integer(attributes, "ref", line) if is_way else None})
 
     def _element(self, tag: str, attributes: dict[str, str], line: int) -> None:
         if tag == "node":
-            self.elements.positions[self._integer(attributes, "id", line)] = self._place(
-                attributes, line)
-            if len(self.elements.positions) > self.most:
+            number = self._integer(attributes, "id", line)
+            self.elements.positions[number] = _position(f"{self.path}, line {line}: a node",
+                                                        attributes)
+            if len(self.elements.positions) > self.max_nodes:
                 VERTICES.check(len(self.elements.positions), self.path)
         elif tag in ("way", "relation"):
-            self.open = Way([]) if tag == "way" else Relation()
-            self.number = self._integer(attributes, "id", line)
+            self.subject = f"{self.path}, line {line}: a {tag}"
+            self.open = {"type": tag, "id": self._integer(attributes, "id", line), "tags": {},
+                         "nodes": [], "geometry": [], "members": []}
         elif tag == "remark":
             self.elements.remarked = True
 
-    def _content(self, tag: str, attributes: dict[str, str], line: int) -> None:
-        assert self.open is not None
-        if tag == "tag":
-            self.open.tags[attributes.get("k", "")] = attributes.get("v", "")
-        elif tag == "nd" and isinstance(self.open, Way):
-            node = self._integer(attributes, "ref", line)
-            if "lat" in attributes:  # of `out geom;`
-                self.elements.node_at(self._place(attributes, line), node)
-            self.open.nodes.append(node)
-        elif (tag == "member" and isinstance(self.open, Relation)
-              and attributes.get("type") == "way"):
-            way = self._integer(attributes, "ref", line)
-            self.open.members.append((way, attributes.get("role", "")))
-            self.member = Way([])
-
-    def _place(self, attributes: dict[str, str], line: int) -> tuple[float, float]:
-        return (self._degrees(attributes, "lon", 180, line),
-                self._degrees(attributes, "lat", 90, line))
+    def end(self, tag: str) -> None:
+        self.depth -= 1
+        if self.depth == 1 and self.open is not None:
+            _add_element(self.elements, self.subject, self.open)
+            self.open = None
 
     def _integer(self, attributes: dict[str, str], name: str, line: int) -> int:
         try:
@@ -390,22 +397,12 @@ class _Reader:
             raise BadInput(f"{self.path}, line {line}: {name}={attributes.get(name)!r} is not a "
                            "whole number; export the map again") from None
 
-    def _degrees(self, attributes: dict[str, str], name: str, limit: float, line: int) -> float:
-        try:
-            value = float(attributes[name])
-        except (KeyError, ValueError):
-            value = math.nan
-        if not -limit <= value <= limit:
-            raise BadInput(f"{self.path}, line {line}: a node has {name}={attributes.get(name)!r}; "
-                           f"allowed is -{limit} to {limit} degrees; export the map again")
-        return value
-
 
 def osm_of_json(path: Path, document: Mapping) -> OsmElements:
-    """Return the elements of OpenStreetMap's JSON.
+    """Return the elements of OpenStreetMap's JSON [3].
 
-    Nodes are elements of their own, or, where Overpass was asked for `out geom;`, places in the
-    ways and in the members of relations.
+    Nodes are elements of their own, or, if Overpass was asked for `out geom;`, positions in ways
+    and in members of relations.
 
     Raises:
         BadInput: an impossible value, with the element.
@@ -417,47 +414,56 @@ def osm_of_json(path: Path, document: Mapping) -> OsmElements:
             raise BadInput(f"{path}: element {number} is not an object; export the map again")
         if element.get("visible") is not False:
             by_kind.get(str(element.get("type")), []).append((f"{path}: element {number}", element))
-
-    def place(subject: str, point: Mapping) -> tuple[float, float]:
-        try:
-            found = float(point["lon"]), float(point["lat"])
-        except (KeyError, TypeError, ValueError, OverflowError):
-            found = math.nan, math.nan
-        if not (abs(found[0]) <= 180 and abs(found[1]) <= 90):
-            raise BadInput(f"{subject} has lon={point.get('lon')!r:.20}, lat="
-                           f"{point.get('lat')!r:.20}; allowed are -180 to 180 and -90 to 90 "
-                           "degrees; export the map again")
-        return found
-
-    def way(subject: str, element: Mapping) -> Way:
-        nodes, points = _list(subject, element, "nodes"), _list(subject, element, "geometry")
-        found = [_whole(subject, node) for node in nodes]
-        for row, point in enumerate(points):
-            if isinstance(point, dict):  # of a part outside of a box, null
-                number = found[row] if row < len(found) else None
-                found[row:row + 1] = [elements.node_at(place(subject, point), number)]
-            elif row >= len(found):
-                found.append(0)  # a node without a place
-        VERTICES.check(len(elements.positions), path)
-        return Way(found, _tags(element))
-
     for subject, element in by_kind["node"]:
-        elements.node_at(place(subject, element), _whole(subject, element.get("id")))
-    for subject, element in by_kind["way"]:
-        elements.add(_whole(subject, element.get("id")), way(subject, element))
-    for subject, element in by_kind["relation"]:
-        members = [(_whole(subject, one.get("ref")), str(one.get("role", "")), one)
-                   for one in _list(subject, element, "members")
-                   if isinstance(one, dict) and one.get("type") == "way"]
-        for number, _, member in members:
-            if number not in elements.ways and member.get("geometry"):
-                elements.ways[number] = way(subject, member)
-        elements.add(_whole(subject, element.get("id")), Relation(
-            [(number, role) for number, role, _ in members], _tags(element)))
+        elements.node_at(_position(subject, element), _whole(subject, element.get("id")))
+    for subject, element in (*by_kind["way"], *by_kind["relation"]):
+        _add_element(elements, subject, element)
     return elements
 
 
+def _add_element(elements: OsmElements, subject: str, element: Mapping) -> None:
+    """Add a way or relation in the form of OSM JSON; `subject` names it in messages."""
+    number, tags = _whole(subject, element.get("id")), element.get("tags")
+    tags = {str(key): str(value) for key, value in tags.items()} if isinstance(tags, dict) else {}
+    if element["type"] == "way":
+        elements.add(number, Way(_nodes(elements, subject, element), tags))
+        return
+    members = [(_whole(subject, member.get("ref")), str(member.get("role", "")), member)
+               for member in _list(subject, element, "members")
+               if isinstance(member, dict) and member.get("type") == "way"]
+    for way, _, member in members:
+        if way not in elements.ways and member.get("geometry"):
+            elements.ways[way] = Way(_nodes(elements, subject, member))
+    elements.add(number, Relation([(way, role) for way, role, _ in members], tags))
+
+
+def _nodes(elements: OsmElements, subject: str, element: Mapping) -> list[int]:
+    """Return the nodes of a way or member, and add the positions that `out geom;` gave them."""
+    nodes = [_whole(subject, node) for node in _list(subject, element, "nodes")]
+    for row, point in enumerate(_list(subject, element, "geometry")):
+        if isinstance(point, dict):  # null: outside of Overpass's box
+            number = nodes[row] if row < len(nodes) else None
+            nodes[row:row + 1] = [elements.node_at(_position(subject, point), number)]
+        elif row >= len(nodes):
+            nodes.append(0)  # a node without a position
+    VERTICES.check(len(elements.positions), "the map")
+    return nodes
+
+
+def _position(subject: str, point: Mapping) -> tuple[float, float]:
+    """Return longitude and latitude [degrees] of a node; BadInput if they are impossible."""
+    try:
+        longitude_deg, latitude_deg = float(point["lon"]), float(point["lat"])
+    except (KeyError, TypeError, ValueError, OverflowError):
+        longitude_deg = latitude_deg = math.nan
+    if not (abs(longitude_deg) <= 180 and abs(latitude_deg) <= 90):
+        raise BadInput(f"{subject} has lon={point.get('lon')!r:.20}, lat={point.get('lat')!r:.20}; "
+                       "allowed are -180 to 180 and -90 to 90 degrees; export the map again")
+    return longitude_deg, latitude_deg
+
+
 def _list(subject: str, element: Mapping, name: str) -> list:
+    """Return a list of an element, empty if it has none; BadInput if it is something else."""
     found = element.get(name) or []
     if not isinstance(found, list):
         raise BadInput(f"{subject}: its {name} are no list; export the map again")
@@ -465,14 +471,10 @@ def _list(subject: str, element: Mapping, name: str) -> list:
 
 
 def _whole(subject: str, value: object) -> int:
+    """Return an integer of JSON; BadInput if it is something else."""
     if type(value) is not int:
         raise BadInput(f"{subject}: {value!r:.40} is no whole number; export the map again")
     return value
-
-
-def _tags(element: Mapping) -> dict[str, str]:
-    tags = element.get("tags")
-    return {str(key): str(value) for key, value in tags.items()} if isinstance(tags, dict) else {}
 
 
 def read_osm_pbf(path: Path) -> OsmElements:
@@ -490,14 +492,14 @@ def read_osm_pbf(path: Path) -> OsmElements:
     file = osmium.io.File(str(path.absolute()), "pbf")
     kinds, filters = osmium.osm, osmium.filter
 
-    def matching(kind: Any, selected: Any) -> Iterable[Any]:
-        return osmium.FileProcessor(file, kind).with_filter(selected)
+    def matching(kind: Any, condition: Any) -> Iterable[Any]:
+        return osmium.FileProcessor(file, kind).with_filter(condition)
 
-    def selected(kind: Any, ids: set[int]) -> Iterable[Any]:
-        # The filter takes 4 MiB for every 2^25 numbers of which there is one, and no negative ones
+    def with_ids(kind: Any, ids: set[int]) -> Iterable[Any]:
+        # The filter knows no negative ids
         if min(ids) > 0 and len({number >> 25 for number in ids}) * _IDS_PER_BLOCK <= len(ids):
             return matching(kind, filters.IdFilter(ids))
-        return (each for each in osmium.FileProcessor(file, kind) if each.id in ids)
+        return (element for element in osmium.FileProcessor(file, kind) if element.id in ids)
 
     elements = OsmElements()
     try:
@@ -512,13 +514,13 @@ def read_osm_pbf(path: Path) -> OsmElements:
                        for way, _ in relation.members}
         missing = member_ids - elements.ways.keys()
         if missing:
-            _add_ways(elements, selected(kinds.WAY, missing))
+            _add_ways(elements, with_ids(kinds.WAY, missing))
         elements.ways |= _street_ways(
             matching(kinds.WAY, filters.TagFilter(*(("highway", kind) for kind in STREETS))),
             elements.ways)
         nodes = {node for way in elements.ways.values() for node in way.nodes}
         if nodes:
-            for node in selected(kinds.NODE, nodes):
+            for node in with_ids(kinds.NODE, nodes):
                 if node.location.valid():
                     elements.positions[node.id] = node.location.lon, node.location.lat
     except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
@@ -528,6 +530,7 @@ def read_osm_pbf(path: Path) -> OsmElements:
 
 
 def _add_ways(elements: OsmElements, ways: Iterable[Any]) -> None:
+    """Add pyosmium's ways; BadInput if there are too many."""
     corners = sum(len(way.nodes) for way in elements.ways.values())
     for way in ways:
         nodes = [node.ref for node in way.nodes]
@@ -538,7 +541,7 @@ def _add_ways(elements: OsmElements, ways: Iterable[Any]) -> None:
 
 
 def _street_ways(ways: Iterable[Any], known: Mapping[int, Way]) -> dict[int, Way]:
-    """Return the streets that are not known, none where they have too many nodes."""
+    """Return pyosmium's streets that are not in `known`; none if they have too many nodes."""
     found: dict[int, Way] = {}
     nodes = 0
     for way in ways:
@@ -552,7 +555,7 @@ def _street_ways(ways: Iterable[Any], known: Mapping[int, Way]) -> dict[int, Way
 
 
 def _drop_other_relations(elements: OsmElements) -> None:
-    """Keep vegetation, and buildings that are so themselves or, as in old maps, by their ways."""
+    """Drop relations that neither their own tags nor their ways make vegetation or buildings."""
     for number, relation in list(elements.relations.items()):
         if kind_of(relation.tags) is None and not any(
                 key in relation.tags for key in BUILDING_KEYS) and not any(

@@ -12,7 +12,8 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import local_crs, to_local
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
-from radiotwin.scene.readers import MapOptions, build_scene_from_map, map_name, map_suffix
+from radiotwin.scene.readers import build_scene_from_map
+from radiotwin.scene.readers.build import map_name, map_suffix
 
 TOWN = Path(__file__).with_name("town.osm")
 
@@ -98,13 +99,13 @@ def test_a_box_within_a_part_that_lies_in_another_part(tmp_path):
     (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [
         {"type": "Feature", "properties": {"height": 9}, "geometry": {"type": "MultiPolygon", "coordinates": rings}}]}))
     report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out",
-                                  MapOptions(bbox_deg=(47.49995, -5e-5, 47.50005, 5e-5)))
+                                  BuildOptions(bbox=(47.49995, -5e-5, 47.50005, 5e-5)))
     assert pd.read_csv(report.folder / "buildings.csv")["area_m2"].tolist() == [pytest.approx(3010, rel=0.01)]
 
 
 def test_a_box_of_degrees(tmp_path):
     box = 47.4998, 8.699, 47.5002, 8.7001
-    report = build_scene_from_map(TOWN, tmp_path / "part", MapOptions(bbox_deg=box, default_height_m=4.5))
+    report = build_scene_from_map(TOWN, tmp_path / "part", BuildOptions(bbox=box, default_height_m=4.5))
     scene = Scene.load(tmp_path / "part")
     table = pd.read_csv(tmp_path / "part" / "buildings.csv")
     assert set(table["building"]) == {"way/101", "way/102", "way/103", "relation/201"}
@@ -128,10 +129,7 @@ def test_only_a_scene_is_replaced(tmp_path, empty_map):
 
 
 def test_the_table_of_materials_is_used(tmp_path):
-    from radiotwin.scene.materials import STANDARD
-    from radiotwin.scene.readers import with_materials
-
-    options = MapOptions(materials=with_materials(STANDARD, {"straw": "itu_wood", "ground": "wet_ground"}))
+    options = BuildOptions(materials={"straw": "itu_wood", "ground": "wet_ground"})
     report = build_scene_from_map(TOWN, tmp_path / "unused", options, check_only=True)
     assert {use.name: use.shapes for use in report.materials}["wood"] == 2
     assert "wet_ground" in {use.name for use in report.materials} and not (tmp_path / "unused").exists()
@@ -139,12 +137,12 @@ def test_the_table_of_materials_is_used(tmp_path):
 
 
 @pytest.mark.parametrize(("options", "message"), [
-    ({"bbox_deg": (1, 2, 0, 3)}, "bbox .* is not possible"), ({"bbox_deg": (float("nan"), 0, 1, 1)}, "not possible"),
-    ({"bbox_deg": (0, 0, 1, 1)}, r"no building reaches into --bbox .*the file's lie in 47\.\d+,8\.\d+"),
+    ({"bbox": (1, 2, 0, 3)}, "bbox .* is not possible"), ({"bbox": (float("nan"), 0, 1, 1)}, "not possible"),
+    ({"bbox": (0, 0, 1, 1)}, r"no building reaches into --bbox .*the file's lie in 47\.\d+,8\.\d+"),
     ({"default_height_m": 0.0}, "default height of 0 m"), ({"default_height_m": float("inf")}, "default height")])
 def test_impossible_options(tmp_path, options, message):
     with pytest.raises(BadInput, match=message):
-        build_scene_from_map(TOWN, tmp_path / "out", MapOptions(**options))
+        build_scene_from_map(TOWN, tmp_path / "out", BuildOptions(**options))
     assert not (tmp_path / "out").exists()
 
 

@@ -16,8 +16,9 @@ from radiotwin.geo import to_local
 from radiotwin.io.budgets import TAG_BYTES, VERTICES
 from radiotwin.io.forms import Origin
 from radiotwin.scene import Scene
+from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.materials import STANDARD
-from radiotwin.scene.readers import MapOptions, build_scene_from_map, with_materials
+from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.scene.readers.citygml import read_citygml
 from radiotwin.scene.readers.extrude import make_blocks
 from radiotwin.scene.readers.gis_files import read_json_map
@@ -246,7 +247,7 @@ def test_feet(tmp_path):
 def test_a_box_keeps_what_lies_in_it(tmp_path):
     path = write(tmp_path, made.cityjson(HOUSES))
     west, south = Transformer.from_crs("EPSG:28992", "EPSG:4326", always_xy=True).transform(85_030, 445_990)
-    report = build_scene_from_map(path, tmp_path / "out", MapOptions(bbox_deg=(south, west, south + 0.001, west + 0.001)))
+    report = build_scene_from_map(path, tmp_path / "out", BuildOptions(bbox=(south, west, south + 0.001, west + 0.001)))
     assert dict(report.facts)["buildings"] == "1 in 1 blocks"
 
 
@@ -254,7 +255,7 @@ def test_a_box_keeps_all_parts_of_a_building(tmp_path):
     """Their heights count from the lowest point of all: the part in the box would else stand in the air."""
     path = write(tmp_path, made.in_one_building(made.cityjson([(0, 0, 500), (50, 0, 505)])))
     west, south = Transformer.from_crs("EPSG:28992", "EPSG:4326", always_xy=True).transform(85_040, 445_990)
-    report = build_scene_from_map(path, tmp_path / "out", MapOptions(bbox_deg=(south, west, south + 0.001, west + 0.001)))
+    report = build_scene_from_map(path, tmp_path / "out", BuildOptions(bbox=(south, west, south + 0.001, west + 0.001)))
     table = pd.read_csv(report.folder / "buildings.csv")
     assert table["building"].tolist() == ["B0", "B0"] and sorted(table["bottom_m"]) == [0, 5]
 
@@ -335,7 +336,7 @@ def test_budgets(tmp_path, monkeypatch):
 
 
 def test_roofs_of_a_material_of_their_own(tmp_path):
-    options = MapOptions(materials=with_materials(STANDARD, {"roof": "metal"}))
+    options = BuildOptions(materials={"roof": "metal"})
     report = build_scene_from_map(write(tmp_path, made.cityjson(HOUSES)), tmp_path / "out", options)
     assert {use.name: use.shapes for use in report.materials} == {"concrete": 2, "metal": 2, "asphalt_concrete": 1}
     assert dict(report.facts)["buildings"] == "3 in 2 blocks"

@@ -6,7 +6,8 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.readers import MapOptions, build_scene_from_map
+from radiotwin.scene.build import BuildOptions
+from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.scene.readers.heights import HeightColumn, declared_column, full_names, height_of
 
 
@@ -18,7 +19,7 @@ def box(x_m):
 def build(tmp_path, rows, **options):
     features = [{"type": "Feature", "properties": row, "geometry": box(100 * number)} for number, row in enumerate(rows)]
     (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out", MapOptions(**options))
+    report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out", BuildOptions(**options))
     table = pd.read_csv(tmp_path / "out" / "buildings.csv", keep_default_na=False)
     return report, list(zip(table["top_m"], table["height_from"]))
 
@@ -103,7 +104,7 @@ def test_some_buildings_without_a_height_are_told(tmp_path):
     assert dict(report.facts)["heights from"] == "num_floors × 3 m: 1, default: 1 (10 m)"
 
 
-@pytest.mark.parametrize(("column", "name"), [(HeightColumn("roof"), "'roof'"), (HeightColumn("a", ground="dtm"), "'dtm'")])
-def test_a_declared_column_that_is_not_there(tmp_path, column, name):
-    with pytest.raises(BadInput, match=f"has no column {name}; its columns are: 'a', 'building'"):
-        build(tmp_path, [{"A": 1}], height_column=column)
+@pytest.mark.parametrize(("column", "ground", "missing"), [("roof", None, "'roof'"), ("a", "dtm", "'dtm'")])
+def test_a_declared_column_that_is_not_there(tmp_path, column, ground, missing):
+    with pytest.raises(BadInput, match=f"has no column {missing}; its columns are: 'a', 'building'"):
+        build(tmp_path, [{"A": 1}], height_column=column, ground_column=ground)

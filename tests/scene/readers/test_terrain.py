@@ -14,7 +14,7 @@ from radiotwin.io.budgets import TERRAIN_BLOCK_BYTES, TERRAIN_PIXELS
 from radiotwin.io.forms import Origin
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
-from radiotwin.scene.readers import MapOptions, build_scene_from_map
+from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.scene.readers.terrain import read_heights
 from tests.scene.readers import city_models as made
 from tests.scene.readers.conftest import Map
@@ -28,8 +28,8 @@ SLOPE = incline(0.1, -0.05, 431.5)
 
 def build(tmp_path, drawn, dem, **more):
     path = drawn.write(tmp_path / "a.osm")
-    report = build_scene_from_map(path, tmp_path / "out", MapOptions(terrain=dem),
-                                  BuildOptions(origin=ORIGIN, devices=4, **more))
+    report = build_scene_from_map(path, tmp_path / "out",
+                                  BuildOptions(terrain=dem, origin=ORIGIN, devices=4, **more))
     return report, pd.read_csv(tmp_path / "out" / "buildings.csv").set_index("building")
 
 
@@ -80,8 +80,8 @@ def test_parts_of_a_city_model_stand_on_the_ground_of_their_building(tmp_path):
         made.cityjson([(0, 0, 500), (50, 0, 505)], "EPSG:32634", at=(round(east), round(north))))
     (tmp_path / "a.city.json").write_text(json.dumps(model))
     dem = write_dem(tmp_path / "a.tif", incline(0.1, 0, 500))
-    report = build_scene_from_map(tmp_path / "a.city.json", tmp_path / "out", MapOptions(terrain=dem),
-                                  BuildOptions(origin=ORIGIN))
+    report = build_scene_from_map(tmp_path / "a.city.json", tmp_path / "out",
+                                  BuildOptions(terrain=dem, origin=ORIGIN))
     low_m = 500 - Scene.load(report.folder).config.terrain.datum_m
     table = pd.read_csv(report.folder / "buildings.csv").sort_values("x_m")
     assert table["ground_m"].tolist() == pytest.approx([low_m] * 2, abs=0.1)
@@ -147,14 +147,14 @@ def test_a_device_or_a_flight_in_the_hill_is_refused(copied):
 def test_the_altitude_of_an_origin_is_the_datum(tmp_path):
     dem = write_dem(tmp_path / "a.tif", SLOPE)
     at = Origin(latitude_deg=10, longitude_deg=20, altitude_m=400.0)
-    report = build_scene_from_map(hamlet().write(tmp_path / "a.osm"), tmp_path / "out", MapOptions(terrain=dem),
-                                  BuildOptions(origin=at))
+    report = build_scene_from_map(hamlet().write(tmp_path / "a.osm"), tmp_path / "out",
+                                  BuildOptions(terrain=dem, origin=at))
     scene = Scene.load(report.folder)
     assert scene.config.terrain.datum_m == scene.config.origin.altitude_m == 400
     assert scene.city.ground_height_m(0.0, 0.0) == pytest.approx(31.5, abs=0.05)
     with pytest.raises(BadInput, match=r"the altitude of --origin, 500 m, is above the lowest ground of the scene"):
-        build_scene_from_map(tmp_path / "a.osm", tmp_path / "out", MapOptions(terrain=dem),
-                             BuildOptions(origin=at.model_copy(update={"altitude_m": 500.0})))
+        build_scene_from_map(tmp_path / "a.osm", tmp_path / "out",
+                             BuildOptions(terrain=dem, origin=at.model_copy(update={"altitude_m": 500.0})))
 
 
 def heights(path, box_m=BOX_M):

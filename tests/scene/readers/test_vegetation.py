@@ -7,7 +7,7 @@ import shapely
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.config import read_config
-from radiotwin.scene.readers import MapOptions, build_scene_from_map
+from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.scene.readers.features import left_out_problems
 from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml
 
@@ -67,8 +67,8 @@ def test_pbf_holds_the_same(area_osm, tmp_path):
 
 
 def test_a_scene_declares_it(area_osm, tmp_path):
-    report = build_scene_from_map(area_osm, tmp_path / "scene", MapOptions((47.499, 8.699, 47.505, 8.7065)),
-                                  BuildOptions(uavs=0))
+    report = build_scene_from_map(area_osm, tmp_path / "scene",
+                                  BuildOptions(uavs=0, bbox=(47.499, 8.699, 47.505, 8.7065)))
     declared = {each.name: each for each in read_config(tmp_path / "scene" / "scene.toml").vegetation}
     assert {name: (each.kind, each.height_m) for name, each in declared.items()} == {
         "way/2": ("wood", 23.0), "way/5": ("park", 10.0), "way/7": ("tree_row", 10.0), "relation/1": ("wood", 16.0)}
