@@ -139,7 +139,8 @@ def _learnt(scene: Scene, truth: object, seed: int, rng: np.random.Generator,
     measured = fly_survey(scene, truth, flights=1, seed=seed)  # type: ignore[arg-type]
     anchors = [each.device for each in scene.config.devices if each.role == "anchor"]
     names = measured.devices["device"].to_numpy()[measured.device_index]
-    twin = fit_twin(measured.select(np.isin(names, anchors)), scene, seed=seed)
+    twin = fit_twin(measured.select(np.isin(names, anchors)), scene, "segmented_nn",
+                    seed=seed)
     devices = []
     for each, true in zip(twin.devices, scene.config.devices, strict=True):
         angle, off_m = rng.uniform(0, 2 * np.pi), rng.uniform(*OFF_M) * is_displaced

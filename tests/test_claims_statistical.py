@@ -35,7 +35,7 @@ def runs():
     for seed in SEEDS:
         flown = fly_survey(scene, truth, flights=2 * FLIGHTS, pattern="random-waypoint", seed=seed, noise_db=0.0)
         early = flown.table["flight"].isin(flown.flights[:FLIGHTS]).to_numpy()
-        twin = fit_twin(flown.select(early), scene, seed=seed)
+        twin = fit_twin(flown.select(early), scene, "segmented_nn", seed=seed)
         results.append((seed, twin, flown.select(~early)))
     return scene, results
 

@@ -36,13 +36,13 @@ def fit(
     scene: SceneOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the twin.")] = Path("twin"),
     model: Annotated[str, typer.Option(
-        help="segmented_nn, segmented_log_distance, log_distance, regression_kriging; auto: the "
-             "one of these with the least held-out error. Or raytrace: paths over the 3D map, also "
-             "to find devices in narrow streets; takes minutes. "
+        help="auto: the one with the least held-out error of log_distance, "
+             "segmented_log_distance, segmented_nn, regression_kriging. Or raytrace: paths over "
+             "the 3D map, also to find devices in narrow streets; takes minutes. "
              "path_kriging: the same over a map that may be wrong. Or a "
              "published law, which needs no anchor: tr36777_uma, tr36777_umi, al_hourani_urban "
              "(_suburban, _dense_urban, _high_rise), p1411, cost231_wi (_metropolitan).")
-        ] = "segmented_nn",
+        ] = "auto",
     devices: DeviceTable = None,
     start: Annotated[Path | None, typer.Option(
         help="An earlier twin, to start the search from.")] = None,
@@ -55,7 +55,8 @@ def fit(
 ) -> None:
     """Fit a twin: the channel and the unknown devices.
 
-    The channel is learnt from the anchors; then the unknown devices are located with it.
+    The channel is learnt from the anchors. With --model auto, segmented_nn locates the unknown
+    devices, and the model with the least held-out error predicts levels; else one does both.
     """
     from radiotwin.links.measurements import read_measurements
     from radiotwin.runtime.execution import open_executor
@@ -76,7 +77,7 @@ def fit(
 
 
 def _print_twin(twin: "Twin", title: str) -> None:
-    from radiotwin.twin.selection import HeldOut
+    from radiotwin.twin.selection import LOCATED_BY, HeldOut
 
     table, columns = twin.positions, {"device": "left", "role": "left", "x [m]": "right",
                                       "y [m]": "right", "90 % radius [m]": "right"}
@@ -91,9 +92,13 @@ def _print_twin(twin: "Twin", title: str) -> None:
         print_rows("Law of the channel, with 90 % intervals",
                    {"links": "left", "parameter": "left", "value": "right", "low": "right",
                     "high": "right", "unit": "left"}, law.to_numpy(dtype=object).tolist())
+    model, located_by = twin.channel.name, twin.provenance.get(LOCATED_BY, "")
     held_out = HeldOut.kept(twin.provenance)
-    if held_out is not None:
-        say(held_out.sentence(twin.channel.name))
+    say(f"{model} was not compared with others: too few links of anchors to hold any out"
+        if held_out is None else held_out.sentence(model))
+    if located_by not in ("", model):
+        say(f"The unknown devices were located with {located_by}, and levels are predicted with "
+            f"{model}")
 
 
 def _note(device: "TwinDevice") -> str:

@@ -23,13 +23,14 @@ from radiotwin.propagation.laws import channel_named
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.propagation.laws.published import PublishedLaw
+from radiotwin.propagation.laws.segmented_nn import SegmentedNN
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import NO_ANCHOR, anchors_links, fit_links
 from radiotwin.twin.fit_paths import fit_along_paths, fit_over_wrong_map
 from radiotwin.twin.law import LAW, law_parameters
 from radiotwin.twin.localize import LocalizeSettings
-from radiotwin.twin.selection import AUTO, CHEAP, HELD_OUT, HeldOut
+from radiotwin.twin.selection import AUTO, CHEAP, HELD_OUT, LOCATED_BY, UNTRIED, HeldOut
 from radiotwin.twin.shadowing import MAP_ERRORS, MapErrors
 from radiotwin.twin.twin import Twin
 
@@ -42,7 +43,7 @@ HEIGHT_NEEDED = ("with a 3D map every position needs one. Fill it in, in metres 
 
 
 def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scene | Path | str,
-             model: str = "segmented_nn", *, seed: int = 0, start: Twin | None = None,
+             model: str = AUTO, *, seed: int = 0, start: Twin | None = None,
              allow_indoor: bool = False, executor: Executor | None = None,
              compare: bool = False) -> Twin:
     """Learn the channel from the anchors' links, then locate the unknown devices with it.
@@ -55,12 +56,13 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
         scene: its map and extent, and the receivers' sensitivity; or its folder.
         model: name of a channel model (`radiotwin.propagation.laws.channel_models`); `raytrace`
             stands for `image_paths`, which follows paths over the 3D map, and `path_kriging` allows
-            for errors of that. `auto` is the cheap one with the least held-out error.
+            for errors of that. `auto` is the one of `selection.CHEAP` with the least held-out
+            error; then `segmented_nn` locates the devices.
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
         allow_indoor: whether unknown devices may be inside buildings.
-        compare: whether the twin's provenance says how the cheap models compare on links that are
-            held out, see `HeldOut`; so it does with the model `auto`.
+        compare: whether to hold links out and note in the twin's provenance how well each of
+            `selection.CHEAP` predicts them, see `HeldOut`; with the model `auto` always.
         executor: where a model that follows paths searches for devices, inside `keep_pieces`;
             None: in this process.
 
@@ -104,19 +106,22 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
         geometry, level_db, limit_db = anchors_links(links)
         held_out = HeldOut.of(geometry, links.flight[of_anchors], level_db, limit_db, seed)
         if model == AUTO:
-            channel = channel_named(CHEAP[1] if held_out is None else held_out.best)
+            channel = channel_named(UNTRIED if held_out is None else held_out.best)
     if along_paths:
         fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
         twin = fit(links, scene, seed, start, executor)
     else:
         settings = LocalizeSettings(allow_indoor=allow_indoor)
-        twin = fit_links(links, scene, channel, seed, start, settings)
+        twin = fit_links(links, scene, channel, seed, start, settings,
+                         locator=SegmentedNN if model == AUTO else None)
     twin.provenance.update(flights=flights, seed=seed)
     if not along_paths:  # which would be followed once more
         twin.provenance[MAP_ERRORS] = asdict(MapErrors.of(twin, links, seed))
         twin.provenance[LAW] = law_parameters(twin.channel, *anchors_links(links), seed)
     if held_out is not None:
         twin.provenance[HELD_OUT] = held_out.record
+    if model == AUTO and not measurements.is_anchor.all():
+        twin.provenance[LOCATED_BY] = SegmentedNN.name
     return replace(twin, scene=scene)
 
 

@@ -29,7 +29,8 @@ MAX_POWER_APART_DB = 3.0  # between declared and fitted powers; more hints at a 
 
 
 def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int,
-              start: Twin | None = None, settings: LocalizeSettings | None = None) -> Twin:
+              start: Twin | None = None, settings: LocalizeSettings | None = None,
+              locator: type[ChannelModel] | None = None) -> Twin:
     """Learn a channel from the anchors' links, then locate the unknown devices with it.
 
     Args:
@@ -39,28 +40,34 @@ def fit_links(links: Links, scene: Scene, channel: type[ChannelModel], seed: int
         seed: as of `fit_twin`.
         start: as of `fit_twin`.
         settings: of the search.
+        locator: class of the channel model that locates, learnt from the anchors' links; None:
+            `channel`.
 
     Raises:
         BadInput: as of `fit_twin`.
     """
     anchors_m = _anchors_m(links)
     is_anchor = np.isfinite(anchors_m).all(axis=1)
-    if issubclass(channel, PublishedLaw):
-        fitted: ChannelModel = _published(links, anchors_m, scene, channel)
+    unknown = np.flatnonzero(~is_anchor)
+    if locator is None or not len(unknown):
+        locator = channel
+    if issubclass(locator, PublishedLaw):
+        fitted: ChannelModel = _published(links, anchors_m, scene, locator)
     else:
-        fitted = _fit_channel(links, anchors_m, channel, seed)
+        fitted = _fit_channel(links, anchors_m, locator, seed)
     devices: list[Any] = [TwinDevice.anchor(name, *position_m) if anchor else None
                           for name, position_m, anchor in
                           zip(links.device_names, links.device_m, is_anchor, strict=True)]
-    unknown = np.flatnonzero(~is_anchor)
     if len(unknown):
         law_error = None if isinstance(fitted, PublishedLaw) else LawError.learnt(
-            fitted.trend, channel.uses_map, *_known_links(links, anchors_m)[:2])
+            fitted.trend, locator.uses_map, *_known_links(links, anchors_m)[:2])
         found = _locate(links, scene, fitted.trend, law_error, unknown, seed, start, settings)
         for index, each in zip(unknown, found, strict=True):
             devices[index] = each
-    if fitted.trend is not fitted:
-        fitted = _fit_channel(links, reliable_m(devices), channel, seed)
+    interpolates = channel.trend is not ChannelModel.trend
+    if len(unknown) and (interpolates or locator is not channel):
+        known_m = reliable_m(devices) if interpolates else anchors_m
+        fitted = _fit_channel(links, known_m, channel, seed)
     if isinstance(fitted, PublishedLaw):
         for note in fitted.outside(_known_links(links, reliable_m(devices))[0]):
             warnings.warn(note, stacklevel=3)

@@ -16,6 +16,7 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.links.plausible import LEVELS
 from radiotwin.scene import Scene
 from radiotwin.twin.fit import fit_twin
+from radiotwin.twin.selection import AUTO
 
 
 class TwinRegressor:
@@ -39,7 +40,7 @@ class TwinRegressor:
     _estimator_type = "regressor"
 
     def __init__(self, scene: Scene | Path | str | None = None,
-                 devices: pd.DataFrame | None = None, model: str = "segmented_nn",
+                 devices: pd.DataFrame | None = None, model: str = AUTO,
                  level: str = "rssi_dbm", origin: Origin | None = None, seed: int = 0) -> None:
         self.scene = scene
         self.devices = devices

@@ -1,4 +1,4 @@
-"""Which of the cheap channel models predicts links best that it has not seen."""
+"""Choose a channel model by its error on held-out links of the anchors."""
 
 from __future__ import annotations
 
@@ -16,37 +16,41 @@ from radiotwin.propagation.laws.base import MIN_DETECTED
 from radiotwin.propagation.laws.segmented_nn import BLOCK_M
 
 AUTO = "auto"
-HELD_OUT = "held_out"  # in the provenance of a twin
+HELD_OUT, LOCATED_BY = "held_out", "located_by"  # in the provenance of a twin
 CHEAP = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging")
+UNTRIED = "segmented_log_distance"  # taken where too few links are there to hold any out
 FOLDS, MIN_FLIGHTS = 3, 3
+ALIKE = 0.04  # of the mean squared error, 2 % of the RMSE: too little to prefer a complex model
 MAX_LINKS = 5_000  # that models are judged on; kriging of more takes minutes
-AS_GOOD = 1.02  # ratio of errors up to which a simpler model is as good
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors of models on anchors' links that took no part in their fits.
+    """Errors of channel models on anchors' links that took no part in their fits.
 
     Attributes:
         by: what was held out together: `flight`, or `block` of ground.
         rmse_db: of detected links, by the name of the model, simple ones first [dB].
+        as_good: models whose mean squared error is within one standard error, or `ALIKE`, of the
+            least; simple ones first.
     """
 
     by: str
     rmse_db: dict[str, float]
+    as_good: tuple[str, ...]
 
     @classmethod
     def of(cls, links: LinkGeometry, flight: np.ndarray, level_db: np.ndarray, limit_db: Limit,
            seed: int, models: tuple[str, ...] = CHEAP) -> HeldOut | None:
-        """Judge models.
+        """Fit each model to the links outside a fold, and compute its errors inside.
 
         Args:
             links: n links of the anchors.
             flight: (n,) index.
             level_db: (n,) as of `ChannelModel.fit`.
             limit_db: as of `ChannelModel.fit`.
-            seed: of the parts that are held out, and of the fits.
-            models: names.
+            seed: of the folds and of the fits.
+            models: names, simple ones first.
 
         Returns:
             None where too few links would be left to learn from.
@@ -58,56 +62,84 @@ class HeldOut:
             rows = np.sort(rng.choice(len(flight), MAX_LINKS, replace=False))
             links, flight, level_db = links.select(rows), flight[rows], level_db[rows]
             limit_db = limit_db[rows] if isinstance(limit_db, np.ndarray) else limit_db
+        cell = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
         by, group = "flight", flight
         if len(np.unique(flight)) < MIN_FLIGHTS:
-            cell = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)
-            by, group = "block", np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+            by, group = "block", _index_rows(cell)
         fold = deal_groups(group, FOLDS, rng)
-        seen, limits_db = np.isfinite(level_db), limits_of(limit_db, len(level_db))
+        detected, limits_db = np.isfinite(level_db), limits_of(limit_db, len(level_db))
         if len(np.unique(fold)) < 2 or min(
-                int(seen[fold != each].sum()) for each in np.unique(fold)) < MIN_DETECTED:
+                int(detected[fold != each].sum()) for each in np.unique(fold)) < MIN_DETECTED:
             return None
-        rmse_db = {}
+        square_db2 = {}
         for name in models:
             error_db = np.full(len(level_db), np.nan)
             for each in np.unique(fold):
                 train, test = fold != each, fold == each
                 with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # that of all links is said
+                    warnings.simplefilter("ignore")  # the fit to all links warns of the same
                     model = fit_once(channel_named(name), links.select(train), level_db[train],
                                      limits_db[train], seed)
                 expected_db = mean_if_detected(*model.predict(links.select(test)), limits_db[test])
                 error_db[test] = level_db[test] - expected_db
-            rmse_db[name] = float(np.sqrt(np.nanmean(error_db**2)))
-        return cls(by, rmse_db)
+            square_db2[name] = error_db[detected]**2
+        least = min(square_db2.values(), key=lambda square: float(square.mean()))
+        block = _index_rows(np.column_stack([links.device, cell])[detected])
+        as_good = tuple(name for name, square in square_db2.items() if np.mean(square - least)
+                        <= max(standard_error(square - least, block), ALIKE * np.mean(least)))
+        return cls(by, {name: float(np.sqrt(square.mean())) for name, square in square_db2.items()},
+                   as_good)
 
     @classmethod
     def kept(cls, provenance: dict[str, Any]) -> HeldOut | None:
-        """Return what a twin's provenance holds; None if nothing."""
-        found = provenance.get(HELD_OUT)
-        if found is None:
+        """Return the errors in a twin's provenance; None if it has none."""
+        rows = provenance.get(HELD_OUT)
+        if not rows:
             return None
-        return cls(found["by"], {name: value for name, value in found.items() if name != "by"})
+        return cls(rows[0]["by"], {row["model"]: row["rmse_db"] for row in rows},
+                   tuple(row["model"] for row in rows if row["as_good"]))
 
     @property
-    def record(self) -> dict[str, Any]:
-        """For the provenance of a twin."""
-        return {"by": self.by, **self.rmse_db}
+    def record(self) -> list[dict[str, Any]]:
+        """Rows for the provenance of a twin."""
+        return [{"model": name, "rmse_db": rmse_db, "by": self.by, "as_good": name in self.as_good}
+                for name, rmse_db in self.rmse_db.items()]
 
     @property
     def best(self) -> str:
-        """The simplest model whose error is within 2 % of the least."""
-        least_db = min(self.rmse_db.values())
-        return next(name for name, each in self.rmse_db.items() if each <= AS_GOOD * least_db)
+        """The simplest model that is as good as the one with the least error."""
+        return self.as_good[0]
 
     def sentence(self, model: str) -> str:
-        """Say how good a model is beside the others."""
-        tried = ", ".join(f"{name} {each:.2f}" for name, each in self.rmse_db.items())
-        text = f"RMSE on anchors' links held out by {self.by} [dB]: {tried}."
+        """Say how the error of a model compares with that of the others."""
+        errors = ", ".join(f"{name} {rmse_db:.2f}" for name, rmse_db in self.rmse_db.items())
+        text = f"RMSE on anchors' links held out by {self.by} [dB]: {errors}."
         if model not in self.rmse_db:
             return f"{text} {model} was not tried: it takes too long"
-        if self.rmse_db[model] <= AS_GOOD * self.rmse_db[self.best]:
-            return f"{text} {model} is the best of them, or as good"
+        if model == self.best:
+            return f"{text} {model} is the simplest that is as good as any of them"
+        if model in self.as_good:
+            return f"{text} {model} is as good as any of them"
         return (f"{text} {self.best} would be better: {self.rmse_db[self.best]:.2f} dB, where "
                 f"{model} has {self.rmse_db[model]:.2f} dB; take --model {self.best}, or --model "
                 f"{AUTO}")
+
+
+def _index_rows(rows: np.ndarray) -> np.ndarray:
+    """Return the index (n,) of each row (n, k) among the different ones."""
+    return np.unique(rows, axis=0, return_inverse=True)[1].ravel()
+
+
+def standard_error(value: np.ndarray, block: np.ndarray) -> float:
+    """Return the standard error of the mean of n values that are alike within a block.
+
+    Of a ratio of block sums (Cochran 1977, 'Sampling Techniques', chapter 6): the errors of
+    links to one device from receivers close together are alike.
+
+    Args:
+        value: (n,)
+        block: (n,) index of the block of each value.
+    """
+    deviation = np.bincount(block, value - value.mean())
+    blocks = len(deviation)
+    return float(np.sqrt(np.square(deviation).sum() * blocks / max(blocks - 1, 1)) / len(value))

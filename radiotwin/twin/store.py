@@ -151,6 +151,15 @@ class _LawParameter(_Strict):
     unit: str
 
 
+class _HeldOutError(_Strict):
+    """A row of `HeldOut.record`."""
+
+    model: str
+    rmse_db: Real
+    by: Literal["flight", "block"]
+    as_good: bool
+
+
 class _Provenance(BaseModel):
     """Fields of the provenance that are read; the others are only kept."""
 
@@ -161,7 +170,7 @@ class _Provenance(BaseModel):
     origin: Origin | None = None
     receiver_heights_m: Annotated[list[Real], Field(min_length=2, max_length=2)] | None = None
     map_errors: _MapErrors | None = None
-    held_out: dict[str, str | Real] | None = None
+    held_out: Annotated[list[_HeldOutError], Field(max_length=10)] | None = None
     law: Annotated[list[_LawParameter], Field(max_length=10)] | None = None
 
 

@@ -43,7 +43,7 @@ def test_the_map_is_one_that_others_can_read(chain):
     with xr.open_dataset(chain / "twin.nc", engine="h5netcdf") as dataset:
         assert dict(dataset.sizes) == {"device": 7, "z": 2, "y": 16, "x": 16}
         assert np.isfinite(dataset["gain_db"]).all() and (dataset["gain_db"] < 0).all()
-        assert dataset.attrs["source"] == "twin:segmented_nn"
+        assert dataset.attrs["source"] == "twin:segmented_log_distance"
 
 
 def test_the_comparison_has_every_model_against_both_judges(chain):

@@ -18,7 +18,7 @@ from radiotwin.errors import BadInput
 
 @pytest.fixture(scope="module")
 def learnt(small_scene):
-    return fit_twin(fly_survey(small_scene, "segmented", flights=2, seed=0), small_scene)
+    return fit_twin(fly_survey(small_scene, "segmented", flights=2, seed=0), small_scene, "segmented_log_distance")
 
 
 def test_nine_of_ten_true_worlds_bring_p10(tiny):
