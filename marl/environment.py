@@ -10,11 +10,10 @@ which take a fifth of the memory, and makes features of them again.
 from typing import NamedTuple
 
 import numpy as np
-from numba.typed import List
 from scipy.fft import fft2, next_fast_len
 
 from marl.mission import COSTS, MOVES, NO_OP, Mission
-from radiotwin.runtime.compiled import njit
+from radiotwin.runtime.compiled import List, njit
 
 ACTION_COUNT = len(COSTS)
 DEVICE_FEATURES = 7  # SNR, reachable, data left, distance, dx, dy, assigned

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numba.typed import List
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from typing_extensions import override
@@ -22,7 +21,7 @@ from marl.flights import Policy
 from marl.learner import Learner
 from marl.mission import HOVER, MOVES, NO_OP, Mission
 from marl.planner import expected_data, plan
-from radiotwin.runtime.compiled import njit
+from radiotwin.runtime.compiled import List, njit
 
 WEIGHTS = Path(__file__).with_name("policy.safetensors")
 BEST_RATE = 10.0  # [bit/s/Hz], about the best link; rates are in units of it

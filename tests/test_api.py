@@ -137,6 +137,7 @@ def test_functions_have_defaults_where_commands_have(name):
 
 @pytest.mark.parametrize("command", [
     ["-m", "radiotwin", "--version"], ["-m", "marl.fedqmix", "--help"],
+    ["-c", "import marl.flights"],
     ["-c", "import radiotwin.propagation.paths.surfaces, marl.environment, numba, sys; assert '' in sys.path"]])
 def test_an_output_folder_named_coverage_does_no_harm(tmp_path, command):
     """numba would take it for the package of that name; it is imported by both packages."""

@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-__all__ = ["njit"]
+__all__ = ["List", "njit"]
 
 
 def _path_without_folder(name: str) -> list[str]:
@@ -33,6 +33,7 @@ sys.path[:] = _path_without_folder("coverage")
 try:
     from numba import njit
     from numba.core.caching import _SourceFileBackedLocatorMixin as _Locator
+    from numba.typed import List
 finally:
     sys.path[:] = _whole_path
 
