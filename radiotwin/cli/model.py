@@ -309,7 +309,7 @@ def _print(report: dict[str, Any]) -> None:
     anomalies = anomaly_words.rows(report)
     if anomalies:
         print_rows("What stands out", dict(zip(
-            anomaly_words.COLUMNS, ("left", "left", "right", "right", "right", "right", "left"),
+            anomaly_words.COLUMNS, ("left", "left", "left", "right", "right", "right", "right"),
             strict=True)), anomalies)
     error = report["error"]
     groups = [(name, both) for name, both in (("all", error), *error["by_los"].items())

@@ -59,9 +59,7 @@ def where(report: dict) -> str:
 
 def sentence(anomaly: dict, report: dict) -> str:
     """Say how a group reads otherwise than its peers: "Device d3 reads 5.6 dB less than …"."""
-    who, is_plural = group(anomaly, origin_of(report))
-    sight = SIGHT.get(anomaly.get("sight", "all"))
-    start = f"{sight} {who}" if sight else who
+    start, is_plural = group(anomaly, origin_of(report))
     maybe = "" if anomaly["probability"] >= MIN_SURE else "probably "
     over = [OVER[each] for each in anomaly.get("same_over", [])]
     everywhere = f", {join_names(over)}" if over else ""
@@ -114,22 +112,23 @@ def group(anomaly: dict, origin: Origin | None = None) -> tuple[str, bool]:
         text += f"{joined}{end}{'s' * (len(names) > 1)} {some_names(names)}"
     text += " (they never part)" * one
     is_plural = bool(members) and len(next(iter(members.values()))) > 1
-    ranges = [_range(name, *ends, origin=origin) for name, ends in _ranges(anomaly)]
+    sight = SIGHT.get(anomaly.get("sight", "all"), "")
     if not members:
-        text, is_plural = "links", True
+        text, is_plural = f"links {sight}".rstrip(), True
+    elif sight:
+        text += f" ({sight})"
+    ranges = [_range(name, *ends, origin=origin) for name, ends in _ranges(anomaly)]
     return " ".join([text, *ranges]), is_plural
 
 
 def rows(report: dict) -> list[list[str]]:
-    """Return a row for each anomaly: group, statistic, size, interval, probability, links, why."""
+    """Return a row of `COLUMNS` for each anomaly."""
     found = []
     for index, each in enumerate(report.get("anomalies", [])):
-        sight = SIGHT.get(each.get("sight", "all"))
-        group_words = group(each, origin_of(report))[0] + (f", {sight}" if sight else "")
+        why = causes(each, _named(index, report)).partition(": ")[2].removesuffix(".")
         found.append([
-            group_words, statistic(each), size(each), interval(each["size"]),
-            probability(each["probability"]), f"{each['links']:,}",
-            causes(each, _named(index, report)).partition(": ")[2].removesuffix(".") or "open"])
+            group(each, origin_of(report))[0], why or "open", statistic(each), size(each),
+            interval(each["size"]), probability(each["probability"]), f"{each['links']:,}"])
     return found
 
 
@@ -139,8 +138,8 @@ def statistic(anomaly: dict) -> str:
     return f"{STATISTICS[anomaly['statistic']]} {along}".rstrip()
 
 
-COLUMNS = ("group", "statistic", "against its peers", "90 % interval", "probability", "links",
-           "possible causes")
+COLUMNS = ("group", "possible causes", "statistic", "against its peers", "90 % interval",
+           "probability", "links")
 
 
 def seen_from(report: dict) -> str:

@@ -24,6 +24,7 @@ from radiotwin.report.closeloop_data import (
     bin_means,
     collect,
 )
+from radiotwin.report.closeloop_words import rmse_after_db
 from radiotwin.report.group_figures import groups_figure
 from radiotwin.report.labels import (
     AFTER,
@@ -295,7 +296,8 @@ def waterfall_figure(report: dict) -> Figure:
 
     Other models of `closeloop.json` are horizontal lines, up to `MAX_LINE` times the highest bar.
     """
-    before, after = (report["error"][when]["rmse_db"] or 0.0 for when in ("before", "after"))
+    error = report["error"]
+    before, after = error["before"]["rmse_db"] or 0.0, rmse_after_db(error) or 0.0
     kept = [(candidate["name"], candidate["heldout_rmse_db"]) for candidate in report["candidates"]
             if candidate["kept"] and candidate["heldout_rmse_db"] is not None]
     declared = sum(effect.get("is_declared", False) for effect in report["effects"])
@@ -305,7 +307,7 @@ def waterfall_figure(report: dict) -> Figure:
     steps = [(name_label(name), name in without_cause) for name, _ in kept]
     if kept and abs(levels[-1] - after) > MIN_STEP_DB:
         levels.append(after)
-        known = report["error"].get("after_with_quality")
+        known = error.get("after_with_quality")
         steps.append(("on a map: quality not known" if known else "joint refit", False))
     figure = new_figure(max(1.15 * (len(steps) + 2) + 2.6, 6.5), 4.6)
     ax = figure.add_subplot()
@@ -324,8 +326,8 @@ def waterfall_figure(report: dict) -> Figure:
     highest = MAX_LINE * max(before, after, *levels)  # or the bars would be too low to be read
     lines = [(value["rmse_db"], name_label(name), "--") for name, value in
              report["baselines"].items() if (value["rmse_db"] or np.inf) <= highest]
-    if report["error"]["noise_floor_db"] is not None:
-        lines.append((report["error"]["noise_floor_db"], "noise of one\nmeasurement", ":"))
+    if error["noise_floor_db"] is not None:
+        lines.append((error["noise_floor_db"], "noise of one\nmeasurement", ":"))
     top = 1.12 * max(before, after, *levels, *(value for value, *_ in lines))
     ax.set(xlim=(-0.6, len(names) - 0.4), ylim=(0, max(top, 0.1)),
            ylabel="RMSE on held-out links [dB]",

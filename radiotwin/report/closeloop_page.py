@@ -50,6 +50,7 @@ COLUMNS = {"n": "links", "bias_db": "bias [dB]", "std_db": "standard deviation [
            "nll": "−log-likelihood [nats]"}
 LEARNT = {"combined": "all that was learnt together",
           "map": "its map, which has the mean at a faultless receiver, also where nothing is heard"}
+UNITS = {"deg": "°"}  # where a page does not write them as the file does
 MAX_ROWS = 40  # groups with more members are left out of the tables
 MAX_COLUMNS = 30  # of the scores
 MAX_MODELS = 100
@@ -87,7 +88,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "lead": lead, "more": more, "rivals": words.rivals(report), "cards": _cards(report),
         "map": read_picture(folder, *MAP, ("before", "after") if is_changed else ()),
         "steps": read_picture(folder, *STEPS),
-        "anomalies": Table(anomaly_words.COLUMNS, anomaly_words.rows(report), "", 2),
+        "anomalies": Table(anomaly_words.COLUMNS, anomaly_words.rows(report), "", 3),
         "figures": [picture for picture in pictures if picture],
         "effects": [_effect(each, folder) for each in report["effects"][:MAX_EFFECTS]],
         "more_effects": max(len(report["effects"]) - MAX_EFFECTS, 0),
@@ -133,7 +134,7 @@ def _effect(effect: dict, folder: Path) -> dict[str, Any]:
     kind = ("interpolated, not explained" if name in interpolations() else
             "part of the base" if effect.get("is_declared") else "")
     has_panels = any(each.figure == "links" for each in effects_named(name))
-    rows = [[parameter_label(key, labels), _value(p), _interval(p), p["unit"]]
+    rows = [[parameter_label(key, labels), _value(p), _interval(p), UNITS.get(p["unit"], p["unit"])]
             for key, p in effect["parameters"].items()]
     return {"rank": effect["rank"], "label": label, "kind": kind, "evidence": _evidence(effect),
             "picture": read_picture(folder, effect_picture(effect["rank"], name), label, "",

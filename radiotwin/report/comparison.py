@@ -283,10 +283,31 @@ def _estimates_figure(comparison: Comparison, models: list[str], scene: Scene) -
 def comparison_context(comparison: Comparison, folder: Path) -> dict[str, Any]:
     """Collect what a run's page shows of a comparison, with the figures of a folder."""
     pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
-    return {"lead": _summary(comparison),
-            "tables": [Table(list(columns), rows, title)
-                       for title, columns, rows in comparison.tables()],
+    return {"lead": _summary(comparison), "tables": _tables(comparison),
             "figures": [picture for picture in pictures if picture]}
+
+
+def _tables(comparison: Comparison) -> list[tuple[str, Table]]:
+    """Return title and table of the errors on each kind of links, and of the devices' positions."""
+    columns = ("model", "RMSE", "RMSE LoS", "RMSE NLoS", "MAE", "bias")
+    tables = []
+    estimated = comparison.scores.query("positions == 'estimated'")
+    for against, part in estimated.groupby("against", sort=False):
+        by_model = part.set_index(["model", "links"])
+        rmse_db = by_model["rmse_db"].unstack()[list(CLASSES)]
+        of_all = by_model.xs("all", level="links")
+        rows = [[MODELS.get(name, name), *rmse_db.loc[name], of_all.mae_db[name],
+                 of_all.bias_db[name]] for name in of_all.index]
+        best = [list(of_all.index).index(of_all["rmse_db"].idxmin())] \
+            if of_all["rmse_db"].notna().any() else []
+        tables.append((f"Error on {against} [dB], {of_all['n'].max():,} links",
+                       Table(columns, rows, strong=best)))
+    located = [[MODELS.get(row.model, row.model), int(row.devices), row.median_m, row.p90_m,
+                row.worst_m] for row in comparison.location_summary().itertuples()]
+    if located:
+        tables.append(("Error of the unknown devices' positions [m]", Table(
+            ("model", "located devices", "median", "90 %", "worst"), located)))
+    return tables
 
 
 def _judged(comparison: Comparison) -> pd.DataFrame:
@@ -303,7 +324,11 @@ def _summary(comparison: Comparison) -> str:
     if not set(SHOWN) <= set(judged.index):
         return ""
     line, twin = judged.loc["log_distance"], judged.loc["segmented_nn"]
-    return ("Fitted to a few flights, the twin predicts the gain over the whole map with an RMSE "
+    text = ("Fitted to a few flights, the twin predicts the gain over the whole map with an RMSE "
             f"of {twin.rmse_db:.1f} dB (log-distance model: {line.rmse_db:.1f} dB) and locates the "
             f"unknown devices with a median error of {twin.median_m:.1f} m (log-distance model: "
             f"{line.median_m:.1f} m).")
+    best = judged["rmse_db"].idxmin()
+    return text if best == "segmented_nn" else (
+        f"{text} The least error over the whole map has {MODELS.get(best, best)}: "
+        f"{judged.rmse_db[best]:.1f} dB.")

@@ -10,11 +10,10 @@ from matplotlib.patches import Patch, Rectangle
 
 from radiotwin.coverage import Coverage
 from radiotwin.coverage.output import Legend, drawn_rasters, file_stem, legend_of
-from radiotwin.report.labels import new_figure, plain, save
+from radiotwin.report.labels import attribution, new_figure, plain, save
 from radiotwin.report.map_figures import HeightGrid
 from radiotwin.scene import Scene
 from radiotwin.scene.plot import draw_streets, height_grid
-from radiotwin.scene.streets import CREDIT
 
 BUILDING_M = 2.0  # lowest height that is drawn
 OUTLINE_CELLS = 800  # along the longer side
@@ -24,7 +23,6 @@ MAX_RATIO = 3.0  # of the sides of a picture
 MAX_LABELS = 30  # transmitters with a name beside them
 MAX_LEGEND_ROWS = 24
 BUILDING_COLOUR, OUTLINE_COLOUR = "#8f8f8f", "#4a4a4a"
-OSM_SUFFIXES = (".osm", ".osm.pbf")
 ROUND_LENGTHS = (1, 2, 5, 10)
 
 
@@ -154,11 +152,5 @@ def _caption(coverage: Coverage, scene: Scene) -> str:
              f"{facts['step_m']:g} m",
              f"bandwidth {facts['bandwidth_hz'] / 1e6:g} MHz, noise {facts['noise_dbm']:.1f} dBm "
              f"(noise figure {facts['noise_figure_db']:.1f} dB)"]
-    credit = _attribution(scene)
+    credit = attribution(scene)
     return "\n".join([lines[0], lines[1] + (f"; map {credit}" if credit else "")])
-
-
-def _attribution(scene: Scene) -> str:
-    """Return the credit that the map a scene was built from asks for; empty if none is known."""
-    source = scene.config.provenance.get("source", "").lower()
-    return CREDIT if source.endswith(OSM_SUFFIXES) else ""

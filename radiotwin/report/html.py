@@ -144,5 +144,5 @@ def _final(value: object) -> object:
 
 def _cell(value: object) -> str:
     if isinstance(value, float):
-        return "–" if value != value else f"{value:.2f}"
+        return "–" if value != value else f"{value:.2f}".replace("-", "−")
     return str(value)

@@ -15,6 +15,8 @@ from radiotwin.geo import to_geographic
 from radiotwin.io.files import atomic_file
 from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
+from radiotwin.scene import Scene
+from radiotwin.scene.streets import CREDIT
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 
 VARIABLES = {  # label and unit
@@ -163,6 +165,12 @@ def place_words(x_m: float, y_m: float, origin: Origin | None) -> str:
     longitude_deg, latitude_deg = (float(each) for each in to_geographic(origin, x_m, y_m))
     return (f"{abs(latitude_deg):.5f}° {'NS'[latitude_deg < 0]}, "
             f"{abs(longitude_deg):.5f}° {'EW'[longitude_deg < 0]}")
+
+
+def attribution(scene: Scene) -> str:
+    """Return the credit that the map a scene was built from asks for; empty if none is known."""
+    source = scene.config.provenance.get("source", "").lower()
+    return CREDIT if source.endswith((".osm", ".osm.pbf")) else ""
 
 
 def probability(value: float | None) -> str:

@@ -7,7 +7,7 @@ from textwrap import fill
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import LineCollection, PathCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
@@ -90,11 +90,9 @@ def _radio_map_figure(radio_map: RadioMap, scene: Scene, devices: Sequence[TwinD
     names = radio_map.devices[:MAX_PANELS]
     radio_map = radio_map.thinned(max(-(-max(radio_map.lattice.shape[1:]) // MAX_CELLS), 1))
     level_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values
-    common_dbm = radio_map.dataset.attrs.get("tx_power_dbm")
-    powers_dbm = [radio_map.tx_power_dbm.get(name, common_dbm) for name in names]
-    is_power = None not in powers_dbm
-    if is_power:
-        level_db = level_db + np.array(powers_dbm, dtype=float)[:, None, None]
+    powers_dbm = tx_powers_dbm(radio_map)
+    if powers_dbm is not None:
+        level_db = level_db + powers_dbm[:len(names), None, None]
     rows = -(-len(names) // MAX_COLUMNS)
     columns = -(-len(names) // rows)
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
@@ -117,8 +115,8 @@ def _radio_map_figure(radio_map: RadioMap, scene: Scene, devices: Sequence[TwinD
             ax.set(ylabel="", yticklabels=[])
         if number + columns < len(names):
             ax.set(xlabel="", xticklabels=[])
-    what = "received power" if is_power else "channel gain"
-    figure.colorbar(image, ax=axes, label=f"{what} [{'dBm' if is_power else 'dB'}]", shrink=0.7)
+    what, unit = ("channel gain", "dB") if powers_dbm is None else ("received power", "dBm")
+    figure.colorbar(image, ax=axes, label=f"{what} [{unit}]", shrink=0.7)
     source = plain(str(radio_map.dataset.attrs.get("source", "")))
     left_out = len(radio_map.devices) - len(names)
     more = f" ({left_out} more devices not shown)" if left_out else ""
@@ -133,6 +131,13 @@ def _radio_map_figure(radio_map: RadioMap, scene: Scene, devices: Sequence[TwinD
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", frameon=False,
                   ncols=min(len(handles), 1 + columns))
     return figure
+
+
+def tx_powers_dbm(radio_map: RadioMap) -> np.ndarray | None:
+    """Return the (k,) transmit powers of a map's devices [dBm]; None if one is not known."""
+    common_dbm = radio_map.dataset.attrs.get("tx_power_dbm")
+    powers_dbm = [radio_map.tx_power_dbm.get(name, common_dbm) for name in radio_map.devices]
+    return None if None in powers_dbm else np.array(powers_dbm, dtype=float)
 
 
 def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene,
@@ -150,7 +155,7 @@ def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene
     axes[1, 0].set_axis_off()
     axes[1, 0].text(
         0.02, 0.5, f"device {plain(device)}\nat {_lowest(truth)} altitude\n\n"
-        "top: channel gain\nbottom: model − truth\ntriangle: device\nwhite: not detected\n\n"
+        "top: channel gain\nbottom: model − truth\ntriangle: device\nblank: not detected\n\n"
         "models: mean of\nthe detected levels", transform=axes[1, 0].transAxes, fontsize=11)
     for column, (name, radio_map) in enumerate(models.items(), start=1):
         model_db = comparable_db(radio_map, truth)[radio_map.devices.index(device), 0]
@@ -354,11 +359,21 @@ def mark(ax: Axes, effect: EffectData) -> None:
 
 
 def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:
-    """Write beside a marker, on the side of the middle of the map."""
-    right = position_m[0] < np.mean(ax.get_xlim())
-    ax.annotate(text, tuple(position_m), xytext=(14 if right else -14, 12),
+    """Write beside a marker, on the side of the middle of the map, where fewer ends are covered."""
+    side = 1 if position_m[0] < np.mean(ax.get_xlim()) else -1
+    point_m = np.ptp(ax.get_xlim()) / (72 * (PANEL_IN - 0.7))
+    lines = text.split("\n")
+    width_m, height_m = 6 * point_m * max(map(len, lines)), 12 * point_m * len(lines)
+    ends_m = np.concatenate([np.zeros((0, 2)), *(
+        each.get_offsets() for each in ax.collections if isinstance(each, PathCollection))])
+    across_m, up_m = (ends_m - position_m[:2]).T
+    level = (side * across_m > 0) & (side * across_m < width_m + 20 * point_m)
+    above, below = ((level & (sign * up_m > 0) & (sign * up_m < height_m + 20 * point_m)).sum()
+                    for sign in (1, -1))
+    ax.annotate(text, tuple(position_m), xytext=(14 * side, 12 if above <= below else -12),
                 textcoords="offset points", color=FOUND, fontsize=9, fontweight="bold",
-                ha="left" if right else "right", zorder=7, path_effects=HALO)
+                ha="left" if side > 0 else "right", va="bottom" if above <= below else "top",
+                zorder=7, path_effects=HALO)
 
 
 def residual_map_figure(data: LoopData, background: MapBackground, report: dict) -> Figure:
@@ -375,6 +390,7 @@ def residual_map_figure(data: LoopData, background: MapBackground, report: dict)
         added = join_names(names) if len(names) < 3 else f"{len(names)} effects"
         panels.append((f"after: with {added}", data.after_db))
     residuals_db = [data.links.level_db - predicted_db for _, predicted_db in panels]
+    has_before = np.isfinite(residuals_db[0])  # errors that are said together are of the same links
     cells = [background.cell_means(residual_db) for residual_db in residuals_db]
     axes = background.panels(len(panels))
     range_db = residual_range_db(cells[0][2])
@@ -383,7 +399,7 @@ def residual_map_figure(data: LoopData, background: MapBackground, report: dict)
         _ring_devices(ax, data.links, report)
         for effect in data.effects:
             mark(ax, effect)
-        ax.set_title(f"{title}\nRMSE {rmse_db(residual_db):.2f} dB", fontsize=11)
+        ax.set_title(f"{title}\nRMSE {rmse_db(residual_db[has_before]):.2f} dB", fontsize=11)
         _draw_cells(ax, grid, RESIDUAL_COLOURS, -range_db, range_db, f"{RESIDUAL_LABEL}, mean over "
                     f"cells of {background.cell_m:g} m")
     return axes[0].figure.figure  # type: ignore[return-value]

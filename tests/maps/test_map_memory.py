@@ -19,7 +19,7 @@ from pathlib import Path
 from radiotwin.maps.export import geotiff
 from radiotwin.coverage import CoverageSettings, predict_coverage
 from radiotwin.maps.radiomap import RadioMap
-from radiotwin.report import export_map, folders, read_run, run_page
+from radiotwin.report import export_map, folders, read_run, viewer_data
 from radiotwin.scene import Scene
 
 folders.OVERVIEW_LINKS = 500_000
@@ -37,7 +37,7 @@ def work(folder):
         found = predict_coverage(radio_map, scene, settings=CoverageSettings(tx_power_dbm=20.0))
         assert found.summary["cells"] > 0
     run = read_run(folder, folder / "scene")
-    assert run_page.map_layers(run) and set(run.maps) == {"again", "map"}
+    assert viewer_data.map_layers(run) and set(run.maps) == {"again", "map"}
 
 work(Path(sys.argv[1]))  # what libraries take is not the map's
 before = peak_bytes()

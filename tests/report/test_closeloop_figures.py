@@ -31,6 +31,7 @@ from radiotwin.report.closeloop_data import bin_index, bin_means, collect
 from radiotwin.report.closeloop_figures import (
     dependence_figure,
     effect_figure,
+    waterfall_figure,
     write_closeloop_figures,
 )
 from radiotwin.report.closeloop_page import write_closeloop_page
@@ -189,6 +190,13 @@ def test_effects_of_the_map_are_drawn_on_it(small_scene, tmp_path):
         assert frames[0][0].min(axis=0).tolist() == [25.0, 0.0] and frames[0][0].max(axis=0).tolist() == [50.0, 25.0]
         save(drawn(changed, small_scene), tmp_path / "effect.png")
         assert (tmp_path / "effect.png").stat().st_size > 5000
+
+
+def test_errors_in_the_steps_are_of_the_links_that_the_base_predicts(loop):
+    content = make_report(loop)
+    content["error"]["after_same_links"] = content["error"]["after"] | {"rmse_db": 0.5}
+    title = waterfall_figure(content).axes[0].get_title()
+    assert f"{content['error']['before']['rmse_db']:.2f} → 0.50 dB" in title
 
 
 def test_means_of_bins_and_their_errors():

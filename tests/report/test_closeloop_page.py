@@ -201,7 +201,7 @@ def test_the_member_that_others_are_compared_with_is_marked_and_no_table_is_empt
     known = {"error": error["error"] | {"after_with_quality": SCORES | {"rmse_db": 1.0}}, "baselines": {}}
     loop._print(report("located", effects=[DRIFT | {"parameters": vague}]) | known)
     groups, errors, added = printed.values()
-    assert [row[:4] for row in groups] == [["device d3", "level", "−5.6 dB", "−6.1 to −5.1"]]
+    assert [[row[0], *row[2:5]] for row in groups] == [["device d3", "level", "−5.6 dB", "−6.1 to −5.1"]]
     assert [row[1:3] for row in errors] == [["before", 3.0], ["after", 2.0], ["after with quality", 1.0]]
     assert added[0][2] == "not determined" and added[0][3] != added[0][3]
 

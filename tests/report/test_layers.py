@@ -1,6 +1,7 @@
 """What goes into a page: packed numbers, simplified cities, thinned maps, residuals and flights."""
 
 import base64
+import dataclasses
 
 import numpy as np
 import pandas as pd
@@ -8,9 +9,8 @@ import pytest
 
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import Run, read_run
-from radiotwin.report import run_page as city
-from radiotwin.report import run_page as layers
-from radiotwin.report.run_page import NOT_DETECTED, pack, pack_db
+from radiotwin.report import viewer_data as layers
+from radiotwin.report.viewer_data import NOT_DETECTED, pack, pack_db
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin.model.model import FittedModel
 
@@ -27,7 +27,7 @@ def test_levels_are_kept_to_a_hundredth_of_a_decibel():
 
 def test_blocks_have_the_citys_volume_and_a_closed_surface():
     height_m = np.array([[0, 5.0, 5.0], [0, 12.0, 0.2], [3.0, 0, 0]])
-    vertices_m, faces = city.blocks(height_m, 10.0, -20.0, 4.0)
+    vertices_m, faces = layers.blocks(height_m, 10.0, -20.0, 4.0)
     triangles_m = vertices_m[faces]
     area_m2 = 0.5 * np.cross(triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0])
     flat = np.abs(area_m2[:, 2]) > 0
@@ -41,10 +41,10 @@ def test_blocks_have_the_citys_volume_and_a_closed_surface():
 
 
 def test_a_city_with_too_many_triangles_is_drawn_as_blocks(small_scene, monkeypatch):
-    whole, note = city.city_mesh(small_scene)
+    whole, note = layers.city_mesh(small_scene)
     assert note == "" and unpacked(whole["i"]).size < len(small_scene.city.faces)  # without the ground
-    monkeypatch.setattr(city, "MAX_FACES", 20)
-    blocks, note = city.city_mesh(small_scene)
+    monkeypatch.setattr(layers, "MAX_FACES", 20)
+    blocks, note = layers.city_mesh(small_scene)
     assert "blocks" in note
     assert unpacked(blocks["z"]).max() == pytest.approx(small_scene.city.vertices[:, 2].max(), abs=0.01)
 
@@ -92,6 +92,29 @@ def test_residuals_stand_where_the_moving_end_is(tmp_path):
     assert measured["kind"] == "gain" and unpacked(measured["values"]).tolist() == [-8000] * 6
     x_min, x_max, *_ = layers.bounds_m(run)
     assert x_min <= 5.0 and x_max >= run.residuals["receiver_x_m"].max()
+
+
+def test_the_strongest_paths_of_the_links_with_the_largest_residuals_join_both_ends(small_scene, monkeypatch):
+    table = links().assign(receiver_z_m=60.0, after_db=[np.nan, 9.0, 0, 0, 0, 0])
+    table.loc[3, "receiver_x_m"] = np.nan
+    monkeypatch.setattr(layers, "MAX_PATH_LINKS", 2)
+    found = {name: unpacked(packed) for name, packed in layers.path_layer(small_scene, table).items()}
+    assert set(found["link"]) == {0, 1}, "9 dB, of a reading that is predicted afterwards alone, and 4 dB"
+    assert np.bincount(found["link"]).max() == layers.MAX_PATHS and found["end"][-1] == len(found["points"])
+    starts = found["points"][np.r_[0, found["end"][:-1]]]
+    ends = found["points"][found["end"] - 1]
+    np.testing.assert_allclose(starts, 5.0)
+    np.testing.assert_allclose(ends, table.iloc[found["link"]][[f"receiver_{axis}_m" for axis in "xyz"]], rtol=1e-6)
+
+
+def test_levels_are_in_the_unit_that_was_measured(run_folder):
+    run = read_run(run_folder)
+    run.maps = {"twin": run.maps["twin"]}
+    run.twin = dataclasses.replace(run.twin, level="rssi_dbm")
+    run.maps["twin"].dataset.attrs["tx_power_dbm"] = 20.0
+    field = layers.map_layers(run)[0]["fields"][0]
+    assert field["title"] == "received power [dBm]" and field["unit"] == "dBm"
+    np.testing.assert_allclose(unpacked(field["values"]) / 100, run.maps["twin"].gain_db + 20.0, atol=0.006)
 
 
 def test_flights_start_at_zero_and_keep_their_order(tmp_path):

@@ -147,10 +147,12 @@ def test_a_click_on_a_link_tells_its_levels(opened, tmp_path):
     page.locator("#viewer").scroll_into_view_if_needed()
     box, at = page.locator("#viewer").bounding_box(), page.evaluate("stage.pixel(0, 0, 0)")
     page.mouse.click(box["x"] + at[0], box["y"] + at[1])
-    assert page.inner_text("#control-hover") == "a, f0, 0 s, LoS: measured -70.0, predicted -71.0 (90 %: -71.9 to -70.1) dB"
+    assert page.inner_text("#control-hover") == "a, f0, 0 s, LoS: measured −70.0, predicted −71.0 (90 %: −71.9 to −70.1) dB"
     assert page.evaluate("linksOf(view())") == [0, 1]
     page.check("#control-only")
     assert page.evaluate("linksOf(view())") == [0], "of the chosen flight"
+    page.evaluate("data.links.paths = {link: [4, 0], end: [2, 5], points: Float32Array.from({length: 15}, (_, n) => n)}")
+    assert page.evaluate("pathsOf(0)") == [[[6, 7, 8], [9, 10, 11], [12, 13, 14]]]
 
 
 def test_names_from_a_file_are_never_run(opened, tmp_path):

@@ -2,8 +2,9 @@
 // The overlay of the 3D picture: axes, what was found, devices and their estimates, paths and positions of the UAVs.
 
 const UAV_COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9"];  // Okabe and Ito
-const FOUND = "#e5383b", UNKNOWN = "#f08a00", CAUSE = "#c05bc4";
+const UNKNOWN = "#f08a00";
 const MAX_NAMES = 60;  // of devices, beside their marks
+const LABEL_SHIFTS = [0, 14, -14, 28, -28, 42, -42];  // upwards, in pixels
 const FONT = "12px system-ui, sans-serif";
 
 function path(context, stage, points, colour, width) {
@@ -19,23 +20,30 @@ function path(context, stage, points, colour, width) {
   context.stroke();
 }
 
-// A text over a point; its ends stay in the picture.
+const written = number => number.toString().replace("-", "−");
+
+// A text over a point. It stays in the picture, and moves up or down where another one or a mark is.
 function label(context, stage, text, [x, y], colour = stage.ink) {
   Object.assign(context, {font: FONT, textAlign: "center", lineWidth: 3, fillStyle: colour, strokeStyle: stage.halo});
   const half = context.measureText(text).width / 2 + 3;
   x = Math.max(half, Math.min(x, stage.width - half));
+  const covers = up => stage.taken.some(([left, right, top, bottom]) =>
+    left < x + half && x - half < right && top < y - up + 3 && y - up - 10 < bottom);
+  y -= LABEL_SHIFTS.find(up => !covers(up)) ?? 0;
+  stage.taken.push([x - half, x + half, y - 10, y + 3]);
   context.strokeText(text, x, y);
   context.fillText(text, x, y);
 }
 
-function ring(context, [x, y]) {
+function ring(context, [x, y], colour) {
   context.beginPath();
   context.arc(x, y, 5, 0, 2 * Math.PI);
-  Object.assign(context, {strokeStyle: FOUND, lineWidth: 2});
+  Object.assign(context, {strokeStyle: colour, lineWidth: 2});
   context.stroke();
 }
 
-function mark(context, kind, [x, y], size, colour) {
+function mark(context, stage, kind, [x, y], size, colour) {
+  stage.taken.push([x - size, x + size, y - size, y + size]);
   context.beginPath();
   if (kind === "cross") {
     context.moveTo(x - size, y - size); context.lineTo(x + size, y + size);
@@ -64,11 +72,12 @@ function drawAxes(context, stage) {
   const step = roundStep(side), off = 0.03 * side;
   path(context, stage, [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0], [x0, y0, 0]], "#9aa5ad", 1);
   if (stage.width < 500) return;  // no room for numbers
-  const write = (text, x, y) => { const at = stage.pixel(x, y, 0); if (at) label(context, stage, text, at); };
-  for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) write(x.toFixed(0), x, y0 - off);
-  for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) write(y.toFixed(0), x1 + 1.3 * off, y);
-  write("x, east [m]", (x0 + x1) / 2, y0 - 2.6 * off);
-  write("y, north [m]", x1 + 6 * off, (y0 + y1) / 2);
+  const write = (at, end, way, x, y) => {
+    const pixel = stage.pixel(x, y, 0);
+    if (pixel) label(context, stage, written(Math.round(at)) + (at + step > end ? ` m ${way}` : ""), pixel);
+  };
+  for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) write(x, x1, "east", x, y0 - off);
+  for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) write(y, y1, "north", x1 + 1.3 * off, y);
 }
 
 // The part of a circle that is over the ground of the city.
@@ -79,7 +88,7 @@ function circle(context, stage, [x, y, z], radius, dashes) {
     points.push(at[0] >= x0 && at[0] <= x1 && at[1] >= y0 && at[1] <= y1 ? at : null);
   }
   context.setLineDash(dashes);
-  path(context, stage, points, FOUND, 1.5);
+  path(context, stage, points, stage.found, 1.5);
   context.setLineDash([]);
 }
 
@@ -88,11 +97,11 @@ function drawFound(context, stage) {
   for (const {text, x, y, outline, height} of stage.data.found) {
     const corners = outline ?? [[x, y]], raised = z => corners.map(([east, north]) => [east, north, z]);
     if (outline) for (const line of [raised(0), raised(height), ...corners.map(at => [[...at, 0], [...at, height]])])
-      path(context, stage, line, CAUSE, 2.5);
+      path(context, stage, line, stage.cause, 2.5);
     const at = stage.pixel(x, y, height);
     if (!at) continue;
-    if (!outline) mark(context, "cross", at, 7, CAUSE);
-    label(context, stage, text, [at[0], at[1] - 12], CAUSE);
+    if (!outline) mark(context, stage, "cross", at, 7, stage.cause);
+    label(context, stage, text, [at[0], at[1] - 12], stage.cause);
   }
 }
 
@@ -101,21 +110,21 @@ function drawDevices(context, stage) {
   for (const {name, estimate, true: position, radius_m: radius, located, second} of devices) {
     if (!estimate) continue;
     const [x, y, z] = estimate;
-    if (position) path(context, stage, [position, estimate], FOUND, 1.5);
+    if (position) path(context, stage, [position, estimate], stage.found, 1.5);
     if (radius > 0) circle(context, stage, estimate, radius, located ? [] : [6, 5]);
     const place = second && stage.pixel(second[0], second[1], z);
-    if (place) ring(context, place);
+    if (place) ring(context, place, stage.found);
     const at = stage.pixel(x, y, z);
     if (!at) continue;
-    mark(context, "cross", at, 5, FOUND);
+    mark(context, stage, "cross", at, 5, stage.found);
     const within = radius === null ? "" : ` ± ${radius.toFixed(0)} m`;
-    if (devices.length <= MAX_NAMES) label(context, stage, name + within, [at[0], at[1] + 19], FOUND);
+    if (devices.length <= MAX_NAMES) label(context, stage, name + within, [at[0], at[1] + 19], stage.found);
   }
   for (const device of devices) {
     const at = device.true && stage.pixel(...device.true);
     if (!at) continue;
     const anchor = device.role === "anchor";
-    mark(context, anchor ? "diamond" : "circle", at, anchor ? 6 : 5, anchor ? stage.ink : UNKNOWN);
+    mark(context, stage, anchor ? "diamond" : "circle", at, anchor ? 6 : 5, anchor ? stage.ink : UNKNOWN);
     if (devices.length <= MAX_NAMES) label(context, stage, device.name, [at[0], at[1] - 9]);
   }
 }
@@ -125,7 +134,7 @@ function drawFlight(context, stage, uavs) {
   uavs.forEach(({name, position}, number) => {
     const at = stage.pixel(...position);
     if (!at) return;
-    mark(context, "circle", at, 7, UAV_COLOURS[number % UAV_COLOURS.length]);
+    mark(context, stage, "circle", at, 7, UAV_COLOURS[number % UAV_COLOURS.length]);
     label(context, stage, name, [at[0], at[1] - 11]);
   });
 }

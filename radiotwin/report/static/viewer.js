@@ -1,8 +1,8 @@
 "use strict";
 // The controls: which map or links, device and altitude is shown, and which moment of which flight. The page
-// holds all data as JSON (run_page.py); nothing is fetched.
+// holds all data as JSON (viewer_data.py); nothing is fetched.
 
-const NOT_DETECTED = -32768;  // stands for NaN among levels (run_page.py)
+const NOT_DETECTED = -32768;  // stands for NaN among levels (viewer_data.py)
 const PLAY_MS = 40, PLAY_FRAMES = 400;
 const HOVER_PIXELS = 8;
 const HOLES = "Holes: not detected.", DOTS = "Each dot is a held-out link, at the position of its moving end; click one for its levels.";
@@ -76,7 +76,7 @@ function drawView() {
   bar.style.background = los ? `linear-gradient(to right, ${stops[0]} 50%, ${stops.at(-1)} 50%)`
                              : `linear-gradient(to right, ${stops})`;
   control("title").textContent = title;
-  const ticks = los ? [[0.25, "no"], [0.75, "yes"]] : ticksBetween(low, high).map(at => [share(at), at.toString().replace("-", "−")]);
+  const ticks = los ? [[0.25, "no"], [0.75, "yes"]] : ticksBetween(low, high).map(at => [share(at), written(at)]);
   bar.replaceChildren(...ticks.map(([at, text]) => {
     const tick = Object.assign(document.createElement("span"), {textContent: text});
     tick.style.left = `${100 * at}%`;
@@ -172,19 +172,35 @@ function textOf(n) {
   const residual = shown.values[n] / 100, ends = shown.interval_db[links.los[n]];
   const what = [links.devices[links.device[n]], links.flights[links.flight[n]],
                 ...links.time ? [`${links.time[n].toFixed(0)} s`] : [], links.los[n] ? "LoS" : "NLoS"].join(", ");
-  if (!measured || measured.values[n] === NOT_DETECTED || shown.values[n] === NOT_DETECTED) return `${what}: ${residual.toFixed(1)} dB`;
+  if (!measured || measured.values[n] === NOT_DETECTED || shown.values[n] === NOT_DETECTED) return `${what}: ${written(residual.toFixed(1))} dB`;
   const level = measured.values[n] / 100, predicted = level - residual;
-  return `${what}: measured ${level.toFixed(1)}, predicted ${predicted.toFixed(1)} `
-    + `(90 %: ${(predicted + ends[0]).toFixed(1)} to ${(predicted + ends[1]).toFixed(1)}) ${links.unit}`;
+  const [read, expected, low, high] = [level, predicted, predicted + ends[0], predicted + ends[1]].map(
+    each => written(each.toFixed(1)));
+  return `${what}: measured ${read}, predicted ${expected} (90 %: ${low} to ${high}) ${links.unit}`;
+}
+
+// Points of each path of a link that is in the page.
+function pathsOf(n) {
+  const {link, end, points} = data.links.paths ?? {link: []}, found = [];
+  for (let one = 0; one < link.length; one++) {
+    if (link[one] !== n) continue;
+    const corners = [];
+    for (let at = one ? end[one - 1] : 0; at < end[one]; at++) corners.push(Array.from(points.subarray(3 * at, 3 * at + 3)));
+    found.push(corners);
+  }
+  return found;
 }
 
 function drawPicked(context) {
   if (picked === null || !view() || view().map) return;
   const {links, devices} = data, at = [links.x[picked], links.y[picked], links.z[picked]];
   const device = devices.find(({name}) => name === links.devices[links.device[picked]]);
+  context.setLineDash(links.los[picked] ? [] : [4, 4]);
   path(context, stage, [at, device?.estimate ?? device?.true], stage.ink, 1.5);
+  context.setLineDash([]);
+  for (const points of pathsOf(picked)) path(context, stage, points, UNKNOWN, 2);
   const pixel = stage.pixel(...at);
-  if (pixel) ring(context, pixel);
+  if (pixel) ring(context, pixel, stage.found);
 }
 
 // The level under the pointer
@@ -200,9 +216,9 @@ function textUnder(event) {
   const column = Math.round((at.x - map.x[0]) / map.step_m), row = Math.round((at.y - map.y[0]) / map.step_m);
   if (column < 0 || row < 0 || column >= map.x.length || row >= map.y.length) return "";
   const level = levelsOf(shown)[row * map.x.length + column];
-  const text = level === null ? "not detected" : field.kind !== "los" ? `${level.toFixed(2)} dB`
+  const text = level === null ? "not detected" : field.kind !== "los" ? written(level.toFixed(1)) + ` ${field.unit}`
     : level ? "line of sight" : "no line of sight";
-  return `(${map.x[column]}, ${map.y[row]}, ${z}) m: ${text}`;
+  return `(${[map.x[column], map.y[row], z].map(written).join(", ")}) m: ${text}`;
 }
 
 let stage = null;
@@ -214,9 +230,9 @@ function start() {
     container.textContent = "The city cannot be drawn without WebGL, which this browser does not provide: " + error.message;
     return;
   }
-  stage.drawings.push(context => drawAxes(context, stage), context => drawFound(context, stage),
-                      context => { if (control("devices").checked) drawDevices(context, stage); },
-                      context => drawFlight(context, stage, uavsNow()), drawPicked);
+  stage.drawings.push(context => drawAxes(context, stage), context => drawFlight(context, stage, uavsNow()),
+                      context => drawFound(context, stage), drawPicked,
+                      context => { if (control("devices").checked) drawDevices(context, stage); });
   stage.pick = event => {
     picked = view() && !view().map ? linkUnder(event) : null;
     control("hover").textContent = textUnder(event);
