@@ -68,7 +68,7 @@ def candidates_of(seed: int, settings: dict) -> dict:
                        for score in loop.found.log.trials if score.features],
         "steps": [[max([0.0, *(score.nats for score in loop.found.log.trials if score.features
                                and score.step == step.number)]),
-                   step.best_unnamed, step.rest_db, step.noise_db]
+                   step.best_unnamed_nats, step.rest_db, step.noise_db]
                   for step in loop.found.steps]}
 
 

@@ -1,7 +1,7 @@
-"""A base with effects, fitted to all links and, for each fold, to all links outside it.
+"""Cross-validate a base model and its effects: folds, bases, held-out predictions.
 
-Folds say which links are held out together. A base is a kind of twin that can be fitted to any of
-the links; its residual on held-out links is what effects have to explain.
+A base is a channel model with a way to locate unknown devices. It is fitted to all links, and once
+for each fold to the links outside that fold. Effects have to explain its held-out residual.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from radiotwin.twin.model.model import Fit, Model
 from radiotwin.twin.twin import Twin
 
 WAYS = ("flight", "block", "quadrant", "device")
-MIN_FLIGHTS = 4  # that most devices and receivers must be in, for flights to be held out
+MIN_FLIGHTS = 4  # flights in which a typical device or receiver must be, to hold out flights
 MAX_FOLDS = 6
-BLOCK_M = 60.0  # side of a block on the ground
+BLOCK_M = 60.0  # side of a ground block [m]
 MIN_BLOCKS = 10
-MIN_CLUSTERS = 6  # places that are held out one by one
-STRETCHES = 4  # of each fold, where nothing moves
-MAX_ENDS = 500  # more are positions of one end that moves, and need not return
-QUALITIES = 16  # quantiles of the column `quality` that a map's prediction is averaged over
-MAX_RADIUS_M = 100.0  # of a device's circle by the law, for paths to be followed to locate it
-FIRST_LOOK_LINKS = 300  # whose paths are followed first; minutes on a map of many buildings
-MIN_GAIN_DB = 0.1  # of the error of these, for the paths of all to be followed
+MIN_CLUSTERS = 6  # with fewer separate places, stretches of time are held out instead
+STRETCHES = 4  # stretches of time in each fold
+MAX_ENDS = 500  # more "devices" are positions of one moving device, which need not recur in flights
+QUALITIES = 16  # quantiles of the column `quality` over which a map's prediction is averaged
+MAX_RADIUS_M = 100.0  # the law's credible radius up to which paths are used to locate a device [m]
+FIRST_LOOK_LINKS = 300  # sample on which paths are tried: they take minutes on a large map
+MIN_GAIN_DB = 0.1  # RMSE reduction on that sample from which the paths of all links are followed
 
 
 @dataclass(frozen=True, eq=False)
 class Folds:
-    """A partition of n links.
+    """Assignment of n links to folds.
 
     Attributes:
-        by: one of `WAYS`.
+        by: what is held out together, one of `WAYS`.
         index: (n,) fold of each link; -1 = never held out.
     """
 
@@ -68,25 +68,25 @@ class Folds:
 
 
 def make_folds(links: Links, seed: int, by: str = "auto") -> Folds:
-    """Return which links are held out together.
+    """Assign links to folds that are held out one after the other.
 
     Args:
         links: n links.
-        seed: of which go together.
-        by: one of `WAYS`; or `auto`: by flight where most links are of devices and receivers that
-            are in at least `MIN_FLIGHTS`, else by blocks on the ground.
+        seed: random seed of the assignment.
+        by: one of `WAYS`; or `auto`: by flight if devices and receivers typically are in at least
+            `MIN_FLIGHTS` flights, else by blocks on the ground.
 
     Raises:
-        BadInput: an unknown way, or one that these data do not allow.
+        BadInput: an unknown way, or too few flights, quadrants or anchors for it.
     """
     rng = np.random.default_rng(seed)
     if by == "auto":
-        by = "flight" if _flights_are_alike(links) else "block"
+        by = "flight" if _can_hold_out_flights(links) else "block"
     if by in ("flight", "quadrant"):
         groups = links.flight if by == "flight" else _quadrants(links)
         return Folds(by, deal_groups(_require_several(groups, by), MAX_FOLDS, rng))
     if by == "device":
-        # A device whose position is to be found from its own links cannot be left out.
+        # An unknown device is located by its own links, so they cannot all be held out.
         known = np.isin(links.device, sorted(links.anchors))
         _require_several(links.device[known], by)
         index = np.full(len(links), -1)
@@ -98,10 +98,10 @@ def make_folds(links: Links, seed: int, by: str = "auto") -> Folds:
 
 
 def _blocks(links: Links) -> np.ndarray:
-    """Return labels (n,) of squares of ground of the end that moves, or of stretches of time.
+    """Label links (n,) by ground square of the moving end, or by stretch of time.
 
-    Where `BLOCK_M` is too wide for `MIN_BLOCKS`, squares are smaller. Clusters of positions that no
-    square parts are held out as they are; where there are too few of them, stretches are.
+    Squares are smaller than `BLOCK_M` if the area has fewer than `MIN_BLOCKS` of them. If even so
+    the moving end was in fewer than `MIN_CLUSTERS`, consecutive stretches of time are used.
     """
     width_m = evidence_width_m(links, BLOCK_M, MIN_BLOCKS)
     cell = np.floor(moving_end_m(links)[:, :2] / width_m).astype(np.int64)
@@ -115,9 +115,9 @@ def _blocks(links: Links) -> np.ndarray:
 
 
 def _quadrants(links: Links) -> np.ndarray:
-    """Return labels (n,) of the four parts of the area on either side of its middle link.
+    """Label links (n,) by quadrant around the median position of the moving end.
 
-    Each is a piece of ground that no other link is near to: what is learnt has to extrapolate.
+    Few links outside a quadrant are near it, so a model has to extrapolate into it.
     """
     end_m = moving_end_m(links)[:, :2]
     east, north = (end_m > np.median(end_m, axis=0)).T
@@ -125,6 +125,7 @@ def _quadrants(links: Links) -> np.ndarray:
 
 
 def _require_several(index: np.ndarray, by: str) -> np.ndarray:
+    """Return group labels (n,) unchanged; raise BadInput if there are fewer than two groups."""
     if len(np.unique(index)) < 2:
         declared = " declared" * (by == "device")
         raise BadInput(f"links cannot be held out by {by}: there are fewer than two{declared}; "
@@ -132,11 +133,12 @@ def _require_several(index: np.ndarray, by: str) -> np.ndarray:
     return index
 
 
-def _flights_are_alike(links: Links) -> bool:
+def _can_hold_out_flights(links: Links) -> bool:
+    """Return whether devices and receivers typically recur in at least `MIN_FLIGHTS` flights."""
     if len(np.unique(links.flight)) < MIN_FLIGHTS:
         return False
     seen = np.bincount(links.flight[np.isfinite(links.level_db)])
-    if seen.max() > 0.5 * seen.sum():  # what is left without that flight would say little
+    if seen.max() > 0.5 * seen.sum():  # without that flight too little is left to learn from
         return False
     for end in (links.device, links.receiver):
         pairs = np.unique(np.column_stack([end, links.flight]), axis=0)
@@ -148,10 +150,10 @@ def _flights_are_alike(links: Links) -> bool:
 
 
 class Base(ABC):
-    """A kind of twin.
+    """A channel model with a way to locate unknown devices.
 
     Attributes:
-        max_radius_m: devices with a wider circle say nothing about the channel [m].
+        max_radius_m: links of devices with a larger credible radius are not used [m].
     """
 
     name: ClassVar[str]
@@ -159,14 +161,14 @@ class Base(ABC):
 
     @abstractmethod
     def fit(self, links: Links) -> Twin:
-        """Fit to links.
+        """Fit the channel and locate the unknown devices from links.
 
         Raises:
-            BadInput: they are too few or of no use.
+            BadInput: too few usable links.
         """
 
     def device_m(self, twin: Twin) -> np.ndarray:
-        """Return positions (k, 3) of a twin's devices that may be relied on [m]; else NaN."""
+        """Return a twin's device positions (k, 3) [m]; NaN if uncertain by over `max_radius_m`."""
         return reliable_m(twin.devices, self.max_radius_m)
 
 
@@ -194,7 +196,7 @@ class TwinBase(Base):
 
     def __init__(self, scene: Scene | None, seed: int) -> None:
         self.scene, self._seed = scene, seed
-        # The base that follows paths asks for the same fits again.
+        # Cached, since `RaytraceBase` starts from the same fits.
         self._fitted: WeakKeyDictionary[Links, Twin] = WeakKeyDictionary()
 
     @override
@@ -208,11 +210,10 @@ class TwinBase(Base):
 
 
 class RaytraceBase(Base):
-    """Paths over the 3D map, and unknown devices where they explain the levels best.
+    """Paths over the 3D map; unknown devices are located where the paths explain the levels best.
 
-    A device stays where the law has it if that is less sure than `MAX_RADIUS_M`: one that is surely
-    elsewhere, because of what the map lacks, would be taken for an effect. All parts of the links
-    are fitted in one process, as they ask for the same paths.
+    A device keeps the law's position if the law's credible radius is over `MAX_RADIUS_M`. Otherwise
+    an error of the map could move it far away, and its links would look like an effect.
     """
 
     name = "raytrace"
@@ -228,7 +229,7 @@ class RaytraceBase(Base):
         return fit_paths(links, self._scene, self._law.fit(links), self._relocation)
 
     def locate(self, links: Links, channel: ImagePaths) -> list[TwinDevice]:
-        """Return the devices where paths over the map of links put them, by a fitted channel."""
+        """Locate unknown devices by paths over the links' own map, with a fitted channel."""
         return self._relocation.relocate(links, self._law.fit(links).devices, channel)
 
 
@@ -236,7 +237,7 @@ BASES = (TwinBase.name, RaytraceBase.name, LogDistanceBase.name)
 
 
 def make_bases(scene: Scene | None, seed: int) -> dict[str, Base]:
-    """Return every kind of base that a scene allows, by name."""
+    """Return all bases that are possible with a scene (None: no map), by name."""
     twin = TwinBase(scene, seed)
     bases: dict[str, Base] = {twin.name: twin, LogDistanceBase.name: LogDistanceBase(scene, seed)}
     if scene is not None:
@@ -246,13 +247,13 @@ def make_bases(scene: Scene | None, seed: int) -> dict[str, Base]:
 
 @dataclass(eq=False)
 class CrossFit:
-    """A base with effects, of all links and of each fold's others.
+    """A base with effects, fitted to all links and once without each fold.
 
     Attributes:
-        whole: learnt from all links.
-        folds: learnt from all but one fold each.
-        index: (n,) fold of each link.
-        twin: the base as it was fitted to all links.
+        whole: fit to all n links.
+        folds: fits to the links outside each fold.
+        index: (n,) fold of each link; -1 = never held out.
+        twin: the base without effects, fitted to all links.
     """
 
     whole: Fit
@@ -261,47 +262,57 @@ class CrossFit:
     twin: Twin
 
     @property
-    def each(self) -> tuple[Fit, ...]:
-        """The whole, then the folds."""
+    def fits(self) -> tuple[Fit, ...]:
+        """The fit to all links, then the fit without each fold."""
         return (self.whole, *self.folds)
 
     @property
     def links(self) -> Links:
-        """The n links, with the devices where the base has them."""
+        """The n links, with unknown devices where the base located them."""
         return self.whole.links
 
-    def extended(self, whole: Fit, folds: Iterable[Fit]) -> CrossFit:
-        """Return the same base with other effects."""
+    def with_fits(self, whole: Fit, folds: Iterable[Fit]) -> CrossFit:
+        """Return the same base and folds with other fits, such as with one more effect."""
         return CrossFit(whole, tuple(folds), self.index, self.twin)
 
     def map(self, function: Callable[..., Fit], *further: Iterable[Any]) -> CrossFit:
-        """Return what a function makes of the whole, then of the folds, as `extended` does.
+        """Apply a function to the fit to all links and to the fit without each fold.
 
         Args:
-            function: of a fit, and of its own of each of the `further` arguments.
-            further: for the whole, then for the folds.
+            function: called with a fit, and with its element of each `further` argument.
+            further: one element for each of `fits`.
         """
-        whole, *folds = (function(*own) for own in zip(self.each, *further, strict=True))
-        return self.extended(whole, folds)
+        whole, *folds = (function(*each) for each in zip(self.fits, *further, strict=True))
+        return self.with_fits(whole, folds)
 
-    def held_out(self, of: Callable[[Fit], np.ndarray]) -> np.ndarray:
-        """Return values (…, n) of each link, from the fold that has not seen it."""
-        of_folds = [of(fold) for fold in self.folds]
-        result = np.full(of_folds[0].shape, np.nan)
-        for number, values in enumerate(of_folds):
+    def held_out(self, predict: Callable[[Fit], np.ndarray]) -> np.ndarray:
+        """Predict each link by the fit that has not seen it.
+
+        Args:
+            predict: returns values (…, n) of all links by one fold's fit.
+
+        Returns:
+            (…, n) values; NaN for links that are never held out.
+        """
+        predictions = [predict(fold) for fold in self.folds]
+        result = np.full(predictions[0].shape, np.nan)
+        for number, values in enumerate(predictions):
             result[..., self.index == number] = values[..., self.index == number]
         return result
 
     @cached_property
     def held_out_reading(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) predicted reading and (n,) its error scale [dB], with shadowing; NaN = none."""
+        """(n,) held-out predicted reading and (n,) its error scale [dB], with shadowing.
+
+        NaN where the fold could not locate the device.
+        """
         mean_db, scale_db, unheard_db = self._held_out_parts
         shift, left = self.held_out_shadowing
         return mean_db + shift * scale_db, np.hypot(scale_db * left, unheard_db)
 
     @property
     def held_out_scales(self) -> np.ndarray:
-        """(2, n) error scale without shadowing, and sd of unheard levels [dB]; NaN = none."""
+        """(2, n) held-out error scale without shadowing, and sd of unheard levels [dB]; or NaN."""
         return self._held_out_parts[1:]
 
     @cached_property
@@ -310,14 +321,14 @@ class CrossFit:
 
     @cached_property
     def held_out_nll(self) -> np.ndarray:
-        """(n,) negative log-likelihood [nats]; NaN where there is none."""
+        """(n,) held-out negative log-likelihood [nats]; NaN without a prediction."""
         reading = self.held_out_reading
         return self.held_out(lambda fold: np.where(
             fold.usable, fold.model.regression().nll_at(*reading), np.nan))
 
     @cached_property
     def held_out_mean_db(self) -> np.ndarray:
-        """(n,) predicted level of a link that is detected [dB]; NaN where there is none."""
+        """(n,) held-out mean level, given that the link is detected [dB]; NaN without one."""
         reading = self.held_out_reading
         return self.held_out(lambda fold: np.where(
             fold.usable, mean_if_detected(*reading, fold.model.limit_db, fold.model.dof,
@@ -325,15 +336,15 @@ class CrossFit:
 
     @property
     def reads_quality(self) -> bool:
-        """Whether an effect reads the links' own quality, which no map has."""
+        """Whether an effect depends on the column `quality`, which a map does not have."""
         return self.links.quality is not None and any(
             "quality" in each.uses for each in self.whole.effects)
 
     @cached_property
     def on_map(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) held-out mean [dB] and (n,) negative log-likelihood [nats], as a map has them.
+        """(n,) held-out mean [dB] and (n,) negative log-likelihood [nats], as from a map.
 
-        A map does not know a link's own quality: the prediction is averaged over that of the
+        A map does not know a link's quality: the prediction is averaged over the qualities of the
         training links.
         """
         if not self.reads_quality:
@@ -345,111 +356,104 @@ class CrossFit:
 
     @cached_property
     def unforeseen(self) -> np.ndarray:
-        """(n,) bool, links on which a fault acts that was not there when their fold learnt.
+        """(n,) bool, links affected by a fault that their fold's training links do not show.
 
-        What happens on a flight cannot be known before it: such links say nothing of the rest.
+        A fault of one flight cannot be predicted from other flights, so such links are not scored.
         """
         found = np.zeros(len(self.index), dtype=bool)
         for number, fold in enumerate(self.folds):
             for effect, term, place in zip(self.whole.effects, self.whole.model.terms,
-                                           same_effects(self.whole, fold), strict=True):
+                                           match_effects(self.whole, fold), strict=True):
                 if effect.within_flights and place is None:
                     found |= (self.index == number) & term.acts
         return found
 
     def rmse_db(self, rows: np.ndarray | None = None) -> float:
-        """Return the held-out RMSE of the detected links of a mask (n,), or of all [dB]."""
+        """Return the held-out RMSE of detected links in a mask (n,) [dB]; None: of all links."""
         return _rms(self.links.level_db - self.held_out_mean_db, rows)
 
     def rmse_on_map_db(self) -> float:
-        """Return the held-out RMSE of all detected links, as a map has it [dB]."""
+        """Return the held-out RMSE of all detected links, predicted as by a map [dB]."""
         return _rms(self.links.level_db - self.on_map[0])
 
     @cached_property
     def held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) what shadowing adds [error scales], and (n,) the share left of the scale."""
+        """(n,) interpolated shadowing [error scales], and (n,) factor left of the error scale."""
         shift, left = np.zeros(len(self.index)), np.ones(len(self.index))
         for number, fold in enumerate(self.folds):
-            own = np.flatnonzero(self.index == number)
+            rows = np.flatnonzero(self.index == number)
             if fold.shadowing is not None:
-                shift[own], left[own] = fold.shadowing.at(fold.links.select(own))
+                shift[rows], left[rows] = fold.shadowing.at(fold.links.select(rows))
         return shift, left
 
 
-def same_effects(whole: Fit, fold: Fit) -> list[int | None]:
-    """Return the place in a fold of each effect of the whole; None for what it has not found.
+def match_effects(whole: Fit, fold: Fit) -> list[int | None]:
+    """Find each effect of the fit to all links among the effects of a fold's fit.
 
-    Of several of a kind those are the same that act on the same links: one faulty flight is not
-    another. Where a fold has as many, each is one of them, if in another order.
+    Effects of one kind are matched by the overlap of the links they act on: one faulty flight is
+    not another. If the fold has as many of that kind, all are matched.
+
+    Returns:
+        for each effect of `whole`, its index in `fold.effects`; None if the fold lacks it.
     """
-    places: list[int | None] = [None] * len(whole.effects)
+    matches: list[int | None] = [None] * len(whole.effects)
     for entry in dict.fromkeys(each.entry for each in whole.effects):
-        of_whole, of_fold = ([place for place, each in enumerate(model.effects)
+        in_whole, in_fold = ([number for number, each in enumerate(model.effects)
                               if each.entry is entry] for model in (whole, fold))
-        for place, found in _on_the_same_links(whole, fold, of_whole, of_fold):
-            places[place] = found
-    return places
-
-
-def _on_the_same_links(whole: Fit, fold: Fit, of_whole: list[int],
-                       of_fold: list[int]) -> list[tuple[int, int]]:
-    """Return pairs of places of one kind of effect whose links overlap most, all in all."""
-    as_many = len(of_whole) == len(of_fold)
-    if as_many and len(of_whole) == 1:
-        return [(of_whole[0], of_fold[0])]
-    # Where nothing tells them apart, the order in which they were found does.
-    shared = np.eye(len(of_whole), len(of_fold)) * 1e-9
-    for row, place in enumerate(of_whole):
-        acts = whole.model.terms[place].acts
-        for column, found in enumerate(of_fold):
-            others = fold.model.terms[found].acts
-            shared[row, column] += (acts & others).sum() / max((acts | others).sum(), 1)
-    return [(of_whole[row], of_fold[column])
-            for row, column in zip(*linear_sum_assignment(shared, maximize=True), strict=True)
-            if as_many or shared[row, column] > 1e-9]
+        as_many = len(in_whole) == len(in_fold)
+        # Equal overlaps are matched in the order in which the effects were found.
+        overlap = np.eye(len(in_whole), len(in_fold)) * 1e-9
+        for row, number in enumerate(in_whole):
+            acts = whole.model.terms[number].acts
+            for column, other in enumerate(in_fold):
+                acts_in_fold = fold.model.terms[other].acts
+                overlap[row, column] += ((acts & acts_in_fold).sum()
+                                         / max((acts | acts_in_fold).sum(), 1))
+        for row, column in zip(*linear_sum_assignment(overlap, maximize=True), strict=True):
+            if as_many or overlap[row, column] > 1e-9:
+                matches[in_whole[row]] = in_fold[column]
+    return matches
 
 
 def _rms(error: np.ndarray, rows: np.ndarray | None = None) -> float:
+    """Return the root mean square of the known values of an error (n,), in a mask (n,)."""
     error = error if rows is None else error[rows]
     return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
 
 
 def _with_quality(model: CrossFit, share: float) -> CrossFit:
-    """Return a model whose held-out links all have one quality, a quantile of the training links'.
-
-    Nothing is fitted again.
-    """
-    def blind(each: Fit) -> Fit:
-        own = each.links.quality
-        assert own is not None
-        known = own[each.train & np.isfinite(own)]
+    """Give all held-out links one quality, a quantile of the training links'; refit nothing."""
+    def with_quantile(each: Fit) -> Fit:
+        quality = each.links.quality
+        assert quality is not None
+        known = quality[each.train & np.isfinite(quality)]
         usual = float(np.quantile(known, share)) if len(known) else np.nan
-        links = each.links.with_columns(quality=np.where(each.train, own, usual))
+        links = each.links.with_columns(quality=np.where(each.train, quality, usual))
         terms = tuple(term if "quality" not in effect.uses
                       else effect.term(links, each.model.level_at)
                       for effect, term in zip(each.effects, each.model.terms, strict=True))
         return replace(each, model=replace(each.model, links=links, terms=terms))
 
-    return model.map(blind)
+    return model.map(with_quantile)
 
 
 def training_parts(links: Links, folds: Folds) -> list[Links]:
-    """Return the links outside each fold; the same objects serve every base."""
+    """Return the training links of each fold; bases cache their fits by these objects."""
     return [links.select(folds.index != number) for number in range(folds.count)]
 
 
 def cross_validate(links: Links, base: Base, folds: Folds,
                    parts: list[Links]) -> CrossFit:
-    """Fit a base to all links, and to those outside each fold.
+    """Fit a base to all links, and to the links outside each fold.
 
     Args:
         links: n links.
-        base: kind of model.
-        folds: of the links.
-        parts: `training_parts` of both.
+        base: what to fit.
+        folds: assignment of the links.
+        parts: `training_parts(links, folds)`.
 
     Raises:
-        BadInput: links that the base cannot be fitted to.
+        BadInput: too few usable links.
     """
     twin = base.fit(links)
     device_m = base.device_m(twin)
@@ -469,10 +473,10 @@ def cross_validate(links: Links, base: Base, folds: Folds,
 
 
 def best_base(models: dict[str, CrossFit]) -> str:
-    """Return the base with the least held-out error of the links that all can predict.
+    """Return the name of the base with the least held-out RMSE on links that all bases predict.
 
-    One that cannot locate the devices that are hard to predict does not win by that. Of several
-    without a link in common, the one that predicts most.
+    So a base does not win by failing to locate difficult devices. If no link is predicted by all,
+    the base that predicts most links is returned.
     """
     known = {name: np.isfinite(model.links.level_db - model.held_out_mean_db)
              for name, model in models.items()}
@@ -483,19 +487,19 @@ def best_base(models: dict[str, CrossFit]) -> str:
 
 
 def paths_gain_db(links: Links, scene: Scene, folds: Folds, seed: int) -> float:
-    """Return by how much paths make the held-out error of a few links of anchors smaller [dB].
+    """Return how much following paths reduces the held-out RMSE on a sample of anchors' links [dB].
 
-    Following those of all links takes minutes to hours, and over maps whose buildings are guesses
-    paths explain no more than line of sight does.
+    Paths of all links take minutes to hours, and over maps with guessed building heights they
+    explain no more than line of sight does.
 
     Args:
         links: n links.
-        scene: its map.
-        folds: of the links.
-        seed: as of `make_bases`.
+        scene: 3D map and radio.
+        folds: assignment of the links.
+        seed: random seed, see `make_bases`.
 
     Returns:
-        the gain over the law; infinite if so few links cannot tell.
+        RMSE of the segmented law minus RMSE of paths; inf if the sample is too small.
     """
     known = np.isin(links.device, sorted(links.anchors)) & np.isfinite(links.level_db)
     rows = subsample(np.flatnonzero(known & (folds.index >= 0)), FIRST_LOOK_LINKS)
@@ -517,7 +521,7 @@ def paths_gain_db(links: Links, scene: Scene, folds: Folds, seed: int) -> float:
 
 
 def _with_evidence(links: Links, whole: Model) -> Links:
-    """Return links with pieces of evidence that fit the base's residual, if they have none yet."""
+    """Group links that err alike, by the base's residual, unless that was done already."""
     if links.evidence is not None:
         return links
     view, z = whole.fit().view, np.full(len(links), np.nan)

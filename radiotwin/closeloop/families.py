@@ -1,4 +1,4 @@
-"""Groups that links may be compared in: by ends, flights, times, directions, distances, places."""
+"""Group links by device, receiver, flight, time, direction, distance or place, to compare them."""
 
 from __future__ import annotations
 
@@ -13,30 +13,32 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.inference.groups import Groups, Units
 from radiotwin.links.correlation import moving_end_m
 
-PASSING_M, LASTING_M = 25.0, 75.0  # errors of one flight, and of the map, are alike within
-SECTORS, BANDS, WINDOWS = 8, 8, (2, 4, 8, 16, 32)
-RAY_SAMPLES, LOW_M, GRID_M = 24, 40.0, (25.0, 50.0, 100.0)  # of links that pass through a place
-READINGS_A_BIN, MAX_WINDOWS, LEVEL_BANDS, CURVE_SECTOR_DEG = 40, 64, 12, 22.5  # of curves
-Words = tuple[dict[str, tuple[str, ...]], dict[str, tuple[float, float]]]
-"""Members and ranges of a group."""
+# Squares within which errors are correlated [m]: in one flight; in all flights (errors of the map).
+PASSING_M, LASTING_M = 25.0, 75.0
+SECTORS, BANDS, WINDOWS = 8, 8, (2, 4, 8, 16, 32)  # directions; distance bands; windows a flight
+# Links through a place: points sampled along a link, greatest height there [m], square sides [m].
+RAY_SAMPLES, LOW_M, GRID_M = 24, 40.0, (25.0, 50.0, 100.0)
+READINGS_A_BIN, MAX_WINDOWS, LEVEL_BANDS, CURVE_SECTOR_DEG = 40, 64, 12, 22.5  # bins of curves
+Description = tuple[dict[str, tuple[str, ...]], dict[str, tuple[float, float]]]
+"""Names of a group's devices, receivers and flights; ranges of the variables that bound it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """n readings with what a model that has not seen them predicts.
+    """n readings with their held-out prediction.
 
     Attributes:
-        residual_db: (n,) measured minus predicted; NaN where nothing was heard or predicted.
-        blank_excess: (n,) 1 for a blank, 0 for a level, less the probability of a blank.
-        los: (n,) bool.
-        device, receiver, flight: (n,) int.
-        time_s: (n,) NaN where unknown.
-        moving_m: (n, 3) end of the link that moves [m].
-        device_m, receiver_m: (n, 3) both ends [m].
-        angles_deg: azimuth and elevation at the device, and azimuth in the receiver's body, (n,)
-            each [degree]; NaN where unknown.
-        predicted_db: (n,) level.
-        names: of devices, receivers and flights.
+        residual_db: (n,) measured minus predicted [dB]; NaN if not detected or not predicted.
+        blank_excess: (n,) 1 for a blank, 0 for a level, minus the predicted blank probability.
+        los: (n,) bool, line of sight.
+        device, receiver, flight: (n,) int indices into `names`.
+        time_s: (n,) NaN if unknown.
+        moving_m: (n, 3) position of the moving end of the link [m].
+        device_m, receiver_m: (n, 3) positions of both ends [m].
+        angles_deg: (n,) "azimuth" and "elevation" at the device, "body azimuth" at the receiver
+            [degree]; NaN if unknown.
+        predicted_db: (n,) predicted mean level [dB].
+        names: names by "device", "receiver" and "flight".
     """
 
     residual_db: np.ndarray
@@ -55,13 +57,13 @@ class Readings:
 
     @cached_property
     def track(self) -> np.ndarray:
-        """(n,) number of each receiver's flight."""
-        return codes_of(self.receiver, self.flight)
+        """(n,) label of each pair of receiver and flight."""
+        return combined_labels(self.receiver, self.flight)
 
     @cached_property
     def previous(self) -> np.ndarray:
-        """(n,) row of the reading before, of the same ends and flight; -1 where there is none."""
-        series = codes_of(self.device, self.receiver, self.flight)
+        """(n,) row of the previous reading of the same ends in the flight; -1 for the first."""
+        series = combined_labels(self.device, self.receiver, self.flight)
         order = np.lexsort((np.arange(len(self)), self.time_s, series))
         found = np.full(len(self), -1)
         follows = series[order[1:]] == series[order[:-1]]
@@ -70,9 +72,9 @@ class Readings:
 
     @property
     def step_db(self) -> np.ndarray:
-        """(n,) change since the reading before over the square root of 2; NaN = none.
+        """(n,) change of the residual since the previous reading, over √2 [dB]; NaN for the first.
 
-        What a map has wrong changes slowly along a track; an instrument's noise does not.
+        It estimates the receiver's noise: errors of the map change slowly along a track.
         """
         before = self.previous
         alike = (before >= 0) & (self.los == self.los[before])
@@ -80,7 +82,7 @@ class Readings:
 
     @classmethod
     def of(cls, model: CrossFit) -> Readings:
-        """Return the readings of a model's links, held out."""
+        """Return the readings of a model's links with their held-out prediction."""
         links, level_db = model.links, model.links.level_db
         mean_db, scale_db = model.held_out_reading
         predicted_db = model.held_out_mean_db
@@ -101,24 +103,23 @@ class Readings:
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Groups that are each other's peers.
+    """Groups of links that are compared with each other, such as all receivers.
 
     Attributes:
-        name: of the family.
-        groups: of links.
-        describe: members and ranges of a group.
-        ends: labels (n,) whose levels are taken off first, as they are families of their own.
-        statistics: that are compared.
-        pairs: label of both ends (k,) each, of groups that are pairs.
-        is_crossing: whether several groups may have read one device at one place.
-        curve: (k,) of groups that are bins of curves, the number of each one's curve, of which
-            `describe` tells; None: each group is judged by itself.
-        along: of curves, the variable that they go along, with unit.
+        name: what the links of a group share: `device`, `direction`, `place`, …
+        groups: the k groups of links.
+        describe: returns the names and ranges of a group (or of a curve) by its number.
+        ends: labels (n,) of ends whose mean levels are subtracted before the comparison.
+        statistics: names of the statistics to compare.
+        pairs: if groups are pairs of ends, the label (k,) of each end.
+        is_crossing: whether several groups may contain readings of one device at one place.
+        curve: (k,) if groups are bins of curves, the curve of each; None: groups are judged singly.
+        along: variable along which curves run, with its unit.
     """
 
     name: str
     groups: Groups
-    describe: Callable[[int], Words]
+    describe: Callable[[int], Description]
     ends: tuple[np.ndarray, ...] = ()
     statistics: tuple[str, ...] = ("level", "noise", "scatter", "blanks")
     pairs: tuple[np.ndarray, ...] = ()
@@ -127,7 +128,7 @@ class Family:
     along: str = ""
 
     def members(self, group: int, n: int) -> np.ndarray:
-        """Return the mask (n,) of the rows of a group, or of a curve."""
+        """Return the mask (n,) of the links in a group, or in all bins of a curve."""
         if self.curve is None:
             return self.groups.members(group, n)
         rows = np.zeros(n, dtype=bool)
@@ -136,46 +137,52 @@ class Family:
 
 
 def units_of(readings: Readings) -> Units:
-    """Return which readings err alike: of one flight nearby; of one device, in a larger place."""
+    """Label readings with correlated errors: nearby in a flight; of a device in a wider square."""
     passing, lasting = (_squares_of(readings.moving_m, width_m)
                         for width_m in (PASSING_M, LASTING_M))
-    return Units(codes_of(*passing.T, readings.flight), codes_of(*lasting.T, readings.device))
+    return Units(combined_labels(*passing.T, readings.flight),
+                 combined_labels(*lasting.T, readings.device))
 
 
 def _squares_of(position_m: np.ndarray, width_m: float) -> np.ndarray:
-    """Return the square (n, 2) of each position (n, 3); 0 of one that is not known."""
+    """Return the ground square (n, 2) of each position (n, 3) [m], as indices; NaN counts as 0."""
     return np.floor(np.nan_to_num(position_m[:, :2]) / width_m).astype(np.int64)
 
 
-def codes_of(*labels: np.ndarray) -> np.ndarray:
-    """Return one label (n,) for each combination of labels (n,)."""
+def combined_labels(*labels: np.ndarray) -> np.ndarray:
+    """Return consecutive numbers (n,) of the combinations of several labels (n,)."""
     code = np.zeros(len(labels[0]), dtype=np.int64)
     for label in labels:
         code = code * (int(np.ptp(label)) + 1 if len(label) else 1) + (label - label.min(initial=0))
     return np.unique(code, return_inverse=True)[1].ravel()
 
 
-def _packed(label: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Return labels (n,) without gaps; -1 where a mask (n,) is not set."""
+def _renumber(label: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Renumber labels (n,) consecutively from 0 within a mask (n,); -1 outside it."""
     code = np.full(len(label), -1)
     code[known] = np.unique(label[known], return_inverse=True)[1].ravel()
     return code
 
 
 def families_of(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield all families of groups, with the units in which errors are alike."""
+    """Yield all families of groups.
+
+    Args:
+        readings: n readings.
+        units: labels of readings with correlated errors, see `units_of`.
+    """
     labels = {"device": readings.device, "receiver": readings.receiver, "flight": readings.flight}
-    several = {name: label for name, label in labels.items() if len(np.unique(label)) > 1}
-    for name, label in several.items():
-        def describe(group: int, name: str = name) -> Words:
+    varying = {name: label for name, label in labels.items() if len(np.unique(label)) > 1}
+    for name, label in varying.items():
+        def describe(group: int, name: str = name) -> Description:
             return {name: (readings.names[name][group],)}, {}
-        within: tuple[np.ndarray, ...] = ()
-        if name == "flight" and "receiver" in several and _is_nested(label, readings.receiver):
-            within = (readings.receiver,)  # flights of one receiver share its level
+        nested_in: tuple[np.ndarray, ...] = ()
+        if name == "flight" and "receiver" in varying and _is_nested(label, readings.receiver):
+            nested_in = (readings.receiver,)  # flights of one receiver share its level
         yield Family(name, Groups.of_labels(label, units), describe, is_crossing=name != "device",
-                     pairs=tuple(end[_examples(label)] for end in within))
+                     pairs=tuple(end[_row_of_label(label)] for end in nested_in))
     for first, second in (("device", "flight"), ("receiver", "flight"), ("device", "receiver")):
-        if first in several and second in several:
+        if first in varying and second in varying:
             yield from _pairs(readings, first, second, labels, units)
     yield from _windows(readings, units)
     yield from _directions(readings, units)
@@ -186,38 +193,39 @@ def families_of(readings: Readings, units: Units) -> Iterator[Family]:
 
 def _pairs(readings: Readings, first: str, second: str,
            labels: Mapping[str, np.ndarray], units: Units) -> Iterator[Family]:
+    """Yield the pairs of two kinds of ends, unless each end of one kind has a single partner."""
     one, other = labels[first], labels[second]
-    code = codes_of(one, other)
+    code = combined_labels(one, other)
     count = int(code.max()) + 1
     if count in (len(np.unique(one)), len(np.unique(other))):
-        return  # the two never part
-    example = _examples(code)
+        return
+    row_of_pair = _row_of_label(code)
 
-    def describe(group: int) -> Words:
-        row = example[group]
+    def describe(group: int) -> Description:
+        row = row_of_pair[group]
         return {first: (readings.names[first][one[row]],),
                 second: (readings.names[second][other[row]],)}, {}
 
     yield Family(f"{first} x {second}", Groups.of_labels(code, units), describe,
                  statistics=("level", "noise", "scatter"),
-                 pairs=(one[example], other[example]), is_crossing=True)
+                 pairs=(one[row_of_pair], other[row_of_pair]), is_crossing=True)
 
 
 def _is_nested(label: np.ndarray, within: np.ndarray) -> bool:
-    """Return whether links of each label (n,) share one of fewer labels within (n,)."""
-    pairs = len(np.unique(codes_of(label, within)))
+    """Return whether each label (n,) occurs within only one of fewer outer labels `within` (n,)."""
+    pairs = len(np.unique(combined_labels(label, within)))
     return pairs == len(np.unique(label)) and pairs > len(np.unique(within))
 
 
-def _examples(label: np.ndarray) -> np.ndarray:
-    """Return one row of each label from 0 on; row 0 for one that no link has."""
-    example = np.zeros(int(label.max()) + 1, dtype=np.int64)
-    example[label] = np.arange(len(label))
-    return example
+def _row_of_label(label: np.ndarray) -> np.ndarray:
+    """Return the last row with each label 0, 1, …; 0 for labels that do not occur."""
+    row = np.zeros(int(label.max()) + 1, dtype=np.int64)
+    row[label] = np.arange(len(label))
+    return row
 
 
 def _windows(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield windows of time within flights, of all receivers and of one."""
+    """Yield windows of time within each flight, of all receivers together and of each."""
     timed = np.isfinite(readings.time_s)
     if timed.mean() < 0.5:
         return
@@ -231,29 +239,25 @@ def _windows(readings: Readings, units: Units) -> Iterator[Family]:
         for number in WINDOWS:
             for shift in (0.0, 0.5):
                 window = np.floor(share * number + shift).astype(np.int64)
-                code = _packed(label * (number + 1) + window, timed)
+                code = _renumber(label * (number + 1) + window, timed)
                 yield Family("time", Groups.of_labels(code, units),
-                             _time_words(readings, scope, code), ends, ("level", "blanks"),
+                             _describe_window(readings, scope, code), ends, ("level", "blanks"),
                              is_crossing=True)
 
 
 def _share_of_time(readings: Readings, label: np.ndarray) -> np.ndarray:
-    """Return the share (n,) of its label's time that has passed, below 1; 0 where unknown."""
-    begin, end = _extremes(readings.time_s, label)
-    share = (readings.time_s - begin[label]) / np.maximum(end - begin, 1e-9)[label]
+    """Return elapsed time (n,) as a share in [0, 1) of the label's duration; 0 if unknown."""
+    begin_s, end_s = np.full(label.max() + 1, np.inf), np.full(label.max() + 1, -np.inf)
+    known = np.isfinite(readings.time_s)
+    np.minimum.at(begin_s, label[known], readings.time_s[known])
+    np.maximum.at(end_s, label[known], readings.time_s[known])
+    share = (readings.time_s - begin_s[label]) / np.maximum(end_s - begin_s, 1e-9)[label]
     return np.clip(np.nan_to_num(share), 0, 1 - 1e-9)
 
 
-def _extremes(values: np.ndarray, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.full(label.max() + 1, np.inf), np.full(label.max() + 1, -np.inf)
-    known = np.isfinite(values)
-    np.minimum.at(low, label[known], values[known])
-    np.maximum.at(high, label[known], values[known])
-    return low, high
-
-
-def _time_words(readings: Readings, scope: str, code: np.ndarray) -> Callable:
-    def describe(group: int) -> Words:
+def _describe_window(readings: Readings, scope: str, code: np.ndarray) -> Callable:
+    """Return the `describe` of windows of time with labels `code` (n,), by flight or receiver."""
+    def describe(group: int) -> Description:
         rows = code == group
         flight = readings.flight[rows][0]
         members: dict[str, tuple[str, ...]] = {"flight": (readings.names["flight"][flight],)}
@@ -265,7 +269,7 @@ def _time_words(readings: Readings, scope: str, code: np.ndarray) -> Callable:
 
 
 def _directions(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield directions at each device, and in the body of each receiver."""
+    """Yield sectors of azimuth and elevation at each device, and of body azimuth at receivers."""
     for angle, end, names in (("azimuth", readings.device, "device"),
                               ("elevation", readings.device, "device"),
                               ("body azimuth", readings.receiver, "receiver")):
@@ -279,12 +283,12 @@ def _directions(readings: Readings, units: Units) -> Iterator[Family]:
             if angle != "elevation":
                 sector %= SECTORS
             sector -= sector.min()
-            code = _packed(codes_of(end, sector), known)
+            code = _renumber(combined_labels(end, sector), known)
 
             def describe(group: int, code: np.ndarray = code, end: np.ndarray = end,
                          names: str = names, angle: str = angle, shift: float = shift,
                          width: float = width, values: np.ndarray = values
-                         ) -> Words:
+                         ) -> Description:
                 row = np.flatnonzero(code == group)[0]
                 low = (np.floor(values[row] / width + shift) - shift) * width
                 return ({names: (readings.names[names][end[row]],)},
@@ -294,7 +298,7 @@ def _directions(readings: Readings, units: Units) -> Iterator[Family]:
 
 
 def _bands(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield bands of distance, altitude and level, of all links."""
+    """Yield bands of distance, altitude and predicted level with equally many links."""
     distance_m = np.linalg.norm(readings.receiver_m - readings.device_m, axis=1)
     for name, values, key in (("distance", distance_m, "distance_m"),
                               ("altitude", readings.moving_m[:, 2], "height_m"),
@@ -303,11 +307,11 @@ def _bands(readings: Readings, units: Units) -> Iterator[Family]:
         edges = _quantiles(values, BANDS)
         if len(edges) < 2:
             continue
-        code = _packed(np.searchsorted(edges, values), known)
+        code = _renumber(np.searchsorted(edges, values), known)
 
         def describe(group: int, code: np.ndarray = code, values: np.ndarray = values,
                      key: str = key
-                     ) -> Words:
+                     ) -> Description:
             rows = code == group
             return {}, {key: (float(values[rows].min()), float(values[rows].max()))}
         yield Family(name, Groups.of_labels(code, units), describe, (readings.device,),
@@ -315,17 +319,17 @@ def _bands(readings: Readings, units: Units) -> Iterator[Family]:
 
 
 def _curves(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield how the levels of each device, receiver and flight go along a variable.
+    """Yield curves: levels of each device, receiver or flight in bins along time, flight or angle.
 
-    A device's levels by direction are left to the directions: a wrong building nearby changes them.
+    There is no curve of a device's levels over direction: a wrong building nearby would change it.
     """
     track, device, receiver = readings.track, readings.device, readings.receiver
     timed, predicted_db = np.isfinite(readings.time_s), readings.predicted_db
     body_deg = readings.angles_deg["body azimuth"]
     ends = device, track
-    by_receiver, by_flight = (_windows_of(readings, label, READINGS_A_BIN)
+    by_receiver, by_flight = (_window_of_reading(readings, label, READINGS_A_BIN)
                               for label in (track, readings.flight))
-    few = _windows_of(readings, readings.flight, READINGS_A_BIN * len(np.unique(device)))
+    wide = _window_of_reading(readings, readings.flight, READINGS_A_BIN * len(np.unique(device)))
     sector = np.floor(np.nan_to_num(body_deg) / CURVE_SECTOR_DEG).astype(np.int64)
     level = np.searchsorted(_quantiles(predicted_db, LEVEL_BANDS), predicted_db)
     for end, along, bins, known, off in (
@@ -334,35 +338,35 @@ def _curves(readings: Readings, units: Units) -> Iterator[Family]:
             ("receiver", "body_azimuth_deg", (sector,), np.isfinite(body_deg), ends),
             ("receiver", "predicted_db", (level,), np.isfinite(predicted_db), ends),
             ("flight", "time_s", (by_flight,), timed, ends),
-            ("device", "time_s", (readings.flight, few), timed, ends),
+            ("device", "time_s", (readings.flight, wide), timed, ends),
             ("device", "flight", (readings.flight,), None, ends)):
         label = getattr(readings, end)
         known = np.ones(len(readings), dtype=bool) if known is None else known
         if known.mean() < 0.5 or (along == "flight" and readings.flight.max() == 0):
             continue
-        code = _packed(codes_of(label, *bins), known)
+        code = _renumber(combined_labels(label, *bins), known)
 
-        def describe(group: int, end: str = end) -> Words:
+        def describe(group: int, end: str = end) -> Description:
             return {end: (readings.names[end][group],)}, {}
         yield Family(end, Groups.of_labels(code, units), describe, off, ("curve",),
-                     is_crossing=True, curve=label[known][_examples(code[known])], along=along)
+                     is_crossing=True, curve=label[known][_row_of_label(code[known])], along=along)
 
 
-def _windows_of(readings: Readings, label: np.ndarray, count: int) -> np.ndarray:
-    """Return the window (n,) of time within its label (n,), of about `count` readings each."""
+def _window_of_reading(readings: Readings, label: np.ndarray, count: int) -> np.ndarray:
+    """Split each label's time into windows of about `count` readings; return each one's window."""
     number = np.clip(np.bincount(label) // count, 2, MAX_WINDOWS)
     return np.floor(_share_of_time(readings, label) * number[label]).astype(np.int64)
 
 
 def _quantiles(values: np.ndarray, count: int) -> np.ndarray:
-    """Return the different edges between `count` bands with as many known values each."""
+    """Return the inner edges of up to `count` bands with equally many known values (n,)."""
     known = np.isfinite(values)
     return np.unique(np.quantile(values[known], np.linspace(0, 1, count + 1)[1:-1])) \
         if known.any() else np.zeros(0)
 
 
 def _places(readings: Readings, units: Units) -> Iterator[Family]:
-    """Yield squares of ground that links end in, or pass low above."""
+    """Yield ground squares in which links end, or which they cross below `LOW_M`."""
     share = (np.arange(RAY_SAMPLES) + 0.5) / RAY_SAMPLES
     along_m = readings.device_m[:, None] + share[:, None] * (
         readings.receiver_m - readings.device_m)[:, None]
@@ -371,21 +375,30 @@ def _places(readings: Readings, units: Units) -> Iterator[Family]:
     ends = readings.device, readings.track
     for width_m in GRID_M:
         end = _squares_of(readings.moving_m, width_m)
-        yield _squares(np.arange(len(readings)), end, width_m, ends, units)
+        yield _square_family(np.arange(len(readings)), end, width_m, ends, units)
         cell = _squares_of(along_m[low], width_m)
         if len(cell):
-            yield _squares(link, cell, width_m, ends, units)
+            yield _square_family(link, cell, width_m, ends, units)
 
 
-def _squares(link: np.ndarray, cell: np.ndarray, width_m: float, ends: tuple[np.ndarray, ...],
-             units: Units) -> Family:
+def _square_family(link: np.ndarray, cell: np.ndarray, width_m: float,
+                   ends: tuple[np.ndarray, ...], units: Units) -> Family:
+    """Group links by the squares that they touch.
+
+    Args:
+        link: (m,) link of each touch, which may repeat.
+        cell: (m, 2) indices of the square.
+        width_m: side of the squares [m].
+        ends: labels whose mean levels are subtracted, see `Family.ends`.
+        units: labels of readings with correlated errors.
+    """
     least = cell.min(axis=0)
     columns = np.int64(np.ptp(cell[:, 1]) + 1)
     code, group = np.unique((cell - least) @ np.array([columns, 1]), return_inverse=True)
     squares, count = np.column_stack(np.divmod(code, columns)) + least, len(code)
     pair = np.unique(link * np.int64(count) + group.ravel())  # once for each link
 
-    def describe(group: int) -> Words:
+    def describe(group: int) -> Description:
         low_m = squares[group] * width_m
         return {}, {name: (float(low), float(low + width_m))
                     for name, low in zip(("x_m", "y_m"), low_m, strict=True)}

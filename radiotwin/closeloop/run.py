@@ -1,4 +1,4 @@
-"""The loop: fit a base, look at its residual, search for effects, and compare held-out errors."""
+"""Run the loop: fit a base, scan its residual, search for effects, compare held-out errors."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from radiotwin.closeloop.crossfit import (
 )
 from radiotwin.closeloop.predict.predictor import CombinedPrediction, combined_prediction
 from radiotwin.closeloop.scan import scan
-from radiotwin.closeloop.scan_limits import Seen, seen_from
+from radiotwin.closeloop.scan_sensitivity import LeastDeviation, least_deviations
 from radiotwin.closeloop.search.anomaly_causes import add_causes_of_anomalies
 from radiotwin.closeloop.search.causes import add_causes
 from radiotwin.closeloop.search.declared import add_declared
@@ -61,7 +61,7 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 
-BASE_FITTED = "looking at the residual"  # what is done once the data have been accepted
+BASE_FITTED = "looking at the residual"  # first progress message after the data were accepted
 FIXED_CPU_S, LINKS_A_CPU_S, LINKS_A_CPU_S_ON_MAP = 45.0, 220.0, 120.0  # see `expected_cpu_s`
 
 
@@ -71,16 +71,16 @@ class Loop(Summarised):
 
     Attributes:
         base: name of the base.
-        links: that were used: all, or a sample of very many.
+        links: the links used: all, or a sample if there are very many.
         folds: how they were held out.
-        before: the base alone, with what is declared.
-        explained: base and named effects, without trends and interpolation of the rest.
-        found: base and effects, and the log of all trials.
+        before: the base with declared effects only.
+        explained: base and named effects, without trends and interpolated shadowing.
+        found: base and all effects, and the log of all trials.
         criteria: thresholds that decided.
-        dependences_before, dependences_after: of the held-out residual.
-        seed: of the folds, and of the draws in `prediction`.
-        noise_floor_db: from links measured twice at one position; NaN where there are none.
-        origin: of the frame of the links; None where it is not known.
+        dependences_before, dependences_after: variables on which the held-out residual depends.
+        seed: random seed of the folds and of `prediction`.
+        noise_floor_db: standard deviation of repeated readings at one position; NaN without any.
+        origin: origin of the local frame; None if unknown.
     """
 
     base: str
@@ -98,14 +98,14 @@ class Loop(Summarised):
 
     @property
     def after(self) -> CrossFit:
-        """Base and effects."""
+        """The base with all effects that were found."""
         return self.found.model
 
     @cached_property
     def for_twin(self) -> CrossFit:
-        """`after`, fitted again without effects that no map can show.
+        """`after`, fitted again without descriptive effects that a map cannot show.
 
-        If there are none it is `after` itself, with its interpolated shadowing.
+        If there is no such effect, `after` itself with its interpolated shadowing.
         """
         dropped = [each.entry for each in self.after.whole.effects
                    if not (each.is_cause or each.is_declared or each.is_on_maps())]
@@ -116,16 +116,16 @@ class Loop(Summarised):
 
     @property
     def remaining(self) -> list[ResidualDependence]:
-        """Dependences that are left."""
+        """Variables on which the residual still depends significantly."""
         return significant(self.dependences_after, self.criteria)
 
     @property
     def anomalies(self) -> pd.DataFrame:
-        """Groups of links that stand out in the held-out residual of `before`.
+        """Groups of links that stand out in the held-out residual of `before`, one a row.
 
-        Columns: `family`, its `devices, receivers, flights`, `sight` (line of sight), `statistic`,
-        its `size, low, high, unit`, `probability`, number of `links`, and `causes`: the probability
-        of each.
+        Columns: `family`; `devices, receivers, flights` (names); `sight` (line of sight);
+        `statistic` with its `size, low, high, unit`; `probability`; `links` (number); `causes`
+        (probability by effect).
         """
         rows = [{"family": each.family,
                  **{f"{end}s": ", ".join(each.members.get(end, ()))
@@ -140,7 +140,7 @@ class Loop(Summarised):
 
     @property
     def effects(self) -> pd.DataFrame:
-        """Effects that were found: a row for each of their parameters, with its 90 % interval.
+        """Parameters of the effects that were found, one a row, with 90 % intervals.
 
         Columns: `effect`, its `rank` and `probability`, and `parameter, value, low, high, unit,
         determined`; see `Parameter.record`.
@@ -156,10 +156,10 @@ class Loop(Summarised):
 
     @property
     def verdict(self) -> str:
-        """`effect`, `located`, `none` or `undecided`.
+        """The verdict: `effect`, `located`, `none` or `undecided`.
 
-        It is `effect` where a cause was named, `located` where a group of links surely stands out
-        and its cause is open. It is never `none` while a group probably stands out.
+        `effect`: a cause was named. `located`: a group of links surely stands out, without a named
+        cause. `none`: probably nothing is hidden, and no group stands out. Else `undecided`.
         """
         if any(each.is_cause and not each.is_declared for each in self.after.whole.effects):
             return "effect"
@@ -181,32 +181,31 @@ class Loop(Summarised):
 
     @cached_property
     def prediction(self) -> CombinedPrediction:
-        """Held-out, by all that was learnt, and by other models alone; takes a while."""
+        """Held-out prediction by the combination of models, and by each alone; takes minutes."""
         return combined_prediction(self.for_twin, bool(self.remaining), self.seed)
 
     @cached_property
     def detectable(self) -> list[Detectable]:
-        """How large effects would have had to be, to be named."""
-        left = self.found.looked_at
-        if left is None:
+        """Least size of each effect from which it would have been named."""
+        if self.found.looked_at is None:
             return []
-        model, hypotheses = left
+        model, hypotheses = self.found.looked_at
         return detectable(model.whole.view, hypotheses, self.criteria,
                           [effect() for effect in catalogue()], model.whole.model.effect_names)
 
     @cached_property
-    def seen_from(self) -> list[Seen]:
-        """Sizes from which groups of each family would have been said, where none stands out."""
-        return [] if self.found.anomalies else seen_from(self.before)
+    def seen_from(self) -> list[LeastDeviation]:
+        """Least deviations of groups that would have been found; empty if a group stands out."""
+        return [] if self.found.anomalies else least_deviations(self.before)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:
-        """Of each kept effect, see `effect_parameters`."""
+        """Parameters of each effect of `after`, by name, with 90 % intervals."""
         return effect_parameters(self.after)
 
     @cached_property
     def sizes_db(self) -> list[Parameter]:
-        """Of each kept effect, see `effect_size_db`."""
+        """RMS change of held-out readings by each effect of `after` [dB], with 90 % intervals."""
         return [effect_size_db(self.after, number)
                 for number in range(len(self.after.whole.effects))]
 
@@ -216,24 +215,24 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
                seed: int = 0, on_progress: Callable[[str], None] = lambda _: None,
                hold_out: str = "auto", criteria: SelectionCriteria | None = None,
                executor: Executor | None = None) -> Loop:
-    """Find what a base model lacks.
+    """Find the effects that a base model lacks, and report held-out errors before and after.
 
     Args:
-        measurements: links; of a file or a data frame, too.
-        scene: 3D map and radio, or their folder; None: every link counts as one with line of sight.
+        measurements: readings; also a data frame or a file.
+        scene: 3D map and radio, or their folder; None: every link counts as line of sight.
         base: one of `BASES`, or `auto`: the one with the least held-out error. Paths are then
-            followed only if they make that of a few links smaller.
-        seed: of folds, fits and permutations.
-        on_progress: called with what is being done.
+            followed only if they reduce the error on a sample of links.
+        seed: random seed of folds, fits and permutations.
+        on_progress: called with a text on each step.
         hold_out: which links are held out together, see `make_folds`.
         criteria: thresholds; None: the defaults.
         executor: where effects are fitted, inside `keep_pieces`; None: in this process.
 
     Returns:
-        what was found, with the error before and after on links that took no part.
+        the anomalies and effects, with errors before and after on held-out links.
 
     Raises:
-        BadInput: an unknown base or way to hold out, or data of which nothing can be used.
+        BadInput: an unknown base or way to hold out, or no usable data.
     """
     if base not in (*BASES, "auto"):
         raise BadInput(f"base {base!r} is unknown; allowed are auto, {', '.join(BASES)}")
@@ -244,7 +243,7 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
                        "base log-distance")
     criteria = criteria or SelectionCriteria()
     all_links = prepare_links(measurements, scene)
-    if scene is not None:  # the log-distance law needs no line of sight
+    if scene is not None:  # anchors inside buildings are refused if the base uses line of sight
         all_links = move_anchors_out(all_links, scene, refuse=base != LogDistanceBase.name)
     links = limits_to_explain(thin_links(all_links, seed))
     folds = make_folds(links, seed, hold_out)
@@ -260,8 +259,8 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
     found = search(declared, [add_causes_of_anomalies, add_faults, add_changes, add_causes,
                               drop_idle_faults], inputs)
     on_progress("unknown devices again, beside the effects")
-    anew = make_bases(scene, seed)[fitted.name]  # which remembers no earlier position
-    explained = relocate_devices(found.model, links, anew)
+    fresh_base = make_bases(scene, seed)[fitted.name]  # without cached positions
+    explained = relocate_devices(found.model, links, fresh_base)
     on_progress("looking at what is left")
     if explained is not declared.model:
         after = dependences(explained, seed)
@@ -273,9 +272,9 @@ def close_loop(measurements: Measurements | pd.DataFrame | Path | str,
 
 
 def expected_cpu_s(links: int, has_map: bool) -> float:
-    """Return about how much processor time `close_loop` takes for so many links [s].
+    """Estimate the processor time of `close_loop` [s].
 
-    Of 41 recorded runs with 5,000 to 106,000 links 40 took half to twice as long
+    It was right within a factor of two in 40 of 41 recorded runs with 5,000 to 106,000 links
     (`docs/results/real.json`, `injected.json`, `campus.json`).
     """
     used = links if links <= MAX_LINKS else SAMPLE_LINKS
@@ -285,19 +284,19 @@ def expected_cpu_s(links: int, has_map: bool) -> float:
 def fit_base(links: Links, scene: Scene | None, folds: Folds, base: str = "auto", seed: int = 0,
              on_progress: Callable[[str], None] = lambda _: None
              ) -> tuple[Links, Base, CrossFit]:
-    """Fit a base, or the one with the least held-out error.
+    """Fit a base with cross-validation, or choose the base with the least held-out error.
 
     Args:
-        links: that are used.
-        scene: their map; None: the log-distance law is taken.
-        folds: of the links.
-        base: one of `BASES`, or `auto`: paths are followed if they make the held-out error of a
-            few links smaller.
-        seed: of the fits.
-        on_progress: called with what is being done.
+        links: n links.
+        scene: 3D map and radio; None: `auto` takes the log-distance law.
+        folds: assignment of the links.
+        base: one of `BASES`, or `auto`: paths are followed if they reduce the held-out error on a
+            sample of links.
+        seed: random seed of the fits.
+        on_progress: called with a text on each step.
 
     Returns:
-        the links, with a note where paths were not followed; the base; and its cross-validated fit.
+        the links, with a note if paths were not followed; the base; its cross-validated fit.
     """
     names = [base]
     if base == "auto":

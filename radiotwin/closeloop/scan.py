@@ -1,10 +1,10 @@
-"""Where the residual stands out: groups of links that read otherwise than their peers.
+"""Scan held-out residuals for anomalies: groups of links that read otherwise than their peers.
 
-Before any theory of a cause, held-out residuals of the base are grouped by device, receiver and
-flight, by their pairs, by windows of time, directions, distances and places. Each group's level,
-scatter and share of blanks is laid beside those of its peers (`radiotwin.inference.groups`). A
-greedy cover takes the group that explains most of what stands out, takes its share out of the
-residuals, and looks again: one flight is said, not its twenty-four pairs.
+Residuals are grouped by device, receiver, flight and their pairs, by time, direction, distance and
+place. The level, scatter and share of blanks of each group is compared with those of its peers
+(`radiotwin.inference.groups`). A greedy cover takes the group that explains most, subtracts its
+deviation from the residuals, and scans again. So one faulty flight is reported once, and not as
+its twenty-four pairs with devices.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from radiotwin.closeloop.crossfit import CrossFit
-from radiotwin.closeloop.families import Family, Readings, codes_of, families_of, units_of
+from radiotwin.closeloop.families import Family, Readings, combined_labels, families_of, units_of
 from radiotwin.closeloop.verdict.criteria import MIN_SURE
 from radiotwin.effects.params import QUANTILE_90, Parameter
 from radiotwin.inference.curves import Curves, combine_curves, compare_curves
@@ -42,31 +42,31 @@ from radiotwin.inference.groups import (
 )
 from radiotwin.links.sites import inseparable_pairs
 
-# Spread of levels of peers. Of ends it is that of instruments, antennas and cables. By direction,
-# place, distance and height every base errs.
+# Prior standard deviation of the levels of faultless groups [dB]: tolerances of instruments,
+# antennas and cables for ends, errors of the base by direction, place, distance and height.
 PAIR_SPREAD_DB, SPREAD_DB = 0.6, {"device": 0.3, "receiver": 0.3, "flight": 0.3, "direction": 1.0,
                                   "place": 1.0, "distance": 2.0, "altitude": 2.0, "level": 2.0}
-# Share of a base's scatter with line of sight, and without, in which whole groups differ.
+# The same as a share of the residual's scale, added in quadrature.
 LOS_SHARE, NLOS_SHARE = 0.1, 0.4
-LOS_DOF, NLOS_DOF = 60.0, 6.0  # tails of these differences of levels, Student's t
-BOTH_SHARE = 0.8  # of what stands out does so with line of sight and without
-SCATTER_SPREAD, NOISE_SPREAD = 0.2, 0.3  # of peers: logarithm
-LOS_BLANKS_SPREAD, NLOS_BLANKS_SPREAD = 0.03, 0.12  # of peers: share of blanks
-LOS_CURVE_SHARE, NLOS_CURVE_SHARE = 0.08, 0.1  # of a base's scatter by which curves change
-# Scale of what stands out.
+LOS_DOF, NLOS_DOF = 60.0, 6.0  # Student-t degrees of freedom of these levels
+BOTH_SHARE = 0.8  # share of anomalies that show in LoS and NLoS links alike
+SCATTER_SPREAD, NOISE_SPREAD = 0.2, 0.3  # prior sd of the log scatter of faultless groups
+LOS_BLANKS_SPREAD, NLOS_BLANKS_SPREAD = 0.03, 0.12  # prior sd of their share of blanks
+LOS_CURVE_SHARE, NLOS_CURVE_SHARE = 0.08, 0.1  # sd of faultless curves over the residual's scale
+# Standard deviation of anomalies: dB, dB, share; logarithm of the scatter.
 ANYWHERE, ANYWHERE_LOG = {"level": 5.0, "curve": 3.0, "blanks": 0.3}, 0.8
-# Odds that something of a family stands out in one way: a device, receiver or flight; others.
+# Prior odds that a family has an anomaly; of families that are not named.
 ODDS, FAMILY_ODDS = {"device": 0.4, "receiver": 0.4, "flight": 0.4, "place": 1.0}, 0.03
-PLACE_BOTH = 0.3
-LEAST_SCALE_DB = 0.5  # half a step of coarse readings
+PLACE_BOTH = 0.3  # `BOTH_SHARE` of places: a wrong building changes mostly NLoS links
+LEAST_SCALE_DB = 0.5  # half a step of receivers that round to 1 dB
 MAX_ANOMALIES = 10
-ECHO = 1 / 3  # of the first size, below which a later find may be what the first left on others
-MAX_RIVALS = 4  # groups of which the one that explains most is taken
-LIKELY = 0.5  # groups less probable than this are not said
-MIN_LINKS = 60  # of a class of line of sight
+ECHO = 1 / 3  # of the first anomaly's size, below which a later one may be its remainder
+MAX_RIVALS = 4  # groups that are tried, to take the one that explains most
+MIN_PROBABILITY = 0.5  # below it a group is not an anomaly
+MIN_LINKS = 60  # detected links with (or without) line of sight, to be judged apart
 ENDS = "device", "receiver", "flight"
-BASE_ERRORS = "distance", "altitude", "level"  # in which a base's usual errors differ
-HEIGHTS_M, QUARTERS = (5.0, 20.0, 60.0), 4  # at which a base errs otherwise: street, roofs, above
+BASE_ERRORS = "distance", "altitude", "level"  # families that are judged by the raw residual
+HEIGHTS_M, QUARTERS = (5.0, 20.0, 60.0), 4  # street, roofs, above: a base's bias differs [m]
 UNITS = {"level": "dB", "curve": "dB", "scatter": "times", "noise": "times", "blanks": "share"}
 
 
@@ -77,16 +77,16 @@ class Anomaly:
     Attributes:
         family: what its links share: `device`, `receiver`, `flight`, a pair such as
             `device x flight`, `time`, `direction`, `distance`, `altitude`, `level` or `place`.
-        members: names of the devices, receivers and flights.
-        ranges: low and high end of each variable that bounds it, by name with unit.
-        sight: `los`, `nlos` or `all`: the links that it is of.
-        statistic: `level`, `scatter`, `blanks`, or `curve`: levels that change along a variable.
-        size: against its peers, with its 90 % interval: dB, times or share.
+        members: names of its devices, receivers and flights.
+        ranges: lowest and highest value of each variable that bounds it, by name with unit.
+        sight: which of its links differ: `los`, `nlos` or `all`.
+        statistic: what differs: `level`, `scatter`, `blanks`, or `curve` (levels along a variable).
+        size: difference from its peers with its 90 % interval: dB, times or share.
         probability: that it is real.
         rows: (n,) bool, its links.
-        along: of a curve, the variable that the levels change along.
-        causes: probability of each cause that may explain it, by name of the effect; `another` is
-            one that the catalogue does not have. Empty before causes were looked for.
+        along: the variable along which a curve runs.
+        causes: probability of each possible cause, by the effect's name; `another` = not in the
+            catalogue. Empty until causes were searched for.
     """
 
     family: str
@@ -103,7 +103,7 @@ class Anomaly:
 
 @dataclass(frozen=True, eq=False)
 class Compared:
-    """One statistic of a family, in one class of line of sight or both together."""
+    """Log odds that groups of a family stand out by one statistic, in LoS, NLoS or all links."""
 
     family: Family
     statistic: str
@@ -113,12 +113,14 @@ class Compared:
 
     @property
     def key(self) -> tuple[int, str, str]:
-        """What tells it from the others of one comparison."""
+        """Identity of family, statistic and sight."""
         return id(self.family), self.statistic, self.sight
 
 
 @dataclass(frozen=True)
 class _Found:
+    """One group of a comparison."""
+
     compared: Compared
     group: int
 
@@ -132,37 +134,37 @@ class _Found:
 
 
 def scan(model: CrossFit) -> list[Anomaly]:
-    """Return the groups of a model's held-out links that stand out, most evident first.
+    """Find groups of links whose held-out residuals stand out, the most evident first.
 
     Args:
-        model: of n links.
+        model: cross-validated fit of n links.
 
     Returns:
-        those that are more probable than not, at most `MAX_ANOMALIES`.
+        groups with a probability over `MIN_PROBABILITY`, at most `MAX_ANOMALIES`.
     """
     return scan_readings(Readings.of(model))
 
 
 def scan_readings(readings: Readings) -> list[Anomaly]:
-    """Return the groups of readings that stand out, see `scan`."""
+    """Find groups of readings that stand out, see `scan`."""
     units = units_of(readings)
     families = list(families_of(readings, units))
-    few = [each for each in families
-           if each.curve is None and (each.name in ENDS or each.pairs)]
+    end_families = [each for each in families
+                    if each.curve is None and (each.name in ENDS or each.pairs)]
     found: list[Anomaly] = []
     taken: list[_Found] = []
     left, first = readings, None
     while len(found) < MAX_ANOMALIES:
         compared = compare(left, families, units)
         first = first or compared
-        rivals = _likeliest(compared, first, taken)
+        rivals = _candidates(compared, first, taken)
         if not rivals:
             break
-        after = [(each, _without(left, each)) for each in rivals]
+        after = [(each, _without_group(left, each)) for each in rivals]
         best = 0
-        if len(after) > 1:  # what explains most of what ends, flights and their pairs show
-            best = int(np.argmin([_evidence(compare(rest, few, units)) - each.log_odds
-                                  for each, rest in after]))
+        if len(after) > 1:  # the group that explains most in devices, receivers, flights and pairs
+            best = int(np.argmin([_total_log_odds(compare(rest, end_families, units))
+                                  - each.log_odds for each, rest in after]))
         chosen, left = after[best]
         taken.append(chosen)
         found.append(_anomaly(chosen, readings))
@@ -170,18 +172,18 @@ def scan_readings(readings: Readings) -> list[Anomaly]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Class:
-    """Values of one statistic, of the links of one class of line of sight.
+class _SightClass:
+    """Values of one statistic on the LoS links, or on the NLoS links.
 
     Attributes:
-        values: (n,), NaN outside `rows`.
-        rows: (n,) bool.
+        values: (n,) such as residuals [dB]; NaN outside `rows`.
+        rows: (n,) bool, links of the class.
         statistic: `level`, `scatter`, `noise` or `blanks`.
-        is_los: whether the class is that with line of sight.
-        scale_db: of its residuals.
-        units: of the n values.
-        lasting: estimator of the error of lasting units, over `rows`.
-        taken_off: values less the levels of ends that were asked for, kept.
+        is_los: whether these are the LoS links.
+        scale_db: robust standard deviation of their residuals.
+        units: labels of readings with correlated errors.
+        lasting: how far errors of `rows` are correlated in those units.
+        less_ends: cache: values minus the levels of some ends, by the ends' ids.
     """
 
     values: np.ndarray
@@ -191,17 +193,17 @@ class _Class:
     scale_db: float
     units: Units
     lasting: LastingErrors
-    taken_off: dict[tuple[int, ...], np.ndarray] = field(default_factory=dict)
+    less_ends: dict[tuple[int, ...], np.ndarray] = field(default_factory=dict)
 
-    def of(self, family: Family, groups: Groups) -> np.ndarray:
-        """Return values (n,) in which a family's groups can be compared."""
+    def comparable_values(self, family: Family, groups: Groups) -> np.ndarray:
+        """Return values (n,) minus the levels of a family's ends and of units its groups share."""
         key = tuple(id(end) for end in family.ends)
-        if key not in self.taken_off:
+        if key not in self.less_ends:
             values, ends = self.values.copy(), [end[self.rows] for end in family.ends]
-            take_off = _centred if self.statistic == "blanks" else median_polish
-            values[self.rows] = take_off(values[self.rows], ends)
-            self.taken_off[key] = values
-        values = self.taken_off[key]
+            subtract = _less_group_means if self.statistic == "blanks" else median_polish
+            values[self.rows] = subtract(values[self.rows], ends)
+            self.less_ends[key] = values
+        values = self.less_ends[key]
         if not family.is_crossing or self.statistic != "level":
             return values
         values = values.copy()
@@ -210,17 +212,18 @@ class _Class:
         return values
 
     def compare(self, family: Family) -> PeerComparison | Curves | None:
-        """Return how far a family's groups are from their peers; None if too few are judged."""
+        """Return how far a family's groups are from their peers; None if under two are judged."""
         groups = family.groups.restrict_to(self.rows)
         if not len(groups.row):
             return None
-        values = self.of(family, groups)
-        own, scale_db = values[self.rows], self.scale_db
+        values = self.comparable_values(family, groups)
+        in_class, scale_db = values[self.rows], self.scale_db
         if self.statistic == "level":
-            # A level gives way to outliers; so much of a unit's error as it follows counts.
-            own, limit_db = own - np.median(own), HUBER * scale_db
-            followed_db = self.lasting.sd(np.clip(own, -limit_db, limit_db))
-            lasting_db = followed_db / float((np.abs(own) < limit_db).mean())
+            # A Huber level is insensitive to outliers, so errors of units are clipped as well, and
+            # divided by the share of values within the clip (the slope of Huber's influence).
+            centred_db, clip_db = in_class - np.median(in_class), HUBER * scale_db
+            clipped_db = self.lasting.sd(np.clip(centred_db, -clip_db, clip_db))
+            lasting_db = clipped_db / float((np.abs(centred_db) < clip_db).mean())
             is_bin = family.curve is not None
             found = levels(values, groups, lasting_db, LEAST_SCALE_DB, is_bin)
             if family.curve is not None:
@@ -230,12 +233,12 @@ class _Class:
             prior = SPREAD_DB.get(family.name, PAIR_SPREAD_DB)
             prior = float(np.hypot(prior, (LOS_SHARE if self.is_los else NLOS_SHARE) * scale_db))
         elif self.statistic == "blanks":
-            found = means(values, groups, self.lasting.sd(own))
+            found = means(values, groups, self.lasting.sd(in_class))
             prior = LOS_BLANKS_SPREAD if self.is_los else NLOS_BLANKS_SPREAD
             prior *= 1 if family.name in ENDS else 2
         else:
-            size = np.minimum(np.abs(own) / scale_db, MAX_SCALES)
-            # What an instrument adds is another at each reading.
+            size = np.minimum(np.abs(in_class) / scale_db, MAX_SCALES)
+            # An instrument's noise is independent from reading to reading.
             lasting_sd = None if self.statistic == "noise" else \
                 self.lasting.sd(size / max(size.mean(), TINY))
             found = log_scatters(values, groups, lasting_sd, scale_db)
@@ -249,28 +252,28 @@ class _Class:
         return compare_with_peers(found, prior, NLOS_DOF if heavy else LOS_DOF)
 
 
-def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _Class]]:
-    """Return the values of each statistic, in each class that has enough links."""
+def _classes(readings: Readings, units: Units) -> dict[str, dict[str, _SightClass]]:
+    """Return the values of each statistic by `los` and `nlos`, where there are enough links."""
     usual_db = _usual_errors(readings)
     values = {"level": readings.residual_db - usual_db, "scatter": readings.residual_db - usual_db,
               "noise": readings.step_db, "blanks": readings.blank_excess,
               "base": readings.residual_db}
-    found: dict[str, dict[str, _Class]] = {name: {} for name in values}
+    found: dict[str, dict[str, _SightClass]] = {name: {} for name in values}
     heard = np.isfinite(readings.residual_db)
     for sight, is_los in (("los", True), ("nlos", False)):
         of_class = readings.los if is_los else ~readings.los
         if (of_class & heard).sum() < MIN_LINKS:
             continue
-        scale_db = _scale(readings.residual_db[of_class & heard])
+        scale_db = max(robust_sd(readings.residual_db[of_class & heard]), LEAST_SCALE_DB)
         for name, each in values.items():
             rows = of_class & np.isfinite(each)
-            found[name][sight] = _Class(each, rows, "level" if name == "base" else name, is_los,
-                                        scale_db, units, LastingErrors(units, rows))
+            found[name][sight] = _SightClass(each, rows, "level" if name == "base" else name,
+                                             is_los, scale_db, units, LastingErrors(units, rows))
     return found
 
 
 def compare(readings: Readings, families: list[Family], units: Units) -> list[Compared]:
-    """Return all statistics of families, in each class and in both together."""
+    """Compare the groups of families with their peers, by each statistic in LoS, NLoS and all."""
     found, classes = [], _classes(readings, units)
     alike = Counter((family.name, family.curve is None) for family in families)
     for family in families:
@@ -301,43 +304,44 @@ def compare(readings: Readings, families: list[Family], units: Units) -> list[Co
 
 
 def _together(parts: list[PeerComparison | Curves]) -> PeerComparison | Curves:
+    """Combine the distances from peers in LoS and NLoS links, weighted by precision."""
     of_groups = [each for each in parts if isinstance(each, PeerComparison)]
     of_curves = [each for each in parts if isinstance(each, Curves)]
     return combine_parts(of_groups) if of_groups else combine_curves(of_curves)
 
 
 def _usual_errors(readings: Readings) -> np.ndarray:
-    """Return the median residual (n,) at like height and distance, of one class of sight [dB].
+    """Return the median residual (n,) of links with like height, distance and line of sight [dB].
 
-    A base errs otherwise in a street than above the roofs, which is no fault of a flight there.
+    The bias of a base differs between streets and above roofs, which is no fault of a flight.
     """
     heard = np.isfinite(readings.residual_db)
     height = np.searchsorted(HEIGHTS_M, readings.moving_m[:, 2])
     distance_m = np.linalg.norm(readings.receiver_m - readings.device_m, axis=1)
-    cell = codes_of(readings.los.astype(int), height)
+    cell = combined_labels(readings.los.astype(int), height)
     quarter = np.zeros(len(readings), dtype=np.int64)
     for each in np.unique(cell[heard]):
         rows = heard & (cell == each)
         edges = np.quantile(distance_m[rows], np.linspace(0, 1, QUARTERS + 1)[1:-1])
         quarter[rows] = np.searchsorted(edges, distance_m[rows])
-    cell = codes_of(cell, quarter)
-    receivers, flights = (_members(cell[heard], end[heard], int(cell.max()) + 1)
+    cell = combined_labels(cell, quarter)
+    receivers, flights = (_count_ends(cell[heard], end[heard], int(cell.max()) + 1)
                           for end in (readings.receiver, readings.track))
-    # What several flights of one receiver share may be its own level.
-    own = heard & ~((receivers == 1) & (flights > 1))[cell]
+    # In a cell with several flights of one receiver only, the median may be that receiver's fault.
+    rows = heard & ~((receivers == 1) & (flights > 1))[cell]
     found = np.zeros(len(readings))
-    found[own] = medians(readings.residual_db[own], cell[own], int(cell.max()) + 1)[cell[own]]
+    found[rows] = medians(readings.residual_db[rows], cell[rows], int(cell.max()) + 1)[cell[rows]]
     return found
 
 
-def _members(cell: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
-    """Return how many different ends (n,) each of some cells (n,) has, (count,)."""
+def _count_ends(cell: np.ndarray, end: np.ndarray, count: int) -> np.ndarray:
+    """Count the different ends (n,) in each of `count` cells, given the cell (n,) of each link."""
     size = int(end.max(initial=0)) + 1
     return np.bincount(np.unique(cell * np.int64(size) + end) // size, minlength=count)
 
 
-def _centred(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
-    """Return values (n,) less the means of each label's groups in turn."""
+def _less_group_means(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
+    """Subtract the mean of each group of each label (n,) from values (n,), in two rounds."""
     for _ in range(2):
         for label in labels:
             number = np.maximum(np.bincount(label), 1)
@@ -345,56 +349,49 @@ def _centred(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:
     return values
 
 
-def _scale(values: np.ndarray) -> float:
-    return max(robust_sd(values), LEAST_SCALE_DB)
+def _candidates(compared: list[Compared], first: list[Compared],
+                taken: list[_Found]) -> list[_Found]:
+    """Return the most probable group of each family, at most `MAX_RIVALS`, most probable first.
 
-
-def _likeliest(compared: list[Compared], first: list[Compared],
-               taken: list[_Found]) -> list[_Found]:
-    """Return the most probable groups, at most `MAX_RIVALS`, of each group only once.
-
-    No group is taken twice. Beside what was taken first, one that did not stand out then and is
-    much smaller is its echo.
+    Args:
+        compared: comparison of what is left in the residuals.
+        first: comparison before any group was taken.
+        taken: groups that were taken. They are excluded, and so is a group that did not stand out
+            at first and is much smaller than the first one taken: that may be its remainder.
     """
     found, before = [], {table.key: table.log_odds for table in first}
     for table in compared:
-        likely = table.log_odds > logit(LIKELY)
+        likely = table.log_odds > logit(MIN_PROBABILITY)
         for other in taken:
             if other.compared.key[:2] == table.key[:2]:
                 likely[other.group] = False
         for other in taken[:1]:
             if other.compared.statistic == table.statistic:
-                likely &= (before.get(table.key, table.log_odds) > logit(LIKELY)) | (
+                likely &= (before.get(table.key, table.log_odds) > logit(MIN_PROBABILITY)) | (
                     np.abs(table.distance.size) > ECHO * abs(other.size))
         found += [_Found(table, int(group)) for group in np.flatnonzero(likely)]
-    found.sort(key=lambda each: -each.log_odds)
-    seen, rivals = set(), []
-    for each in found:
-        key = id(each.compared.family), each.group
-        if key not in seen:
-            seen.add(key)
-            rivals.append(each)
     best: dict[str, _Found] = {}
-    for each in rivals:
+    for each in sorted(found, key=lambda each: -each.log_odds):
         best.setdefault(each.compared.family.name, each)
-    # What is sure comes before what may explain more: a receiver that scatters covers its flights.
+    # Sure groups first: a receiver that scatters, before a flight of it that may explain more.
     sure = [each for each in best.values() if each.log_odds > logit(MIN_SURE)]
     return (sure or list(best.values()))[:MAX_RIVALS]
 
 
-def _evidence(compared: list[Compared]) -> float:
-    """Return how much stands out in all [nats]."""
+def _total_log_odds(compared: list[Compared]) -> float:
+    """Sum the positive log odds of all groups [nats]: how much still stands out."""
     return float(sum(np.nansum(np.maximum(each.log_odds, 0.0)) for each in compared))
 
 
 def _rows(found: _Found, readings: Readings) -> np.ndarray:
+    """Return the mask (n,) of a group's links with the line of sight in which it stands out."""
     rows = found.compared.family.members(found.group, len(readings))
     sight = found.compared.sight
     return rows & (readings.los if sight == "los" else ~readings.los if sight == "nlos" else True)
 
 
-def _without(readings: Readings, found: _Found) -> Readings:
-    """Return readings of which a group's size is taken off."""
+def _without_group(readings: Readings, found: _Found) -> Readings:
+    """Subtract a group's deviation from the residuals, or drop its blanks."""
     rows = _rows(found, readings)
     if found.compared.statistic == "blanks":
         excess = readings.blank_excess.copy()
@@ -402,10 +399,11 @@ def _without(readings: Readings, found: _Found) -> Readings:
         return replace(readings, blank_excess=excess)
     if isinstance(found.compared.distance, Curves):
         return _without_curve(readings, found, found.compared.distance)
-    return moved(readings, rows, found.compared.statistic, -found.size)
+    return shift_group(readings, rows, found.compared.statistic, -found.size)
 
 
 def _without_curve(readings: Readings, found: _Found, distance: Curves) -> Readings:
+    """Subtract a fitted curve from the residuals of its links."""
     residual_db, groups = readings.residual_db.copy(), found.compared.family.groups
     for sight in distance.bins:
         level_db = np.zeros(len(readings))
@@ -415,8 +413,15 @@ def _without_curve(readings: Readings, found: _Found, distance: Curves) -> Readi
     return replace(readings, residual_db=residual_db)
 
 
-def moved(readings: Readings, rows: np.ndarray, statistic: str, size: float) -> Readings:
-    """Return readings with the level [dB] or log scatter of some rows (n,) off by a size more."""
+def shift_group(readings: Readings, rows: np.ndarray, statistic: str, size: float) -> Readings:
+    """Add a size to the level [dB] of some readings, or scale their scatter by its exponential.
+
+    Args:
+        readings: n readings.
+        rows: (n,) bool, which of them.
+        statistic: `level`, or any other for the scatter.
+        size: dB; logarithm of the factor.
+    """
     residual_db = readings.residual_db.copy()
     if statistic == "level":
         residual_db[rows] += size
@@ -427,9 +432,10 @@ def moved(readings: Readings, rows: np.ndarray, statistic: str, size: float) -> 
 
 
 def _anomaly(found: _Found, readings: Readings) -> Anomaly:
+    """Describe a group that stands out: its names, ranges, size with interval and probability."""
     compared = found.compared
     members, ranges = compared.family.describe(found.group)
-    if compared.family.name in ENDS:  # another end that has the same links may be meant
+    if compared.family.name in ENDS:  # also name another end that has exactly the same links
         labels = {end: getattr(readings, end) for end in ENDS}
         for other in (end for end in ENDS if end != compared.family.name):
             same = inseparable_pairs(labels[compared.family.name], labels[other])

@@ -60,4 +60,4 @@ def fitted(table, effect, seed=0, devices_m=MASTS_M):
     folds = make_folds(links, seed)
     before = cross_validate(links, make_bases(None, seed)["log-distance"], folds, training_parts(links, folds))
     whole = add_effect(before.whole, effect)
-    return before.extended(whole, [add_effect(fold, effect, whole.effects[-1]) or fold for fold in before.folds])
+    return before.with_fits(whole, [add_effect(fold, effect, whole.effects[-1]) or fold for fold in before.folds])

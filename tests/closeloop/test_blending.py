@@ -10,7 +10,7 @@ import pytest
 from radiotwin.closeloop.crossfit import cross_validate, make_bases, make_folds, training_parts
 from radiotwin.closeloop.predict import baselines, predictor
 from radiotwin.closeloop.predict.baselines import Part, fitted_law, grow_trees, held_out_baselines
-from radiotwin.closeloop.predict.predictor import combined_prediction, served
+from radiotwin.closeloop.predict.predictor import combined_fit, combined_prediction
 from radiotwin.closeloop.predict.weights import Combination
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.errors import BadInput
@@ -65,7 +65,7 @@ def of_map(links):
 def blended():
     links = links_of()
     model = folded(links)
-    return SimpleNamespace(links=links, model=model, twin=replace(model.twin, fitted=served(model, SHARES, 0)))
+    return SimpleNamespace(links=links, model=model, twin=replace(model.twin, fitted=combined_fit(model, SHARES, 0)))
 
 
 @pytest.mark.parametrize("devices_move", [False, True])
@@ -84,7 +84,7 @@ def test_a_twin_of_a_fold_predicts_what_was_scored(devices_move, monkeypatch, tm
     found = combined_prediction(model, True, 0)
     for number in (0, 3):
         fold = model.folds[number]
-        fitted = served(model.extended(fold, model.folds), used[number], 0)
+        fitted = combined_fit(model.with_fits(fold, model.folds), used[number], 0)
         replace(model.twin, fitted=fitted).save(tmp_path / str(number))
         twin, own = Twin.load(tmp_path / str(number)), model.index == number
         held_out = fold.links.select(own)

@@ -42,7 +42,7 @@ def test_a_candidate_that_no_held_out_link_can_judge_is_refused(open_ground):
     links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
     folds = make_folds(links, 0)
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-    extended = model.extended(model.whole, model.folds)
+    extended = model.with_fits(model.whole, model.folds)
     extended.held_out_nll = np.full(len(links), np.nan)
     score = score_model(model, extended, Trial("device_gain_offset"), INPUTS.criteria)
     assert "no held-out link" in score.reason
@@ -100,8 +100,8 @@ def test_what_may_be_nothing_at_all_is_not_named(open_ground, monkeypatch):
 def keep_best(monkeypatch):
     """Function that keeps the best of some candidates; `several` is what is found of one kind."""
     def run(state, tried, several=()):
-        for name, stand_in in (("_settled", lambda model: model),
-                               ("_on_one_mast", lambda _: 0), ("_several", lambda *_: several)):
+        for name, stand_in in (("_refit_exactly", lambda model: model),
+                               ("_devices_on_one_mast", lambda _: 0), ("_repeat", lambda *_: several)):
             monkeypatch.setattr(causes, name, stand_in)
         return causes._keep_best(state, tried, None, INPUTS).log
     return run
@@ -158,13 +158,13 @@ def test_what_gains_nothing_is_no_part_of_the_base_either(open_ground):
     links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
     folds = make_folds(links, 0)
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-    same = model.extended(model.whole, model.folds)
+    same = model.with_fits(model.whole, model.folds)
     score = score_model(model, same, Trial("roof_heights"), INPUTS.criteria)
     assert score.nll_gain == 0 and not score.passed and "gains too little" in score.reason
 
 
 def test_of_two_effects_of_one_name_the_one_that_is_probable_beside_another_is_kept(monkeypatch):
-    monkeypatch.setattr(causes, "_settled", lambda model: model)
+    monkeypatch.setattr(causes, "_refit_exactly", lambda model: model)
     sector, dipole = (Tried(variant, Trial("antenna_pattern", variant=variant, passed=True), None)
                       for variant in ("", "dipole"))
     other = Tried("grove", Trial("foliage", passed=True), None)

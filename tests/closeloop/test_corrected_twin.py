@@ -33,7 +33,7 @@ def test_devices_that_the_loop_found_elsewhere_are_not_located_against_their_dec
     effect = DevicePositionError()
     moved = effect.with_params(effect.Params(device=1, move_m=(20.0, 5.0)))
     whole = replace(model.whole, model=model.whole.model.with_effects([*model.whole.effects, moved]))
-    _, held_out, *_ = asked(model.extended(whole, model.folds), monkeypatch)
+    _, held_out, *_ = asked(model.with_fits(whole, model.folds), monkeypatch)
     assert all(each.anchors == model.links.anchors - {1} for each in held_out)
 
 
@@ -44,7 +44,7 @@ def test_what_only_describes_the_rest_does_not_locate(model, monkeypatch):
         curved = fold.model.with_effects([*fold.effects, trend.with_params(trend.propose(fold.view)[0])])
         folds.append(replace(fold, model=curved, coefficients=np.r_[
             fold.coefficients, np.zeros(curved.terms[-1].columns.shape[1])]))
-    models, *_ = asked(model.extended(model.whole, folds), monkeypatch)
+    models, *_ = asked(model.with_fits(model.whole, folds), monkeypatch)
     assert all([own.name for own in each.effects] == ["receiver_gain_offset"] for each in models)
 
 

@@ -282,7 +282,7 @@ def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
     kind = make_bases(None, 0)["log-distance"]
     base = cross_validate(links, kind, folds, training_parts(links, folds))
     result = search(SearchState(base), [add_declared], SearchInputs(links, kind, folds, tuple(effect() for effect in BUILT_IN)))
-    fields = [each.rest(0) for each in result.model.each]
+    fields = [each.rest(0) for each in result.model.fits]
     model = result.model.map(lambda fit, own: replace(fit, shadowing=own), fields)
     mean_db, scale_db = model.held_out_reading
     spread_db, unheard_db = model.held_out_scales

@@ -12,10 +12,10 @@ from radiotwin.closeloop.crossfit import (
     cross_validate,
     make_bases,
     make_folds,
-    same_effects,
+    match_effects,
     training_parts,
 )
-from radiotwin.closeloop.search.faults import _without, drop_idle_faults, with_effect
+from radiotwin.closeloop.search.faults import _without, drop_idle_faults
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.effects.base import Term
@@ -125,20 +125,20 @@ def test_one_fault_is_not_another_where_a_fold_has_not_seen_the_first(effect):
     first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
     as_its_fold_has_it = on_links(effect, 63, 80)
     whole = model_of(first, trend, second)
-    assert same_effects(whole, model_of(first, trend, as_its_fold_has_it)) == [0, 1, 2]
-    assert same_effects(whole, model_of(trend, as_its_fold_has_it)) == [None, 0, 1]
-    assert same_effects(whole, model_of(first, trend)) == [0, 1, None]
-    assert same_effects(whole, model_of(on_links(effect, 40, 50))) == [None, None, None]
-    assert same_effects(whole, model_of()) == [None, None, None]
+    assert match_effects(whole, model_of(first, trend, as_its_fold_has_it)) == [0, 1, 2]
+    assert match_effects(whole, model_of(trend, as_its_fold_has_it)) == [None, 0, 1]
+    assert match_effects(whole, model_of(first, trend)) == [0, 1, None]
+    assert match_effects(whole, model_of(on_links(effect, 40, 50))) == [None, None, None]
+    assert match_effects(whole, model_of()) == [None, None, None]
 
 
 @pytest.mark.parametrize("effect", [FaultyFlight(), Episode()])
 def test_two_of_a_kind_that_a_fold_found_in_another_order_are_not_swapped(effect):
     first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
     whole = model_of(first, second)
-    assert same_effects(whole, model_of(on_links(effect, 61, 80), on_links(effect, 10, 28))) == [1, 0]
-    assert same_effects(whole, model_of(on_links(effect, 31, 40), on_links(effect, 40, 50))) == [0, 1]
-    assert same_effects(whole, model_of(on_links(effect, 31, 40), on_links(effect, 15, 50))) == [1, 0]
+    assert match_effects(whole, model_of(on_links(effect, 61, 80), on_links(effect, 10, 28))) == [1, 0]
+    assert match_effects(whole, model_of(on_links(effect, 31, 40), on_links(effect, 40, 50))) == [0, 1]
+    assert match_effects(whole, model_of(on_links(effect, 31, 40), on_links(effect, 15, 50))) == [1, 0]
 
 
 @pytest.mark.parametrize("step_db", [0.0, 8.0])
@@ -147,8 +147,8 @@ def test_a_step_that_other_effects_explain_is_taken_back(step_db):
     folds = make_folds(links, 0, "flight")
     base = make_bases(None, 0)["log-distance"]
     model = cross_validate(links, base, folds, training_parts(links, folds))
-    step = ReceiverDrift.Params(receivers={0: Drift("step", 600.0)})
-    found = SearchState(model).keep(Trial("receiver_drift"), with_effect(model, ReceiverDrift(True).with_params(step)))
+    step = ReceiverDrift(True).with_params(ReceiverDrift.Params(receivers={0: Drift("step", 600.0)}))
+    found = SearchState(model).keep(Trial("receiver_drift"), model.map(lambda fit: fit.with_effects([step])))
     result = drop_idle_faults(found, SearchInputs(links, base, folds, ()))
     stays = step_db > 0
     assert result.step == len(result.log.kept) == stays
@@ -166,10 +166,11 @@ def test_a_fault_that_its_own_search_would_not_find_beside_the_others_is_taken_b
     folds = make_folds(links, 0, "flight")
     base = make_bases(None, 0)["log-distance"]
     model = cross_validate(links, base, folds, training_parts(links, folds))
-    episode = Episode.Params(receiver=0, flight=None, start_s=BEGIN_S, end_s=END_S, start_within_s=(BEGIN_S - 1, BEGIN_S),
-                             end_within_s=(END_S, END_S + 1), form="loss", frequency_hz=2.4e9)
+    params = Episode.Params(receiver=0, flight=None, start_s=BEGIN_S, end_s=END_S, start_within_s=(BEGIN_S - 1, BEGIN_S),
+                            end_within_s=(END_S, END_S + 1), form="loss", frequency_hz=2.4e9)
+    episode = Episode().with_params(params)
     inputs = SearchInputs(links, base, folds, ())
-    found = SearchState(model).keep(Trial("episode"), with_effect(model, Episode().with_params(episode)))
+    found = SearchState(model).keep(Trial("episode"), model.map(lambda fit: fit.with_effects([episode])))
     assert model.whole.objective - found.model.whole.objective > inputs.criteria.min_training_gain_nats
     result = drop_idle_faults(found, inputs)
     assert result.step == len(result.log.kept) == (not always)
@@ -177,15 +178,15 @@ def test_a_fault_that_its_own_search_would_not_find_beside_the_others_is_taken_b
 
 def test_what_there_is_one_of_is_the_same_wherever_a_fold_finds_it():
     effect = Episode()
-    assert same_effects(model_of(on_links(effect, 0, 10)), model_of(on_links(effect, 50, 60))) == [0]
+    assert match_effects(model_of(on_links(effect, 0, 10)), model_of(on_links(effect, 50, 60))) == [0]
 
 
 def test_only_the_fault_that_is_taken_back_leaves_a_fold():
     effect = Episode()
     first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
     whole, fold = model_of(first, second), model_of(second)
-    assert _without(fold, same_effects(whole, fold)[0]).effects == [second[0]]
-    assert _without(fold, same_effects(whole, fold)[1]).effects == []
+    assert _without(fold, match_effects(whole, fold)[0]).effects == [second[0]]
+    assert _without(fold, match_effects(whole, fold)[1]).effects == []
 
 
 def test_of_two_faults_each_is_unforeseen_where_its_flight_was_held_out():

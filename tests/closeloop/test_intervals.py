@@ -110,7 +110,7 @@ def test_folds_follow_no_paths_of_their_own_for_intervals(monkeypatch):
     assert 4 <= len(moves_m) <= 8 and (np.array(moves_m) == around).any(axis=1).all()
 
     whole = linearise(model.whole)
-    shared = [np.concatenate(estimates(linearise(fold, intervals._as_followed(whole, fold)))[0].sides_sd)
+    shared = [np.concatenate(estimates(linearise(fold, intervals._path_secants(whole, fold)))[0].sides_sd)
               for fold in model.folds]
     np.testing.assert_allclose(shared, own, rtol=0.4)
 
@@ -128,9 +128,9 @@ def test_a_fold_that_has_only_the_prior_of_a_parameter_does_not_count():
     known = Parameter(10.0, 9.5, 10.5, "dB")
     telling = [Parameter(value, value - 0.6, value + 0.6, "dB") for value in (9.9, 10.1, 10.0, 10.0)]
     prior = Parameter(0.5, -20.0, 21.0, "dB")
-    assert intervals._with_folds(known, [*telling, prior], 5) == known
+    assert intervals._with_jackknife(known, [*telling, prior], 5) == known
     contradicting = Parameter(4.0, 3.5, 4.5, "dB")
-    assert intervals._with_folds(known, [*telling, contradicting], 5).low < 6.0
+    assert intervals._with_jackknife(known, [*telling, contradicting], 5).low < 6.0
 
 
 def test_a_parameter_that_most_folds_do_not_find_is_not_determined():

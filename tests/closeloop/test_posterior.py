@@ -27,7 +27,7 @@ def test_evidence_for_an_offset_that_is_there_and_none_for_one_that_is_not(open_
     for change, low, high in ((louder, 15.0, np.inf), (lambda world: None, -np.inf, 0.0)):
         model, hypotheses = looked_at(open_ground, 2, change)
         found = add_effect(model.whole, ReceiverGainOffset())
-        assert low < hypotheses.of_named(found) < high
+        assert low < hypotheses.effect_evidence_nats(found) < high
 
 
 def test_an_end_that_is_off_does_not_pay_for_those_that_are_not(open_ground, monkeypatch):
@@ -36,12 +36,12 @@ def test_an_end_that_is_off_does_not_pay_for_those_that_are_not(open_ground, mon
 
     model, hypotheses = looked_at(open_ground, 2, weaker)
     found = add_effect(model.whole, DeviceGainOffset())
-    few_nats = hypotheses.of_named(found)
+    few_nats = hypotheses.effect_evidence_nats(found)
     monkeypatch.setattr(DeviceGainOffset, "sparse", False)
-    assert few_nats > hypotheses.of_named(found) + 2.0
+    assert few_nats > hypotheses.effect_evidence_nats(found) + 2.0
     monkeypatch.undo()
     model, hypotheses = looked_at(open_ground, 2)
-    assert hypotheses.of_named(add_effect(model.whole, DeviceGainOffset())) < 0
+    assert hypotheses.effect_evidence_nats(add_effect(model.whole, DeviceGainOffset())) < 0
 
 
 def test_no_further_cause_is_no_evidence_wherever_the_variances_are(open_ground):
@@ -68,13 +68,13 @@ def moved(world):
 def test_evidence_is_that_of_all_numbers_an_effect_may_have(open_ground, monkeypatch, effect, change, seed):
     model, hypotheses = looked_at(open_ground, seed, change)
     found = add_effect(model.whole, effect)
-    by_laplace = hypotheses.of_named(found)
+    by_laplace = hypotheses.effect_evidence_nats(found)
     monkeypatch.setattr("radiotwin.closeloop.verdict.hypotheses._slopes",
                         lambda fit: Columns(np.zeros((int(fit.train.sum()), 0)), np.zeros(0)))
     varied = found.effects[-1].variation()
 
     def nats(numbers):
-        return hypotheses.of_named(found.with_effects([varied.effect(numbers)]))
+        return hypotheses.effect_evidence_nats(found.with_effects([varied.effect(numbers)]))
 
     # Of a uniform prior: the sum over a grid around the best, wide enough to hold what is likely.
     best, reach = nats(varied.values), []
@@ -99,7 +99,7 @@ def test_what_depends_on_time_alone_is_more_likely_without_a_name(open_ground):
 
 
 def test_noise_is_told_from_a_rest_that_belongs_to_places(open_ground):
-    rest_db, noise_db = looked_at(open_ground, 4)[1].sizes_db
+    rest_db, noise_db = looked_at(open_ground, 4)[1].rest_and_noise_db
     assert rest_db < 1.0 and noise_db == pytest.approx(2.0, rel=0.15)
 
 

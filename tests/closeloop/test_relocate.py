@@ -7,7 +7,7 @@ import pytest
 
 from radiotwin.closeloop.crossfit import make_bases
 from radiotwin.closeloop.search import relocate
-from radiotwin.closeloop.search.relocate import is_better, relocate_devices
+from radiotwin.closeloop.search.relocate import moves_help, relocate_devices
 from radiotwin.effects.catalogue.gain_offsets import ReceiverGainOffset
 from radiotwin.twin.model.model import Model
 from tests.closeloop.drives import MASTS_M, drive, fitted
@@ -32,7 +32,7 @@ def misplaced(seed, device=1):
 def test_a_device_moves_to_where_it_is_in_every_fold():
     before = misplaced(3)
     after = relocate_devices(before, before.links, make_bases(None, 0)["twin"])
-    for each in after.each:
+    for each in after.fits:
         assert np.hypot(*(each.links.device_m[1, :2] - MASTS_M[1, :2])) < 0.5 * np.hypot(*WRONG_M)
     assert after.rmse_db() < before.rmse_db()
     assert (after.links.device_m[[0, 2]] == before.links.device_m[[0, 2]]).all()
@@ -49,7 +49,7 @@ def test_a_device_that_is_found_counts_for_more_than_chance_on_the_links_of_othe
     """200 links of which some could not be predicted; the others change by so much each."""
     before_nll = np.where(np.arange(200) < lost, np.nan, 2.0)
     after_nll = np.where(np.isnan(before_nll), 2.0, 2.0 + change_nats)
-    assert is_better(before_nll, after_nll) == kept
+    assert moves_help(before_nll, after_nll) == kept
 
 
 class Following:
@@ -68,7 +68,7 @@ class Following:
 def test_along_paths_folds_are_located_anew_only_where_a_device_moves(monkeypatch, moved_m, asked):
     """By what the whole says; NaN: the device is lost over the corrected map."""
     model = misplaced(3)
-    assert len(model.each) == 7
+    assert len(model.fits) == 7
     model = model.map(lambda fit: replace(fit, model=replace(fit.model, channel=Following(fit.channel))))
     located = []
 

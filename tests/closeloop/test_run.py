@@ -198,7 +198,7 @@ def test_when_a_receiver_changed_a_flight_that_is_held_out_does_not_tell(open_gr
     world.gain_db[(world.receiver == 1) & (world.flight >= 3)] -= 6.0
     loop = close_loop(open_ground.measured(world), base="log-distance", hold_out="flight")
     whole, *folds = ([each.params.receivers[1].number for each in model.effects if each.name == "receiver_drift"]
-                     for model in loop.for_twin.each)
+                     for model in loop.for_twin.fits)
     (when_s,) = whole
     assert 459 <= when_s <= 600  # between the ends of the third flight and the beginning of the fourth
     without_fourth_s = folds[int(loop.folds.index[world.flight == 3][0])]

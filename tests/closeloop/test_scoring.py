@@ -52,7 +52,7 @@ class Sentenced(DevicePositionError):
 
 def fitted(moved, evidence_nats, effect=DevicePositionError):
     model, channel = moved
-    hypotheses = SimpleNamespace(of_named=lambda *_: evidence_nats)
+    hypotheses = SimpleNamespace(effect_evidence_nats=lambda *_: evidence_nats)
     channel.followed = 0
     return fit_candidate(model, effect(), SelectionCriteria(), hypotheses), channel.followed
 

@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.output.result_file import _explained_share, agreeing, same_over
+from radiotwin.closeloop.output.result_file import _explained_share, consistent_sizes, same_over
 from radiotwin.closeloop.scan import scan
-from radiotwin.closeloop.scan_limits import seen_from
+from radiotwin.closeloop.scan_sensitivity import least_deviations
 from radiotwin.closeloop.verdict.sensitivity import Detectable
 from radiotwin.effects.catalogue.gain_offsets import DeviceGainOffset
 from radiotwin.effects.catalogue.unexplained_trend import UnexplainedTrend
@@ -40,7 +40,7 @@ def test_the_error_of_a_map_does_not_know_the_state_of_each_reading():
 
 def test_a_device_that_is_off_by_what_would_have_been_seen_is_seen():
     table = drive(5, sd_db=1.0)
-    (least,) = [each.size for each in seen_from(of_base(table)) if (each.family, each.statistic) == ("device", "level")]
+    (least,) = [each.size for each in least_deviations(of_base(table)) if (each.family, each.statistic) == ("device", "level")]
     assert 0.5 < least < 10.0
     for share, is_seen in ((0.3, False), (1.5, True)):
         off = table.assign(gain_db=table["gain_db"] + share * least * (table["device"] == "d1"))
@@ -66,7 +66,7 @@ def test_what_was_seen_is_not_said_to_be_invisible():
     sizes = [Detectable(name, size, "dB", "") for name, size in (
         ("antenna_pattern", np.inf), ("foliage", 9.0), ("interference", np.inf), ("device_gain_offset", 2.0))]
     steps = [SimpleNamespace(probabilities={"antenna_pattern": 0.71, "interference": 0.01, "foliage": 0.4})]
-    assert [each.name for each in agreeing(sizes, {"device_gain_offset"}, steps)] == ["foliage", "interference"]
+    assert [each.name for each in consistent_sizes(sizes, {"device_gain_offset"}, steps)] == ["foliage", "interference"]
 
 
 @pytest.mark.parametrize(("statistic", "size", "change_db", "scatters", "share"), (

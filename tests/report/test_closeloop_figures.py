@@ -82,7 +82,7 @@ def with_model(loop, model):
 def with_effect(model, effect, params):
     """Return a model with an effect of given parameters."""
     plain = model.whole.model
-    return model.extended(plain.with_effects([effect().with_params(effect.Params(**params))]).fit(), model.folds)
+    return model.with_fits(plain.with_effects([effect().with_params(effect.Params(**params))]).fit(), model.folds)
 
 
 def drawn(loop, scene=None):

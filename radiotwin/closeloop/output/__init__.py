@@ -1,1 +1,1 @@
-"""What a loop leaves: closeloop.json, corrected scene, twin and residuals."""
+"""Output of a loop: closeloop.json, corrected scene, corrected twin and residuals."""

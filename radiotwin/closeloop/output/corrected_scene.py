@@ -1,7 +1,7 @@
-"""The declared scene corrected by what the loop found.
+"""Write the declared scene as corrected by the loop's effects.
 
-Boxes are added, buildings taken out, roofs raised and lowered, anchors moved, antennas declared;
-`buildings.csv` lists the buildings that are left, with the heights as estimated.
+Boxes are added, buildings removed, roofs raised or lowered, anchors moved, antennas declared.
+`buildings.csv` lists the remaining buildings with their estimated heights.
 """
 
 from collections.abc import Sequence
@@ -31,30 +31,30 @@ from radiotwin.scene.streets import STREETS
 
 ANTENNAS = "antennas"
 AZIMUTH_DEG, ELEVATION_DEG = np.arange(0.0, 360.0, 5.0), np.arange(-90.0, 91.0, 2.0)
-DECIMALS = 2  # of a gain [dBi] and an azimuth
-SOURCE = "close-loop"  # of an estimated height, in `height_from`
-MIN_SD_M = 0.1
-CONTENT = SCENE_FILES | {ANTENNAS}  # of a corrected scene
-BOX_MATERIAL = "concrete"  # the likeliest of a building of unknown material
+DECIMALS = 2  # decimals of a gain [dBi] and an azimuth [degree]
+SOURCE = "close-loop"  # value of `height_from` for estimated heights
+MIN_SD_M = 0.1  # least standard deviation written for a height [m]
+CONTENT = SCENE_FILES | {ANTENNAS}  # files and folders of a corrected scene
+BOX_MATERIAL = "concrete"  # most common building material
 CLEARANCE_M = 0.5  # between walls and positions that are known to be outside [m]
-MAX_SHIFT_M = 60.0  # by which a device is moved out of a building [m]
+MAX_SHIFT_M = 60.0  # largest distance by which a device is moved out of a building [m]
 
 
 def with_antennas(config: SceneConfig, found: Sequence[Correction], links: Links,
                   scene: Scene) -> tuple[SceneConfig, dict[str, FoundAntenna], list[str]]:
-    """Return a scene's configuration with the antennas that were found.
+    """Declare the antennas that were found in a scene's configuration.
 
-    An anchor of the measurements that the scene does not declare is declared with its antenna, if
-    it is within the extent and outside buildings.
+    An anchor of the measurements that the scene lacks is added, if it is within the extent and
+    outside buildings.
 
     Args:
-        config: to add them to.
-        found: corrections with them.
-        links: of the loop that found them.
-        scene: that it was run with.
+        config: configuration to change.
+        found: corrections by the loop's effects.
+        links: links of the loop.
+        scene: declared scene of the loop.
 
     Returns:
-        the configuration, file in the scene's folder -> antenna, and a sentence for each.
+        the configuration; antennas by their file in the scene's folder; a sentence for each.
     """
     devices = {each.device: each for each in config.devices}
     antennas = {links.device_names[device]: antenna for each in found
@@ -72,7 +72,7 @@ def with_antennas(config: SceneConfig, found: Sequence[Correction], links: Links
             try:
                 device = DeviceConfig(device=name, x_m=round(x_m, 2), y_m=round(y_m, 2),
                                       z_m=round(z_m, 2), role="anchor")
-            except ValidationError:  # measurements may call and place a device as they like
+            except ValidationError:  # names and heights in measurements are not restricted
                 changes.append(f"{name!r} has a {antenna.kind}, and is not in the scene: scene.toml"
                                " has devices above z = 0, whose names are of letters, digits and "
                                "_.+-")
@@ -90,7 +90,7 @@ def with_antennas(config: SceneConfig, found: Sequence[Correction], links: Links
 
 
 def _write_antenna(antenna: FoundAntenna, path: Path) -> None:
-    """Write a pattern about its own boresight, with its tilt, as lossless: its mean power is 1."""
+    """Write an antenna pattern relative to its boresight, normalised to a mean power gain of 1."""
     elevation, azimuth = (axis.ravel() for axis in np.meshgrid(ELEVATION_DEG, AZIMUTH_DEG,
                                                                indexing="ij"))
     gain_db = antenna.gain_db(azimuth, elevation)
@@ -103,20 +103,20 @@ def _write_antenna(antenna: FoundAntenna, path: Path) -> None:
 
 
 def _stretch(roof: Roof, base_m: float) -> float:
-    """Return how much taller a building that stands on `base_m` is than on the map, a ratio."""
+    """Return the ratio of a building's corrected height over its base [m] to that on the map."""
     return 1.0 + roof.true_offset_m / max(roof.height_m - base_m, abs(roof.true_offset_m))
 
 
 def _corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[str],
                         roofs: list[Roof], base_m: np.ndarray) -> pd.DataFrame | None:
-    """Return the table of a scene's buildings, as texts, after the correction; None without one.
+    """Return the corrected `buildings.csv` of a scene, as texts; None if the scene has none.
 
     Args:
-        scene: before it.
-        shapes_of: the shapes in `city.xml` of each building.
-        left: shapes that the corrected scene still has.
-        roofs: whose heights are corrected.
-        base_m: (buildings,) what each stands on, before it [m].
+        scene: declared scene.
+        shapes_of: names of the shapes in `city.xml`, by building.
+        left: shapes in the corrected scene.
+        roofs: roofs with corrected heights.
+        base_m: (buildings,) height of the ground under each building [m].
     """
     path = scene.folder / "buildings.csv"
     if not path.is_file():
@@ -129,21 +129,21 @@ def _corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set
         return table
     top_m = as_numbers(table["top_m"])
     for roof in roofs:
-        own_m = float(base_m[roof.building])
+        foot_m = float(base_m[roof.building])
         for row in np.flatnonzero(table["shape"].isin(shapes_of[roof.building])):
-            raised_m = own_m + _stretch(roof, own_m) * (top_m[row] - own_m)
+            raised_m = foot_m + _stretch(roof, foot_m) * (top_m[row] - foot_m)
             table.loc[row, ["top_m", "height_from", "height_sd_m"]] = [
                 f"{raised_m:.3f}", SOURCE, f"{max(roof.offset_sd_m, MIN_SD_M):.1f}"]
     return table
 
 
 def check_corrected_target(folder: Path, scene: Scene | None, report_folder: Path) -> None:
-    """Refuse, before the long work, a folder that no corrected scene can be written to.
+    """Check, before the loop runs, that a corrected scene can be written to a folder.
 
     Args:
-        folder: to write.
-        scene: declared scene; None: there is none.
-        report_folder: where the loop's report goes.
+        folder: folder of the corrected scene.
+        scene: declared scene; None if none was given.
+        report_folder: folder of the loop's report.
 
     Raises:
         BadInput: there is no scene, or the folder cannot be replaced.
@@ -161,15 +161,15 @@ def check_corrected_target(folder: Path, scene: Scene | None, report_folder: Pat
 
 
 def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
-    """Write a copy of the scene in which buildings, roofs, anchors and antennas are as found.
+    """Write a copy of the scene with buildings, roofs, anchors and antennas as the loop found them.
 
     Args:
-        loop: whose accepted effects are the corrections.
-        scene: declared scene that the loop was run with.
-        folder: to write; a scene that is already in it is replaced.
+        loop: loop with its effects.
+        scene: declared scene of the loop.
+        folder: folder to write; a scene in it is replaced.
 
     Returns:
-        corrections, a sentence each; where there are none, nothing is written.
+        a sentence for each correction; without corrections nothing is written.
 
     Raises:
         BadInput: the folder cannot be written or holds something else, or the result is no scene.
@@ -224,7 +224,11 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
 
 def _moved(found: Sequence[Correction], links: Links, scene: Scene,
            city: CityMap | None) -> tuple[SceneConfig, list[str]]:
-    """Return the configuration with anchors moved to the nearest free position, and the changes."""
+    """Move anchors to the found position, or the nearest one outside buildings in `city`.
+
+    Returns:
+        the configuration, and a sentence for each anchor.
+    """
     found_m: dict[str, np.ndarray] = {}
     for each in found:
         for row, move_m in each.moves_m.items():
@@ -249,9 +253,9 @@ def _moved(found: Sequence[Correction], links: Links, scene: Scene,
 
 def _free_position(position_m: np.ndarray, device: DeviceConfig, scene: Scene,
                    city: CityMap | None) -> tuple[float, float, float] | None:
-    """Return the position nearest to one (2,) [m], within the extent and outside buildings.
+    """Return the position within the extent and outside buildings nearest to a position (2,) [m].
 
-    The device stays as high above the ground as it is. None where no such position is near.
+    The device keeps its height above ground. None if there is none within `MAX_SHIFT_M`.
     """
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     low_m, high_m = (x_min, y_min), (x_max, y_max)
@@ -262,7 +266,7 @@ def _free_position(position_m: np.ndarray, device: DeviceConfig, scene: Scene,
     ground_m = scene.city.ground_height_m
     above_m = device.z_m - float(ground_m(device.x_m, device.y_m))
     z_m = np.round(above_m + ground_m(*tried_m.T), 3)
-    free = z_m > 0  # as scene.toml has it
+    free = z_m > 0  # scene.toml requires it
     if city is not None:
         for aside_m in CLEARANCE_M * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]):
             free &= ~city.inside(np.column_stack([tried_m + aside_m, z_m]))
@@ -273,7 +277,7 @@ def _free_position(position_m: np.ndarray, device: DeviceConfig, scene: Scene,
 
 
 def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
-    """Shrink a box until no point (n, 3) [m] is inside, for each on the side that costs least."""
+    """Shrink a box until it contains no point (n, 3) [m], each time with least loss of volume."""
     axes = box.axes
     high = np.array([0.5 * box.length_m, 0.5 * box.width_m, box.height_m])
     low = np.array([-high[0], -high[1], 0.0])
@@ -281,7 +285,7 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
         if (point <= low - CLEARANCE_M).any() or (point >= high + CLEARANCE_M).any():
             continue
         choices = []
-        for axis, side in ((0, low), (0, high), (1, low), (1, high), (2, high)):  # the ground stays
+        for axis, side in ((0, low), (0, high), (1, low), (1, high), (2, high)):  # not the bottom
             pulled = side.copy()
             pulled[axis] = point[axis] + (CLEARANCE_M if side is low else -CLEARANCE_M)
             choices.append((pulled, high) if side is low else (low, pulled))
@@ -292,24 +296,24 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
 
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
-                roofs: list[Roof],
-                base_m: np.ndarray) -> tuple[dict[int, set[str]], set[str]]:
-    """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, roofs, and boxes.
+                roofs: list[Roof], base_m: np.ndarray) -> tuple[dict[int, set[str]], set[str]]:
+    """Write `city.xml` and `meshes/` with kept faces (f,), corrected roofs and added boxes.
 
-    Returns the names of the shapes of each building, and of those that are left.
+    Returns:
+        names of the shapes by building, before; names of the shapes that are left.
     """
     label, shapes, first = buildings(scene.city)[0], [], 0
     shapes_of: dict[int, set[str]] = {}
     for shape in read_city(scene.xml_path):
         part = slice(first, first + len(shape.mesh.faces))
-        own, first = keep[part], part.stop
+        kept, first = keep[part], part.stop
         for building in np.unique(label[part]).tolist():
             shapes_of.setdefault(building, set()).add(shape.name)
         shape = replace(shape, mesh=_with_roofs(shape.mesh, label[part], roofs, base_m))
-        if own.all():
+        if kept.all():
             shapes.append(shape)
-        elif own.any():
-            used, faces = np.unique(shape.mesh.faces[own], return_inverse=True)
+        elif kept.any():
+            used, faces = np.unique(shape.mesh.faces[kept], return_inverse=True)
             mesh = trimesh.Trimesh(shape.mesh.vertices[used], faces.reshape(-1, 3), process=False)
             shapes.append(replace(shape, mesh=mesh))
     taken = Names(name.lower() for shape in shapes for name in (shape.name, shape.material.name))
@@ -319,21 +323,25 @@ def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
 
 def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof],
                 base_m: np.ndarray) -> trimesh.Trimesh:
-    """Return a mesh whose buildings (f,) are stretched to the heights of their roofs.
+    """Stretch the buildings of a mesh vertically to their corrected roof heights.
 
-    They stand on `base_m` (buildings,) [m]; a mesh may hold the roof of one, and not its walls.
+    Args:
+        mesh: mesh with f faces; it may have a building's roof without its walls.
+        label: (f,) building of each face.
+        roofs: corrected roofs.
+        base_m: (buildings,) height of the ground under each building [m].
     """
     vertices_m = np.array(mesh.vertices, dtype=float)
     for roof in roofs:
-        mine = np.unique(mesh.faces[label == roof.building])
-        if len(mine):
-            own_m = float(base_m[roof.building])
-            vertices_m[mine, 2] = own_m + _stretch(roof, own_m) * (vertices_m[mine, 2] - own_m)
+        rows = np.unique(mesh.faces[label == roof.building])
+        if len(rows):
+            foot_m = float(base_m[roof.building])
+            vertices_m[rows, 2] = foot_m + _stretch(roof, foot_m) * (vertices_m[rows, 2] - foot_m)
     return trimesh.Trimesh(vertices_m, mesh.faces, process=False)
 
 
 def _box_shapes(scene: Scene, boxes: list[Box], taken: Names) -> list[CityShape]:
-    """Return shapes from the lowest point of the map up, with names that are not `taken`."""
+    """Return shapes of boxes, from the map's lowest point up, with names that are not `taken`."""
     name = taken.unique(f"found_{BOX_MATERIAL}")
     material = traceable(itu_material(BOX_MATERIAL, name=name), scene.config.radio.frequency_hz)
     bottom_m = min(float(scene.city.vertices[:, 2].min()), 0.0)

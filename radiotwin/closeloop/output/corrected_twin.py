@@ -1,4 +1,4 @@
-"""The twin of a loop: fitted to all its links, with its base, all causes and what maps have."""
+"""Make the corrected twin of a loop: its base with all effects, fitted to all links."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import radiotwin
-from radiotwin.closeloop.predict.predictor import served
+from radiotwin.closeloop.predict.predictor import combined_fit
 from radiotwin.closeloop.run import Loop
 from radiotwin.scene import Scene
 from radiotwin.twin.localize import RadiusCalibration, calibrate_radii, whole_area
@@ -17,17 +17,17 @@ from radiotwin.twin.twin import Twin, measured_heights
 
 
 def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
-    """Return the twin of a loop; it predicts by the loop's combination.
+    """Return the twin of a loop, which predicts by the loop's combination of models.
 
-    What belongs to a receiver (its offset, drift, antenna, …) is part of it, too; but a map is of
-    what arrives at a faultless receiver.
+    It includes effects of receivers (offsets, drift, antennas), but its map is for a faultless
+    receiver.
 
     Args:
-        loop: what was found.
-        scene: that it was found in, if there was one.
+        loop: result of the loop.
+        scene: its scene; None if there was none.
     """
     model = loop.for_twin
-    fitted = replace(served(model, loop.prediction.combination, loop.seed),
+    fitted = replace(combined_fit(model, loop.prediction.combination, loop.seed),
                      **vars(_calibration(loop, scene)))
     provenance: dict[str, Any] = {"links": len(model.links),
                                   "radiotwin_version": radiotwin.__version__}
@@ -41,23 +41,23 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
         provenance |= {"origin": loop.origin.model_dump()}
     if scene is not None:
         provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}
-    # Devices whose position is too uncertain to be learnt from, too: a map with them is better.
+    # Devices too uncertain to learn from are included, so that the map shows them.
     return replace(model.twin, provenance=provenance, fitted=fitted, scene=scene)
 
 
 def _sd_db(residual_db: np.ndarray) -> float:
-    """Return the standard deviation of those residuals that there are; 1 dB of hardly any."""
+    """Return the standard deviation of known residuals (n,), at least 0.1 dB; 1 dB of under two."""
     known = residual_db[np.isfinite(residual_db)]
     return max(float(known.std()), 0.1) if len(known) > 1 else 1.0
 
 
 def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
-    """Return how far positions are to be believed that folds locate as the twin does."""
+    """Calibrate the credible radii of located devices on anchors that folds hold out."""
     model, links = loop.for_twin, loop.links
-    if model.whole.channel.follows_paths:  # which locates nothing: `check_can_locate`
+    if model.whole.channel.follows_paths:  # such a twin locates nothing: `check_can_locate`
         return RadiusCalibration()
     models = [fold.learnt.for_positions() for fold in model.folds]
-    # A device that the loop found elsewhere is not where it was declared.
+    # Anchors that the loop found elsewhere are not at their declared position.
     moved = {device for each in model.whole.effects
              for device in each.correction(model.links).moves_m}
     known = links.with_ends(anchors=links.anchors - moved)

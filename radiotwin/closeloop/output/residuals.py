@@ -1,4 +1,4 @@
-"""Held-out residuals of all links of a close-loop, before and after, to be drawn and saved."""
+"""Table, file and plot of a loop's held-out residuals, before and after the effects."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ WHEN = ("before", "after")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Residuals(Summarised):
-    """Measured minus predicted levels of links that took no part in the prediction.
+    """Held-out residuals: measured minus predicted levels of links not used in the prediction.
 
     Attributes:
-        table: one row for each link, columns as of `residual_table`: `before_db` is of the base,
-            `after_db` of base and effects; NaN where the link was not detected or never held out.
-        origin: of the local frame; None where it is not known.
+        table: one row for each link with the columns of `residual_table`: `before_db` by the base,
+            `after_db` by base and effects; NaN if the link was not detected or never held out.
+        origin: origin of the local frame; None if unknown.
     """
 
     table: pd.DataFrame
@@ -54,7 +54,7 @@ class Residuals(Summarised):
         """Read a `residuals.csv.gz`.
 
         Args:
-            path: `.csv` or `.csv.gz`; `frame.toml` in its folder says where the frame is.
+            path: `.csv` or `.csv.gz`; `frame.toml` in its folder has the frame's origin.
 
         Raises:
             BadInput: names file, row and column of the first value that cannot be used.
@@ -80,14 +80,14 @@ class Residuals(Summarised):
 
     def plot(self, when: str = "after", device: str | None = None, ax: Axes | None = None, *,
              scene: Scene | None = None, geographic: bool | None = None) -> Axes:
-        """Draw the residual of each link at its moving end: red where less was measured.
+        """Draw the residual of each link at its moving end, red where less was measured.
 
         Args:
             when: `before` the effects were added, or `after`.
-            device: whose links are drawn; None: all links, large residuals over small ones.
-            ax: axes of matplotlib to draw into; None: a new figure.
-            scene: whose buildings are outlined; None: none are.
-            geographic: whether axes are longitude and latitude; None: where the origin is known.
+            device: draw the links of this device only; None: all, large residuals on top.
+            ax: matplotlib axes to draw into; None: a new figure.
+            scene: scene whose buildings are outlined; None: no outlines.
+            geographic: whether axes are longitude and latitude; None: if the origin is known.
 
         Returns:
             The axes.
@@ -135,29 +135,29 @@ class Residuals(Summarised):
             ("RMSE before", rmse[0]), ("RMSE after", rmse[1])))
 
     def _values_db(self, table: pd.DataFrame, when: str) -> np.ndarray:
+        """Return the column (n,) `before` or `after` of a table [dB]."""
         if when not in WHEN:
             raise BadInput(f"when = {when!r}: allowed are {', '.join(WHEN)}")
         return table[f"{when}_db"].to_numpy(dtype=float)
 
 
 def rmse_db(values_db: np.ndarray) -> float:
-    """Return the root mean square of the values that are known; NaN where none is [dB]."""
+    """Return the root mean square of the known values (n,) [dB]; NaN without any."""
     known = values_db[np.isfinite(values_db)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
 def residual_table(loop: Loop) -> pd.DataFrame:
-    """Return held-out residuals, measured − predicted, one row for each link.
+    """Return the held-out residuals (measured − predicted) of a loop, one row for each link.
 
     Args:
-        loop: result of the close-loop.
+        loop: result of the loop.
 
     Returns:
         columns `time_s, flight, receiver, receiver_x_m, receiver_y_m, receiver_z_m, device,
-        device_x_m, device_y_m, device_z_m` (device positions of the model; NaN where it has none),
-        `los` (1, 0),
-        `measured_db` (dBm for power), `before_db` and `after_db`, NaN where the link was not
-        detected or never held out
+        device_x_m, device_y_m, device_z_m` (as located; NaN if not located), `los` (1, 0),
+        `measured_db` (dBm for power), `before_db` and `after_db`; NaN if the link was not detected
+        or never held out.
     """
     links = loop.after.links
     device_m = np.where(loop.after.whole.usable[:, None], links.device_m[links.device], np.nan)

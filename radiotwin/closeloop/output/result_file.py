@@ -1,4 +1,4 @@
-"""The result of the loop as `closeloop.json`: all that the page and the terminal show."""
+"""Make, write and read `closeloop.json`, the result of a loop that page and terminal show."""
 
 from __future__ import annotations
 
@@ -28,33 +28,34 @@ from radiotwin.links import Links
 from radiotwin.links.sites import ReceiverDifference, receiver_differences
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 
-AS_GOOD = 1.02  # ratio of errors up to which one model is as good as another
-# Of the models that are fitted; all others are published laws.
+AS_GOOD = 1.02  # ratio of RMSEs up to which one model is as good as another
+# Names of the fitted baselines; all others are published laws.
 _WORDS = {"log_distance": "the log-distance law", "segmented_log_distance": "the segmented law",
           "regression_kriging": "kriging", "extra_trees": "a tree ensemble (ExtraTrees)",
           "hist_gradient_boosting": "gradient boosting (HistGradientBoosting)"}
 SCHEMA = "radiotwin.closeloop/3"
-MIN_PART, AS_LARGE = 10, 0.5  # links of a flight or direction; share of a group's size
+MIN_PART, AS_LARGE = 10, 0.5  # least links of a flight or octant; least share of a group's size
 REMEDY = "run `radiotwin close-loop` again"
-MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
-# Parts that a report need not have.
+MAX_GROUPS = 100  # of more devices or receivers no single errors are listed
+# Optional parts of a report.
 ABSENT: dict[str, Any] = {"posterior": [], "detectable": [], "combination": [], "prediction": None,
                           "anomalies": [], "seen_from": [], "receivers_compared": []}
-# Of the interpolated rest.
+# Fields that interpolated shadowing does not have.
 NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, "probability": None,
                              "anomalies": [], "places": []}
 
 
 def compare_with_baselines(error: dict[str, Any],
                            baselines: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
-    """Return how good the combination is beside the best other model; None without any error.
+    """Compare the combination with the best baseline on the same links.
 
     Args:
-        error: scores of `combined` and of `after`, each with `rmse_db` [dB].
-        baselines: scores of other models by name.
+        error: scores of `combined` and `after`, each with `n` and `rmse_db`.
+        baselines: scores of the baselines by name.
 
     Returns:
-        `best_baseline`, `best_baseline_rmse_db`, `combined_rmse_db`, and `advice`, a sentence.
+        `best_baseline`, `best_baseline_rmse_db`, `combined_rmse_db`, and `advice`, a sentence;
+        None if no baseline predicts the same links.
     """
     rmse_db = {name: each["rmse_db"] for name, each in baselines.items()
                if each["n"] == error["combined"]["n"]}
@@ -79,7 +80,7 @@ def compare_with_baselines(error: dict[str, Any],
 
 
 def make_report(loop: Loop) -> dict[str, Any]:
-    """Return the content of `closeloop.json`; numbers that are not known are null."""
+    """Return the content of `closeloop.json` for a loop; unknown numbers are None."""
     kept = loop.found.log.kept
     named = [trial for trial in kept if trial.name != SHADOWING]
     effects = [each.record() | {
@@ -132,7 +133,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "anomalies": [_anomaly(each) | {"same_over": same_over(each, loop.before)}
                       for each in loop.found.anomalies],
         "posterior": [_step(each) for each in loop.found.steps],
-        "detectable": [vars(each) for each in agreeing(
+        "detectable": [vars(each) for each in consistent_sizes(
             loop.detectable, {each["name"] for each in effects}, loop.found.steps)],
         "seen_from": [vars(each) for each in loop.seen_from],
         "receivers_compared": [_difference(each, links) for each in receiver_differences(links)],
@@ -146,17 +147,16 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "criteria": vars(loop.criteria), "notes": [*links.notes, *loop.found.notes]})
 
 
-def agreeing(found: Iterable[Detectable], named: Set[str],
+def consistent_sizes(found: Iterable[Detectable], named: Set[str],
              steps: Iterable[Step]) -> list[Detectable]:
-    """Return the sizes that would have been seen and agree with what was seen.
+    """Drop least sizes that contradict the search.
 
-    A typical pattern stands for each family. Where the search found another one of that family, it
-    was to be seen: of what was named no size is said, and of what is likely only one that is known.
+    Dropped are those of named effects, and infinite ones of effects that were probable in any step.
 
     Args:
-        found: a size for each family that was looked for.
-        named: effects that were found.
-        steps: with the probabilities of all that were looked for.
+        found: least size of each effect.
+        named: names of the effects found.
+        steps: summaries of the search with probabilities.
     """
     likely = {name for step in steps for name, each in step.probabilities.items()
               if each >= LIKELY}
@@ -165,31 +165,32 @@ def agreeing(found: Iterable[Detectable], named: Set[str],
 
 
 def scores(model: CrossFit, rows: np.ndarray | None = None) -> dict[str, float]:
-    """Return held-out errors, as a map has them, of the links of a mask (n,), or of all.
+    """Return a model's held-out errors, predicted as by a map, on a mask (n,) of links or all.
 
     Returns:
-        as of `errors`, and `nll`, the mean negative log-likelihood of detected and
-        blank links [nats].
+        those of `errors`, and `nll`, mean negative log-likelihood of detected and blank links
+        [nats].
     """
     rows = np.ones(len(model.index), dtype=bool) if rows is None else rows
     return _scores(model.links.level_db[rows], *(each[rows] for each in model.on_map))
 
 
 def _scores(level_db: np.ndarray, mean_db: np.ndarray, nll: np.ndarray) -> dict[str, float]:
+    """Return `errors` of levels (n,) [dB], and the mean of negative log-likelihoods (n,) [nats]."""
     mean_nll = float(np.nanmean(nll)) if np.isfinite(nll).any() else np.nan
     return errors(level_db, mean_db) | {"nll": mean_nll}
 
 
 def errors(level_db: np.ndarray, mean_db: np.ndarray) -> dict[str, float]:
-    """Return errors of detected links.
+    """Return error statistics of the detected links that have a prediction.
 
     Args:
-        level_db: (n,) measured [dB]; NaN = not detected.
-        mean_db: (n,) predicted [dB]; NaN = none.
+        level_db: (n,) measured level [dB]; NaN = not detected.
+        mean_db: (n,) predicted level [dB]; NaN = not predicted.
 
     Returns:
-        number, bias (mean of predicted minus measured), standard deviation, RMSE, MAE [dB], and the
-        correlation of the two.
+        `n` links, `bias_db` (mean of predicted minus measured), `std_db`, `rmse_db`, `mae_db`, and
+        `correlation` of measured and predicted levels.
     """
     seen = np.isfinite(level_db) & np.isfinite(mean_db)
     if not seen.any():
@@ -205,30 +206,30 @@ def errors(level_db: np.ndarray, mean_db: np.ndarray) -> dict[str, float]:
 
 
 def write_report(report: dict[str, Any], path: Path) -> None:
-    """Write `closeloop.json`, whole or not at all."""
+    """Write `closeloop.json` atomically."""
     with atomic_path(path) as temporary:
         text = json.dumps(report, indent=1, allow_nan=False)
         temporary.write_text(text, encoding="utf-8")
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """Read a `closeloop.json`; each field of what is returned has the type of `ReportRecord`.
+    """Read and check a `closeloop.json`; fields have the types of `ReportRecord`.
 
     Raises:
-        BadInput: it cannot be read, it is of another version, or it is damaged.
+        BadInput: it cannot be read, has another version, or is damaged.
     """
     return check_report(read_record(path, "result of a close-loop (closeloop.json)"), path)
 
 
 def check_report(report: dict[str, Any], source: object = "closeloop.json") -> dict[str, Any]:
-    """Return the content of a `closeloop.json` with nothing but checked fields.
+    """Check the content of a `closeloop.json`, and return its known fields.
 
     Args:
         report: content of the file.
-        source: where it is from; messages begin with it.
+        source: name of the file, for messages.
 
     Raises:
-        BadInput: it is of another version, or a field is missing or has another type.
+        BadInput: another version, or a field is missing or has another type.
     """
     if report.get("schema") != SCHEMA:
         raise BadInput(f"{source}: schema is {repr(report.get('schema'))[:60]}, this version reads "
@@ -237,13 +238,13 @@ def check_report(report: dict[str, Any], source: object = "closeloop.json") -> d
 
 
 def _places(effect: Effect, parameters: Iterable[str], links: Links) -> list[dict[str, Any]]:
-    """Return where an effect is: its mark on the map, or each device that it acts on."""
+    """Return the places of an effect: its mark on the map, or the devices named in parameters."""
     named = {name.partition("[")[2].removesuffix("]") for name in parameters}
     mark = effect.mark(links)
     if mark is not None:
         return [{"x_m": float(mark.at_m[0]), "y_m": float(mark.at_m[1]),
                  "outline_m": None if mark.outline_m is None else mark.outline_m.tolist()}]
-    if effect.of_receiver:  # which moves
+    if effect.of_receiver:  # a receiver has no fixed place
         return []
     return [{"device": name, "x_m": x_m, "y_m": y_m} for name, (x_m, y_m) in
             zip(links.device_names, links.device_m[:, :2].tolist(), strict=True)
@@ -251,6 +252,7 @@ def _places(effect: Effect, parameters: Iterable[str], links: Links) -> list[dic
 
 
 def _step(step: Step) -> dict[str, Any]:
+    """Return a `StepRecord`, the most probable effect first."""
     ordered = sorted(step.probabilities.items(), key=lambda item: -item[1])
     return {"step": step.number + 1, "unnamed_nats": step.unnamed_nats, "rest_db": step.rest_db,
             "noise_db": step.noise_db,
@@ -258,6 +260,7 @@ def _step(step: Step) -> dict[str, Any]:
 
 
 def _anomaly(found: Anomaly) -> dict[str, Any]:
+    """Return an `AnomalyRecord` without `same_over`."""
     return {"family": found.family, "members": {key: list(names) for key, names in
                                                 found.members.items()},
             "ranges": {key: list(ends) for key, ends in found.ranges.items()},
@@ -269,10 +272,12 @@ def _anomaly(found: Anomaly) -> dict[str, Any]:
 
 
 def same_over(found: Anomaly, base: CrossFit) -> list[str]:
-    """Return over what a group's level is the same: `flight`, `direction` or both.
+    """Return whether a group's level deviates alike in every `flight` and every `direction`.
 
-    In each flight, or each octant of directions, the median residual is at least half of the size
-    away from that of the peers, on the same side.
+    Each flight (or octant) must deviate from the peers by at least half of the anomaly's size.
+
+    Returns:
+        the names that hold; empty for groups other than devices and receivers with another level.
     """
     links = base.links
     if found.statistic != "level" or found.family not in ("device", "receiver"):
@@ -282,31 +287,27 @@ def same_over(found: Anomaly, base: CrossFit) -> list[str]:
     parts = {"flight": links.flight, "direction": np.floor(angle_deg / 45.0)}
     seen = np.isfinite(residual_db)
     peers_db = np.median(residual_db[seen & ~found.rows])
-    holds = []
+    holding = []
     for name, label in parts.items():
         rows = seen & found.rows & np.isfinite(label)
-        _, index, links_in = np.unique(label[rows], return_inverse=True, return_counts=True)
-        shifts = [np.median(residual_db[rows][index == number]) - peers_db
-                  for number in np.flatnonzero(links_in >= MIN_PART)]
-        if len(shifts) > 1 and (np.array(shifts) / found.size.value >= AS_LARGE).all():
-            holds.append(name)
-    return holds
+        _, index, count = np.unique(label[rows], return_inverse=True, return_counts=True)
+        shifts_db = [np.median(residual_db[rows][index == number]) - peers_db
+                     for number in np.flatnonzero(count >= MIN_PART)]
+        if len(shifts_db) > 1 and (np.array(shifts_db) / found.size.value >= AS_LARGE).all():
+            holding.append(name)
+    return holding
 
 
 def explained_anomalies(loop: Loop) -> list[list[int]]:
-    """Return for each effect the anomalies, by index, of which it explains half or more.
-
-    What the effect changes is laid beside the shift of a group's level against its peers, or taken
-    off the residuals of a group that scatters.
-    """
+    """Return for each effect the indices of the anomalies of which it explains at least half."""
     whole, found = loop.after.whole, []
     if not loop.found.anomalies:
         return [[] for _ in whole.effects]
     residual_db = whole.links.level_db - loop.before.held_out_mean_db
     for number, effect in enumerate(whole.effects):
         change_db = whole.readings().mean_db - whole.without(number).readings().mean_db
-        scatters = whole.model.terms[number].random_effect_sd_db
-        shares = [_explained_share(each, residual_db, change_db, scatters)
+        scatter_sd_db = whole.model.terms[number].random_effect_sd_db
+        shares = [_explained_share(each, residual_db, change_db, scatter_sd_db)
                   for each in loop.found.anomalies]
         found.append([index for index, share in enumerate(shares)
                       if share >= AS_LARGE and effect.is_cause and not effect.is_declared])
@@ -314,14 +315,17 @@ def explained_anomalies(loop: Loop) -> list[list[int]]:
 
 
 def _explained_share(anomaly: Anomaly, residual_db: np.ndarray, change_db: np.ndarray,
-                     scatters: np.ndarray | None) -> float:
-    """Return how much of an anomaly a change (n,) of the predicted level explains; about 1 is all.
+                     scatter_sd_db: np.ndarray | None) -> float:
+    """Return the share of an anomaly that an effect explains; about 1 = all.
+
+    A level is compared with the effect's change of the group against its peers. A scatter or curve
+    is explained as far as the residual's spread shrinks when the change is subtracted.
 
     Args:
         anomaly: a group of n links.
-        residual_db: (n,) of the base.
-        change_db: (n,) by the effect.
-        scatters: (n,) standard deviation that the effect adds to single links [dB]; None: none.
+        residual_db: (n,) held-out residual of the base.
+        change_db: (n,) change of the predicted level by the effect.
+        scatter_sd_db: (n,) standard deviation that the effect adds to readings; None: none.
     """
     seen = np.isfinite(residual_db) & np.isfinite(change_db)
     rows, size = seen & anomaly.rows, anomaly.size.value
@@ -330,8 +334,8 @@ def _explained_share(anomaly: Anomaly, residual_db: np.ndarray, change_db: np.nd
         return float((np.median(change_db[rows]) - peers_db) / size) if rows.any() else 0.0
     if anomaly.statistic not in ("scatter", "curve") or not rows.any():
         return 0.0
-    if scatters is not None:
-        return float((scatters[rows] > 0).mean() - (scatters[seen & ~rows] > 0).mean())
+    if scatter_sd_db is not None:
+        return float((scatter_sd_db[rows] > 0).mean() - (scatter_sd_db[seen & ~rows] > 0).mean())
     spread_db = [np.subtract(*np.quantile(each, [0.75, 0.25])) for each in
                  (residual_db[rows], (residual_db - change_db)[rows])]
     if anomaly.statistic == "curve":
@@ -341,6 +345,7 @@ def _explained_share(anomaly: Anomaly, residual_db: np.ndarray, change_db: np.nd
 
 
 def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:
+    """Return a `ReceiverDifferenceRecord`."""
     value = Parameter(found.difference_db, found.low_db, found.high_db, "dB")
     return {"first": links.receiver_names[found.first],
             "second": links.receiver_names[found.second], "difference_db": value.record(),
@@ -348,6 +353,7 @@ def _difference(found: ReceiverDifference, links: Links) -> dict[str, Any]:
 
 
 def _shadowing(trial: Trial, model: CrossFit, rank: int) -> dict[str, Any]:
+    """Return the `EffectRecord` of interpolated shadowing."""
     shadowing = model.whole.shadowing
     assert shadowing is not None
     field, relatives = shadowing.field, shadowing.relatives
@@ -365,6 +371,7 @@ def _shadowing(trial: Trial, model: CrossFit, rank: int) -> dict[str, Any]:
 
 
 def _groups(links: Links) -> dict[str, dict[str, np.ndarray]]:
+    """Return masks (n,) of links by line of sight, device, receiver and flight, by their names."""
     groups = {"los": {"los": links.los, "nlos": ~links.los}}
     for name, index, labels in (("device", links.device, links.device_names),
                                 ("receiver", links.receiver, links.receiver_names),
@@ -376,7 +383,7 @@ def _groups(links: Links) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _for_json(value: Any) -> Any:
-    """Return NaN as null and numpy's numbers as Python's."""
+    """Convert NaN to None and NumPy numbers to Python's, also within dicts and lists."""
     if isinstance(value, dict):
         return {name: _for_json(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

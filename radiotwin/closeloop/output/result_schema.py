@@ -1,4 +1,4 @@
-"""Schema of `closeloop.json`, by which it is read: it may come from somebody else."""
+"""Schema of `closeloop.json`, with which files of unknown origin are checked."""
 
 from typing import Annotated, Any, Literal, Self
 
@@ -9,7 +9,7 @@ from radiotwin.io.forms import Metres, Origin, Real, Record, Whole
 
 
 class ScoresRecord(Record):
-    """Errors of a model on a group of links; further ones are numbers, too."""
+    """Errors of a model on a group of links; further fields are numbers."""
 
     model_config = {"extra": "allow"}
     __pydantic_extra__: dict[str, Real | None]
@@ -19,24 +19,24 @@ class ScoresRecord(Record):
 
 
 class BaselineRecord(ScoresRecord):
-    """Errors of another model on all links."""
+    """Errors of a baseline on all links."""
 
     n: Whole = 0
 
 
 class BothRecord(Record):
-    """Errors before and after the effects were added."""
+    """Errors without and with the effects."""
 
     before: ScoresRecord
     after: ScoresRecord
 
 
 class ErrorRecord(BothRecord):
-    """Errors of all links and of groups of them, by the groups' names."""
+    """Errors on all links, and on groups of links by the group's name."""
 
     combined: ScoresRecord | None = None
     map: ScoresRecord | None = None
-    after_same_links: ScoresRecord | None = None  # of those that `before` has errors of
+    after_same_links: ScoresRecord | None = None  # on the links of `before` only
     after_with_quality: ScoresRecord | None = None
     noise_floor_db: Real | None
     by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)
@@ -46,7 +46,7 @@ class ErrorRecord(BothRecord):
 
 
 class ParameterRecord(Record):
-    """Estimate with its 90 % interval."""
+    """Estimate with its 90 % interval; `determined`: whether the data determine it."""
 
     value: Real | None
     low: Real | None
@@ -56,7 +56,7 @@ class ParameterRecord(Record):
 
 
 class KnownParameterRecord(ParameterRecord):
-    """Estimate that has all three numbers."""
+    """Estimate with a known 90 % interval."""
 
     value: Real
     low: Real
@@ -64,7 +64,7 @@ class KnownParameterRecord(ParameterRecord):
 
 
 class EvidenceRecord(Record):
-    """Evidence for an effect."""
+    """Held-out gain and evidence for an effect [nats]."""
 
     heldout_nll_gain: Real | None
     evidence_nats: Real | None = None
@@ -74,7 +74,7 @@ Corner = Annotated[list[Metres], Field(min_length=2, max_length=2)]
 
 
 class PlaceRecord(Record):
-    """Where an effect is: a building, an emitter, or a device that it acts on."""
+    """Place of an effect: a building, an emitter, or a device that it acts on."""
 
     device: str = ""
     x_m: Metres
@@ -103,7 +103,7 @@ class EffectRecord(Record):
 
 
 class CandidateRecord(Record):
-    """An effect that was tried, or that the data do not allow to be looked for."""
+    """A trial of an effect, or the reason why it could not be tried."""
 
     name: str
     variant: str = ""
@@ -129,7 +129,7 @@ class WeightRecord(Record):
 
 
 class PredictionRecord(Record):
-    """How good the combination is beside the best of the other models."""
+    """Comparison of the combination with the best baseline."""
 
     best_baseline: str
     best_baseline_rmse_db: Real
@@ -138,7 +138,7 @@ class PredictionRecord(Record):
 
 
 class DependenceRecord(Record):
-    """A variable that the residual depends on."""
+    """Test of the residual's dependence on a variable."""
 
     variable: str
     p_value: Real | None
@@ -146,21 +146,21 @@ class DependenceRecord(Record):
 
 
 class RemainingRecord(Record):
-    """Variables that the residual depends on in the end."""
+    """Variables on which the final residual depends."""
 
     structured: bool
     drivers: list[DependenceRecord]
 
 
 class ProbabilityRecord(Record):
-    """An effect that was scored, passed or not, `none` or `not in the catalogue`; they sum to 1."""
+    """Probability of an effect, `none` or `not in the catalogue`; in a step they sum to 1."""
 
     name: str
     probability: Real | None
 
 
 class StepRecord(Record):
-    """Evidence in the residual at one step of the selection."""
+    """Probabilities and evidence at one step of the search."""
 
     step: Whole
     probabilities: list[ProbabilityRecord]
@@ -170,7 +170,7 @@ class StepRecord(Record):
 
 
 class CauseRecord(Record):
-    """What may be the cause of an anomaly; `another` = none of the catalogue."""
+    """Probability of a possible cause of an anomaly; `another` = not in the catalogue."""
 
     name: str
     probability: Real
@@ -194,7 +194,7 @@ class AnomalyRecord(Record):
 
 
 class DetectableRecord(Record):
-    """How large an effect would have had to be, to be named; no size where none would do."""
+    """Least size from which an effect would have been named; None if no size suffices."""
 
     name: str
     size: Real | None
@@ -203,7 +203,7 @@ class DetectableRecord(Record):
 
 
 class SeenRecord(Record):
-    """How far a group of a family would have had to be from its peers, to be said."""
+    """Least deviation from its peers from which a typical group would have been found."""
 
     family: str
     statistic: Literal["level", "scatter", "blanks"]
@@ -212,7 +212,7 @@ class SeenRecord(Record):
 
 
 class ReceiverDifferenceRecord(Record):
-    """How much more one receiver reads than another where both have been."""
+    """Difference of two receivers' readings at common places."""
 
     first: str
     second: str
@@ -222,7 +222,7 @@ class ReceiverDifferenceRecord(Record):
 
 
 class FoldsRecord(Record):
-    """How links were held out."""
+    """Folds, and the number n of scored links."""
 
     by: str
     folds: Whole
@@ -230,7 +230,7 @@ class FoldsRecord(Record):
 
 
 class InputsRecord(Record):
-    """Files that the loop was given, and the origin of the local frame."""
+    """Input files of the loop, and the origin of the local frame."""
 
     measurements: str | None = None
     scene: str | None = None

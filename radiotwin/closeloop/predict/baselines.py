@@ -1,4 +1,4 @@
-"""Other models on the same folds: laws, kriging, and regressions that know no physics."""
+"""Baselines on the same folds: path-loss laws, kriging, published laws and tree ensembles."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from radiotwin.twin.model.model import FittedModel
 
 LAWS: tuple[type[ChannelModel], ...] = (LogDistance, SegmentedLogDistance, RegressionKriging)
 EXTRA_TREES, BOOSTING = "extra_trees", "hist_gradient_boosting"
-LEARNING_RATE = 0.1  # of 2 * TREES steps of boosting; of fewer steps as much more
-MAX_TREE_LINKS = 30_000  # of more a sample: trees gain little by more, and take longer
-TREES = 50  # a hundred err less by 0.5 %
+LEARNING_RATE = 0.1  # of boosting with 2 * TREES steps; with fewer steps proportionally more
+MAX_TREE_LINKS = 30_000  # more links are sampled: they hardly reduce the error
+TREES = 50  # 100 reduce the error by 0.5 %
 MIN_LEAF = 3  # links in a leaf of the extremely randomised trees
-MAX_FEATURES = 0.5  # share of the columns that a node may split: half the time of all, errors +1 %
-MIN_INSIDE = 0.9  # share of links within a published law's validity, for it to be compared
+MAX_FEATURES = 0.5  # share of the columns tried in a node: half the time of all, errors +1 %
+MIN_INSIDE = 0.9  # least share of links within a published law's range of validity
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Links with what a regression is told of them, devices where a fold's base has them.
+    """Links with the features of tree ensembles; unknown devices are where a fold located them.
 
     Attributes:
         links: n links.
-        known: (n, p) `features` where they are known already.
+        known: (n, p) `features`, if they were computed already.
     """
 
     links: Links
@@ -46,17 +46,17 @@ class Part:
 
     @cached_property
     def features(self) -> np.ndarray:
-        """(n, p) of `link_features`."""
+        """(n, p) features of the links, see `link_features`."""
         return link_features(self.links) if self.known is None else self.known
 
     @property
     def common(self) -> np.ndarray:
-        """(n, q) of them, without those that say which receiver it is."""
+        """(n, q) features without the columns that identify the receiver."""
         devices = len(self.links.device_names)
         return self.features[:, :feature_count(devices, self.links.has_boresights)]
 
     def select(self, rows: np.ndarray) -> Part:
-        """Return the links of an index array."""
+        """Return the part with the rows of an index array."""
         return Part(self.links.select(rows), self.features[rows])
 
 
@@ -67,10 +67,10 @@ def grow_trees(kind: str, features: np.ndarray, target: np.ndarray, seed: int,
     Args:
         kind: `EXTRA_TREES` (Geurts, Ernst and Wehenkel 2006, Machine Learning 63), or `BOOSTING`
             (histogram-based, as LightGBM: Ke et al. 2017, NIPS).
-        features: (n, p).
-        target: (n,).
-        seed: of the trees, and of the sample that is taken of very many rows.
-        trees: number of them; boosting takes twice as many.
+        features: (n, p) features.
+        target: (n,) values to predict, such as levels [dB].
+        seed: random seed of the trees, and of the sample of rows.
+        trees: number of trees; boosting grows twice as many.
     """
     from sklearn.ensemble import ExtraTreesRegressor, HistGradientBoostingRegressor
 
@@ -84,30 +84,30 @@ def grow_trees(kind: str, features: np.ndarray, target: np.ndarray, seed: int,
     boosting = HistGradientBoostingRegressor(
         learning_rate=LEARNING_RATE * TREES / trees, max_iter=2 * trees, early_stopping=False,
         random_state=seed)
-    # Folds have threads of their own, and OpenMP's wait for each other busily: where a core has
-    # other work, several take a hundred times as long as one.
+    # OpenMP's threads wait busily: beside the folds' own threads they take up to a hundred times as
+    # long as a single one.
     with _openmp().limit(limits=1):
         return Forest.of_boosting(boosting.fit(features, target))
 
 
 @cache
 def _openmp() -> ThreadpoolController:
-    """Return what sets the threads of OpenMP, once scikit-learn is loaded."""
+    """Return the controller of OpenMP's threads; call it after scikit-learn is loaded."""
     return ThreadpoolController().select(user_api="openmp")
 
 
 def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: int) -> np.ndarray:
-    """Return what trees that were grown on some detected links predict of others [dB].
+    """Grow trees on the detected links of some rows, and predict the levels of others (m,) [dB].
 
-    Blanks are left out: with them at the level that kriging gives them, trees predict detected
-    links worse. What they predict is therefore the level of a link that is detected.
+    Blanks are left out, so the prediction is the level given that the link is detected. Imputing
+    blanks made predictions of detected links worse.
 
     Args:
-        kind: as of `grow_trees`.
+        kind: see `grow_trees`.
         part: n links.
-        train: (n,) bool or rows, to learn from.
-        test: (m,) rows.
-        seed: as of `grow_trees`.
+        train: (n,) bool or rows of the training links.
+        test: (m,) rows to predict.
+        seed: random seed, see `grow_trees`.
     """
     rows = np.arange(len(part.links))[train]
     rows = rows[np.isfinite(part.links.level_db[rows])]
@@ -123,38 +123,38 @@ def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: i
 
 def fitted_law(kind: type[ChannelModel], links: Links, train: np.ndarray,
                like: ChannelModel | None = None) -> ChannelModel:
-    """Return a channel model that is fitted to some links.
+    """Fit a channel model to some rows of links.
 
     Args:
-        kind: of model.
+        kind: class of the channel model.
         links: n links.
-        train: (n,) bool or rows, to learn from.
-        like: kriging whose correlation is taken; None: it is fitted.
+        train: (n,) bool or rows of the training links.
+        like: kriging whose correlation function is reused; None: everything is fitted.
     """
     geometry, gain_db, limit_db = links.select(train).gains()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of classes with few links
+        warnings.simplefilter("ignore")  # warnings of few LoS or NLoS links
         if isinstance(like, RegressionKriging):
             return like.refit(geometry, gain_db, limit_db)
         return fit_once(kind, geometry, gain_db, limit_db, 0)
 
 
 def law_db(law: ChannelModel, links: Links, test: np.ndarray) -> np.ndarray:
-    """Return the mean readings of rows (m,) of links [dB], as a twin of the model predicts them."""
+    """Predict the mean readings (m,) [dB] of rows (m,) of links by a channel model alone."""
     return FittedModel.of_channel(law).predict(links.select(test)).reading_db
 
 
 def held_out_baselines(model: CrossFit, parts: list[Part], seed: int
                        ) -> tuple[dict[str, np.ndarray], list[dict[str, ChannelModel]]]:
-    """Return the held-out prediction of other models.
+    """Predict held-out links by each baseline.
 
     Args:
-        model: whose folds are used, and whose devices.
-        parts: the links of each fold.
-        seed: of the trees.
+        model: cross-validated fit with the folds and device positions to use.
+        parts: the links with the device positions of each fold.
+        seed: random seed of the trees.
 
     Returns:
-        (n,) prediction by each [dB], by name; and the `LAWS` of each fold, by name.
+        (n,) predictions [dB] by the baseline's name; and the fitted `LAWS` of each fold, by name.
     """
     laws: list[dict[str, ChannelModel]] = []
     published = published_laws(model.links.select(model.whole.usable))
@@ -164,20 +164,17 @@ def held_out_baselines(model: CrossFit, parts: list[Part], seed: int
     for number, (fold, part) in enumerate(zip(model.folds, parts, strict=True)):
         test = np.flatnonzero((model.index == number) & fold.usable)
         laws.append({kind.name: fitted_law(kind, part.links, fold.train) for kind in LAWS})
-        for name, law in laws[-1].items():
-            result[name][test] = law_db(law, part.links, test)
+        for law in (*laws[-1].values(), *published):
+            result[law.name][test] = law_db(law, part.links, test)
         for learner in (EXTRA_TREES, BOOSTING):
             result[learner][test] = trees_db(learner, part, fold.train, test, seed)
-        for law in published:  # a device of unknown position is where the fold has it
-            result[law.name][test] = law_db(law, part.links, test)
     return result, laws
 
 
 def published_laws(links: Links) -> list[PublishedLaw]:
-    """Return laws of recommendations, fitted to nothing.
+    """Return the published laws (recommendations) that are valid for most links; nothing is fitted.
 
-    Of those that hold at the frequency and for most of the heights and distances. Levels must be
-    gains, or powers of devices whose transmit power is declared: no recommendation knows it.
+    Empty for power readings without declared transmit powers, which no recommendation can predict.
 
     Args:
         links: n links.
@@ -190,7 +187,7 @@ def published_laws(links: Links) -> list[PublishedLaw]:
             continue
         try:
             law = kind().fit(*data)
-        except BadInput:  # another frequency, or no map
+        except BadInput:  # not valid at the frequency, or the law needs a map
             continue
         if law.inside(data[0]).mean() >= MIN_INSIDE:
             laws.append(law)

@@ -1,15 +1,14 @@
-"""The final prediction: named physics, an interpolated rest and regressions, by weights.
+"""Combine the named effects, interpolated shadowing, laws and trees into one weighted prediction.
 
-Near measured places interpolation and trees know most, and far from them physics does. So each
+Near measured places interpolation and trees predict best, far from them physics does. So each
 member of the combination has a weight near measurements and one far from them, with a smooth
-transition. The weights are those with the least held-out error on other folds: no reading has a
-part in the members by which it is predicted, and no error of its fold has one in the weights. For a
-few numbers that many readings choose, nested cross-validation is not needed (Wainer and Cawley
-2021, 'Nested cross-validation when selecting classifiers is overzealous for most practical
-applications', Expert Systems with Applications 182).
+transition. The weights minimise the held-out error on other folds: no reading takes part in the
+members or in the weights by which it is predicted. Nested cross-validation is not needed for so few
+weights (Wainer and Cawley 2021, 'Nested cross-validation when selecting classifiers is overzealous
+for most practical applications', Expert Systems with Applications 182).
 
-A fold predicts its held-out links as the twin of a loop predicts any link
-(`radiotwin.twin.model.model.FittedModel.law_on`): both have members from `_learn`.
+Folds and the loop's twin predict by the same code
+(`radiotwin.twin.model.model.FittedModel.law_on`).
 """
 
 from __future__ import annotations
@@ -51,24 +50,24 @@ from radiotwin.twin.model.correlated_shadowing import (
 )
 from radiotwin.twin.model.model import Fit, FittedModel
 
-MAX_AWAY_LINKS = 12_000  # of which quadrants are held out
-AWAY_TREES = 20
-MIN_LEARNT = 60  # detected links that anything is learnt from
-SAME_M = 0.1  # measured places closer together are one
+MAX_AWAY_LINKS = 12_000  # sample of which quadrants are held out
+AWAY_TREES = 20  # trees of a quadrant's fit
+MIN_LEARNT = 60  # least number of detected training links outside a quadrant
+SAME_M = 0.1  # measured places are rounded to this [m]
 
 
 @dataclass(frozen=True, eq=False)
 class CombinedPrediction:
-    """Held-out prediction by all that was learnt, and by other models alone.
+    """Held-out prediction by the combination of models, and by each baseline alone.
 
     Attributes:
-        reading_db: (n,) mean of a reading of each link [dB]: of its receiver and time, given that
-            it is detected; NaN where there is none.
-        map_db: (n,) what a map has there [dB]: the mean level at a faultless receiver, also below
-            the limit of detection.
-        rank: (n,) probability of a lower reading than the measured one.
-        combination: of all links, by which the twin predicts.
-        baselines: (n,) held-out prediction of other models [dB], by name.
+        reading_db: (n,) mean reading [dB] of the link's receiver and time, given that it is
+            detected; NaN without a prediction.
+        map_db: (n,) value of a map [dB]: mean level at a faultless receiver, also below the limit
+            of detection.
+        rank: (n,) predicted probability of a reading below the measured one.
+        combination: weights from all links, by which the twin predicts.
+        baselines: (n,) held-out predictions [dB] by the baseline's name.
     """
 
     reading_db: np.ndarray
@@ -79,21 +78,20 @@ class CombinedPrediction:
 
     @property
     def coverage(self) -> float:
-        """Share of held-out readings in the central 90 % intervals; NaN where there is none."""
+        """Share of held-out readings within their central 90 % intervals; NaN without any."""
         known = self.rank[np.isfinite(self.rank)]
         return float((np.abs(known - 0.5) <= 0.45).mean()) if len(known) else np.nan
 
 
 def combined_prediction(model: CrossFit, with_rest: bool, seed: int) -> CombinedPrediction:
-    """Return the held-out prediction by all that was learnt.
+    """Predict held-out links by a weighted combination of models.
 
-    Trees upon the physics are members, and trees alone, too: a pattern that fits what was measured
-    may be wrong beyond.
+    Members: base with effects, trees on its residual and on levels, interpolated shadowing, laws.
 
     Args:
-        model: with all effects that have a name.
-        with_rest: whether to interpolate the rest, too, where the model does not yet.
-        seed: of trees and samples.
+        model: cross-validated fit with all named effects.
+        with_rest: whether to interpolate the residual even if the model has no shadowing.
+        seed: random seed of trees and samples.
     """
     links = model.links
     parts = [Part(each.links) for each in model.folds]
@@ -103,25 +101,25 @@ def combined_prediction(model: CrossFit, with_rest: bool, seed: int) -> Combined
              *(kind.name for kind in LAWS if kind is not LogDistance)]
 
     def of_fold(number: int) -> tuple[FittedModel, HeldOut]:
-        """Return what is learnt outside a fold, and its links."""
+        """Return the members learnt outside a fold, and their prediction of its links."""
         fold = model.folds[number]
         learnt = _learn(fold, parts[number], names, seed, laws=laws[number])
         test = np.flatnonzero((model.index == number) & fold.usable)
         return learnt, _held_out(learnt, fold, test, model.index[test])
 
-    with warnings.catch_warnings():  # whose filters threads leave as another one had them
+    with warnings.catch_warnings():  # threads interleave their changes of the filters
         folds = in_threads(of_fold, range(len(model.folds)))
     held_out = HeldOut.join([each for _, each in folds])
-    away = _quadrants_held_out(model, folds[-1][0], parts[-1], names, seed)
+    away = _hold_out_quadrants(model, folds[-1][0], parts[-1], names, seed)
     half_m, dof = half_distance_m(held_out, away), model.whole.model.dof
 
     reading_db, map_db, rank = np.full((3, len(links)), np.nan)
     for number, (learnt, _) in enumerate(folds):
-        own = combination(held_out.select(held_out.fold != number),
-                          away.select(away.fold != number), names, half_m, dof)
+        weights = combination(held_out.select(held_out.fold != number),
+                              away.select(away.fold != number), names, half_m, dof)
         fold = model.folds[number]
         test = np.flatnonzero((model.index == number) & fold.usable)
-        learnt = _combined(learnt, fold, own)
+        learnt = _combined(learnt, fold, weights)
         law = learnt.law_on(fold.on_rows(test))
         reading_db[test], rank[test] = law.reading_db, law.rank(links.level_db[test])
         map_db[test] = learnt.law_on(fold.for_map(test)).mean_db
@@ -129,13 +127,13 @@ def combined_prediction(model: CrossFit, with_rest: bool, seed: int) -> Combined
                               combination(held_out, away, names, half_m, dof), baselines)
 
 
-def served(model: CrossFit, found: Combination, seed: int) -> FittedModel:
-    """Return what a twin predicts by: all that was learnt from all links, combined.
+def combined_fit(model: CrossFit, found: Combination, seed: int) -> FittedModel:
+    """Learn the members of a combination from all links, for the loop's twin.
 
     Args:
-        model: with all effects that have a name.
-        found: `CombinedPrediction.combination`.
-        seed: as of `combined_prediction`.
+        model: cross-validated fit with all named effects.
+        found: weights, `CombinedPrediction.combination`.
+        seed: random seed, as in `combined_prediction`.
     """
     whole = model.whole
     return _combined(_learn(whole, Part(whole.links), found.weights, seed), whole, found)
@@ -144,16 +142,16 @@ def served(model: CrossFit, found: Combination, seed: int) -> FittedModel:
 def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int = TREES,
            rest: CorrelatedShadowing | None = None,
            laws: dict[str, ChannelModel] | None = None) -> FittedModel:
-    """Return all that is learnt from the training links of a fit; its weights are still equal.
+    """Learn the members of a combination from the training links of a fit, with equal weights.
 
     Args:
-        fit: to some of n links.
-        part: the links.
-        names: of the members.
-        seed: of trees and samples.
-        trees: number of them.
-        rest: interpolated rest; None: it is fitted where it is a member.
-        laws: fitted already, by name.
+        fit: fit to some of n links.
+        part: the n links with features.
+        names: names of the members.
+        seed: random seed of trees and samples.
+        trees: number of trees.
+        rest: interpolated shadowing; None: it is fitted if it is a member.
+        laws: laws that were fitted already, by name.
     """
     if REST in names:
         rest = rest or fit.shadowing or fit.rest(seed)
@@ -166,14 +164,14 @@ def _learn(fit: Fit, part: Part, names: Collection[str], seed: int, trees: int =
     declared = np.flatnonzero(np.isfinite(boresight_deg))
     blend = Blend(dict.fromkeys(names, (1 / len(names), 1 / len(names))), HALF_M, (1.0, 1.0), move,
                   places[:, :3].astype(np.float32), places[:, 3].astype(int),  # as they are stored
-                  grown_forests(fit, part, seed, names, trees),
+                  grow_forests(fit, part, seed, names, trees),
                   {name: law for name, law in laws.items() if name in names},
                   np.column_stack([declared, boresight_deg[declared]]))
     return replace(fit.learnt, shadowing=rest or fit.shadowing, blend=blend)
 
 
 def _combined(learnt: FittedModel, fit: Fit, found: Combination) -> FittedModel:
-    """Return what was learnt with its weights, without what has none."""
+    """Set the weights of a combination, and drop members without a weight."""
     assert learnt.blend is not None
     blend = learnt.blend.weighted(found.weights, found.half_m, found.sd_ratio)
     shadowing = learnt.shadowing if REST in found.weights else fit.shadowing
@@ -181,24 +179,23 @@ def _combined(learnt: FittedModel, fit: Fit, found: Combination) -> FittedModel:
 
 
 def _held_out(learnt: FittedModel, fit: Fit, test: np.ndarray, fold: np.ndarray) -> HeldOut:
-    """Return rows (m,) of a fit's links, of folds (m,), and what members predict of them."""
+    """Predict rows (m,) of a fit's links by each member; `fold` (m,) is the fold of each row."""
     assert learnt.blend is not None
-    own = fit.on_rows(test)
-    members_db, scales_db, unheard_db = learnt.members_on(own)
-    losses = own.model.losses
+    tested = fit.on_rows(test)
+    members_db, scales_db, unheard_db = learnt.members_on(tested)
+    losses = tested.model.losses
     blank, drop, drop_db = (np.broadcast_to(np.asarray(each, dtype=float), len(test))
                             for each in (losses.blank, losses.drop, losses.drop_db))
-    return HeldOut(own.links.level_db, own.model.limit_db, members_db, scales_db, unheard_db,
-                   learnt.blend.away_m(own.links), blank, drop, drop_db, fold)
+    return HeldOut(tested.links.level_db, tested.model.limit_db, members_db, scales_db, unheard_db,
+                   learnt.blend.away_m(tested.links), blank, drop, drop_db, fold)
 
 
-def _quadrants_held_out(model: CrossFit, learnt: FittedModel, part: Part, names: list[str],
+def _hold_out_quadrants(model: CrossFit, learnt: FittedModel, part: Part, names: list[str],
                         seed: int) -> HeldOut:
-    """Hold out each quadrant of the last fold's training links, fit to the others, and predict.
+    """Hold out each quadrant of the last fold's training links, refit, and predict it.
 
-    Of the physics the coefficients are fitted again, and of rest and kriging the values. What the
-    links that are held out still decide is, of a few numbers for all: the place of a box, the
-    length of a correlation.
+    Refitted are coefficients, trees and interpolated values. A few searched parameters, such as the
+    position of a box or a correlation length, are kept from the fit to all training links.
     """
     fit = model.folds[-1]
     assert learnt.blend is not None
@@ -224,28 +221,25 @@ def _quadrants_held_out(model: CrossFit, learnt: FittedModel, part: Part, names:
 
 
 def _quadrant(links: Links) -> np.ndarray:
-    """Return the quadrant (n,) of the area that the end that moves is in.
-
-    With one left out, as much is extrapolated as by a map of more than was measured.
-    """
+    """Return the quadrant (n,) of the area in which the moving end is, 0 to 3."""
     moving_m = moving_ends(links, receivers_move(links))[0]
     above = moving_m[:, :2] > np.median(moving_m[:, :2], axis=0)
     return above @ np.array([1, 2])
 
 
-def grown_forests(fit: Fit, part: Part, seed: int, names: Collection[str],
+def grow_forests(fit: Fit, part: Part, seed: int, names: Collection[str],
                   trees: int = TREES) -> dict[str, Forest]:
-    """Grow trees on training links: on the standardised residual (`FORESTS`), and on the levels.
+    """Grow trees on training links: on the standardised residual (`FORESTS`) and on the levels.
 
-    A blank counts as the named effects' mean below the limit. The receiver is no feature of
-    theirs: its effects have names, and a map has none.
+    A blank counts as the predicted mean below the limit. The receiver is no feature, since a map
+    is for a faultless receiver.
 
     Args:
-        fit: to some of n links.
-        part: the links, with the features of trees.
-        seed: of the trees.
-        names: those that are asked for, among others.
-        trees: number of them.
+        fit: fit to some of n links.
+        part: the n links with features.
+        seed: random seed of the trees.
+        names: names of the members; only the forests among them are grown.
+        trees: number of trees.
     """
     if not set(names) & set(FORESTS + LEVEL_FORESTS):
         return {}

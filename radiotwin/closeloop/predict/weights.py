@@ -1,10 +1,10 @@
-"""Weights of the members of a combination, and how far off it is, from links that were held out.
+"""Fit the weights and the error scale of a combination of models to held-out links.
 
-Two sets of links count: those that folds held out, and those of quadrants of the area that were
-held out, because a map extrapolates. Each set counts by its errors relative to those of its best
-member. Quadrants count less where the combination would predict a held-out fold worse than the best
-member alone does; where none does as well, that member is taken (the discrete super learner: van
-der Laan, Polley and Hubbard 2007, Statistical Applications in Genetics and Molecular Biology 6).
+Two sets of links are used: those of held-out folds, and those of held-out quadrants of the area,
+because a map extrapolates. Errors of each set are relative to its best member. Quadrants count less
+if the combination would predict a fold worse than the best member alone; if no weight of theirs
+helps, the best member is taken (the discrete super learner: van der Laan, Polley and Hubbard 2007,
+Statistical Applications in Genetics and Molecular Biology 6).
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from radiotwin.inference.held_out import combine, convex_weights
 from radiotwin.inference.student import Losses, ReadingLaw
 from radiotwin.twin.model.blend import NAMED, blended, far_share, sd_factor
 
-HALF_M = 50.0  # distance at which near and far count the same, where no distance tells
-PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
-AWAY_COUNTS = (1.0, 0.25, 0.0625, 0.0)  # what quadrants count beside held-out links, first to last
-AS_GOOD = 1.01  # RMSE of a combination on folds that it has not seen over that of the best member
-MIN_WEIGHT = 0.02  # a member that has less, near and far, is left out
-PASSES = 3  # weights need the error scale, and that needs the weights
-SD_LINKS = 4_000  # whose likelihood tells how wide errors are
-LOG_SD_RATIO = 3.0  # its natural logarithm is within plus and minus this
-SAME_RATIO = 0.01  # a link: penalty of a log ratio near and far that differ by 1 [nats]
+HALF_M = 50.0  # half distance if no links tell it [m]
+PULL = 0.01  # shrinkage towards the best member, see `convex_weights`: 2 % of the RMSE
+QUADRANT_COUNTS = (1.0, 0.25, 0.0625, 0.0)  # weights of the quadrants that are tried in turn
+AS_GOOD = 1.01  # largest ratio of the RMSE on an unseen fold to that of the best member
+MIN_WEIGHT = 0.02  # members with less, near and far, are left out
+PASSES = 3  # alternating fits of weights and error scale
+SD_LINKS = 4_000  # sample for the error scale
+LOG_SD_RATIO = 3.0  # bound of its natural logarithm, plus and minus
+SAME_RATIO = 0.01  # penalty for log ratios near and far that differ by 1 [nats/link]
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """n links that were held out, and their prediction by each member.
+    """n held-out links with their prediction by each of k members.
 
     Attributes:
-        level_db: (n,) measured [dB]; NaN = not detected.
-        limit_db: (n,) of detection [dB].
-        members_db: (n, k) mean level by each member [dB]; NaN where there is none.
-        scales_db: (n, k) of their errors [dB].
-        unheard_db: (n,) standard deviation of what is unheard [dB].
-        away_m: (n,) distance from what was learnt from [m].
-        blank, drop, drop_db: (n,) losses whatever the level, see `Losses`.
-        fold: (n,) that each link belongs to.
+        level_db: (n,) measured level [dB]; NaN = not detected.
+        limit_db: (n,) limit of detection [dB].
+        members_db: (n, k) predicted mean level [dB]; NaN without a prediction.
+        scales_db: (n, k) error scale [dB].
+        unheard_db: (n,) standard deviation of unheard levels [dB].
+        away_m: (n,) distance from the nearest measured place [m].
+        blank, drop, drop_db: (n,) losses that do not depend on the level, see `Losses`.
+        fold: (n,) fold of each link.
     """
 
     level_db: np.ndarray
@@ -59,28 +59,28 @@ class HeldOut:
         return len(self.level_db)
 
     def select(self, rows: np.ndarray) -> HeldOut:
-        """Return some of the links (a mask or indices)."""
+        """Return the links of a mask or of indices."""
         return HeldOut(*(getattr(self, each.name)[rows] for each in fields(self)))
 
     def law(self, mean_db: np.ndarray, scale_db: np.ndarray, dof: float) -> ReadingLaw:
-        """Return the distribution of the levels by means (n,) and error scales (n,) [dB]."""
+        """Return the predicted distribution of readings with means and error scales (n,) [dB]."""
         return ReadingLaw(mean_db, np.hypot(scale_db, self.unheard_db), self.limit_db, dof,
                           Losses(self.blank, self.drop, self.drop_db))
 
     @classmethod
     def join(cls, parts: list[HeldOut]) -> HeldOut:
-        """Return the links of several sets."""
+        """Concatenate several sets of links."""
         return cls(*(np.concatenate([getattr(part, each.name) for part in parts])
                      for each in fields(cls)))
 
 
 @dataclass(frozen=True)
 class Combination:
-    """How members are combined, see `radiotwin.twin.model.blend.Blend`.
+    """Weights of a combination, see `radiotwin.twin.model.blend.Blend`.
 
     Attributes:
-        weights: of each member that has one, near measurements and far from them.
-        half_m: distance at which near and far count the same [m].
+        weights: weight near measurements and far from them, by the member's name.
+        half_m: distance at which the near and far weights count equally [m].
         sd_ratio: error scale over that of the members, near and far.
     """
 
@@ -90,11 +90,9 @@ class Combination:
 
 
 def half_distance_m(held_out: HeldOut, away: HeldOut) -> float:
-    """Return the distance at which near and far count the same [m].
+    """Return the distance from measurements at which near and far weights count equally [m].
 
-    The geometric mean of the medians of both sets, so that the typical link of one is as near as
-    that of the other is far: measured places are metres apart in one campaign and a kilometre in
-    another.
+    It is the geometric mean of both sets' median distances, so it scales with the campaign.
     """
     medians_m = [np.median(each.away_m[np.isfinite(each.away_m)])
                  for each in (held_out, away) if np.isfinite(each.away_m).any()]
@@ -105,14 +103,14 @@ def half_distance_m(held_out: HeldOut, away: HeldOut) -> float:
 
 def combination(held_out: HeldOut, away: HeldOut, names: list[str], half_m: float,
                 dof: float) -> Combination:
-    """Return the weights with the least squared error of readings, and how wide errors are.
+    """Fit the weights with the least squared error of readings, and the error scale.
 
     Args:
-        held_out: links that folds held out.
-        away: links of quadrants that were held out.
-        names: of the k members.
-        half_m: of `half_distance_m`.
-        dof: degrees of freedom of the errors.
+        held_out: links of held-out folds.
+        away: links of held-out quadrants.
+        names: names of the k members.
+        half_m: `half_distance_m` of both sets [m].
+        dof: degrees of freedom of the Student-t errors.
     """
     held_out, away = (each.select(np.isfinite(each.members_db).all(axis=1))
                       for each in (held_out, away))
@@ -128,7 +126,7 @@ def combination(held_out: HeldOut, away: HeldOut, names: list[str], half_m: floa
 
 def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[float, float],
              dof: float) -> np.ndarray:
-    """Return weights (2, k), near and far; 0 of members that count next to nothing."""
+    """Fit weights (2, k), near and far; members below `MIN_WEIGHT` get 0."""
     sets = []
     for links in (held_out, away):
         links = links.select(np.isfinite(links.level_db))
@@ -141,34 +139,33 @@ def _weights(held_out: HeldOut, away: HeldOut, half_m: float, sd_ratio: tuple[fl
         sets.append((error_db / max(best_db, 1e-6), share, links.fold))
     (error, share, fold), (error_away, share_away, fold_away) = sets
 
-    def fitted(counts: float, but: int = -1) -> np.ndarray:
-        """Return weights where quadrants count so much, without the links of a fold."""
-        own, away = fold != but, fold_away != but
-        # Both sets as means over their links, whatever the number of these.
-        repeated = np.sqrt(counts * own.sum() / max(away.sum(), 1))
-        found = convex_weights(np.vstack([error[own], repeated * error_away[away]]),
-                               np.concatenate([share[own], share_away[away]]), PULL)
+    def fitted(count: float, left_out: int = -1) -> np.ndarray:
+        """Return weights with a weight of the quadrants, without the links of one fold."""
+        near, far = fold != left_out, fold_away != left_out
+        # Scale errors so that both sets count by their mean square, not by their number of links.
+        factor = np.sqrt(count * near.sum() / max(far.sum(), 1))
+        found = convex_weights(np.vstack([error[near], factor * error_away[far]]),
+                               np.concatenate([share[near], share_away[far]]), PULL)
         found[:, found.max(axis=0) < MIN_WEIGHT] = 0.0
         return found / found.sum(axis=1, keepdims=True)
 
     folds = np.unique(fold)
     if len(folds) < 2:
-        return fitted(AWAY_COUNTS[0])
-    for counts in AWAY_COUNTS:
+        return fitted(QUADRANT_COUNTS[0])
+    for count in QUADRANT_COUNTS:
         square = sum(np.square(combine(error[fold == each], share[fold == each],
-                                       fitted(counts, each))).sum() for each in folds)
+                                       fitted(count, each))).sum() for each in folds)
         if np.sqrt(square / len(error)) <= AS_GOOD:
-            return fitted(counts)
+            return fitted(count)
     best = np.square(error).mean(axis=0).argmin()
     return np.tile(np.arange(error.shape[1]) == best, (2, 1)).astype(float)
 
 
 def _sd_ratio(held_out: HeldOut, away: HeldOut, weights: np.ndarray, half_m: float,
               dof: float) -> tuple[float, float]:
-    """Return the error scale over that of the members, near and far, of highest likelihood.
+    """Fit the ratio of the error scale to that of the members, near and far, by likelihood.
 
-    Of held-out links and of quadrants together: a map extrapolates, and links that lie near others
-    do not tell what that costs.
+    Both sets are used, since errors far from measurements show only in held-out quadrants.
     """
     links = HeldOut.join([held_out, away])
     links = links.select(np.arange(0, len(links), max(len(links) // SD_LINKS, 1)))

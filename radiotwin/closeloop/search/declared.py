@@ -1,4 +1,4 @@
-"""Add to the base what tables declare and what is wrong in every map, before causes are sought."""
+"""Add declared effects and usual map errors to the base, before causes are searched for."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from radiotwin.effects.base import Effect
 
 
 def add_declared(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Add declared effects where held-out links gain by them.
+    """Add declared effects, such as sector antennas of a table, if held-out links support them.
 
-    A declaration needs no evidence that its effect is there, only that its numbers are right: links
-    that take no part in their fit have to agree. A contradicted declaration is left out, with a
-    note. An effect that is no cause claims nothing, and only has to make these links likelier.
+    A declared effect needs no probability, but the held-out likelihood must increase. One that the
+    readings contradict is left out, with a note.
     """
     declared = [effect for effect in inputs.effects if effect.is_declared]
     for name in dict.fromkeys(effect.name for effect in declared):
@@ -23,7 +22,7 @@ def add_declared(state: SearchState, inputs: SearchInputs) -> SearchState:
 
 
 def _with_best(state: SearchState, forms: list[Effect], inputs: SearchInputs) -> SearchState:
-    """Add the form of one declared effect that held-out links gain most by, if they gain."""
+    """Add the form of one declared effect with the largest held-out gain, if it passes."""
     before = state.model
     tried, passed = [], []
     for effect in forms:

@@ -1,15 +1,14 @@
-"""Faults and changes in time, which a flight that is held out cannot show.
+"""Search for faults within flights and for changes between flights.
 
-Held out by flight, what happens on one flight is never learnt. So faults (of a flight, episodes,
-bursts) are scored on devices that are held out, which the same receiver read at the same times;
-where there are few devices, on blocks of ground that are held out in all flights at once. They come
-before all other candidates, or these would explain the faulty readings by walls and positions.
+If flights are held out, a fault of one flight is never in the training links. So faults (of a
+flight, episodes, bursts) are scored on held-out devices, which the same receiver measured at the
+same times; with few anchors, on blocks of ground that are held out in all flights. They are
+searched for before all other causes, which would explain the faulty readings by walls and
+positions.
 
-Where a receiver or a device changed after its first flight, that flight held out leaves nothing
-that shows it, and the others held out are predicted well by each other. So changes between flights
-are scored on blocks of ground, with the effects that were found already. A warm-up over the first
-flight and ageing change the level between flights, too: the form is the one that explains most.
-How much flights differ anyhow is a part of the evidence (`radiotwin.closeloop.verdict.hypotheses`).
+A change after the first flight cannot be learnt if that flight is held out. So changes between
+flights are scored on blocks of ground, with the effects that were found already. The usual
+tolerance between flights is part of the evidence (`radiotwin.closeloop.verdict.hypotheses`).
 """
 
 from __future__ import annotations
@@ -20,18 +19,16 @@ from dataclasses import replace
 import numpy as np
 
 from radiotwin.closeloop.crossfit import (
-    Base,
     CrossFit,
-    Folds,
     cross_validate,
     make_folds,
-    same_effects,
+    match_effects,
     training_parts,
 )
 from radiotwin.closeloop.search.scoring import (
     Candidate,
     fit_candidate,
-    judged,
+    score_and_judge,
     with_candidate,
 )
 from radiotwin.closeloop.search.stages import SearchInputs, SearchState
@@ -42,22 +39,21 @@ from radiotwin.closeloop.verdict.criteria import (
 )
 from radiotwin.closeloop.verdict.hypotheses import Hypotheses
 from radiotwin.effects.base import DetectionEffect, Effect
-from radiotwin.links import Links
 from radiotwin.links.correlation import devices_move
 from radiotwin.twin.model.model import Fit, Model
 
 
 def add_changes(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Add changes between flights, where flights are held out, one by one until none passes."""
+    """Add changes between flights one by one, if folds are flights, until none passes."""
     changes = [each for effect in inputs.effects if (each := effect.between_flights()) is not None]
     for effect in sorted(changes, key=lambda each: not each.of_receiver):  # receivers first
         if inputs.folds.by == "flight" and not effect.unavailable(inputs.links):
-            state = _with_one_kind(state, effect, inputs)
+            state = _add_changes_of(state, effect, inputs)
     return state
 
 
-def _with_one_kind(state: SearchState, effect: Effect, inputs: SearchInputs) -> SearchState:
-    """Add changes of receivers, or of devices."""
+def _add_changes_of(state: SearchState, effect: Effect, inputs: SearchInputs) -> SearchState:
+    """Add changes of one effect (of receivers, or of devices), until none passes."""
     model = None
     while not state.is_full(inputs.criteria):
         state, hypotheses = state.look(inputs.seed)
@@ -67,41 +63,26 @@ def _with_one_kind(state: SearchState, effect: Effect, inputs: SearchInputs) -> 
         inputs.on_progress(f"{effect.name}, held out by block")
         if model is None:
             model = within_flights(state.model, inputs, "block")
-        trial, extended = judged_elsewhere(model, candidate, [], hypotheses, inputs)
+        trial, extended = judge_in_other_folds(model, candidate, [], hypotheses, inputs)
         if extended is None:
             return state.refuse(trial)
         model = extended
-        # A flight that is held out does not tell when the change was.
+        # The folds of the search are kept: their fits learn the change as far as they show it.
         state = state.keep(trial, with_candidate(state.model, candidate, inputs.executor))
     return state
 
 
-def judged_elsewhere(model: CrossFit, candidate: Candidate, others: Sequence[float],
+def judge_in_other_folds(model: CrossFit, candidate: Candidate, others: Sequence[float],
                      hypotheses: Hypotheses, inputs: SearchInputs
                      ) -> tuple[Trial, CrossFit | None]:
-    """Return `judged` of a candidate that was fitted in other folds than those of the model."""
+    """Score a candidate, fitted in the search's folds, on a model with other folds."""
     found = candidate.whole.effects[-1]
     whole = model.whole.with_effects([*model.whole.effects, found])
-    return judged(model, replace(candidate, whole=whole), others, hypotheses, inputs)
-
-
-def located_links(model: CrossFit, links: Links, base: Base) -> Links:
-    """Return the links with the devices that the base has located as anchors there."""
-    device_m = base.device_m(model.twin)
-    known = np.isfinite(device_m).all(axis=1)
-    device_m = np.where(known[:, None], device_m, links.device_m)
-    anchors = frozenset(np.flatnonzero(known).tolist()) | links.anchors
-    links = links.with_devices(device_m).with_ends(anchors=anchors)
-    return links.with_columns(evidence=model.links.evidence)
-
-
-def with_effect(model: CrossFit, effect: Effect) -> CrossFit:
-    """Return a model with one more effect, as it was found, in the whole and every fold."""
-    return model.map(lambda fit: fit.with_effects([*fit.effects, effect]))
+    return score_and_judge(model, replace(candidate, whole=whole), others, hypotheses, inputs)
 
 
 def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Add effects that act at certain times, one after the other, until none passes."""
+    """Add faults within flights one by one, until none passes."""
     timed = [effect for effect in inputs.undeclared
              if effect.within_flights and not effect.unavailable(state.model.links)]
     criteria, model = inputs.criteria, None
@@ -109,17 +90,17 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
         step = state.step
         state, hypotheses = state.look(inputs.seed)
         fitted = [fit_candidate(state.model, effect, criteria, hypotheses) for effect in timed]
-        fitted = _against_lasting(fitted, state, inputs)
+        fitted = _refuse_lasting(fitted, state, inputs)
         candidates = [each for each in fitted if isinstance(each, Candidate)]
         refused = [each for each in fitted if isinstance(each, Trial)]
-        for candidate in sorted(candidates, key=lambda each: -each.gain):
+        for candidate in sorted(candidates, key=lambda each: -each.gain_nats):
             inputs.on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
             if model is None:
                 model = within_flights(state.model, inputs)
-            trial, extended = judged_elsewhere(model, candidate, [], hypotheses, inputs)
+            trial, extended = judge_in_other_folds(model, candidate, [], hypotheses, inputs)
             if extended is not None:
                 model = extended
-                state = state.keep(trial, adopted(state.model, candidate))
+                state = state.keep(trial, with_fault(state.model, candidate))
                 break
             refused.append(trial)
         else:
@@ -127,12 +108,11 @@ def add_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
     return state
 
 
-def _against_lasting(faults: list[Candidate | Trial], state: SearchState,
-                     inputs: SearchInputs) -> list[Candidate | Trial]:
-    """Return faults, or why one is none: an effect that lasts explains as much of all links.
+def _refuse_lasting(faults: list[Candidate | Trial], state: SearchState,
+                    inputs: SearchInputs) -> list[Candidate | Trial]:
+    """Refuse faults if a lasting effect on the same links explains as much.
 
-    A receiver that has changed reads less from then on, and so it does in the window that ends
-    where the links do not show it. That another one has changed is no reason.
+    A receiver that changed for good also looks faulty in each window of time afterwards.
     """
     rivals = {name for each in faults if isinstance(each, Candidate)
               for name in each.effect.confused_with}
@@ -140,34 +120,35 @@ def _against_lasting(faults: list[Candidate | Trial], state: SearchState,
               for effect in inputs.undeclared if effect.name in rivals
               and not effect.within_flights and not effect.unavailable(state.model.links)]
     lasting = [each for each in fitted if isinstance(each, Candidate)]
-    return [_unless_outdone(each, lasting, state.step) if isinstance(each, Candidate) else each
+    return [_refuse_if_lasting(each, lasting, state.step) if isinstance(each, Candidate) else each
             for each in faults]
 
 
-def _unless_outdone(fault: Candidate, lasting: list[Candidate],
-                    step: int) -> Candidate | Trial:
-    here = _acts(fault)
+def _refuse_if_lasting(fault: Candidate, lasting: list[Candidate],
+                       step: int) -> Candidate | Trial:
+    """Return a fault, or a refused trial if one of the lasting effects explains as much."""
+    faulty = _affected_links(fault)
     rival = next((each for each in lasting if each.effect.name in fault.effect.confused_with
-                  and each.gain >= fault.gain and _acts(each)[here].mean() >= MIN_SHARED), None)
+                  and each.gain_nats >= fault.gain_nats
+                  and _affected_links(each)[faulty].mean() >= MIN_SHARED), None)
     if rival is None:
         return fault
     return Trial(fault.effect.name, step=step, variant=fault.effect.variant, reason=(
-        f"{rival.effect.name} explains as much: {rival.gain:.0f} nats of the links that it is "
-        f"fitted to, and this {fault.gain:.0f}"))
+        f"{rival.effect.name} explains as much: {rival.gain_nats:.0f} nats of the links that it is "
+        f"fitted to, and this {fault.gain_nats:.0f}"))
 
 
-def _acts(candidate: Candidate) -> np.ndarray:
-    """Return (n,) bool, the links that a candidate says something of."""
+def _affected_links(candidate: Candidate) -> np.ndarray:
+    """Return (n,) bool, the links a candidate acts on; all links for effects on detection."""
     blanks = isinstance(candidate.effect, DetectionEffect)
     return blanks | candidate.whole.model.terms[-1].acts
 
 
 def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Take back faults and changes that effects found later explain: an emitter is no episode.
+    """Remove faults and changes that effects found later explain, such as an emitter an episode.
 
-    They come first, when no other effect is there to compare them with. One is taken back if it
-    gains nothing any more on the links that it is fitted to, or if its search would not find it
-    beside the others.
+    One is removed if it gains less than `min_training_gain_nats` beside the later effects, or if
+    its search does not find it again.
     """
     for number in reversed(range(state.step)):
         model, whole = state.model, state.model.whole
@@ -180,16 +161,16 @@ def drop_idle_faults(state: SearchState, inputs: SearchInputs) -> SearchState:
         is_found = _is_cause_of_anomaly(state, number) or _is_found(whole, number, others)
         if gain >= inputs.criteria.min_training_gain_nats and is_found:
             continue
-        folds = [_without(each.model, same_effects(whole, each)[number]).fit()
+        folds = [_without(each.model, match_effects(whole, each)[number]).fit()
                  for each in model.folds]
         taken_back = state.log.kept[number].refuse("what was found later explains it", rivals=())
-        state = replace(state, model=model.extended(others, folds),
+        state = replace(state, model=model.with_fits(others, folds),
                         log=state.log.supersede(taken_back))
     return state
 
 
 def _is_cause_of_anomaly(state: SearchState, number: int) -> bool:
-    """Return whether an effect is the likeliest cause of a group that stands out."""
+    """Return whether an effect is the likeliest cause of an anomaly whose links it acts on."""
     effect, acts = state.model.whole.effects[number], state.model.whole.model.terms[number].acts
     return any(max(each.causes, key=lambda name: each.causes[name]) == effect.name
                and acts[each.rows].mean() >= MIN_SHARED
@@ -197,9 +178,9 @@ def _is_cause_of_anomaly(state: SearchState, number: int) -> bool:
 
 
 def _is_found(fit: Fit, number: int, without: Fit) -> bool:
-    """Return whether the search of a fault finds it in what a fit without it leaves.
+    """Return whether a fault's search finds it in the residual of a fit without it.
 
-    Steps in time have no search of their own.
+    Always true for changes between flights, which have no such search.
     """
     effect, acts, model = fit.effects[number], fit.model.terms[number].acts, without.model
     if not effect.within_flights:
@@ -209,37 +190,42 @@ def _is_found(fit: Fit, number: int, without: Fit) -> bool:
     return any((acts & each).sum() >= MIN_SHARED * (acts | each).sum() for each in again)
 
 
-def _without(model: Model, place: int | None) -> Model:
-    """Return a fold without the effect at a place; None: it has none of it."""
-    return model.with_effects([each for number, each in enumerate(model.effects)
-                               if number != place])
-
-
-def _in_other_folds(model: CrossFit, links: Links, base: Base, folds: Folds) -> CrossFit:
-    """Return the base with a model's effects as they are, fitted to other folds."""
-    other = cross_validate(links, base, folds, training_parts(links, folds))
-    for each in model.whole.effects:
-        other = with_effect(other, each)
-    return other
+def _without(model: Model, number: int | None) -> Model:
+    """Return a model without the effect of an index; None: with all."""
+    return model.with_effects([each for index, each in enumerate(model.effects)
+                               if index != number])
 
 
 def within_flights(model: CrossFit, inputs: SearchInputs, by: str = "") -> CrossFit:
-    """Return the base with a model's effects in folds that leave part of each flight.
+    """Refit a model with the same effects in folds that leave part of each flight.
 
-    Of devices, where enough are known, or of blocks; `by` says which.
+    Devices located by the base count as anchors.
+
+    Args:
+        model: cross-validated fit.
+        inputs: inputs of the search.
+        by: what is held out; "": devices if there are enough anchors, else blocks.
     """
-    links = located_links(model, inputs.links, inputs.base)
+    device_m = inputs.base.device_m(model.twin)
+    located = np.isfinite(device_m).all(axis=1)
+    links = inputs.links.with_devices(np.where(located[:, None], device_m, inputs.links.device_m))
+    links = links.with_ends(anchors=frozenset(np.flatnonzero(located).tolist()) | links.anchors)
+    links = links.with_columns(evidence=model.links.evidence)
     by_device = len(links.anchors & set(links.device.tolist())) >= MIN_HELD_OUT_DEVICES
     by = by or ("device" if by_device and not devices_move(links) else "block")
-    return _in_other_folds(model, links, inputs.base, make_folds(links, inputs.seed, by))
+    folds = make_folds(links, inputs.seed, by)
+    other = cross_validate(links, inputs.base, folds, training_parts(links, folds))
+    for effect in model.whole.effects:  # one by one, so that each fit starts from the one before
+        other = other.map(lambda fit, effect=effect: fit.with_effects([*fit.effects, effect]))
+    return other
 
 
-def adopted(model: CrossFit, candidate: Candidate) -> CrossFit:
-    """Return a model with the effect; a fold has it as far as its own training links show it."""
+def with_fault(model: CrossFit, candidate: Candidate) -> CrossFit:
+    """Add a fault to a model, and to each fold whose own training links show it."""
     found = candidate.whole.effects[-1]
 
-    def of_fold(fold: Fit) -> Fit:
-        own = found.propose_like(fold.view)
-        return fold.with_effects([*fold.effects, found.with_params(own[0])]) if own else fold
+    def extend(fold: Fit) -> Fit:
+        params = found.propose_like(fold.view)
+        return fold.with_effects([*fold.effects, found.with_params(params[0])]) if params else fold
 
-    return model.extended(candidate.whole, [of_fold(fold) for fold in model.folds])
+    return model.with_fits(candidate.whole, [extend(fold) for fold in model.folds])

@@ -1,4 +1,4 @@
-"""Describe the rest that no cause explains: trends over a variable, and a field over the ground."""
+"""Describe the residual that no cause explains: trends over variables, and shadowing by place."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
 
 
 def add_trends(state: SearchState, inputs: SearchInputs, variables: Sequence[str]) -> SearchState:
-    """Add curves over variables that the residual depends on.
+    """Add curves over variables on which the residual depends, if held-out links gain by them.
 
     Args:
-        state: with all causes.
-        inputs: of the search.
-        variables: names, the strongest first.
+        state: state with all causes.
+        inputs: inputs of the search.
+        variables: names of the variables, the most significant first.
     """
     values = residual_variables(state.model.links, state.model.held_out_mean_db)
     trends = [trend_over(name) for name in variables
-              if values[name].dtype.kind == "f"]  # a curve needs an order
+              if values[name].dtype.kind == "f"]  # labels have no order, so no curve
     return forward_selection(state, trends[:inputs.criteria.max_trends], inputs)
 
 
 def add_shadowing(state: SearchState, inputs: SearchInputs) -> SearchState:
-    """Interpolate the rest over the ground; keep that if it predicts held-out links better."""
+    """Interpolate the residual over positions (kriging); keep it if held-out links gain by it."""
     inputs.on_progress(SHADOWING)
     model = state.model
-    fields = [each.rest(inputs.seed) for each in model.each]
-    # If what a field learnt does not return on held-out flights, its mean may be right though its
-    # certainty is not.
+    fields = [each.rest(inputs.seed) for each in model.fits]
+    # If the field does not repeat on held-out flights, its mean may still help, without narrowing
+    # the error scale.
     for tried in (fields, [replace(each, certain=False) for each in fields]):
-        extended = model.map(lambda fit, own: replace(fit, shadowing=own), tried)
+        extended = model.map(lambda fit, field: replace(fit, shadowing=field), tried)
         trial = score_model(model, extended, Trial(SHADOWING, step=state.step), inputs.criteria,
                             inputs.criteria.min_gain_nats)
         if not trial.reason:

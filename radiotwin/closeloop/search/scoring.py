@@ -1,4 +1,4 @@
-"""Fit a candidate to all links and to each fold's others, and score it on held-out links."""
+"""Fit a candidate effect to all links and without each fold, and score it on held-out links."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from radiotwin.closeloop.crossfit import CrossFit
 from radiotwin.closeloop.search.stages import SearchInputs
 from radiotwin.closeloop.search.trials import Trial
 from radiotwin.closeloop.verdict.criteria import SelectionCriteria
-from radiotwin.closeloop.verdict.hypotheses import Hypotheses, is_judged_by_levels
-from radiotwin.closeloop.verdict.intervals import why_not_borne_out
+from radiotwin.closeloop.verdict.hypotheses import Hypotheses, changes_levels
+from radiotwin.closeloop.verdict.intervals import why_not_confirmed
 from radiotwin.closeloop.verdict.posterior import with_probability
 from radiotwin.effects.base import Effect
 from radiotwin.links import Links
@@ -23,75 +23,80 @@ from radiotwin.twin.model.model import Fit
 
 def ends_of(effect: Effect, coefficients: np.ndarray,
             links: Links) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the devices and of the receivers that an effect belongs to.
+    """Return the names of the devices and of the receivers that an effect acts on.
 
-    Where each end has a coefficient, and few are off, that is the one that is off most.
+    A sparse effect has a coefficient for each end; the end with the most extreme one is named.
 
     Args:
-        effect: that was found.
-        coefficients: (q,) of its term.
-        links: that it was fitted to.
+        effect: the effect with its parameters.
+        coefficients: (q,) coefficients of its term.
+        links: the links it was fitted to.
 
     Returns:
-        names of devices, names of receivers; both empty for an effect of all links.
+        names of devices, names of receivers; both empty for an effect on all links.
     """
     params = effect.params
     if effect.sparse and hasattr(params, "members"):
-        off = np.abs(coefficients - np.median(coefficients))
-        most = [params.members[int(off.argmax())]]
-        return (_names(most, links.device_names) if effect.of_device else (),
-                _names(most, links.receiver_names) if effect.of_receiver else ())
+        deviation = np.abs(coefficients - np.median(coefficients))
+        extreme = [params.members[int(deviation.argmax())]]
+        return (_names(extreme, links.device_names) if effect.of_device else (),
+                _names(extreme, links.receiver_names) if effect.of_receiver else ())
     return (_names(_indices(params, "device"), links.device_names),
             _names(_indices(params, "receiver"), links.receiver_names))
 
 
 def _indices(params: object, end: str) -> list[int]:
-    """Return the indices in `device` or `devices`, whatever an effect has."""
+    """Return the indices in a parameter `device` or `devices` (`end`: device or receiver)."""
     one, many = getattr(params, end, None), getattr(params, f"{end}s", ())
     return [each for each in (one, *many) if isinstance(each, int)]
 
 
 def _names(indices: list[int], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names at indices; indices out of range are skipped."""
     return tuple(str(names[each]) for each in indices if 0 <= each < len(names))
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An effect fitted to all links, and how much likelier they are with it [nats].
+    """An effect of the catalogue, fitted to all links.
 
-    `gain` counts every link, `evidence` knows that the base may be wrong (NaN: not looked at).
+    Attributes:
+        effect: the effect without parameters.
+        whole: fit to all links with the effect.
+        gain_nats: gain of the training objective; links count as independent.
+        evidence_nats: evidence beside a correlated residual, see `Hypotheses`; NaN if not computed.
     """
 
     effect: Effect
     whole: Fit
-    gain: float
-    evidence: float = np.nan
+    gain_nats: float
+    evidence_nats: float = np.nan
 
 
 def fit_candidate(model: CrossFit, effect: Effect, criteria: SelectionCriteria,
                   hypotheses: Hypotheses | None = None, group: np.ndarray | None = None,
-                  min_gain: float = 0.0) -> Candidate | Trial:
-    """Fit a candidate to all links; return a trial with the reason if that refuses it already.
+                  min_path_gain_nats: float = 0.0) -> Candidate | Trial:
+    """Fit an effect to all links; return a refused trial with the reason if it is not plausible.
 
     Args:
-        model: without it.
-        effect: that is tried.
-        criteria: that decide.
-        hypotheses: about what the model lacks; None: not to be looked at.
-        group: (m,) bool, training links that it is to explain; None: any.
-        min_gain: nats with quick levels, below which no paths are followed for it.
+        model: cross-validated fit without the effect.
+        effect: the effect to try.
+        criteria: thresholds.
+        hypotheses: to compute its evidence with; None: it is not computed.
+        group: (m,) bool, training links that it has to explain; None: all.
+        min_path_gain_nats: least gain with fast levels for paths to be followed.
     """
     refused = Trial(effect.name, step=len(model.whole.effects), variant=effect.variant)
     whole = add_effect(model.whole, effect, group=group)
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
     links, city = model.links.select(model.whole.usable), model.whole.model.corrected_map
-    if city is not links.city:  # what was found is part of what is known
+    if city is not links.city:  # the map is corrected by effects found before
         links = links.with_city(city)
     why = whole.effects[-1].contradicted(links)
     if why:
         return replace(refused, reason=why)
-    if model.whole.objective - whole.objective >= min_gain:
+    if model.whole.objective - whole.objective >= min_path_gain_nats:
         whole = along_paths(whole, model.whole)
     found = whole.effects[-1]
     why = found.implausible(whole.coefficients_of(-1)) or found.contradicted(links)
@@ -101,28 +106,28 @@ def fit_candidate(model: CrossFit, effect: Effect, criteria: SelectionCriteria,
     if gain < criteria.min_training_gain_nats:
         return replace(refused, reason=f"gains less than {criteria.min_training_gain_nats:.0f} "
                        "nats even on the links that it is fitted to")
-    if hypotheses is None or not is_judged_by_levels(effect):
+    if hypotheses is None or not changes_levels(effect):
         return Candidate(effect, whole, gain)
-    return Candidate(effect, whole, gain, hypotheses.of_named(whole))
+    return Candidate(effect, whole, gain, hypotheses.effect_evidence_nats(whole))
 
 
 def score_candidate(model: CrossFit, candidate: Candidate,
                     inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
-    """Fit a candidate to each fold's training links, and score it on the others.
+    """Fit a candidate to each fold's training links, and score it on the held-out links.
 
     Args:
-        model: without it.
-        candidate: fitted to all links.
-        inputs: of the search.
+        model: cross-validated fit without the candidate.
+        candidate: effect fitted to all links.
+        inputs: inputs of the search.
 
     Returns:
-        the trial, and the model with it; None where it does not pass.
+        the trial, and the model with the effect; None if it does not pass.
     """
     found = candidate.whole.effects[-1]
     devices, receivers = ends_of(found, candidate.whole.coefficients_of(-1), model.links)
     extended = with_candidate(model, candidate, inputs.executor)
     trial = Trial(candidate.effect.name, step=len(model.whole.effects), params=found.params,
-                  evidence_nats=candidate.evidence, variant=candidate.effect.variant,
+                  evidence_nats=candidate.evidence_nats, variant=candidate.effect.variant,
                   devices=devices, receivers=receivers)
     is_judged = found.is_cause or found.is_declared
     trial = score_model(model, extended, trial, inputs.criteria,
@@ -131,41 +136,41 @@ def score_candidate(model: CrossFit, candidate: Candidate,
 
 
 def with_candidate(model: CrossFit, candidate: Candidate, executor: Executor) -> CrossFit:
-    """Return a model with a candidate; a fold has it as its own training links show it."""
+    """Add a candidate to a model, and fit it anew to each fold's training links."""
     effect, like = candidate.effect, candidate.whole.effects[-1]
     prepare_additions(model.folds, [effect], executor, like)
-    return model.extended(candidate.whole, [add_effect(fold, effect, like) or fold
+    return model.with_fits(candidate.whole, [add_effect(fold, effect, like) or fold
                                             for fold in model.folds])
 
 
-def judged(model: CrossFit, candidate: Candidate, others: Sequence[float],
+def score_and_judge(model: CrossFit, candidate: Candidate, others: Sequence[float],
            hypotheses: Hypotheses, inputs: SearchInputs) -> tuple[Trial, CrossFit | None]:
-    """Return what held-out links and the evidence say of a candidate, with its probability.
+    """Score a candidate on held-out links, and compute its probability.
 
     Args:
-        model: without it.
-        candidate: fitted to all links.
-        others: evidence for its rivals [nats].
-        hypotheses: that the evidence is of.
-        inputs: of the search.
+        model: cross-validated fit without the candidate.
+        candidate: effect fitted to all links.
+        others: evidence for rival causes [nats].
+        hypotheses: with which the evidence was computed.
+        inputs: inputs of the search.
 
     Returns:
-        the trial, and the model with it; None where it is refused.
+        the trial, and the model with the effect; None if it is refused.
     """
     trial, extended = score_candidate(model, candidate, inputs)
     if extended is None:
         return trial, None
-    rest_db, noise_db = hypotheses.sizes_db
+    rest_db, noise_db = hypotheses.rest_and_noise_db
     trial = with_probability(trial, others, model, rest_db / noise_db, inputs.criteria)
     if trial.reason:
         return trial, None
-    why = why_not_borne_out(extended, len(model.whole.effects))
+    why = why_not_confirmed(extended, len(model.whole.effects))
     return (trial.refuse(why, passed=False), None) if why else (trial, extended)
 
 
 def fit_and_score(model: CrossFit, effect: Effect, inputs: SearchInputs,
                   hypotheses: Hypotheses | None = None) -> tuple[Trial, CrossFit | None]:
-    """Return `score_candidate` of `fit_candidate`; of one that is refused, no model."""
+    """Fit an effect and score it on held-out links; the model is None if it is refused."""
     candidate = fit_candidate(model, effect, inputs.criteria, hypotheses)
     if isinstance(candidate, Trial):
         return candidate, None
@@ -174,10 +179,17 @@ def fit_and_score(model: CrossFit, effect: Effect, inputs: SearchInputs,
 
 def score_model(model: CrossFit, extended: CrossFit, trial: Trial, criteria: SelectionCriteria,
                 min_gain_nats: float = 0.0) -> Trial:
-    """Return what held-out links say of an extended model; with the reason where it is refused.
+    """Score an extended model on held-out links, and refuse it if it does not predict them better.
 
-    They refuse what does not return: what makes them no likelier (a description by less than
-    `min_gain_nats`), or their error larger.
+    Args:
+        model: cross-validated fit before.
+        extended: the fit with one more effect or with shadowing.
+        trial: to be completed.
+        criteria: thresholds; the RMSE may not rise by more than `max_rmse_rise`.
+        min_gain_nats: least gain of held-out log likelihood.
+
+    Returns:
+        the trial with gains and RMSE, and a reason if it is refused.
     """
     gain = model.held_out_nll - extended.held_out_nll
     known = np.isfinite(gain)

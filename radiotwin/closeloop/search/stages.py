@@ -1,4 +1,4 @@
-"""The search for effects: stages, each of which takes a state and returns the next one."""
+"""State and inputs of the search for effects, which stages pass on from one to the next."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from radiotwin.runtime.execution import Executor
 
 @dataclass(frozen=True, eq=False)
 class SearchInputs:
-    """What is the same in every stage.
+    """Inputs that are the same in every stage.
 
     Attributes:
-        links: n links as the base was given them.
-        base: kind of model that the search begins with.
-        folds: of the links.
-        effects: candidates.
-        criteria: thresholds that decide.
-        seed: of folds and permutations.
+        links: the n links to which the base was fitted.
+        base: the base with which the search begins.
+        folds: assignment of the links.
+        effects: candidates of the catalogue, declared effects included.
+        criteria: thresholds.
+        seed: random seed of folds and samples.
         executor: where candidates are fitted.
-        on_progress: called with what is being done.
+        on_progress: called with a text on each step.
     """
 
     links: Links
@@ -42,22 +42,22 @@ class SearchInputs:
 
     @property
     def undeclared(self) -> list[Effect]:
-        """Candidates that are searched for; the others are part of the base."""
+        """Effects to be searched for; declared effects are part of the base."""
         return [each for each in self.effects if not each.is_declared]
 
 
 @dataclass(frozen=True, eq=False)
 class SearchState:
-    """What a search has found so far.
+    """Result of a search so far.
 
     Attributes:
-        model: base and effects; these are in the order of `log.kept`.
-        log: trials. Not every refused one is logged: of faults only those of the last round are,
-            of effects beside another (pairs, more of a kind) only those kept.
-        steps: what the residual says before each named effect; the last is of what is left.
-        looked_at: the model that was looked at last, and the hypotheses about what it lacks.
+        model: base and effects, in the order of `log.kept`.
+        log: trials. Of faults only the refused ones of the last round are logged, of effects that
+            were tried together only the kept ones.
+        steps: summary of the residual before each named effect, and of the final one.
+        looked_at: the latest model with hypotheses, and these.
         anomalies: groups of links that stand out in the residual of the base, with their causes.
-        notes: what was found about effects that are declared, a sentence each.
+        notes: sentences about declared effects.
     """
 
     model: CrossFit
@@ -73,27 +73,27 @@ class SearchState:
         return len(self.model.whole.effects)
 
     def is_full(self, criteria: SelectionCriteria) -> bool:
-        """Return whether no more effects may be added."""
+        """Return whether the model has `max_effects` effects."""
         return self.step >= criteria.max_effects
 
     def look(self, seed: int) -> tuple[SearchState, Hypotheses]:
-        """Return the state with hypotheses about what its model lacks, made once for each model."""
+        """Return the state with the hypotheses about its model, computed once for each model."""
         if self.looked_at is not None and self.looked_at[0] is self.model:
             return self, self.looked_at[1]
         found = Hypotheses.of(self.model.whole, seed)
         return replace(self, looked_at=(self.model, found)), found
 
     def keep(self, trial: Trial, model: CrossFit) -> SearchState:
-        """Return the state with one more effect, which may have been scored in other folds."""
+        """Return the state with one more effect in its model, and the trial logged as kept."""
         kept = trial.keep(rmse_db=model.rmse_db())
         return replace(self, model=model, log=self.log.record(kept))
 
     def refuse(self, *trials: Trial) -> SearchState:
-        """Return the state with trials whose effects are not added."""
+        """Return the state with the trials of effects logged that are not added."""
         return replace(self, log=self.log.record(*trials))
 
     def note(self, sentence: str) -> SearchState:
-        """Return the state with one more note."""
+        """Return the state with one more note for the user."""
         return replace(self, notes=(*self.notes, sentence))
 
 
@@ -101,12 +101,12 @@ Stage = Callable[[SearchState, SearchInputs], SearchState]
 
 
 def search(state: SearchState, stages: Iterable[Stage], inputs: SearchInputs) -> SearchState:
-    """Return what stages find, one after the other.
+    """Run stages one after the other.
 
     Args:
-        state: to begin with.
-        stages: that add effects to the model, or take them back, and log their trials.
-        inputs: of every stage.
+        state: initial state.
+        stages: functions that add effects to the model or remove them, and log their trials.
+        inputs: inputs of every stage.
     """
     for stage in stages:
         state = stage(state, inputs)

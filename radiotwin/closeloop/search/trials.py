@@ -1,7 +1,6 @@
-"""Trials of effects, and their log, from which `closeloop.json` and the pages are made.
+"""Trials of effects and their log, from which `closeloop.json` and the pages are made.
 
-A trial never changes. Where a later judgement changes what is said of it, a new trial with its
-number supersedes it.
+A trial is immutable. A later judgement is a new trial with the same number, which supersedes it.
 """
 
 from __future__ import annotations
@@ -16,29 +15,28 @@ from radiotwin.effects.params import EffectParams
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """An effect that was tried beside a model, and what held-out links say of it.
+    """Result of trying one effect beside those found before.
 
     Attributes:
-        name: of the effect.
-        kept: whether it was added.
-        reason: why not; empty where it was.
-        nll_gain: held-out likelihood gained [nats]; NaN where it was not tried.
-        rmse_db: held-out RMSE with it [dB].
-        step: number of effects that were there before.
+        name: name of the effect.
+        kept: whether it was added to the model.
+        reason: why it was refused; empty if it was kept.
+        nll_gain: gain of held-out log likelihood [nats]; NaN if it was not scored.
+        rmse_db: held-out RMSE with the effect [dB].
+        step: number of effects in the model before.
         gain_by_fold: (folds,) `nll_gain` of each fold, divided by the design effect;
-            empty where it was not tried.
-        evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
-            it was not looked at.
+            empty if it was not scored.
+        evidence_nats: evidence beside a correlated residual, see `Hypotheses`; NaN if not computed.
         passed: whether held-out links support it; it may be refused for other reasons.
-        features: (5,) what its probability depends on, see `radiotwin.closeloop.verdict.posterior`;
-            empty where it was not tried.
-        probability: that it is there.
-        params: as fitted to all links; None where it was not tried.
-        variant: of the effect.
-        devices: names of those that `params` belong to, see `ends_of`.
-        receivers: the same of receivers.
-        rivals: of a kept effect, names of those that the data cannot tell from it.
-        number: its place in the log; None before it is in one.
+        features: (5,) features of its probability, see `radiotwin.closeloop.verdict.posterior`;
+            empty if it was not scored.
+        probability: posterior probability of the effect.
+        params: parameters fitted to all links; None if it was not scored.
+        variant: variant of the effect.
+        devices: names of the devices that it acts on, see `ends_of`.
+        receivers: names of the receivers that it acts on.
+        rivals: if it was kept, names of effects that the data cannot tell from it.
+        number: index in the log; None before it is logged.
     """
 
     name: str
@@ -61,31 +59,31 @@ class Trial:
 
     @property
     def held_out_nats(self) -> float:
-        """Gain on held-out links, those that err alike counted as one [nats]."""
+        """Held-out gain over the design effect, so that correlated links count once [nats]."""
         return float(self.gain_by_fold.sum())
 
     @property
     def nats(self) -> float:
-        """Evidence beside a correlated rest; on held-out links where residuals do not show it."""
+        """`evidence_nats`, or `held_out_nats` if the effect changes no levels."""
         return self.evidence_nats if np.isfinite(self.evidence_nats) else self.held_out_nats
 
     @property
     def is_open(self) -> bool:
-        """Whether it was neither kept nor refused."""
+        """Whether it is neither kept nor refused yet."""
         return not self.kept and not self.reason
 
     def keep(self, **changes: Any) -> Trial:
-        """Return the same trial as one whose effect was added to the model."""
+        """Return the trial marked as kept, with further changes."""
         return replace(self, kept=True, reason="", **changes)
 
     def refuse(self, reason: str, **changes: Any) -> Trial:
-        """Return the same trial as one whose effect was left out, or taken back."""
+        """Return the trial marked as refused for a reason, with further changes."""
         return replace(self, kept=False, reason=reason, **changes)
 
 
 @dataclass(frozen=True, eq=False)
 class TrialLog:
-    """The last word on each trial, in the order in which they were recorded."""
+    """The latest version of each trial, in the order of recording."""
 
     trials: tuple[Trial, ...] = ()
 
@@ -95,16 +93,16 @@ class TrialLog:
         return [each for each in self.trials if each.kept]
 
     def of_step(self, step: int) -> list[Trial]:
-        """Return the trials beside a model with `step` effects."""
+        """Return the trials made when the model had `step` effects."""
         return [each for each in self.trials if each.step == step]
 
     def record(self, *trials: Trial) -> TrialLog:
-        """Return the log with further trials, which get their numbers here."""
+        """Return the log with further trials, and number them."""
         return TrialLog((*self.trials, *(replace(each, number=number) for number, each in
                                          enumerate(trials, start=len(self.trials)))))
 
     def supersede(self, *trials: Trial) -> TrialLog:
-        """Return the log with a later word on trials that are in it.
+        """Return the log with newer versions of trials that are in it.
 
         Raises:
             ValueError: a trial that was never recorded.

@@ -1,1 +1,1 @@
-"""The verdict and every number that decides it."""
+"""Evidence, probabilities, intervals and the verdict, with the thresholds that decide it."""

@@ -1,4 +1,4 @@
-"""Every threshold that decides what the loop keeps and says, in one place."""
+"""Thresholds that decide which effects the loop keeps and names."""
 
 from __future__ import annotations
 
@@ -6,51 +6,48 @@ from dataclasses import dataclass, fields
 
 from radiotwin.errors import BadInput
 
-# Of single judgements, which no caller sets.
-MIN_FIRST_SHARE = 0.5  # of `min_probability`, for another effect to be tried beside a candidate
-MAX_SECONDS = 2  # effects that are tried beside it
-MIN_RIVAL_SHARE = 0.5  # of what the best gains, for several of a kind to be tried in its place
-SAME_DB = 1.5  # between what a receiver's limit and its readings are off, to be one fault
-MIN_SHARED = 0.5  # of a fault's, on which its rival acts, or the same fault found again
-MIN_HELD_OUT_DEVICES = 4  # of known position, to hold some of them out where a fault is judged
-MAX_LOSS_NATS = 0.01  # a held-out link, where devices that are located anew can predict more links
-# Of intervals (`radiotwin.closeloop.verdict.intervals`).
-MIN_FOLDS = 0.5  # share of the folds that must have found a parameter, too
-MIN_CLUSTERS = 3  # effective ones, of which a spread can be told
-# Of probabilities (`radiotwin.closeloop.verdict.posterior`); the weights are in calibration.json.
-MIN_SURE = 0.9  # of a group for the verdict `located`; what is less sure is said to be probable
-LEAST_RATIO = 0.2  # of what belongs to places to noise; less is none
-NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
-LIKELY = 0.05  # a cause that is less probable is not worth a word
-EXPLAINED = 0.3  # of what a pattern explains, for a search to have found it; it is refined later
+# Search (`radiotwin.closeloop.search`).
+MIN_FIRST_SHARE = 0.5  # a candidate this share of `min_probability` probable is tried with a second
+MAX_SECONDS = 2  # effects tried beside it
+MIN_RIVAL_SHARE = 0.5  # share of the best candidate's gain from which repeats of another are tried
+SAME_DB = 1.5  # offset of a receiver's limit and of its readings this close are one fault [dB]
+MIN_SHARED = 0.5  # share of links in common from which two faults or groups are the same
+MIN_HELD_OUT_DEVICES = 4  # anchors from which devices, not blocks, are held out to judge a fault
+MAX_LOSS_NATS = 0.01  # accepted loss per held-out link if relocated devices make more predictable
+# Intervals (`radiotwin.closeloop.verdict.intervals`).
+MIN_FOLDS = 0.5  # share of the folds that must have found a parameter for it to be determined
+MIN_CLUSTERS = 3  # effective number of clusters from which a standard deviation is estimated
+# Probabilities (`radiotwin.closeloop.verdict.posterior`); the weights are in calibration.json.
+MIN_SURE = 0.9  # probability of a group from which the verdict is `located`
+LEAST_RATIO = 0.2  # smaller ratios of place-bound residual to noise count as this
+NATS = 10.0  # the evidence feature is linear below about this, logarithmic above
+LIKELY = 0.05  # less probable causes are not reported
+EXPLAINED = 0.3  # share of a simulated pattern that a search must explain to have found it
 
 
 @dataclass(frozen=True)
 class SelectionCriteria:
     """Thresholds of selection and verdict; saved in `closeloop.json`.
 
-    "Calibrated" means: chosen on the hidden and the null cases of `tests/undeclared`
-    (`python -m studies hidden`, `null`), before others judged it.
-
     Attributes:
-        min_training_gain_nats: on the links that it is fitted to, for a candidate to be fitted to
-            the folds. Saves time: one that gains less is hardly probable.
-        min_gain_nats: on held-out links, for a description of the rest, which has no probability.
-        min_probability: that a cause is there, to be named; it is told with the name: more probable
-            than not (`radiotwin.closeloop.verdict.posterior`).
-        max_rest_db: standard deviation of what belongs to places and has no name, for
-            "none" to be said.
-        max_rmse_rise: held-out RMSE with the effect over that without, above which likelier links
-            do not help.
-        indistinguishable_nats: log(100): how much likelier the data must be with one effect than
-            with another to tell them apart.
-        max_effects: in all.
-        max_repeats: of one repeatable effect in one step.
-        max_dependence_p_value: of a residual's dependence on a variable (Holm-corrected).
-        min_dependence_db: standard deviation of the residual's mean over the variable; a weaker
-            dependence changes no decision.
-        max_trends: variables that the rest is described by, strongest first.
-        min_repeats_for_noise: measurements repeated at one position, to estimate the noise floor.
+        min_training_gain_nats: least gain on all links for a candidate to be fitted to the folds.
+            It saves time: with less, a cause is hardly probable.
+        min_gain_nats: least held-out gain of a trend or of interpolated shadowing, which have no
+            probability.
+        min_probability: least probability of a cause that is named
+            (`radiotwin.closeloop.verdict.posterior`).
+        max_rest_db: largest standard deviation of unexplained place-bound residual for the verdict
+            `none`.
+        max_rmse_rise: largest ratio of held-out RMSE with an effect to that without.
+        indistinguishable_nats: log(100): difference of evidence from which two effects can be told
+            apart.
+        max_effects: largest number of effects in all.
+        max_repeats: largest number of repeats of one effect in one step.
+        max_dependence_p_value: significance of a residual's dependence on a variable, corrected
+            after Holm.
+        min_dependence_db: least standard deviation of the residual's mean over that variable.
+        max_trends: largest number of trends that describe the residual.
+        min_repeats_for_noise: least number of repeats at one position for a noise floor.
     """
 
     min_training_gain_nats: float = 10.0

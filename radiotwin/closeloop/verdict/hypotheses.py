@@ -1,13 +1,13 @@
-"""Competing explanations of a residual: nuisances of the base, unnamed and named causes.
+"""Evidence for causes of a residual: marginal likelihoods with an effect over that without.
 
-Nuisances are always there: a level and a slope of each class of line of sight, tolerances of
-devices, receivers and flights, and a field over positions (`radiotwin.inference`). How far ends of
-a kind usually differ is estimated from most of them, so that the few that are off further are not
-within the tolerance of the others (empirical Bayes; Efron 2008, 'Microarrays, empirical Bayes and
-the two-groups model', Stat. Sci. 23).
+Each hypothesis includes nuisance terms: level and slope for LoS and NLoS links, tolerances of
+devices, receivers and flights, and a correlated field over positions (`radiotwin.inference`). The
+usual tolerance of a kind of ends is estimated robustly, so that the few faulty ones do not widen it
+(empirical Bayes; Efron 2008, 'Microarrays, empirical Bayes and the two-groups model', Stat. Sci.
+23).
 
-Causes without a name are curves over each variable, for all links, each receiver or each device:
-what one of them explains better than any named effect is not in the catalogue.
+Unnamed causes are curves over each variable, for all links, each receiver or each device. If a
+curve explains more than any effect of the catalogue, the cause is not in the catalogue.
 """
 
 from __future__ import annotations
@@ -30,34 +30,34 @@ from radiotwin.links import Links
 from radiotwin.twin.model.correlated_shadowing import receivers_move
 from radiotwin.twin.model.model import Fit
 
-MAX_Z = 3.0  # an outlier counts as this many scales from its neighbours
+MAX_Z = 3.0  # residuals are clipped to this many scales from the median of their neighbours
 NEIGHBOURS = 9
-LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # of a class of line of sight, at 100 m and per decade
-# Usual spread of the levels of a kind of ends before any is seen, and how many ends it counts for.
+LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # prior sd of a level at 100 m [dB] and a slope [dB/decade]
+# Prior tolerance of devices, receivers or flights [dB], and the number of ends it counts for.
 SPREAD_DB, SPREAD_ENDS = 0.5, 4
-MAX_ENDS = 40  # devices or receivers that have terms of their own
-CURVE_KNOTS, NUISANCE_SD_DB = 6, 2.0  # of the base's errors over its prediction and elevation
-KNOTS = 8  # of a curve over a variable
-TIME_KNOTS = 24  # of one over time
-CURVE_SD_DB = 4.0  # prior standard deviation of a curve
-MAX_COLUMNS = 250  # of one hypothesis
-MAX_FEW = 6  # ends of which each number is tried, before all of them
-STEP_SHARE = 0.3  # of a number's typical uncertainty, for what it changes
+MAX_ENDS = 40  # more devices or receivers get no terms of their own
+CURVE_KNOTS, NUISANCE_SD_DB = 6, 2.0  # base's error over prediction and elevation: knots, sd [dB]
+KNOTS = 8  # knots of an unnamed curve
+TIME_KNOTS = 24  # knots of one over time
+CURVE_SD_DB = 4.0  # prior sd of an unnamed curve [dB]
+MAX_COLUMNS = 250  # larger hypotheses are not tested
+MAX_SUBSET = 6  # of sparse effects, all subsets of the largest 1 to 6 coefficients are tried
+STEP_SHARE = 0.3  # finite-difference step over a parameter's typical uncertainty
 
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Evidence for causes, on the training links of one model.
+    """Evidence for further causes, on the n training links of one fit.
 
     Attributes:
-        evidence: of its residuals, with the field's length.
-        links: n training links.
-        scale_db: (n,) errors' scale, by which all residuals are divided.
-        nuisance: what is fitted beside any cause, over that scale.
-        base_z: (n,) residuals without any further cause.
-        mean_db: (n,) the model's mean.
-        coefficients: of its fit, levels first.
-        near: (n, `NEIGHBOURS`) links of the same series that are nearest to each.
+        evidence: marginal likelihood of its residuals with a correlated field.
+        links: the training links.
+        scale_db: (n,) error scale, by which all residuals are divided.
+        nuisance: design columns fitted beside any cause [scales].
+        base_z: (n,) residuals of the fit [scales], outliers clipped.
+        mean_db: (n,) predicted mean [dB].
+        coefficients: coefficients of the fit, levels first.
+        near: (n, `NEIGHBOURS`) rows of the nearest links of the same series.
     """
 
     evidence: CorrelatedEvidence
@@ -71,53 +71,53 @@ class Hypotheses:
 
     @classmethod
     def of(cls, fit: Fit, seed: int) -> Hypotheses:
-        """Return the hypotheses about what a model lacks.
+        """Prepare the evidence for effects that a fit lacks.
 
         Args:
-            fit: with what was found so far.
-            seed: of the draw of links, where there are many.
+            fit: the base with the effects that were found so far.
+            seed: random seed of the sample of links, if there are many.
         """
         training = fit.model.training
         links, predicted = fit.links.select(fit.train), training.predict(fit)
         nuisance, families = _nuisance(links, predicted.mean_db)
         nuisance = Columns(nuisance.values / predicted.scale_db[:, None], nuisance.prior_sd)
         residual_db = training.residual_db(fit)
-        # A blank that was to be expected says nothing.
-        says = np.isfinite(training.level_db) | (residual_db < 0)
-        residual_db = np.where(says, residual_db, np.nan)
+        # A blank that the model predicts contains no information.
+        informative = np.isfinite(training.level_db) | (residual_db < 0)
+        residual_db = np.where(informative, residual_db, np.nan)
         moving = receivers_move(links)
         series = links.device if moving else links.receiver
         position_m = links.receiver_m if moving else links.device_m[links.device]
-        near = _neighbours(series, links.track, position_m, np.isfinite(residual_db))
-        z = _tamed(residual_db / predicted.scale_db, near)
+        near = _nearest_links(series, links.track, position_m, np.isfinite(residual_db))
+        z = _clip_outliers(residual_db / predicted.scale_db, near)
         evidence = CorrelatedEvidence.fit(series, position_m, z, nuisance, seed)
-        nuisance = _with_usual_spreads(evidence, z, nuisance, families)
+        nuisance = _with_estimated_tolerances(evidence, z, nuisance, families)
         return cls(evidence, links, predicted.scale_db, nuisance, z, predicted.mean_db,
                    fit.coefficients, near)
 
     @cached_property
     def _rotated(self) -> tuple[np.ndarray, float, np.ndarray]:
-        """Nuisance columns, evidence and variances without any further cause."""
+        """Whitened nuisance columns; log likelihood and log variances without a further cause."""
         columns = self.evidence.rotated(self.nuisance.values)
         found = self.evidence.of_rotated(self.evidence.rotated(self.base_z), columns,
                                          self.nuisance.prior_sd)
         return columns, *found
 
     @property
-    def sizes_db(self) -> tuple[float, float]:
-        """Standard deviations of the rest that belongs to places, and of noise [dB]."""
+    def rest_and_noise_db(self) -> tuple[float, float]:
+        """Standard deviations of the place-bound residual and of noise [dB]."""
         _, _, theta = self._rotated
         noise_db = np.exp(0.5 * theta[0]) * float(np.median(self.scale_db))
         return noise_db * np.exp(0.5 * theta[1]), noise_db
 
     def gain_nats(self, z: np.ndarray, columns: Columns,
                   widening: np.ndarray | None = None) -> float:
-        """Return how much likelier residuals are with columns than those of the model.
+        """Return the log likelihood ratio of residuals with further columns over the fit's [nats].
 
         Args:
-            z: (n,) residuals with the effect [its error scales].
-            columns: likewise.
-            widening: (n,) error scales with the effect over those without; None: the same.
+            z: (n,) residuals with the effect [error scales with the effect].
+            columns: design columns of the effect [the same scales].
+            widening: (n,) error scales with the effect over those without; None: 1.
         """
         nuisance, base, theta = self._rotated
         if widening is not None:
@@ -129,64 +129,61 @@ class Hypotheses:
         return self.evidence.of_rotated(self.evidence.rotated(z), both, sd, theta)[0] - base
 
     def information(self, pattern_db: np.ndarray) -> float:
-        """Return how sharply the data would show a change (n,) of unit size [1/size²]."""
+        """Return the Fisher information on the size of a pattern (n,) of unit size [1/size²]."""
         columns, _, theta = self._rotated
         pattern = self.evidence.rotated(pattern_db / self.scale_db)
         return self.evidence.information(pattern, columns, self.nuisance.prior_sd, theta)
 
-    def of_named(self, fit: Fit) -> float:
-        """Return the evidence for the last effect of a model [nats].
+    def effect_evidence_nats(self, fit: Fit) -> float:
+        """Return the evidence for the last effect of a fit [nats].
 
-        Coefficients are integrated over their priors, and so are the numbers that were searched
-        for, of which what they change is taken as linear (Laplace's approximation; MacKay 2003,
-        'Information theory, inference, and learning algorithms', Ch. 28): what the data do not
-        determine costs nothing, and what fits best without the rest is fitted again beside it.
+        Coefficients are integrated over their priors, and so are the searched parameters, whose
+        effect on levels is linearised (Laplace's approximation; MacKay 2003, 'Information theory,
+        inference, and learning algorithms', Ch. 28).
 
         Args:
-            fit: of this one's model with one more effect.
-
-        Returns:
-            NaN for an effect that residuals do not show.
+            fit: the fit of this object with one more effect.
         """
-        effect, own = fit.effects[-1], fit.coefficients_of(-1)
+        effect, coefficients = fit.effects[-1], fit.coefficients_of(-1)
         term = fit.model.terms[-1].select(fit.train)
         scale_db, widening = self.scale_db, None
-        if term.random_effect_sd_db is not None:  # an effect that makes errors larger
+        if term.random_effect_sd_db is not None:  # the effect adds scatter to readings
             scale_db = np.hypot(scale_db, term.random_effect_sd_db)
             widening = scale_db / self.scale_db
-        z = _tamed(fit.model.training.residual_db(fit) / scale_db, self.near)
-        # What its columns brought, and what levels gave way for it, is integrated over again.
-        shown_db = term.columns @ own
+        z = _clip_outliers(fit.model.training.residual_db(fit) / scale_db, self.near)
+        # Add the fitted contribution of the effect's columns and of the changed levels back, since
+        # the likelihood integrates over them.
+        contribution_db = term.columns @ coefficients
         levels = fit.model.level_columns[fit.train]
         p = levels.shape[1]
-        shown_db += levels @ (fit.coefficients[:p] - self.coefficients[:p])
-        z += shown_db / scale_db
+        contribution_db += levels @ (fit.coefficients[:p] - self.coefficients[:p])
+        z += contribution_db / scale_db
         columns = Columns(term.columns / scale_db[:, None], term.prior_sd_db)
         if effect.sparse:
-            return self._of_few(z, columns, own)
+            return self._sparse_evidence_nats(z, columns, coefficients)
         slopes = _slopes(fit)
         return self.gain_nats(z, columns.beside(
             Columns(slopes.values / scale_db[:, None], slopes.prior_sd)), widening)
 
-    def _of_few(self, z: np.ndarray, columns: Columns, coefficients: np.ndarray) -> float:
-        """Return the evidence for the likeliest few of columns, largest coefficients (q,) first.
+    def _sparse_evidence_nats(self, z: np.ndarray, columns: Columns,
+                              coefficients: np.ndarray) -> float:
+        """Return the evidence for the best subset of columns with the largest coefficients (q,).
 
-        Any number of them is as probable as any other, and any set of that number (Scott and Berger
-        2010, 'Bayes and empirical-Bayes multiplicity adjustment in the variable-selection problem',
-        Ann. Stat. 38): one end that is off does not pay for all that are not.
+        The prior is uniform over the subset's size, and over the subsets of one size (Scott and
+        Berger 2010, 'Bayes and empirical-Bayes multiplicity adjustment in the variable-selection
+        problem', Ann. Stat. 38), so that one faulty end is not penalised for all good ones.
         """
         order, q = np.argsort(-np.abs(coefficients - np.median(coefficients))), len(coefficients)
         found = []
-        for count in sorted({*range(1, min(q, MAX_FEW) + 1), q}):
-            few = Columns(columns.values[:, order[:count]], columns.prior_sd[order[:count]])
-            found.append(self.gain_nats(z, few) - log(comb(q, count)) - log(q))
+        for count in sorted({*range(1, min(q, MAX_SUBSET) + 1), q}):
+            subset = Columns(columns.values[:, order[:count]], columns.prior_sd[order[:count]])
+            found.append(self.gain_nats(z, subset) - log(comb(q, count)) - log(q))
         return max(found)
 
-    def of_group(self, group: np.ndarray) -> float:
-        """Return the evidence for a cause without a name that acts on a group of links (n,) only.
+    def group_evidence_nats(self, group: np.ndarray) -> float:
+        """Return the evidence for an unnamed cause of a group of links (n,), at least 0 [nats].
 
-        It is a curve over any one variable, which is as probable as any other; or none of them, as
-        what stands out need not be a curve.
+        The cause is a curve over one variable; all variables are equally probable.
         """
         found = []
         for value, knots, is_angle in self._variables().values():
@@ -198,7 +195,7 @@ class Hypotheses:
 
     @cached_property
     def unnamed_nats(self) -> dict[str, float]:
-        """Evidence for a cause without a name over each variable [nats]."""
+        """Evidence for an unnamed curve over each variable [nats], by its name."""
         found: dict[str, float] = {}
         for name, values in self._curves():
             scaled = values / self.scale_db[:, None]
@@ -207,7 +204,7 @@ class Hypotheses:
         return found
 
     def _variables(self) -> dict[str, tuple[np.ndarray, int, bool]]:
-        """Return values (n,), number of knots, and whether it is an angle, of each variable."""
+        """Return each variable's values (n,), number of knots, and whether it is an angle."""
         links = self.links
         variables = {
             "time": (links.time_s, TIME_KNOTS, False),
@@ -223,6 +220,7 @@ class Hypotheses:
                 and len(np.unique(each[0][known])) >= KNOTS}  # else it is a label
 
     def _curves(self) -> Iterator[tuple[str, np.ndarray]]:
+        """Yield name and design columns of unnamed causes: of all links, by receiver, by device."""
         links = self.links
         ends = {"": None, "receiver": links.receiver, "device": links.device}
         flights = len(np.unique(links.flight))
@@ -245,16 +243,16 @@ class Hypotheses:
 
 
 def _slopes(fit: Fit) -> Columns:
-    """Return what each number of the last effect changes (n, q) [dB], and how far it may (q,)."""
+    """Return derivatives (n, q) of levels [dB] by the last effect's parameters, with prior sds."""
     model, effect = fit.model, fit.effects[-1]
     variation = effect.variation()
     if variation is None:
         return Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0))
-    here = variation.effect(variation.values)
-    if not here.is_same(effect):  # it varies with quicker levels than it has
-        model = model.with_effect_at(-1, here)
+    centre = variation.effect(variation.values)
+    if not centre.is_same(effect):  # varied with faster levels than it was fitted with
+        model = model.with_effect_at(-1, centre)
     mean_db, slopes_db = model.training.predict(fit).mean_db, []
-    # Of paths those that folds will ask for, too.
+    # With paths, the step is the one of the folds, whose paths are then computed already.
     share = NEAR_SHARE if variation.follows_paths else STEP_SHARE
     for number, step in enumerate(share * variation.steps):
         values = variation.values.copy()
@@ -267,39 +265,45 @@ def _slopes(fit: Fit) -> Columns:
     return Columns(np.column_stack(slopes_db), width / np.sqrt(12.0))
 
 
-def _neighbours(series: np.ndarray, track: np.ndarray, position_m: np.ndarray,
-                known: np.ndarray) -> np.ndarray:
-    """Return rows (n, `NEIGHBOURS`) that are known and nearest to each, of the same series.
+def _nearest_links(series: np.ndarray, track: np.ndarray, position_m: np.ndarray,
+                   known: np.ndarray) -> np.ndarray:
+    """Return the rows (n, `NEIGHBOURS`) of the nearest known links of the same series.
 
-    Of the same track (n,) where it has as many: what all links of a flight have in common, be it a
-    scatter, is not measured by other flights.
+    They are of the same track (n,), if it has enough: another flight may scatter less.
+
+    Args:
+        series: (n,) label of the fixed end.
+        track: (n,) label of receiver and flight.
+        position_m: (n, 3) position of the moving end [m].
+        known: (n,) bool, links with a residual.
     """
     near = np.repeat(np.arange(len(series))[:, None], NEIGHBOURS, axis=1)
     for labels in (series[:, None], np.column_stack([series, track])):
         member = np.unique(labels, axis=0, return_inverse=True)[1].ravel()
         order = np.argsort(member, kind="stable")
-        for own in np.split(order, np.cumsum(np.bincount(member))[:-1]):
-            there = own[known[own]]
-            if len(there) >= NEIGHBOURS:
-                near[own] = there[cKDTree(position_m[there]).query(position_m[own], NEIGHBOURS)[1]]
+        for rows in np.split(order, np.cumsum(np.bincount(member))[:-1]):
+            usable = rows[known[rows]]
+            if len(usable) >= NEIGHBOURS:
+                tree = cKDTree(position_m[usable])
+                near[rows] = usable[tree.query(position_m[rows], NEIGHBOURS)[1]]
     return near
 
 
-def _tamed(z: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Return residuals (n,) without outliers: `MAX_Z` scales from its neighbours at most.
+def _clip_outliers(z: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Clip each residual (n,) to `MAX_Z` scales from the median of its neighbours.
 
-    The scale is their own where they scatter more: an outlier is a single link, and what neighbours
-    have in common, level or scatter, is none.
+    The scale is at least 1, or the neighbours' own: a level or scatter that neighbours share is no
+    outlier.
     """
-    common = np.median(z[near], axis=1)
-    most = MAX_Z * np.maximum(MAD_SD * np.median(np.abs(z[near] - common[:, None]), axis=1), 1.0)
-    return common + np.clip(z - common, -most, most)
+    median = np.median(z[near], axis=1)
+    scale = np.maximum(MAD_SD * np.median(np.abs(z[near] - median[:, None]), axis=1), 1.0)
+    return median + np.clip(z - median, -MAX_Z * scale, MAX_Z * scale)
 
 
 def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[slice]]:
-    """Return what every base may be wrong in [dB], and which columns are of ends of one kind.
+    """Return the nuisance columns [dB], and the slices of devices, receivers and tracks.
 
-    Also over its prediction (n,): weak levels are those of ways that it does not follow.
+    They include a curve over the prediction (n,): weak links arrive by paths the base omits.
     """
     slope = np.log10(links.distance_m / 100.0)
     blocks, prior_sd_db, families = [], [], []
@@ -319,13 +323,12 @@ def _nuisance(links: Links, mean_db: np.ndarray) -> tuple[Columns, list[slice]]:
     return Columns(np.hstack(blocks), np.array(prior_sd_db)), families
 
 
-def _with_usual_spreads(evidence: CorrelatedEvidence, z: np.ndarray, nuisance: Columns,
-                        families: list[slice]) -> Columns:
-    """Return the nuisance with the spread of most ends of each kind as their prior.
+def _with_estimated_tolerances(evidence: CorrelatedEvidence, z: np.ndarray, nuisance: Columns,
+                               families: list[slice]) -> Columns:
+    """Set the prior sd of each kind of ends to the robust spread of their levels, with shrinkage.
 
-    The levels of ends are estimated beside all else and a wide prior. Half of them are nearer to
-    their median than those that are off, so the robust spread is that of the others; two tell
-    nothing of how much most differ.
+    Levels are estimated with a wide prior. While fewer than half of the ends are faulty, the robust
+    spread is the tolerance of the good ones. Two ends tell nothing about it.
     """
     for family in families:
         prior_sd = nuisance.prior_sd.copy()
@@ -340,6 +343,6 @@ def _with_usual_spreads(evidence: CorrelatedEvidence, z: np.ndarray, nuisance: C
     return nuisance
 
 
-def is_judged_by_levels(effect: Effect) -> bool:
-    """Return whether an effect changes levels, so that residuals can show it."""
+def changes_levels(effect: Effect) -> bool:
+    """Return whether an effect changes levels, and not only which links are blank."""
     return effect.stage not in ("limit", "detection")

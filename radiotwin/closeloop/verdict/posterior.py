@@ -1,12 +1,11 @@
-"""How probable it is that an effect is there, that nothing is, or something that has no name.
+"""Posterior probabilities: of an effect, of nothing, and of a cause that is not in the catalogue.
 
-Nats are worth what they turned out to be worth: a logistic regression, fitted on traced cases
-(`tests/undeclared`, of the foreign worlds the cities for calibration; `python -m studies foreign`
-judges it on the others), turns evidence beside a correlated rest, what held-out links gain, how
-much of the rest belongs to places (a map that is wrong, or none), and whether an effect of another
-kind is there already (two are rarer than one) into a probability (Platt 1999, 'Probabilistic
-outputs for support vector machines'). Its few numbers are in `calibration.json`, made by
-`python -m studies.calibration`.
+A logistic regression turns four kinds of numbers into a probability (Platt 1999, 'Probabilistic
+outputs for support vector machines'): the evidence beside a correlated residual, the held-out gain,
+the ratio of place-bound residual to noise, and whether another kind of effect was found already. It
+was fitted to ray-traced cases with known effects (`tests/undeclared`, and the foreign cities for
+calibration; `python -m studies foreign` tests it on other cities). The weights are in
+`calibration.json`, made by `python -m studies.calibration`.
 """
 
 from __future__ import annotations
@@ -31,15 +30,15 @@ NONE, OTHER = "none", "not in the catalogue"
 
 @dataclass(frozen=True)
 class Step:
-    """Evidence in the residual at one step.
+    """What the residual says at one step of the search.
 
     Attributes:
-        number: of effects that were there.
-        unnamed_nats: evidence for a curve without a name over each variable.
-        rest_db: standard deviation of what belongs to places and has no name [dB].
-        noise_db: and of what belongs to nothing.
-        probabilities: of each effect that was scored on held-out links, passed or not, of `NONE`
-            and of `OTHER`; they sum to 1.
+        number: number of effects found before.
+        unnamed_nats: evidence for an unnamed curve over each variable.
+        rest_db: standard deviation of the unexplained place-bound residual [dB].
+        noise_db: standard deviation of noise [dB].
+        probabilities: probability of each effect that was scored on held-out links, of `NONE` and
+            of `OTHER`; they sum to 1.
     """
 
     number: int
@@ -49,47 +48,50 @@ class Step:
     probabilities: dict[str, float]
 
     @property
-    def best_unnamed(self) -> float:
-        """Most evidence for a curve without a name, at least 0 [nats]."""
+    def best_unnamed_nats(self) -> float:
+        """Evidence for the best unnamed curve, at least 0 [nats]."""
         return max([0.0, *self.unnamed_nats.values()])
 
 
 def judge(scores: Sequence[Trial], model: CrossFit, hypotheses: Hypotheses,
           criteria: SelectionCriteria) -> tuple[list[Trial], Step]:
-    """Return a step's scores with their probabilities, and what the step says.
+    """Compute the probability of every candidate of a step.
 
     Args:
-        scores: of every candidate of the step.
-        model: without any of them.
-        hypotheses: about what it lacks.
+        scores: trials of all candidates.
+        model: the fit without any of them.
+        hypotheses: evidence for further effects of that fit.
         criteria: a candidate that passed is refused below `min_probability`.
+
+    Returns:
+        the trials with probabilities, and the summary of the step.
     """
-    rest_db, noise_db = hypotheses.sizes_db
+    rest_db, noise_db = hypotheses.rest_and_noise_db
     step = Step(len(model.whole.effects), hypotheses.unnamed_nats, rest_db, noise_db, {})
     judged = []
     for score in scores:
         if score.gain_by_fold.size:
-            # What makes links blank has no rival among what changes levels, nor among curves.
+            # Effects on levels do not compete with effects on detection.
             by_levels = bool(np.isfinite(score.evidence_nats))
             others = [each.nats for each in scores if each.name != score.name
                       and each.held_out_nats > 0
                       and (by_levels or not np.isfinite(each.evidence_nats))]
             score = with_probability(score, others, model, rest_db / noise_db, criteria)
         judged.append(score)
-    return judged, replace(step, probabilities=_probabilities(judged, step.best_unnamed, rest_db,
-                                                              noise_db))
+    return judged, replace(step, probabilities=_probabilities(judged, step.best_unnamed_nats,
+                                                              rest_db, noise_db))
 
 
 def with_probability(score: Trial, others: Sequence[float], model: CrossFit,
                      rest_over_noise: float, criteria: SelectionCriteria) -> Trial:
-    """Return a score with the probability of its effect; refused where that is too low.
+    """Add the probability to the trial of an effect; refuse it if that is too low.
 
     Args:
-        score: of a candidate that was scored on held-out links.
-        others: evidence for its rivals [nats].
-        model: without it.
-        rest_over_noise: standard deviations of what belongs to places and of noise.
-        criteria: one that passed is refused below `min_probability`.
+        score: trial of a candidate that was scored on held-out links.
+        others: evidence for rival effects [nats].
+        model: the fit without the candidate.
+        rest_over_noise: ratio of the standard deviations of place-bound residual and noise.
+        criteria: a candidate that passed is refused below `min_probability`.
     """
     nats = score.nats, score.held_out_nats, score.nats - max([0.0, *others])
     is_another_kind = bool(model.whole.model.effect_names - {score.name})
@@ -102,14 +104,14 @@ def with_probability(score: Trial, others: Sequence[float], model: CrossFit,
 
 
 def verdict_without_effect(steps: Sequence[Step], criteria: SelectionCriteria) -> str:
-    """Return `none` or `undecided`, where no cause was named.
+    """Return `none` or `undecided` for a search that named no cause.
 
-    It is `none` where it is probable that nothing is hidden and no more than `max_rest_db` belongs
-    to places. The first step decides: descriptions of the rest have no part in it.
+    `none` if the first step finds it probable that nothing is hidden, and at most `max_rest_db` of
+    residual is place-bound.
 
     Args:
-        steps: what the residual says; none where no cause was looked for.
-        criteria: that decide.
+        steps: summaries of the search; empty if no cause was searched for.
+        criteria: thresholds.
     """
     if not steps:
         return "undecided"
@@ -122,13 +124,13 @@ def verdict_without_effect(steps: Sequence[Step], criteria: SelectionCriteria) -
 
 def features(nats: tuple[float, float, float], rest_over_noise: float,
              is_another_kind: bool) -> tuple[float, ...]:
-    """Return what a candidate's probability depends on, (5,).
+    """Return the five features of the logistic regression for a candidate.
 
     Args:
-        nats: its evidence beside a correlated rest, its gain on held-out links, and the lead of its
-            evidence over that of the best other effect that held-out links support [nats].
-        rest_over_noise: standard deviations of what belongs to places and of noise.
-        is_another_kind: whether an effect of another name is there already.
+        nats: evidence beside a correlated residual, gain on held-out links, and lead of the
+            evidence over the best other effect that passed [nats].
+        rest_over_noise: ratio of the standard deviations of place-bound residual and noise.
+        is_another_kind: whether an effect of another name was found already.
     """
     return (*np.arcsinh(np.array(nats) / NATS).tolist(),
             float(np.log(max(rest_over_noise, LEAST_RATIO))), float(is_another_kind))
@@ -136,13 +138,13 @@ def features(nats: tuple[float, float, float], rest_over_noise: float,
 
 def probability_of_all(scores: Sequence[Trial], other: float, before: CrossFit,
                        rest_over_noise: float) -> float:
-    """Return the probability that several effects are there, from what they explain together.
+    """Return the probability of several effects from the sum of their evidence.
 
     Args:
-        scores: each of a model with those before it.
-        other: most evidence for any other effect [nats].
-        before: the model without any of them.
-        rest_over_noise: standard deviations of what belongs to places and of noise, without them.
+        scores: trials of the effects, each beside those before it.
+        other: evidence for the best other effect [nats].
+        before: the fit without any of the effects.
+        rest_over_noise: ratio of the standard deviations of place-bound residual and noise, before.
     """
     evidence, held_out = (sum(each.nats for each in scores),
                           sum(each.held_out_nats for each in scores))
@@ -152,26 +154,29 @@ def probability_of_all(scores: Sequence[Trial], other: float, before: CrossFit,
 
 
 def probability_of(name: str, values: tuple[float, ...]) -> float:
-    """Return the probability that an effect is there, from its `features`."""
+    """Return the probability of an effect, given its name and its `features`."""
     weights = calibration()["effect"]
-    own = _log_odds_of(name)
-    return float(expit(weights["intercept"] + own + np.dot(weights["weights"], values)))
+    return float(expit(weights["intercept"] + _calibrated_log_odds(name)
+                       + np.dot(weights["weights"], values)))
 
 
 @cache
-def _log_odds_of(name: str) -> float:
-    """Return how much likelier an effect is, for the same evidence, than effects are on the whole.
+def _calibrated_log_odds(name: str) -> float:
+    """Return the calibrated log odds of an effect relative to the average effect.
 
-    Of one without a calibration as of the effect that it is `calibrated_like`, or else 0, the mean
-    around which the calibration was fitted.
+    An effect without a calibration has that of the effect it is `calibrated_like`, or else 0.
     """
     names = calibration()["effect"]["names"]
     return names[name] if name in names else max(
         (names.get(each.calibrated_like, 0.0) for each in effects_named(name)), default=0.0)
 
 
-def _probabilities(scores: Sequence[Trial], unnamed: float, rest_db: float,
+def _probabilities(scores: Sequence[Trial], unnamed_nats: float, rest_db: float,
                    noise_db: float) -> dict[str, float]:
+    """Return probabilities of the effects, of `NONE` and of `OTHER` that sum to 1.
+
+    An effect with several trials counts with its most probable one.
+    """
     found: dict[str, float] = {}
     for score in scores:
         if np.isfinite(score.probability):
@@ -179,24 +184,29 @@ def _probabilities(scores: Sequence[Trial], unnamed: float, rest_db: float,
     total = sum(found.values())
     missing = float(np.prod([1 - each for each in found.values()]))
     best = max([0.0, *(score.nats for score in scores if np.isfinite(score.nats))])
-    none = missing * _probability_of_nothing(best, unnamed, rest_db, noise_db)
-    # Two effects may both be there: shares of what is not "none" nor without a name.
+    none = missing * _probability_of_nothing(best, unnamed_nats, rest_db, noise_db)
+    # Several effects may be present at once: their probabilities are scaled to the remaining share.
     named = {name: each * (1 - missing) / total for name, each in found.items()} if total else {}
     return named | {NONE: none, OTHER: missing - none}
 
 
-def _probability_of_nothing(best: float, unnamed: float, rest_db: float, noise_db: float) -> float:
-    """Return the probability that nothing is hidden where no effect of the catalogue is.
+def _probability_of_nothing(named_nats: float, unnamed_nats: float, rest_db: float,
+                            noise_db: float) -> float:
+    """Return the probability of no effect at all, given that none of the catalogue is present.
 
-    From the most evidence for an effect, and for a curve without a name [nats].
+    Args:
+        named_nats: evidence for the best effect of the catalogue.
+        unnamed_nats: evidence for the best unnamed curve.
+        rest_db: standard deviation of the place-bound residual.
+        noise_db: standard deviation of noise.
     """
     weights = calibration()["nothing"]
-    values = [*np.arcsinh(np.array([best, unnamed]) / NATS), np.log(max(rest_db, 0.1)),
+    values = [*np.arcsinh(np.array([named_nats, unnamed_nats]) / NATS), np.log(max(rest_db, 0.1)),
               np.log(max(noise_db, 0.1))]
     return float(expit(weights["intercept"] + np.dot(weights["weights"], values)))
 
 
 @cache
 def calibration() -> Mapping[str, dict]:
-    """Return the numbers of both logistic regressions."""
+    """Return the weights of the logistic regressions: `effect`, and `nothing`."""
     return json.loads(files(__package__).joinpath("calibration.json").read_text(encoding="utf-8"))

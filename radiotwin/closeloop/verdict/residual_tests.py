@@ -1,4 +1,4 @@
-"""What the residual still depends on, one permutation test for each variable; and its noise."""
+"""Test by permutations on which variables a residual depends; estimate the noise of readings."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -12,16 +12,16 @@ from radiotwin.links import Links, residual_variables
 from radiotwin.links.sites import repeats_at_places, shared_names
 from radiotwin.runtime.pieces import kept
 
-MAX_LINKS = 20_000  # more are thinned to whole series
-MAX_Z = 4.0  # an outlier counts as this many scales
+MAX_LINKS = 20_000  # of more links, whole series are sampled
+MAX_Z = 4.0  # residuals are clipped to this many scales
 
 
 @dataclass(frozen=True)
 class ResidualDependence:
-    """A variable and whether the residual depends on it.
+    """Test of the residual's dependence on one variable.
 
     Attributes:
-        variable: its name.
+        variable: name of the variable.
         p_value: corrected for the number of variables (Holm 1979).
         effect_db: standard deviation of the residual's mean over the variable [dB].
     """
@@ -32,9 +32,9 @@ class ResidualDependence:
 
 
 def dependences(model: CrossFit, seed: int) -> list[ResidualDependence]:
-    """Test for every variable if a model's held-out residual depends on it; the strongest first.
+    """Test on which variables a model's held-out residual depends; the most significant first.
 
-    Links on which an unforeseen fault acts are left out.
+    Links with a fault that their fold could not learn are left out.
     """
     mean_db = model.held_out_mean_db
     residual_db = np.where(model.unforeseen, np.nan, model.links.level_db - mean_db)
@@ -45,7 +45,7 @@ def dependences(model: CrossFit, seed: int) -> list[ResidualDependence]:
 
 def significant(dependences: list[ResidualDependence],
                 criteria: SelectionCriteria) -> list[ResidualDependence]:
-    """Return those that are not chance and strong enough to matter."""
+    """Return the dependences with a small p-value and at least `min_dependence_db`."""
     return [each for each in dependences if each.p_value <= criteria.max_dependence_p_value
             and each.effect_db >= criteria.min_dependence_db]
 
@@ -57,15 +57,16 @@ def _read(_: dict[str, np.ndarray], content: Any) -> list[ResidualDependence]:
 
 def _tested(links: Links, residual_db: np.ndarray, scale_db: np.ndarray, mean_db: np.ndarray,
             seed: int) -> list[ResidualDependence]:
+    """Run the tests of `dependences`: residual, error scale and prediction (n,) each [dB]."""
     rng = np.random.default_rng(seed)
     rows = np.flatnonzero(np.isfinite(residual_db))
     if len(rows) > MAX_LINKS:
-        # Whole series, so that neighbours stay neighbours.
+        # Whole series are kept, so that correlated neighbours stay together.
         series = links.track[rows] * len(links.device_names) + links.device[rows]
-        names = rng.permutation(np.unique(series))
-        total = np.cumsum(np.bincount(series, minlength=names.max() + 1)[names])
-        kept = total <= MAX_LINKS
-        rows = rows[np.isin(series, names[kept])] if kept.any() else rows[:MAX_LINKS]
+        shuffled = rng.permutation(np.unique(series))
+        total = np.cumsum(np.bincount(series, minlength=shuffled.max() + 1)[shuffled])
+        fits = total <= MAX_LINKS
+        rows = rows[np.isin(series, shuffled[fits])] if fits.any() else rows[:MAX_LINKS]
     part = links.select(rows)
     z = np.clip(residual_db[rows] / scale_db[rows], -MAX_Z, MAX_Z)
     z = z - z.mean()
@@ -88,7 +89,10 @@ def _tested(links: Links, residual_db: np.ndarray, scale_db: np.ndarray, mean_db
 
 
 def noise_floor_db(links: Links, criteria: SelectionCriteria) -> float:
-    """Return the standard deviation of one measurement [dB], from repeats at one position."""
+    """Estimate the standard deviation of one reading from repeats at one position [dB].
+
+    NaN with fewer than `min_repeats_for_noise` repeats.
+    """
     repeats = repeats_at_places(links).without(list(shared_names(links)))
     freedom = round(float(repeats.freedom.sum()))
     if freedom < criteria.min_repeats_for_noise:

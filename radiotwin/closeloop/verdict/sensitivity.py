@@ -1,11 +1,9 @@
-"""How large an effect would have had to be, to be seen in these measurements.
+"""Sensitivity of the search: the least size of each effect that would have been named.
 
-For each family a typical pattern is laid beside what the base may be wrong in (`hypotheses`): the
-size at which the expected evidence makes it probable enough to be named. A search has conditions of
-its own, as that devices agree or that flights differ little: so the pattern is also laid into the
-residual, larger and larger until the effect's search proposes what explains it. What was not named
-and is smaller may be there. Only what was looked for in these links is asked, and a size counts
-only within what its effect allows.
+For a typical pattern of each effect, the Fisher information beside the nuisances (`hypotheses`)
+gives the size from which the expected evidence makes it probable enough. An effect's search has
+further conditions, for example that devices agree. So the pattern is also added to the residual,
+larger and larger, until the search finds it. Smaller effects may be present and are not named.
 """
 
 from __future__ import annotations
@@ -22,20 +20,20 @@ from radiotwin.closeloop.verdict.posterior import features, probability_of
 from radiotwin.effects.base import Effect, ResidualView, Term
 from radiotwin.effects.patterns import Pattern
 
-MAX_NATS = 1e4  # more are not looked for
-LARGER, MAX_TRIALS = 2.0, 5  # times the size before, where a search does not find it
-MAX_SIZE = 1e3  # in any unit
+MAX_NATS = 1e4  # upper end of the search for the evidence that is needed
+GROWTH, MAX_TRIALS = 2.0, 5  # factor by which a size grows until a search finds it; largest number
+MAX_SIZE = 1e3  # in the effect's unit
 
 
 @dataclass(frozen=True)
 class Detectable:
-    """Least size of an effect that would have been named.
+    """Least size of an effect from which it would have been named.
 
     Attributes:
-        name: of the effect.
-        size: in `unit`; inf where no size would do that the effect may have.
+        name: name of the effect.
+        size: least size, in `unit`; inf if no allowed size suffices.
         unit: dB, dB/km or m.
-        pattern: what its size is of.
+        pattern: description of the typical pattern.
     """
 
     name: str
@@ -45,26 +43,26 @@ class Detectable:
 
 
 def detectable(view: ResidualView, hypotheses: Hypotheses, criteria: SelectionCriteria,
-               effects: Iterable[Effect], there: Set[str] = frozenset()) -> list[Detectable]:
-    """Return the least size that would have been named of each family that was looked for.
+               effects: Iterable[Effect], found_names: Set[str] = frozenset()) -> list[Detectable]:
+    """Return the least size from which each effect would have been named, if it can be found.
 
     Args:
-        view: training links and residual of the last model.
-        hypotheses: about what it lacks.
+        view: training links and residual of the last fit.
+        hypotheses: evidence for further effects of that fit.
         criteria: with the probability that is needed.
-        effects: of the catalogue.
-        there: names of the effects of that model.
+        effects: effects of the catalogue.
+        found_names: names of the effects in that fit.
     """
     found: dict[tuple[int, Effect, str, str], list[float]] = {}
-    rest_db, noise_db = hypotheses.sizes_db
+    rest_db, noise_db = hypotheses.rest_and_noise_db
     for effect in effects:
-        named = effect.name in there and not effect.repeatable  # as all there can be of it
-        if named or effect.is_declared or effect.unavailable(view.links) is not None:
+        is_complete = effect.name in found_names and not effect.repeatable
+        if is_complete or effect.is_declared or effect.unavailable(view.links) is not None:
             continue
         for pattern in effect.typical_patterns(view):
             information = hypotheses.information(pattern.change_db)
             nats = needed_nats(effect.name, criteria.min_probability, rest_db / noise_db,
-                               bool(there - {effect.name})) + 0.5 * np.log(len(view.links))
+                               bool(found_names - {effect.name})) + 0.5 * np.log(len(view.links))
             size = float(np.sqrt(2 * nats / information)) if information > 0 else np.inf
             found.setdefault((pattern.rank, effect, pattern.unit, pattern.what), []).append(
                 _size_found(effect, view, pattern, max(size, pattern.low)))
@@ -74,7 +72,7 @@ def detectable(view: ResidualView, hypotheses: Hypotheses, criteria: SelectionCr
 
 
 def _size_found(effect: Effect, view: ResidualView, pattern: Pattern, size: float) -> float:
-    """Return the least size from one on at which a search finds a pattern; inf if at none."""
+    """Enlarge a pattern until the effect's search finds it; return that size, or inf."""
     for _ in range(MAX_TRIALS):
         if size > min(pattern.high, MAX_SIZE):
             break
@@ -84,20 +82,24 @@ def _size_found(effect: Effect, view: ResidualView, pattern: Pattern, size: floa
         if any(changed.score(effect.with_params(params).term(view.links, view.level_at)) >= least
                for params in effect.propose(changed)):
             return size
-        size *= LARGER
+        size *= GROWTH
     return np.inf
 
 
 def needed_nats(name: str, probability: float, rest_over_noise: float,
                 is_another_kind: bool = False) -> float:
-    """Return the evidence that makes an effect so probable, if nothing competes with it [nats].
+    """Return the evidence that gives an effect without rivals a probability [nats]; or inf.
 
-    inf where none does.
+    Args:
+        name: name of the effect.
+        probability: to be reached.
+        rest_over_noise: ratio of the standard deviations of place-bound residual and noise.
+        is_another_kind: whether an effect of another name was found already.
     """
-    def lack(nats: float) -> float:
+    def excess(nats: float) -> float:
         return probability_of(name, features((nats, nats, nats), rest_over_noise,
                                              is_another_kind)) - probability
 
-    if lack(0.0) >= 0:
+    if excess(0.0) >= 0:
         return 0.0
-    return float(brentq(lack, 0.0, MAX_NATS)) if lack(MAX_NATS) > 0 else np.inf
+    return float(brentq(excess, 0.0, MAX_NATS)) if excess(MAX_NATS) > 0 else np.inf
