@@ -3,7 +3,7 @@
 import numpy as np
 
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.readers.terrain import HeightGrid, triangulate
+from radiotwin.scene.readers.terrain import HeightGrid, approximate
 
 LAT_M, LON_M = 110_608, 109_640  # metres in a degree at latitude 10°, as the maps of tests/scene/readers have them
 
@@ -27,7 +27,7 @@ def write_dem(path, height, crs="EPSG:4326+5773", half_m=800.0, pixel_m=10.0, dt
 def terrain_map(height, half_m=500.0, step_m=10.0, tolerance_m=0.01, building=None):
     """Return a map of a terrain of height(x, y) [m], and of a building (a mesh) if there is one."""
     axis_m = np.arange(-half_m, half_m + step_m / 2, step_m)
-    mesh = triangulate(HeightGrid(axis_m, axis_m, height(*np.meshgrid(axis_m, axis_m))), tolerance_m, 100_000)
+    mesh = approximate(HeightGrid(axis_m, axis_m, height(*np.meshgrid(axis_m, axis_m))), tolerance_m, 100_000)
     vertices, faces, terrain = mesh.vertices, mesh.faces, np.ones(len(mesh.faces), dtype=bool)
     if building is not None:
         faces = np.vstack([faces, np.asarray(building.faces) + len(vertices)])

@@ -1,6 +1,6 @@
-"""Streets that maps show under their data: `streets.geojson` of a scene folder, in WGS84.
+"""Streets as a background of plots: `streets.geojson` of a scene folder, in WGS84.
 
-No result depends on them. They are of the OpenStreetMap extract that a scene was built from.
+They are from the OpenStreetMap extract that a scene was built from. No result depends on them.
 """
 
 import json
@@ -20,7 +20,7 @@ from radiotwin.io.inputs import require_within
 STREETS = "streets.geojson"
 CREDIT = "© OpenStreetMap contributors (ODbL)"
 MAX_CORNERS = 20_000  # of all streets: half a megabyte
-SIMPLIFIED_M = 1.0  # what a drawn line may be off
+SIMPLIFIED_M = 1.0  # tolerance of simplified lines
 
 
 class _Lines(Record):
@@ -39,15 +39,15 @@ class _Streets(Record):
 
 def cut_streets(lines_deg: Sequence[np.ndarray], origin: Origin,
                 box_m: tuple[float, float, float, float]) -> list[np.ndarray]:
-    """Cut streets to a box and simplify them; where there are too many, the longest are kept.
+    """Cut streets to a box and simplify them; with too many corners, keep the longest.
 
     Args:
         lines_deg: (n, 2) longitudes and latitudes of each street [degrees].
-        origin: of the local frame.
+        origin: origin of the local frame.
         box_m: x_min, x_max, y_min, y_max [m].
 
     Returns:
-        (n, 2) x and y of each part that is left [m].
+        (n, 2) x and y of each line [m], the longest first.
     """
     x_min, x_max, y_min, y_max = box_m
     lines = [shapely.LineString(np.column_stack(to_local(origin, *line_deg.T)))
@@ -72,7 +72,7 @@ def write_streets(lines_m: Sequence[np.ndarray], origin: Origin, folder: Path) -
 
 
 def read_streets(folder: Path, origin: Origin | None) -> list[np.ndarray]:
-    """Read the streets (n, 2) of a scene folder in its frame [m]; none where it has no such file.
+    """Read the streets (n, 2) of a scene folder in its local frame [m]; [] if it has none.
 
     Raises:
         BadInput: a damaged file, or one that leads out of the folder.

@@ -12,7 +12,7 @@ from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap, perturbed_map
 from radiotwin.scene.config import parse_config
 from radiotwin.scene.lattice import Lattice
-from radiotwin.scene.readers.terrain import HeightGrid, triangulate
+from radiotwin.scene.readers.terrain import HeightGrid, approximate
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 from tests.terrains import incline, ridge, terrain_map
 
@@ -25,7 +25,7 @@ def rough(seed, rows, columns, sd_m=8.0):
 @pytest.mark.parametrize(("seed", "rows", "columns"), [(0, 40, 61), (1, 2, 2), (2, 2, 50), (3, 90, 30)])
 def test_triangles_cover_the_grid_within_the_tolerance(seed, rows, columns):
     grid = rough(seed, rows, columns)
-    mesh = triangulate(grid, 0.5, 100_000)
+    mesh = approximate(grid, 0.5, 100_000)
     a, b, c = mesh.vertices[mesh.faces].swapaxes(0, 1)
     area_m2 = np.cross(b - a, c - a)[:, 2] / 2
     assert (area_m2 > 0).all()  # all face up, none is flat
@@ -42,8 +42,8 @@ def test_triangles_cover_the_grid_within_the_tolerance(seed, rows, columns):
 
 def test_a_plane_is_few_triangles_and_a_budget_holds():
     plane = replace(rough(0, 50, 50), height_m=np.add.outer(np.arange(50) * 0.7, np.arange(50) * 0.2))
-    assert len(triangulate(plane, 0.01, 1000).faces) < 40
-    cut = triangulate(rough(0, 60, 60), 0.01, 500)
+    assert len(approximate(plane, 0.01, 1000).faces) < 40
+    cut = approximate(rough(0, 60, 60), 0.01, 500)
     assert 400 < len(cut.faces) <= 500 and cut.max_error_m > 0.01
 
 

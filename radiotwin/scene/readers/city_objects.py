@@ -1,8 +1,8 @@
-"""Objects of 3D city models (CityGML, CityJSON) as features: the same for all their files.
+"""Objects of 3D city models (CityGML, CityJSON, multipatches), and their conversion to features.
 
-Both have objects with attributes, children, and geometries of several levels of detail (LoD). Of a
-building, the most detailed geometry up to LoD 2 is taken, else its outline (LoD 0) with a height
-from its attributes.
+Objects have attributes, children, and geometries of several levels of detail (LoD). Of a building,
+the most detailed geometry up to LoD 2 is taken, else its outline (LoD 0) with a height from its
+attributes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,8 +33,8 @@ BUILT = ("Building", "BuildingPart", "BuildingInstallation", "BuildingConstructi
          "BuildingUnit", "Bridge", "BridgePart", "BridgeInstallation",
          "BridgeConstructionElement", "BridgeConstructiveElement", "OtherConstruction",
          "ConstructiveElement")
-"""Objects that are read; others (terrain, plants, water, traffic) are counted in a warning."""
-_MAX_PARENTS = 10  # a building, its part, an installation of that: three
+"""Types of objects that are read; others (terrain, plants, traffic) are counted in a warning."""
+_MAX_PARENTS = 10  # usual are three: a building, its part, an installation of the part
 _NOT_BUILT = "object(s) have no surfaces that can be used: left out"
 
 Polygon = list[np.ndarray]
@@ -46,7 +46,7 @@ class Geometry:
 
     Attributes:
         lod: level of detail, 0 to 4; 3D BAG has 1.2, 1.3 and 2.2.
-        polygons: rings of (n, 3) corners as the file gives them.
+        polygons: rings of each polygon, (n, 3) corners in the file's coordinates.
     """
 
     lod: float
@@ -58,11 +58,11 @@ class CityObject:
     """An object of a city model.
 
     Attributes:
-        name: its identifier.
-        kind: its type without `+`, as `Building`.
-        attributes: as texts, by their names in lower case.
+        name: identifier.
+        kind: type without `+`, such as `Building`.
+        attributes: name in lower case -> value as text.
         parent: identifier of the object that it is a part of; "": none.
-        geometries: of all levels of detail.
+        geometries: geometries of all levels of detail.
     """
 
     name: str
@@ -74,16 +74,16 @@ class CityObject:
 
 def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[str],
                   crs: str | None = None) -> MapFile:
-    """Return the buildings among the objects of a city model.
+    """Convert the buildings among the objects of a city model to features.
 
     Args:
         path: file, for messages.
-        objects: in the file's order.
-        systems: names of their coordinate reference system, all that the file has.
-        crs: the one of a file that has none; None: refuse it.
+        objects: objects in the file's order.
+        systems: names of all coordinate reference systems in the file.
+        crs: system of a file that names none; None: refuse it.
 
     Raises:
-        BadInput: no, several or an unknown system, or coordinates outside the area of it.
+        BadInput: no, several or an unknown system, or coordinates outside its area of use.
     """
     by_name = {one.name: one for one in objects}
     built = [one for one in objects if one.kind in BUILT]
@@ -93,7 +93,7 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
     with_surfaces = solid_roots | {_root(one, by_name) for one in built if _choose(one, 0)}
     for one in built:
         root = _root(one, by_name)
-        # An outline of a building whose parts have surfaces says nothing more
+        # The outline of a building is not needed if its parts have surfaces
         geometries = _choose(one, 1) or ([] if root in solid_roots else _choose(one, 0))
         if geometries:
             chosen.append((one, root, geometries))
@@ -101,7 +101,7 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
                 one.geometries and root not in solid_roots):
             unusable.append(one)
     SHAPES.check(sum(len(geometries) for _, _, geometries in chosen), path)
-    problems = _others(objects)
+    problems = _other_objects(objects)
     if not chosen:
         return MapFile([], [LeftOut(one.name, _NOT_BUILT, None) for one in unusable], problems)
     systems = systems or ([crs] if crs else [])
@@ -123,7 +123,7 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
 def _root(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
     """Return the name of the building that an object belongs to.
 
-    A group of buildings (CityObjectGroup) has them as children, and is none itself.
+    A group of buildings (CityObjectGroup), which has them as children, does not count.
     """
     seen = [one.name]
     while (one.parent in by_name and by_name[one.parent].kind in BUILT
@@ -135,11 +135,14 @@ def _root(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
     return one.name
 
 
-def _choose(one: CityObject, least: int) -> list[Geometry]:
-    """Return the geometries of the most detailed level below 3, else of the least above."""
+def _choose(one: CityObject, lowest_lod: int) -> list[Geometry]:
+    """Return the geometries of the best level of detail: the highest below 3, else the lowest.
+
+    `lowest_lod` 1 selects among surfaces (LoD 1 and more), 0 among outlines.
+    """
     usable = [geometry for geometry in one.geometries
               if any(len(ring) for polygon in geometry.polygons for ring in polygon)
-              and (geometry.lod >= 1) == (least >= 1)]
+              and (geometry.lod >= 1) == (lowest_lod >= 1)]
     levels = sorted({geometry.lod for geometry in usable})
     if not levels:
         return []
@@ -147,7 +150,8 @@ def _choose(one: CityObject, least: int) -> list[Geometry]:
     return [geometry for geometry in usable if geometry.lod == best]
 
 
-def _others(objects: Sequence[CityObject]) -> list[Problem]:
+def _other_objects(objects: Sequence[CityObject]) -> list[Problem]:
+    """Return a warning that counts the objects that are neither buildings nor bridges."""
     counts: dict[str, int] = {}
     for one in objects:
         if one.kind not in BUILT and one.geometries:
@@ -160,6 +164,7 @@ def _others(objects: Sequence[CityObject]) -> list[Problem]:
 
 
 def _one_system(path: Path, names: Sequence[str], crs: str | None) -> "CRS":
+    """Return the coordinate reference system of a file; BadInput if it names different ones."""
     chosen_system(path, names[0], crs)
     systems = [find_city_system(path, name) for name in dict.fromkeys(names)]
     for name, other in zip(dict.fromkeys(names), systems):
@@ -188,6 +193,13 @@ def _in_degrees(path: Path, geometries: Sequence[Geometry], system: "CRS") -> li
 
 def _features(chosen: list[tuple[CityObject, str, list[Geometry]]], points: list[np.ndarray],
               by_name: Mapping[str, CityObject]) -> list[Feature]:
+    """Return a feature for each chosen geometry.
+
+    Args:
+        chosen: objects, names of their buildings, and their geometries.
+        points: corners of all these geometries, (n, 3) longitude, latitude [degrees], height [m].
+        by_name: name -> object.
+    """
     ground_m: dict[str, float] = {}
     corners = iter(points)
     rows = [(one, root, geometry, next(corners))
@@ -209,18 +221,13 @@ def _features(chosen: list[tuple[CityObject, str, list[Geometry]]], points: list
 
 def _indices(geometry: Geometry) -> list[list[np.ndarray]]:
     """Return the rings of each polygon as indices of the geometry's corners."""
-    found, at = [], 0
-    for polygon in geometry.polygons:
-        rings = []
-        for ring in polygon:
-            rings.append(np.arange(at, at + len(ring)))
-            at += len(ring)
-        found.append(rings)
-    return found
+    sizes = [len(ring) for polygon in geometry.polygons for ring in polygon]
+    rings = iter(np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]))
+    return [[next(rings) for _ in polygon] for polygon in geometry.polygons]
 
 
 def _outline(geometry: Geometry, known: np.ndarray) -> shapely.MultiPolygon:
-    """Return the area of an outline (LoD 0)."""
+    """Return the area of an outline (LoD 0) with corners (n, 3), in degrees."""
     polygons = []
     for rings in _indices(geometry):
         loops = [known[ring, :2] for ring in rings if len(ring) > 2]

@@ -1,8 +1,8 @@
 """Reader of CityGML 1.0 to 3.0 [1, 2]: buildings with their surfaces, element by element.
 
-The names of elements are compared without their namespaces, which differ between the versions. Of
-geometry, polygons with their rings are read wherever they stand. A solid often names (`xlink:href`)
-the polygons of walls and roofs that stand beside it; then these are its surfaces.
+Element names are compared without their namespaces, which differ between versions. Polygons are
+read wherever they occur in an object. A solid often only refers (`xlink:href`) to the polygons of
+walls and roofs beside it; then these are its surfaces.
 
 [1] https://docs.ogc.org/is/20-010/20-010.html
 [2] https://portal.ogc.org/files/?artifact_id=47842
@@ -29,7 +29,7 @@ from radiotwin.scene.readers.features import MapFile
 _ROOTS = ("CityModel", "FeatureCollection")
 _MEMBERS = ("cityObjectMember", "featureMember", "featureMembers")
 _LOD = re.compile(r"lod([0-4])(\w+)")
-# Inside of buildings, placed copies (in coordinates of their own), pictures
+# Interiors of buildings, placed copies (in coordinates of their own), textures
 _SKIPPED = ("Room", "BuildingRoom", "BuildingFurniture", "IntBuildingInstallation",
             "interiorBuildingInstallation", "InteriorWallSurface", "CeilingSurface",
             "FloorSurface", "ImplicitGeometry", "appearanceMember", "appearance")
@@ -44,9 +44,11 @@ _MAX_VALUE = 1000  # characters of an attribute
 
 
 def read_citygml(path: Path, crs: str | None = None) -> MapFile:
-    """Read the surfaces of buildings in a CityGML file; of objects with an outline only, that.
+    """Read the surfaces of buildings in a CityGML file; outlines of those without surfaces.
 
-    A file that names no coordinate reference system needs `crs`.
+    Args:
+        path: CityGML file.
+        crs: coordinate reference system of a file that names none; None: refuse it.
 
     Raises:
         BadInput: no such file, malformed XML, not CityGML, or coordinates that are not numbers;
@@ -59,9 +61,9 @@ def read_citygml(path: Path, crs: str | None = None) -> MapFile:
 
 @dataclass
 class _Surfaces:
-    """Geometries of one object by their level: those of solids, and those beside them.
+    """Geometries of one object, by level of detail: those of solids, and others.
 
-    An outline (LoD 0) is its footprint, or where it has none the edge of its roof.
+    The outline (LoD 0) is the footprint, or if there is none the edge of the roof.
     """
 
     solids: dict[float, Geometry] = field(default_factory=dict)
@@ -70,6 +72,7 @@ class _Surfaces:
     referring: set[float] = field(default_factory=set)  # levels with a solid that names surfaces
 
     def geometries(self) -> list[Geometry]:
+        """Return one geometry per level: the solid, or the surfaces that it refers to."""
         found, others = [], self.roof_edges | self.others
         for lod in sorted({*self.solids, *others}):
             solid, other = self.solids.get(lod), others.get(lod)

@@ -1,8 +1,7 @@
-"""Reader of CityJSON 1.0 to 2.0 [1] and CityJSON text sequences, which are plain JSON.
+"""Reader of CityJSON 1.0 to 2.0 [1] and CityJSON text sequences.
 
-The package of the format's authors, cjio, is a command line for changing such files: it had its
-last release in May 2025, takes a file as a whole without any limit, and triangulates with further
-packages only.
+cjio, the package of the format's authors, is a command for changing such files: it reads a file
+without any limit of size, and needs further packages to triangulate.
 
 [1] https://www.cityjson.org/specs/2.0.1
 """
@@ -25,11 +24,11 @@ _DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2
 
 
 def cityjson_map(path: Path, documents: Sequence[Any], crs: str | None = None) -> MapFile:
-    """Return the surfaces of buildings in CityJSON; of objects with an outline only, that.
+    """Return the surfaces of buildings in CityJSON; outlines of those without surfaces.
 
     Args:
-        path: of the file, for messages.
-        documents: the model, or of a text sequence its lines, the first of them with metadata.
+        path: file, for messages.
+        documents: the model; of a text sequence, its lines, the first with the metadata.
         crs: coordinate reference system of a file that names none; None: refuse it.
 
     Raises:
@@ -67,6 +66,7 @@ def _transform(path: Path, head: Mapping) -> tuple[np.ndarray, np.ndarray]:
 
 def _objects(path: Path, document: Any, scale: np.ndarray,
              offset: np.ndarray) -> Iterator[CityObject]:
+    """Yield the objects of a document, with vertices × scale + offset as corners."""
     try:
         vertices = np.array(document["vertices"], dtype=float).reshape(-1, 3)
         objects = document["CityObjects"]
@@ -96,11 +96,12 @@ def _objects(path: Path, document: Any, scale: np.ndarray,
 
 
 def _names(value: Any) -> list[str]:
+    """Return the texts in a list; empty if it is no list."""
     return [name for name in value if isinstance(name, str)] if isinstance(value, list) else []
 
 
 def _attributes(known: Any) -> dict[str, str]:
-    """Return what is a number, a text, or true or false."""
+    """Return the attributes with a plain value (number, text, boolean) as texts."""
     if not isinstance(known, dict):
         return {}
     return {str(key).lower(): f"{value:g}" if isinstance(value, float) else str(value)
@@ -108,7 +109,7 @@ def _attributes(known: Any) -> dict[str, str]:
 
 
 def _geometries(geometry: Mapping, corners: np.ndarray) -> Iterator[Geometry]:
-    """Yield a set of surfaces as one, and each solid by itself; others are left out."""
+    """Yield a set of surfaces as one geometry, and each solid as one; skip other types."""
     kind = geometry["type"]
     if kind not in _DEPTHS:
         return
@@ -117,12 +118,13 @@ def _geometries(geometry: Mapping, corners: np.ndarray) -> Iterator[Geometry]:
     depth = _DEPTHS[kind]
     solids = boundaries if depth == 2 else [boundaries] if depth == 1 else [[boundaries]]
     for shells in solids:
-        # Cavities are inner shells: no ray gets there
+        # Only the outer shell: no ray gets into cavities
         yield Geometry(lod, [_polygon(surface, corners) for surface in shells[0]]
                        if shells else [])
 
 
 def _polygon(rings: list, corners: np.ndarray) -> Polygon:
+    """Return the rings of a surface as corners (n, 3)."""
     indices = [np.array(ring, dtype=np.int64).reshape(-1) for ring in rings]
     if any((ring < 0).any() for ring in indices):
         raise IndexError

@@ -1,7 +1,7 @@
-"""Watertight meshes from prisms, one for each group of touching prisms of one material.
+"""Extrusion of prisms to watertight meshes, one for each block of touching prisms of one material.
 
-A ray tracer would hit coincident walls twice, so neighbours of one material are united, and between
-neighbours of different materials a slot of 2 cm is left open.
+A ray tracer would hit coincident walls twice: so neighbours of one material are united, and a slot
+of 2 cm is left between neighbours of different materials.
 """
 
 from collections.abc import Sequence
@@ -20,20 +20,20 @@ from radiotwin.scene.meshes import clean, connected, is_volume
 from radiotwin.scene.readers.solids import GRID_M, Contacts, Prism, closed_solid
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-MIN_ROOF_COSINE = 0.2  # of a roof's normal to the vertical: the steepest have about 78 degrees
+MIN_ROOF_COSINE = 0.2  # between a roof's normal and the vertical: slopes of up to 78 degrees
 SLOT_M = 0.02  # [m], more than the 1 cm below which the 3D map takes two surfaces for one
-# [m], how far a surface may move to remove a splinter; files hold single precision, 0.1 mm at 1 km
+# [m], tolerance for removing splinters; files have single precision, 0.1 mm at 1 km
 SIMPLIFY_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One mesh of the city.
+    """Touching prisms of one material, as one mesh.
 
     Attributes:
-        members: indices of its prisms, the largest first.
-        material: of all of them.
-        mesh: watertight, normals outwards, unless it is that of an open body [m].
+        members: indices of the prisms, the largest first.
+        material: material of all of them.
+        mesh: watertight with outward normals, unless it is an open body [m].
     """
 
     members: list[int]
@@ -42,10 +42,9 @@ class Block:
 
 
 def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
-    """Unite touching prisms of one material.
+    """Unite prisms of one material that share a wall; a common corner is not enough.
 
-    A common wall or more joins them, a corner does not. Where blocks of different materials meet,
-    the larger one stays whole.
+    Where blocks of different materials overlap or touch, the smaller one is cut.
     """
     if not prisms:
         return []
@@ -84,26 +83,27 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
 
 
 def split_roof(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, trimesh.Trimesh | None]:
-    """Part the roofs of a block, which face upwards, from its walls and bottom.
+    """Split a mesh into walls with bottom, and roofs (faces that look up).
 
-    The roofs are None if nothing, or everything, faces upwards.
+    The roofs are None if no face, or every face, looks up.
     """
     is_roof = mesh.face_normals[:, 2] > MIN_ROOF_COSINE
     if is_roof.all() or not is_roof.any():
         return mesh, None
-    walls, roof = (trimesh.Trimesh(mesh.vertices, mesh.faces[which], process=False)
-                   for which in (~is_roof, is_roof))
+    walls, roof = (trimesh.Trimesh(mesh.vertices, mesh.faces[part], process=False)
+                   for part in (~is_roof, is_roof))
     for part in (walls, roof):
         part.remove_unreferenced_vertices()
     return walls, roof
 
 
 def _union(solids: list[Manifold]) -> Manifold:
+    """Return the union of solids."""
     return Manifold.batch_boolean(solids, OpType.Add)
 
 
 def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
-    """Return a prism, with all its faces moved outwards by `wider_m`."""
+    """Return a prism as a solid, with all its faces moved outwards by `wider_m`."""
     if prism.body is not None:
         solid = _placed(prism)
         return _union([solid.translate(wider_m * corner) for corner in _CORNERS]) if wider_m \
@@ -114,9 +114,9 @@ def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
 
 
 def _placed(prism: Prism) -> Manifold:
-    """Return the solid of a body with its top at that of the prism, and walls down to its bottom.
+    """Return the solid of a prism's body, moved to the prism's top, with walls to its bottom.
 
-    A building on terrain begins below the ground that its file has.
+    On terrain, the bottom of the prism is lower than that of the body in the file.
     """
     assert prism.body is not None and prism.body.solid is not None
     _, _, low_m, _, _, high_m = prism.body.solid.bounding_box()
@@ -129,7 +129,7 @@ def _placed(prism: Prism) -> Manifold:
 
 
 def _extruded(area: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
-    """Return a solid with vertical walls."""
+    """Return the solid over an area [m] with vertical walls, between two heights."""
     rings = [shapely.get_coordinates(ring) for ring in (area.exterior, *area.interiors)]
     points, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])
     roof: np.ndarray = mapbox_earcut.triangulate_float64(points, ends).reshape(-1, 3)
@@ -155,10 +155,10 @@ def _extruded(area: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
 
 
 def _mesh(solid: Manifold) -> trimesh.Trimesh:
-    """Return a clean mesh, or the mesh as it is where cleaning would open it.
+    """Return the mesh of a solid, cleaned unless that would open it.
 
-    Cleaning merges corners that coincide and drops triangles without area. Where a solid touches
-    itself along a vertical edge, its two sides need corners of their own.
+    Cleaning merges coincident corners. Where a solid touches itself along a vertical edge, both
+    sides need corners of their own.
     """
     found = solid.to_mesh64()
     vertices, faces = found.vert_properties[:, :3], found.tri_verts.astype(np.int64)

@@ -1,10 +1,10 @@
-"""Areas of a map file with their tags, as every reader returns them, and budgets of outlines.
+"""`MapFile`: buildings and vegetation of a map with their tags, as every reader returns them.
 
-To take apart an outline that crosses itself costs time and memory by the number of crossings, which
-can be the square of the number of corners: it is checked before geometry is computed.
+Repairing an outline that crosses itself takes time and memory by the number of crossings, which can
+grow with the square of the number of corners: `OutlineBudget` checks it before.
 
-What lies below the ground is told by tags of OpenStreetMap [1] [2] [3], Overture Maps [4], CityGML
-(`relativeToTerrain`), ALKIS of the German states (`OFL`) and the Dutch BGT.
+Buildings below the ground are recognised by tags of OpenStreetMap [1] [2] [3], Overture Maps [4],
+CityGML (`relativeToTerrain`), ALKIS of the German states (`OFL`) and the Dutch BGT.
 
 [1] https://wiki.openstreetmap.org/wiki/Key:location
 [2] https://wiki.openstreetmap.org/wiki/Tag:building:levels=0
@@ -32,17 +32,17 @@ INDOORS = "room(s) are inside of buildings: left out"
 NOT_THERE = "building(s) do not stand, or not yet: left out"
 _LIFECYCLE = ("proposed", "planned", "demolished", "removed", "razed", "destroyed", "collapsed")
 _CAR_PARKS = ("parking", "garage", "garages")
-_BELOW = {  # tag or column -> its values of what lies below the ground
+_BELOW = {  # tag or column -> values that mean below the ground
     "is_underground": ("true", "yes", "1"),
     "tunnel": ("yes", "true", "1"),
     "relativetoterrain": ("entirelybelowterrain",),
     "ofl": ("1200",), "lagezurerdoberflaeche": ("1200",)}
-# At the ground: 0
+# Tags that count levels from 0 at the ground
 _LEVELS = ("layer", "level", "max_level", "relatievehoogteligging", "relatieve_hoogteligging")
 READ_TAGS = frozenset((*BUILDING_KEYS, *_BELOW, *_LEVELS, "location", "parking", "indoor",
                        "has_parts", "building_id", "building:levels:underground", "other_tags"))
 _LEVEL_RANGE = re.compile(r"\s*(-?\d+(?:\.\d+)?)\s*(?:-\s*(-?\d+(?:\.\d+)?)\s*)?")
-_CHUNK = 256  # segments: bounds the pairs that are found at once
+_CHUNK = 256  # segments or boxes that are queried at once: bounds the memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,8 @@ class Shell:
 
     Attributes:
         points: (n, 3) longitude, latitude [degrees] and elevation [m].
-        polygons: rings of each surface, the outer one first: indices of points, the first not
-            again at the end.
-        ground_m: elevation of the ground beside the building: that of its lowest point [m].
+        polygons: rings of each surface, the outer one first: indices of points, not closed.
+        ground_m: elevation of the ground beside the building, i.e. of its lowest point [m].
     """
 
     points: np.ndarray
@@ -66,11 +65,11 @@ class Feature:
     """One building or part of a building, or an area or line of vegetation.
 
     Attributes:
-        name: as in the file: `way/17`, `relation/3`, `feature 4`.
-        tags: as in OpenStreetMap: `building`, `building:part`, `height`, `building:levels`, ….
-        area: polygons, or the line of a row of trees, in longitude and latitude [degrees]; as in
-            the file, so possibly invalid. Of a feature with a shell, the hull of its points.
-        shell: its surfaces; None: the area is to be extruded.
+        name: name in the file: `way/17`, `relation/3`, `feature 4`.
+        tags: tags as in OpenStreetMap: `building`, `building:part`, `height`, ….
+        area: polygons, or the line of a row of trees, in longitude and latitude [degrees]; may be
+            invalid, as in the file. With a shell, the convex hull of its points.
+        shell: surfaces in three dimensions; None: the area is to be extruded.
     """
 
     name: str
@@ -80,18 +79,18 @@ class Feature:
 
     @property
     def is_part(self) -> bool:
-        """Whether it is part of a building and not a building itself."""
+        """Whether it is a part of a building, not a building itself."""
         return _is_set(self.tags, "building:part") and not _is_set(self.tags, "building")
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Something of a map file that could not be used.
+    """A building or area of a map file that could not be used.
 
     Attributes:
-        name: as in the file.
-        reason: what it is and why, as `problems_of` continues a number with.
-        place: where it lies, longitude and latitude [degrees]; None: unknown.
+        name: name in the file.
+        reason: the reason, as `building(s) lie below the ground: left out`.
+        place: points or area, longitude and latitude [degrees]; None: unknown.
     """
 
     name: str
@@ -106,11 +105,11 @@ class MapFile:
     Attributes:
         features: buildings and parts, in the file's order.
         vegetation: areas, and lines of trees, see `radiotwin.scene.readers.vegetation`.
-        left_out: parts of the file that could not be used.
-        problems: findings about the whole file.
-        plan_m: unit of its east and north [m].
-        columns: of its tables, also those of other things than buildings.
-        layers: that hold no areas.
+        left_out: buildings and areas that could not be used.
+        problems: problems of the whole file.
+        plan_m: unit of the file's east and north [m].
+        columns: names of all columns of its tables.
+        layers: names of layers without areas.
         streets: (n, 2) longitudes and latitudes of each street [degrees].
     """
 
@@ -125,7 +124,7 @@ class MapFile:
 
 
 def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:
-    """Return one problem that counts and lists features; an empty list if there are none."""
+    """Return one problem: the number of names, a text, and the first names; [] without names."""
     return [Problem(severity, "", f"{len(names)} {text} ({listed(names)})")] if names else []
 
 
@@ -133,7 +132,7 @@ def left_out_problems(left_out: Sequence[LeftOut],
                       bbox_deg: tuple[float, float, float, float] | None) -> list[Problem]:
     """Return one problem for each reason why features were left out.
 
-    Only features that reach into the box (south, west, north, east) [degrees] count; None: all.
+    Only features that reach into the box (south, west, north, east) [degrees] count; None: all do.
     """
     by_reason: dict[str, list[str]] = {}
     for one in left_out:
@@ -178,7 +177,7 @@ def _below_ground(tags: Mapping[str, str]) -> str:
     storeys, below = (number(tags.get(key, "")) for key in (
         "building:levels", "building:levels:underground"))
     top_m, roof_m = (parse_length_m(tags.get(key, "")) for key in ("height", "roof:height"))
-    # A layer only says what it is below, and a level may be that of a shop in the building
+    # A layer is only relative to other objects, and a level may be that of a shop in the building
     stands = {"layer": top_m > 0, "level": _is_set(tags, "building") and (top_m > 0 or storeys > 0)}
     for key in _LEVELS:
         if is_below_zero(tags, key) and not stands.get(key):
@@ -195,21 +194,22 @@ def _below_ground(tags: Mapping[str, str]) -> str:
 
 
 def is_below_zero(tags: Mapping[str, str], key: str) -> bool:
-    """Return whether all levels or layers of a tag, such as `-2;-1` or `-2--1`, are below zero."""
+    """Return whether all levels in a tag, such as `-2;-1` or `-2--1`, are below zero."""
     found = [_LEVEL_RANGE.fullmatch(part) for part in tags.get(key, "").split(";")]
     ends = [float(end) for each in found if each for end in each.groups() if end]
     return all(found) and max(ends) < 0
 
 
 def _is_set(tags: Mapping[str, str], key: str) -> bool:
+    """Return whether a tag exists with another value than no."""
     return tags.get(key, "").strip().lower() not in ("", "no", "none", "false", "0")
 
 
 def check_crowding(bounds: np.ndarray, source: object) -> None:
     """Raise BadInput if too many bounding boxes (n, 4) overlap.
 
-    Counted are the boxes that contain the centre of each box. In a city these are few: that of the
-    building itself, and of the building that it is a part of.
+    For each box, the boxes that contain its centre are counted. In a city these are few: the
+    building itself, and the building that it is a part of.
     """
     bounds = bounds[np.isfinite(bounds).all(axis=1)]
     boxes: Any = shapely.box(*bounds.T)
@@ -221,16 +221,17 @@ def check_crowding(bounds: np.ndarray, source: object) -> None:
 
 
 class OutlineBudget:
-    """Corners and crossings of the outlines of one map so far; messages begin with `source`."""
+    """Counts corners and crossings of the outlines of a map; messages begin with `source`."""
 
     def __init__(self, source: object) -> None:
         self.source = source
         self.corners = self.crossings = 0
 
     def check(self, name: str, area: BaseGeometry) -> None:
-        """Raise BadInput if outlines have too many corners or cross themselves too often.
+        """Count an outline (polygons, valid or not) that may cross itself.
 
-        One building is checked (polygons, valid or not), and all so far.
+        Raises:
+            BadInput: it, or all outlines so far, have too many corners or crossings.
         """
         subject = f"{self.source}: {name}"
         corners = int(shapely.get_num_coordinates(area))
@@ -241,6 +242,7 @@ class OutlineBudget:
             self.crossings += self._count_crossings(subject, area)
 
     def _count_crossings(self, subject: str, area: BaseGeometry) -> int:
+        """Return the number of crossings of an area's sides."""
         rings = shapely.get_rings(shapely.get_parts(shapely.get_parts(area)))
         points = [shapely.get_coordinates(ring) for ring in rings]
         ends = [np.stack([ring[:-1], ring[1:]], axis=1) for ring in points]

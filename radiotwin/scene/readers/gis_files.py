@@ -1,13 +1,13 @@
 """Readers of GeoJSON and other JSON maps, GeoPackage [1], GeoParquet [2]: columns become tags.
 
-Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only such
-rows are buildings; else every polygon is one. `_` may stand for the `:` of a tag, and case does not
-matter. The tags in GDAL's column `other_tags` are read, too.
+In a file with a column `building` or `building:part`, as exports of OpenStreetMap have, only rows
+with such a value are buildings; else every polygon is one. `_` may replace the `:` of a tag, and
+case does not matter. The tags in GDAL's column `other_tags` are read, too.
 
-GeoPackages are read by SQLite, and the well-known binary of GeoParquet by pyarrow, without GDAL. It
-looks at a file's content, not at its ending: a `.gpkg` can be an XML that names other files or
-servers. Well-known binary [3] is checked before GEOS reads it, whose reader calls itself for every
-level of nesting: a few kilobytes can hold more levels than a stack has room for.
+GeoPackages are read by SQLite, and GeoParquet by pyarrow, without GDAL, which looks at a file's
+content, not at its suffix: a `.gpkg` could be an XML that names other files or servers. Well-known
+binary [3] is checked before GEOS reads it: its reader is recursive, and a few kilobytes can nest
+deeper than the stack.
 
 [1] https://www.geopackage.org/spec140
 [2] https://geoparquet.org/releases/v1.1.0
@@ -57,7 +57,7 @@ _AREAS = ("Polygon", "MultiPolygon", "GeometryCollection")
 NO_AREA = "building(s) are points or lines, without an area: left out"
 _KINDS = ("POLYGON", "MULTIPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE", "MULTISURFACE",
           "CURVEPOLYGON")
-ELEVATIONS = "z of the coordinates"  # as a report of what is not used names it
+ELEVATIONS = "z of the coordinates"  # name in the report of columns that are not used
 UNREAD = ("building(s) have no geometry, or one that is not read (not finite, a curve, a surface "
           "in space): left out; `ogr2ogr -nlt CONVERT_TO_LINEAR` makes polygons of curves")
 _ENVELOPE_DOUBLES = (0, 4, 6, 6, 8)  # of a geometry's header, by its code
@@ -65,7 +65,7 @@ _Z, _M, _SRID = 0x80000000, 0x40000000, 0x20000000  # flags of EWKB
 _POINT, _RINGS = (1,), (3, 17)  # a polygon, a triangle
 _POSITIONS = (2, 8)  # a line, a circular string
 _COLLECTIONS = (4, 5, 6, 7, 9, 10, 11, 12, 15, 16)
-_PLANE = (1, 2, 3, 4, 5, 6, 7)  # that GEOS has as we need them: without arcs and surfaces in space
+_PLANE = (1, 2, 3, 4, 5, 6, 7)  # kinds that are read: without arcs, and surfaces in space
 LINES = (".jsonl", ".ndjson", ".geojsonl", ".geojsons", ".geojsonseq")
 """Endings of files with a feature in each line."""
 _GEOJSON = ("FeatureCollection", "Feature", "Polygon", "MultiPolygon")
@@ -73,7 +73,11 @@ _RECORD = "\x1e"  # may begin each line (RFC 8142)
 
 
 def read_json_map(path: Path, crs: str | None = None) -> MapFile:
-    """Read a map in JSON; one that names no coordinate reference system may need `crs`.
+    """Read a map in JSON: CityJSON, GeoJSON, or an answer of Overpass.
+
+    Args:
+        path: JSON file, also of one object per line, also gzipped.
+        crs: coordinate reference system of a file that names none; None: as the format has it.
 
     Raises:
         BadInput: no such file, none of the three, or an impossible value, with the object's name.
@@ -103,19 +107,19 @@ def read_json_map(path: Path, crs: str | None = None) -> MapFile:
 
 
 def read_geojson(path: Path, crs: str | None = None) -> MapFile:
-    """Read the polygons of a GeoJSON file, as `geojson_map`.
+    """Read the polygons of a GeoJSON file; see `geojson_map`.
 
     Raises:
-        BadInput: also, no such file, or not JSON.
+        BadInput: no such file, not JSON, or as `geojson_map`.
     """
     return geojson_map(path, parse_json(read_text(path, "GeoJSON file"), path, allow_nan=True), crs)
 
 
 def geojson_map(path: Path, data: Any, crs: str | None = None) -> MapFile:
-    """Return the polygons of GeoJSON: a collection of features, one, or a geometry.
+    """Return the polygons of parsed GeoJSON: a collection of features, a feature, or a geometry.
 
-    It is after RFC 7946 (longitude, latitude), or has an older `crs` member; `crs` is the system of
-    a file without.
+    Coordinates are longitude and latitude (RFC 7946), or in the system of an older `crs` member, or
+    in the system `crs` that the user declares for a file without it.
 
     Raises:
         BadInput: not GeoJSON, or coordinates that are not numbers; with the feature's number.
@@ -142,9 +146,9 @@ def geojson_map(path: Path, data: Any, crs: str | None = None) -> MapFile:
 
 
 def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None:
-    """Return the polygons of a GeoJSON geometry, or the points of another type; None: none.
+    """Return the polygons of a GeoJSON geometry; the points of another type; None: neither.
 
-    Polygons whose points have elevations other than 0 have some z.
+    If any point has an elevation other than 0, the polygons have a z.
     """
     kind = geometry.get("type")
     coordinates: Any = geometry.get("coordinates")  # unchecked: no list raises TypeError below
@@ -156,18 +160,18 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
                                     ) if areas else None
     if kind not in ("Polygon", "MultiPolygon"):
         return _points(coordinates)
+    listed = [coordinates] if kind == "Polygon" else coordinates
     try:
         polygons = [[np.array([point[:2] for point in ring], dtype=float) for ring in polygon]
-                    for polygon in ([coordinates] if kind == "Polygon" else coordinates)]
+                    for polygon in listed]
         if not all(np.isfinite(ring).all() and ring.ndim == 2
                    for polygon in polygons for ring in polygon):
             raise ValueError
         # RFC 7946 wants at least four points a ring; shorter ones have no area anyway
         area = shapely.MultiPolygon([(polygon[0], [ring for ring in polygon[1:] if len(ring) > 3])
                                      for polygon in polygons if polygon and len(polygon[0]) > 3])
-        elevated = any(len(point) > 2 and point[2] for polygon in (
-            [coordinates] if kind == "Polygon" else coordinates) for ring in polygon
-            for point in ring)
+        elevated = any(len(point) > 2 and point[2] for polygon in listed for ring in polygon
+                       for point in ring)
         return shapely.force_3d(area, 1.0) if elevated else area
     except (TypeError, ValueError, LookupError, OverflowError):
         raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite "
@@ -175,7 +179,7 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
 
 
 def _points(coordinates: Any) -> BaseGeometry | None:
-    """Return all positions of a geometry that is no area, for where it lies."""
+    """Return all positions of a geometry that is no area, to locate it; None if impossible."""
     points, waiting = [], [coordinates]
     while waiting:
         part = waiting.pop()
@@ -193,6 +197,7 @@ def _points(coordinates: Any) -> BaseGeometry | None:
 
 
 def _crs_name(path: Path, data: Mapping) -> str | None:
+    """Return the system's name in an older `crs` member of GeoJSON; None if there is none."""
     crs = data.get("crs")
     if crs is None:
         return None
@@ -206,10 +211,15 @@ def _crs_name(path: Path, data: Mapping) -> str | None:
 def map_file(
     path: Path, rows: Iterable[tuple[str, Mapping, BaseGeometry | None]], crs: str | None
 ) -> MapFile:
-    """Return the buildings among the rows of a table: name, properties and area of each.
+    """Convert the rows of a table to buildings.
+
+    Args:
+        path: file, for messages.
+        rows: name, columns, and geometry of each row, None: it has none.
+        crs: coordinate reference system of the geometries; None: unknown.
 
     Raises:
-        BadInput: no coordinate reference system, or one that is not known.
+        BadInput: the coordinate reference system is unknown.
     """
     tagged: list[tuple[str, dict[str, str], BaseGeometry | None]] = []
     columns: set[str] = set()
@@ -246,7 +256,7 @@ def map_file(
 
 
 def _tags(properties: Mapping) -> dict[str, str]:
-    """Return columns as tags, without empty cells."""
+    """Convert the columns of a row to tags, without empty cells."""
     tags: dict[str, str] = {}
     for key, value in properties.items():
         if (value is None or isinstance(value, dict | list | bytes)
@@ -262,7 +272,7 @@ def _tags(properties: Mapping) -> dict[str, str]:
 
 
 def _part_or_whole(columns: Mapping, tags: dict[str, str]) -> dict[str, str]:
-    """Return the tags of a row, of Overture Maps with what tells a part from a building."""
+    """Mark a row of Overture Maps as `building` or `building:part`; leave others unchanged."""
     names = {str(name).lower() for name in columns}
     if not names & set(BUILDING_KEYS) and names & {"facade_color", "roof_shape", "is_underground"}:
         if "building_id" in tags:  # that the part belongs to
@@ -273,9 +283,9 @@ def _part_or_whole(columns: Mapping, tags: dict[str, str]) -> dict[str, str]:
 
 
 def _other_tags(text: str) -> dict[str, str]:
-    """Return the pairs of `"key"=>"value","key"=>"value"`, as GDAL writes rare tags."""
+    """Parse GDAL's column of rare tags, `"key"=>"value","key"=>"value"`."""
     tags, found = {}, _OTHER_TAG.match(text)
-    while found:  # one after the other: a search would try every quotation mark of a long text
+    while found:  # `findall` would try every quotation mark of a long text
         tags[found[1]] = found[2]
         found = _OTHER_TAG.match(text, found.end())
     return tags
@@ -286,12 +296,12 @@ def read_geopackage(path: Path, crs: str | None = None, wanted: Sequence[str] = 
 
     Args:
         path: `.gpkg` file.
-        crs: of layers whose own is undefined; None: refuse them.
-        wanted: names of layers; none: those that hold buildings, see `choose_layers`.
+        crs: coordinate reference system of layers with an undefined one; None: refuse them.
+        wanted: names of layers; empty: those that hold buildings, see `choose_layers`.
 
     Raises:
         BadInput: no such file, not a GeoPackage, one that another program has open, a layer that is
-            a view, or layers of which nothing tells which to read.
+            a view, or no layer seems to hold buildings.
     """
     parts: dict[str, MapFile] = {}
     others: list[str] = []
@@ -313,7 +323,7 @@ def read_geopackage(path: Path, crs: str | None = None, wanted: Sequence[str] = 
 
 
 def _layers(database: sqlite3.Connection, others: list[str]) -> list[tuple[str, str, int]]:
-    """Return table, column of the geometry, and number of the system of each layer of areas.
+    """Return table, geometry column and srs_id of each layer of areas.
 
     Names of other layers are added to `others`.
     """
@@ -329,7 +339,7 @@ def _layers(database: sqlite3.Connection, others: list[str]) -> list[tuple[str, 
             others.append(str(table)[:_NAME_LENGTH])
         elif str(table).lower() in registered:
             require_table(database, str(table))
-            if not isinstance(srs, int):  # of SQLite's columns the type is a wish
+            if not isinstance(srs, int):  # SQLite does not enforce the types of columns
                 raise sqlite3.DataError(f"srs_id of {str(table)[:100]!r} is {srs!r:.100}")
             layers.append((str(table), str(column), srs))
     return layers
@@ -337,7 +347,7 @@ def _layers(database: sqlite3.Connection, others: list[str]) -> list[tuple[str, 
 
 def _rows(path: Path, database: sqlite3.Connection, layer: str,
           geometry: str) -> Iterator[tuple[str, dict[str, Any], Any]]:
-    """Yield name, columns and area of each row of a layer."""
+    """Yield name, columns and geometry of each row of a layer."""
     # The integer primary key is no attribute
     columns = [name for _, name, kind, _, _, key in stored_columns(database, layer)
                if name.lower() != geometry.lower() and not (key and kind.upper() == "INTEGER")]
@@ -352,7 +362,7 @@ def _rows(path: Path, database: sqlite3.Connection, layer: str,
 
 
 def _area(blob: Any, source: str) -> BaseGeometry | None:
-    """Return the geometry of a blob [1, section 2.1.3]; None where there is none."""
+    """Return the geometry of a blob [1, section 2.1.3]; None: empty, or not one."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None
     flags = blob[3]
@@ -363,7 +373,7 @@ def _area(blob: Any, source: str) -> BaseGeometry | None:
 
 
 def _system(database: sqlite3.Connection, number: int) -> str | None:
-    """Return the coordinate reference system of a number: authority and code, or WKT."""
+    """Return the system of a srs_id: authority and code, or WKT; None: undefined."""
     for known, authority, code, definition in scan(
             database, "gpkg_spatial_ref_sys",
             ["srs_id", "organization", "organization_coordsys_id", "definition"]):
@@ -380,15 +390,15 @@ def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
 
     Args:
         path: `.parquet` file.
-        crs: coordinate reference system of a file that names none; None: longitude and latitude, as
-            [2] has it, or where it says that the system is not known, refuse it.
+        crs: coordinate reference system of a file that names none; None: longitude and latitude
+            [2], but a file that declares its system unknown is refused.
 
     Raises:
         BadInput: no such file, no GeoParquet, damaged, or too large; no pyarrow.
     """
-    names, nested, geometry, own = _schema(path)
-    system = chosen_system(path, _name(path, own) if own else None, crs)
-    if own is None and system is None:
+    names, nested, geometry, declared = _schema(path)
+    system = chosen_system(path, _system_name(path, declared) if declared else None, crs)
+    if declared is None and system is None:
         system = WGS84[0]
     cells = read_cells(path, [geometry], names, [geometry])
     columns = [name for name in cells.columns if name != geometry]
@@ -409,7 +419,12 @@ def read_geoparquet(path: Path, crs: str | None = None) -> MapFile:
 
 
 def _schema(path: Path) -> tuple[list[str], list[str], str, dict | str | None]:
-    """Return flat and nested columns, that of geometries, its system: "" unknown, None default."""
+    """Read the metadata of a GeoParquet file.
+
+    Returns:
+        Names of plain columns, of nested columns, of the geometry column, and its coordinate
+        reference system (PROJ's JSON or a name; "": unknown; None: longitude and latitude).
+    """
     require_pyarrow(path)
     from pyarrow import ArrowException, types
     from pyarrow.parquet import ParquetFile
@@ -434,49 +449,49 @@ def _schema(path: Path) -> tuple[list[str], list[str], str, dict | str | None]:
         if column["encoding"] != "WKB":
             raise BadInput(f"{path}: its geometries are encoded as {column['encoding']!r:.40}; "
                            "only WKB is read: export it again with that")
-        own = column.get("crs")
-        if own is None and "crs" in column:
-            own = ""
-        if not isinstance(own, dict | str | None) or geometry not in schema.names:
+        declared = column.get("crs")
+        if declared is None and "crs" in column:
+            declared = ""
+        if not isinstance(declared, dict | str | None) or geometry not in schema.names:
             raise TypeError
     except (KeyError, TypeError):
         raise BadInput(f"{path}: its metadata `geo` is not as GeoParquet has it (primary_column, "
                        "and of that encoding and crs); export it again") from None
     names, nested = ([field.name for field in schema if types.is_nested(field.type) == is_nested]
                      for is_nested in (False, True))
-    return names, nested, geometry, own
+    return names, nested, geometry, declared
 
 
-def _name(path: Path, own: dict | str) -> str:
+def _system_name(path: Path, declared: dict | str) -> str:
     """Return the name of a system in PROJ's JSON: authority and code, else WKT."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
-    if isinstance(own, str):
-        return own
-    known = own.get("id")
+    if isinstance(declared, str):
+        return declared
+    known = declared.get("id")
     if isinstance(known, dict) and {"authority", "code"} <= known.keys():
         return f"{known['authority']}:{known['code']}"
     try:
-        return CRS.from_json_dict(own).to_wkt()
+        return CRS.from_json_dict(declared).to_wkt()
     except CRSError as error:
         raise BadInput(f"{path}: its coordinate reference system is unknown ({error!s:.100}); "
                        "export it in EPSG:4326") from None
 
 
 def area_of_wkb(data: bytes, source: object) -> BaseGeometry | None:
-    """Return a geometry in well-known binary, with its z.
+    """Parse a geometry in well-known binary, with its z.
 
     Args:
         data: one geometry.
-        source: of it, for the message.
+        source: name of the row, for messages.
 
     Returns:
-        None of one that is not finite, or has curves or surfaces in space.
+        The geometry; None if it is not finite, or has curves or surfaces in space.
 
     Raises:
-        BadInput: geometries within geometries, too many levels of them.
-        shapely.errors.GEOSException: damaged.
+        BadInput: geometries are nested too deep.
+        shapely.errors.GEOSException: the data are damaged.
     """
     if not _kinds(data, source) <= {*_PLANE}:
         return None
@@ -487,9 +502,9 @@ def area_of_wkb(data: bytes, source: object) -> BaseGeometry | None:
 
 
 def _kinds(data: bytes, source: object) -> set[int]:
-    """Return the kinds of a geometry and all within it."""
+    """Return the kinds (codes of [3]) of a geometry and all geometries nested in it."""
     found: set[int] = set()
-    at, waiting = 0, [1]  # geometries that are still to come, by level
+    at, waiting = 0, [1]  # geometries that are still to be read, by level of nesting
     try:
         while waiting:
             if not waiting[-1]:

@@ -1,10 +1,10 @@
-"""Height of a building from its tags, or from the columns of a publisher, with its source.
+"""Heights of buildings from their tags or columns, with source and standard deviation.
 
 Tags and units are as in OpenStreetMap [1]: metres unless a unit is given, `33'`, `33 ft`, `33'6"`.
 A height counts from the ground beside the building, and includes the roof. An elevation counts from
-a vertical datum, so that of the ground is subtracted. Storeys count 3 m each; `building:levels` are
-those below the roof [5], which `roof:height` or `roof:levels` are added to. Only columns whose
-meaning and unit are published are known by name: OpenStreetMap [1], Overture Maps [2], CityGML 2.0
+a vertical datum: the ground's elevation is subtracted. A storey counts 3 m; `building:levels` does
+not include those of the roof [5], so `roof:height` or `roof:levels` is added. Columns are known by
+name only if their meaning and unit are published: OpenStreetMap [1], Overture Maps [2], CityGML 2.0
 (section 10.3), 3D BAG [3], swissBUILDINGS3D 3.0, the LoD models of German states (AdV), BD TOPO of
 IGN, OS MasterMap, buildings of New York City [4] and INSPIRE BU.
 
@@ -33,18 +33,19 @@ _UNIT = re.compile(r"(.+):(m|ft|cm|mm|storeys)", re.IGNORECASE | re.DOTALL)
 # A comma may separate decimals, where it cannot separate thousands
 _DECIMAL = r"\d+(?:\.\d*|,\d{1,2})?|\.\d+"
 _NUMBER = re.compile(rf"\s*([+-]?(?:{_DECIMAL}))\s*")
-# Tags and columns whose `:` a table cannot have in its names, and names of Overture Maps
+# Column -> tag: names of tables, which cannot have the `:` of a tag, and of Overture Maps
 ALIASES = {key.replace(":", "_"): key for key in (
     "building:part", "building:levels", "building:min_level", "building:material",
     "building:height", "building:levels:underground", "roof:height", "roof:levels")} | {
     "min_floor": "building:min_level", "num_floors_underground": "building:levels:underground",
     "facade_material": "building:material", "hasparts": "has_parts", "minheight": "min_height"}
 ESTIMATED = "est_height"
-HIGHEST = "max_level"  # storey, of which the one at the ground is 0: Simple Indoor Tagging
-ROOFLESS = ("building:levels", "num_floors")  # storeys that do not count those of the roof
-TAG_SD_M, STOREYS_SD_M = 1.5, 3.0  # of a height that is given in metres; counted from storeys
-GUESS_SD_M = 6.0  # of a default, where few heights of the map are known
-MIN_KNOWN = 10  # heights of a map that tell how far a default is off
+HIGHEST = "max_level"  # number of the top storey, 0 at the ground: Simple Indoor Tagging
+ROOFLESS = ("building:levels", "num_floors")  # numbers of storeys without those of the roof
+# Standard deviations of a height in metres, a height from storeys, and a default height of a map
+# with fewer than `MIN_KNOWN` known heights
+TAG_SD_M, STOREYS_SD_M, GUESS_SD_M = 1.5, 3.0, 6.0
+MIN_KNOWN = 10
 MAX_HEIGHT_M = 1000.0  # [m], the tallest building has 828 m
 _METRES = re.compile(rf"([+-]?(?:{_DECIMAL}))\s*(?:m|meters?|metres?)?", re.IGNORECASE)
 _FEET = re.compile(rf"([+-]?(?:{_DECIMAL}))\s*(?:'|′|’|ft\.?|feet|foot)\s*"
@@ -54,12 +55,12 @@ _FEET = re.compile(rf"([+-]?(?:{_DECIMAL}))\s*(?:'|′|’|ft\.?|feet|foot)\s*"
 
 @dataclass(frozen=True)
 class HeightColumn:
-    """A column with the top of a building.
+    """A column with the height or the roof's elevation of buildings.
 
     Attributes:
-        name: of the column, in lower case.
-        unit: key of `UNITS_M`.
-        ground: column with the elevation of the ground, where `name` is an elevation; or "".
+        name: name in lower case.
+        unit: unit, a key of `UNITS_M`.
+        ground: column of the ground's elevation if `name` is an elevation; "": it is a height.
     """
 
     name: str
@@ -68,16 +69,17 @@ class HeightColumn:
 
     @property
     def label(self) -> str:
-        """Its name in `buildings.csv` and in reports."""
+        """Name in `buildings.csv` and in reports."""
         return f"{self.name} - {self.ground}" if self.ground else self.name
 
     @property
     def sd_m(self) -> float:
-        """Standard deviation of the heights in it [m]."""
+        """Standard deviation of heights from the column [m]."""
         return STOREYS_SD_M if self.unit == STOREYS or self.name == ESTIMATED else TAG_SD_M
 
 
 def _elevations(ground: str, *names: str) -> tuple[HeightColumn, ...]:
+    """Return columns of roof elevations that share a column of the ground's elevation."""
     return tuple(HeightColumn(name, ground=ground) for name in names)
 
 
@@ -96,13 +98,13 @@ KNOWN = (
         "building:levels", "num_floors", "storeysaboveground", "b3_bouwlagen", "numfloors",
         "nombre_d_etages", "nb_etages", "numberoffloorsaboveground", "aog", "geschosse",
         "storeys", "stories", "floors", "levels", HIGHEST)))
-"""Known columns; of a building, the first usable one counts."""
+"""Known columns; the first usable one of a building is taken."""
 READ_COLUMNS = frozenset(name for column in KNOWN for name in (column.name, column.ground)) | {
     "roof:height", "roof:levels", "min_height", "building:min_level"}
 
 
 def column_name(text: str) -> str:
-    """Return a column's name as `Feature.tags` has it.
+    """Return the tag of a column's name, as in `Feature.tags`.
 
     >>> column_name("Building_Levels"), column_name("HOEHE")
     ('building:levels', 'hoehe')
@@ -111,9 +113,9 @@ def column_name(text: str) -> str:
 
 
 def full_names(cut: Iterable[str], length: int = 10) -> dict[str, str]:
-    """Return the known columns that names were cut to, as Shapefiles do.
+    """Return cut name -> full name of known columns, as Shapefiles cut names.
 
-    Those of elevations are left out: `b3_h_dak_m` may be of the highest or of the lowest roof.
+    Columns of elevations are left out: `b3_h_dak_m` could be the highest or the lowest roof.
 
     >>> full_names(["b3_h_maaiv", "b3_h_dak_m", "height"])
     {'b3_h_maaiv': 'b3_h_maaiveld'}
@@ -139,16 +141,16 @@ def declared_column(text: str, ground: str | None) -> HeightColumn:
 
 
 def check_declared(column: HeightColumn, rows: Iterable[Mapping[str, str]], source: object) -> None:
-    """Raise BadInput unless the columns that the user named are in the tags of some building."""
-    there = {key for tags in rows for key in tags}
+    """Raise BadInput if no building has a column that the user named."""
+    columns = {key for tags in rows for key in tags}
     for name in (column.name, column.ground):
-        if name and name not in there:
+        if name and name not in columns:
             raise BadInput(f"{source} has no column {name!r}; its columns are: "
-                           f"{listed_names(there)}")
+                           f"{listed_names(columns)}")
 
 
 def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
-    """Return the error message for rows without a usable height; None if no column has numbers."""
+    """Return the message that no row has a usable height; None if no column has numbers."""
     counts: dict[str, int] = {}
     for tags in rows:
         for key, value in tags.items():
@@ -177,7 +179,7 @@ def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
 
 
 def listed_names(names: Iterable[str]) -> str:
-    """Return names in order, of many the first twenty."""
+    """Format names in alphabetical order for a message, at most the first twenty."""
     ordered = sorted(names)
     more = len(ordered) - MAX_LISTED
     return ", ".join(repr(name[:60]) for name in ordered[:MAX_LISTED]) + (
@@ -185,7 +187,7 @@ def listed_names(names: Iterable[str]) -> str:
 
 
 def parse_length_m(text: str) -> float:
-    """Parse a length of OpenStreetMap [m]; NaN if the text is none.
+    """Parse a length as in OpenStreetMap [m]; NaN if the text is no length.
 
     >>> parse_length_m("12,5"), round(parse_length_m("33'"), 4)
     (12.5, 10.0584)
@@ -207,10 +209,10 @@ class Height:
     Attributes:
         bottom_m: lower end [m].
         top_m: upper end [m].
-        source: of the top: a tag or column, as `HeightColumn.label` has it, `model` of a solid that
-            the file holds, or `default`.
-        unusable: tags that were skipped, as `height=-3`.
-        sd_m: standard deviation of the top [m]; NaN of a default.
+        source: source of the top: `HeightColumn.label` of a tag or column, `model` if the file has
+            a solid, or `default`.
+        unusable: tags that were skipped, such as `height=-3`.
+        sd_m: standard deviation of the top [m]; NaN: of a default, see `height_sds_m`.
     """
 
     bottom_m: float
@@ -222,11 +224,15 @@ class Height:
 
 def height_of(tags: Mapping[str, str], default_m: float,
               declared: HeightColumn | None = None) -> Height:
-    """Return the vertical extent of a building; values that cannot be used are listed.
+    """Return the vertical extent of a building.
 
-    The top is the first usable of the declared column, the known ones (see `KNOWN`), and the
-    default; the bottom that of `min_height`, `building:min_level` × 3 m, and the ground, where it
-    is below that, too.
+    The top is the first usable of the declared column, the columns `KNOWN`, and the default. The
+    bottom is `min_height`, else `building:min_level` × 3 m, but at least 0 (the ground).
+
+    Args:
+        tags: tags of the building.
+        default_m: height of a building without a usable one [m].
+        declared: column that the user named.
     """
     unusable: list[str] = []
     top_m, source, sd_m = default_m, "default", math.nan
@@ -247,25 +253,28 @@ def height_of(tags: Mapping[str, str], default_m: float,
 
 
 def _first(tags: Mapping[str, str], keys: Iterable[tuple[str, float]], unusable: list[str],
-           least_m: float = 0.0) -> float:
-    """Return the first usable length [m] among tags, given with their units; 0 if there is none."""
+           lowest_m: float = 0.0) -> float:
+    """Return the first usable length [m] of tags, given with their units [m]; 0 if there is none.
+
+    Others are appended to `unusable`.
+    """
     for key, unit_m in keys:
         if key in tags:
             value_m = parse_length_m(tags[key]) if unit_m == 1 else unit_m * number(tags[key])
-            if least_m <= value_m <= MAX_HEIGHT_M:
+            if lowest_m <= value_m <= MAX_HEIGHT_M:
                 return value_m
             unusable.append(f"{key}={tags[key]}")
     return 0.0
 
 
 def height_sds_m(top_m: np.ndarray, sd_m: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (n,) of heights [m], with estimates for defaults.
+    """Estimate the standard deviations of default heights, and return all (n,) [m].
 
-    The error of a default is estimated as the RMS difference of the map's known heights from it.
+    It is the RMS difference of the map's known heights from the default, at least that of storeys.
 
     Args:
         top_m: (n,) heights of the tops above the ground [m].
-        sd_m: (n,) standard deviations [m]; NaN: of a default.
+        sd_m: (n,) standard deviations [m]; NaN: the height is a default.
     """
     guessed = np.isnan(sd_m)
     if guessed.any():
@@ -277,7 +286,7 @@ def height_sds_m(top_m: np.ndarray, sd_m: np.ndarray) -> np.ndarray:
 
 
 def source_text(source: str, declared: HeightColumn | None = None) -> str:
-    """Return the source of a height as a report names it.
+    """Format the source of a height for a report.
 
     >>> source_text("num_floors"), source_text("height")
     ('num_floors × 3 m', 'height tag')
@@ -290,7 +299,7 @@ def source_text(source: str, declared: HeightColumn | None = None) -> str:
 
 
 def _top_m(column: HeightColumn, tags: Mapping[str, str]) -> float:
-    """Return the top above the ground [m]; NaN where a text is no number."""
+    """Return the height of the top above the ground from a column [m]; NaN if it is no number."""
     unit_m = UNITS_M[column.unit]
     top = parse_length_m(tags[column.name]) if column.unit == "m" else number(tags[column.name])
     top += column.name == HIGHEST
@@ -299,6 +308,6 @@ def _top_m(column: HeightColumn, tags: Mapping[str, str]) -> float:
 
 
 def number(text: str) -> float:
-    """Parse a number, with a decimal point or comma; NaN if the text is none."""
+    """Parse a number with a decimal point or comma; NaN if the text is no number."""
     found = _NUMBER.fullmatch(text)
     return float(found[1].replace(",", ".")) if found else math.nan

@@ -1,4 +1,4 @@
-"""Download buildings, vegetation and streets of an area from the Overpass API of OpenStreetMap [1].
+"""Download of buildings, vegetation and streets from the Overpass API of OpenStreetMap [1].
 
 [1] https://wiki.openstreetmap.org/wiki/Overpass_API
 """
@@ -71,7 +71,7 @@ def download_osm(
 
 
 def _copy(answer: Any, file: IO[bytes], path: Path) -> None:
-    """Copy an answer that ends in time, is not too large, and is complete."""
+    """Copy a server's answer to a file; OSError if it takes too long or is cut off."""
     read, deadline = 0, time.monotonic() + MAX_DOWNLOAD_S
     while part := answer.read1(2**16):
         read += len(part)

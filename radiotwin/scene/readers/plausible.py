@@ -1,9 +1,9 @@
-"""Warnings about implausible heights in maps, and voids in terrains.
+"""Plausibility of heights: warnings about buildings of a map, and voids in terrain rasters.
 
-A building of more than 300 m is rare: some 200 of them exist [1]; the most slender is 24 times as
-tall as wide [2]. No city has a median above 60 m, and a room is 2.1 m high at least [5]. Rasters
-that were clipped or warped without a value for no data have zeros there [3]. Single pixels that
-differ by more than 100 m from those around them were taken for errors where SRTM was edited [4].
+Some 200 buildings are taller than 300 m [1]; the most slender one is 24 times as tall as wide [2].
+No city has a median height above 60 m, and a room is at least 2.1 m high [5]. Rasters that were
+clipped or warped without a no-data value have zeros there [3]. SRTM's editors took single pixels
+for errors that differ by more than 100 m from their neighbours [4].
 
 [1] Council on Tall Buildings and Urban Habitat, height criteria ("supertall").
 [2] https://skyscraper.org/super-slenders/slenderness
@@ -26,13 +26,17 @@ from radiotwin.scene.checks import MAX_MEDIAN_M, Problem
 from radiotwin.scene.readers.features import problems_of
 from radiotwin.scene.readers.heights import KNOWN, STOREYS, Height, number
 
-RARE_M, RARE_SLENDERNESS = 300.0, 24.0  # of a building: [1]; height over width: [2]
-ROOM_M = 2.1  # [5]
-VOID_STEP_M, VOID_SLOPE = 30.0, 1.0  # around zeros that are no heights
-VOID_BORDER = 0.9  # share of the pixels around them that are so much higher
-KERNEL_PIXELS = 3  # that a cubic interpolation mixes with a void
-STEP_M, STEP_SLOPE = 100.0, math.tan(math.radians(80.0))  # between pixels, that is told: [4]
+RARE_M, RARE_SLENDERNESS = 300.0, 24.0  # height [1], and height over width [2], of a building
+ROOM_M = 2.1  # least height of a room [5]
+VOID_STEP_M, VOID_SLOPE = 30.0, 1.0  # a step from 0 that is higher and steeper borders a void
+VOID_BORDER = 0.9  # share of such steps along the border of a void
+KERNEL_PIXELS = 3  # pixels beside a void that a cubic interpolation mixed with it
+STEP_M, STEP_SLOPE = 100.0, math.tan(math.radians(80.0))  # larger steps are implausible [4]
 _AROUND = np.ones((3, 3), dtype=bool)
+_FIRST, _LAST, _ALL = slice(None, -1), slice(1, None), slice(None)
+# (Pixels, their neighbours) as indices of a raster, for each of the four sides
+_NEIGHBOURS = (((_FIRST, _ALL), (_LAST, _ALL)), ((_LAST, _ALL), (_FIRST, _ALL)),
+               ((_ALL, _FIRST), (_ALL, _LAST)), ((_ALL, _LAST), (_ALL, _FIRST)))
 
 
 def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
@@ -40,8 +44,8 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
     """Return a warning about buildings whose height is implausible.
 
     Args:
-        buildings: name, height and site in the local frame [m]; default heights are not judged.
-        columns: by name of a building, its tags.
+        buildings: name, height and footprint in the local frame [m]; default heights are skipped.
+        columns: name of a building -> its tags.
     """
     tallest: dict[str, tuple[str, Height, BaseGeometry]] = {}
     for name, height, site in buildings:
@@ -54,7 +58,7 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
         return []
     sites: Any = np.array([site for _, _, site in known], dtype=object)
     bounds_m = shapely.bounds(sites)
-    # No narrower than its area over its longest diagonal: the width of few has to be measured
+    # A building is at least as wide as its area over its diagonal: most need no exact width
     least_m = shapely.area(sites) / np.hypot(*(bounds_m[:, 2:] - bounds_m[:, :2]).T)
     wide_m = np.array([_width_m(site) if top_m > RARE_SLENDERNESS * low_m else math.inf
                        for site, top_m, low_m in zip(sites, tops_m, least_m)])
@@ -68,13 +72,13 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
     if not (rare.any() or shifted):
         return []
     named = np.flatnonzero(rare if rare.any() else tops_m > MAX_MEDIAN_M)
-    said = [f"{known[row][0]}: {tops_m[row]:.4g} m tall, {_width_m(sites[row]):.3g} m wide"
-            for row in sorted(named, key=lambda row: -tops_m[row])]
+    examples = [f"{known[row][0]}: {tops_m[row]:.4g} m tall, {_width_m(sites[row]):.3g} m wide"
+                for row in sorted(named, key=lambda row: -tops_m[row])]
     what = (f"building(s) are taller than {RARE_M:g} m, or than {RARE_SLENDERNESS:g} times their "
             "width, as hardly any building is" if rare.any() else
             f"of {len(tops_m):,} building(s) are taller than {MAX_MEDIAN_M:g} m, more than half, "
             "as in no city")
-    return problems_of(said, what + _hint(known[int(named[0])][1].source, known, columns))
+    return problems_of(examples, what + _hint(known[int(named[0])][1].source, known, columns))
 
 
 def _width_m(site: BaseGeometry) -> float:
@@ -86,7 +90,7 @@ def _width_m(site: BaseGeometry) -> float:
 
 def _hint(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
           columns: Mapping[str, Mapping[str, str]]) -> str:
-    """Return the remedy: what the column may hold instead, and the option for that."""
+    """Return a remedy for a column of implausible heights: what it may hold, and the option."""
     if source == "model":
         return "; are the model's elevations in metres?"
     column = source.split(" - ")[0]
@@ -101,7 +105,7 @@ def _hint(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
 
 def _ground_column(known: Sequence[tuple[str, Height, BaseGeometry]],
                    columns: Mapping[str, Mapping[str, str]]) -> str | None:
-    """Return a column that may be the ground's elevation: subtracting it gives usual heights."""
+    """Return a column that may be the ground's elevation: minus it, heights are usual; or None."""
     rows = [(height.top_m, columns.get(name, {})) for name, height, _ in known]
     for column in sorted({column for _, tags in rows for column in tags}):
         above_m = np.array([top_m - number(tags.get(column, "")) for top_m, tags in rows])
@@ -126,7 +130,7 @@ def zero_voids(height_m: np.ndarray, pixel_m: float) -> np.ndarray:
         return np.zeros(height_m.shape, dtype=bool)
     wall_m = max(VOID_STEP_M, VOID_SLOPE * pixel_m)
     borders, walls = np.zeros(count + 1), np.zeros(count + 1)
-    for inner, outer in _neighbours(height_m.shape):
+    for inner, outer in _NEIGHBOURS:
         beside = (region[inner] > 0) & (region[outer] == 0) & np.isfinite(height_m[outer])
         at = region[inner][beside]
         borders += np.bincount(at, minlength=count + 1)
@@ -135,22 +139,20 @@ def zero_voids(height_m: np.ndarray, pixel_m: float) -> np.ndarray:
     for _ in range(KERNEL_PIXELS if void.any() else 0):
         rim = ndimage.binary_dilation(void, _AROUND) & ~void
         mixed = np.zeros_like(void)
-        for inner, outer in _neighbours(height_m.shape):
+        for inner, outer in _NEIGHBOURS:
             mixed[inner] |= rim[inner] & ~void[outer] & (height_m[outer] - height_m[inner] > wall_m)
         void |= mixed
     return void
 
 
 def steep_steps(height_m: np.ndarray, pixel_m: float) -> tuple[float, int]:
-    """Return the largest step between neighbouring pixels [m], and how many are implausible."""
+    """Return the largest step between neighbouring pixels [m], and the number of implausible ones.
+
+    Args:
+        height_m: (rows, columns) [m], NaN without data.
+        pixel_m: side of a pixel [m].
+    """
     steps_m = np.concatenate([np.abs(np.diff(height_m, axis=axis)).ravel() for axis in (0, 1)])
     steps_m = steps_m[np.isfinite(steps_m)]
     steep = steps_m > max(STEP_M, STEP_SLOPE * pixel_m)
     return float(steps_m.max(initial=0.0)), int(np.count_nonzero(steep))
-
-
-def _neighbours(shape: tuple[int, ...]) -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
-    """Return index pairs of the pixels of a raster and of their neighbours on each side."""
-    first, last, whole = slice(None, -1), slice(1, None), slice(None)
-    return [((first, whole), (last, whole)), ((last, whole), (first, whole)),
-            ((whole, first), (whole, last)), ((whole, last), (whole, first))]

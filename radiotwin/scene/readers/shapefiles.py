@@ -1,9 +1,8 @@
 """Reader of ESRI Shapefiles [1]: a folder's `.shp`, `.dbf` and `.prj`, or a ZIP archive of them.
 
-Polygons are outlines, multipatches are buildings in three dimensions. The bytes are taken from the
-files that were named, or from the archive without unpacking it, and read by pyshp. It is plain
-Python and opens nothing by itself: GDAL would take a file for what it looks like, and could be led
-to others.
+Polygons are outlines, multipatches are buildings in three dimensions. The bytes are read from the
+named files, or from the archive in memory, and parsed by pyshp, which is plain Python and opens no
+file by itself. GDAL would judge a file by its content, and could be led to others.
 
 [1] https://www.esri.com/library/whitepapers/pdfs/shapefile.pdf
 """
@@ -59,7 +58,7 @@ _ERRORS = (struct.error, ValueError, LookupError, TypeError, AttributeError, Ass
 
 
 def _patches_file(path: Path, rows: Iterable[tuple[str, Mapping, Any]], system: str) -> MapFile:
-    """Return the buildings of rows (name, columns, surfaces) of multipatches."""
+    """Return the buildings of multipatches, rows (name, columns, surfaces)."""
     known = find_system(path, system)
     project, unit_m = degrees_from(path, plane_of(known)), vertical_unit_m(known)
     objects = []
@@ -79,30 +78,38 @@ def _patches_file(path: Path, rows: Iterable[tuple[str, Mapping, Any]], system: 
 
 def _patch_surfaces(shape: Any) -> list[Polygon]:
     """Return the polygons of a multipatch: triangles of strips and fans, rings with their holes."""
-    starts = list(shape.parts)
-    if not starts:
-        return []
-    corners = np.column_stack([np.array([point[:2] for point in shape.points], dtype=float),
-                               np.array(shape.z, dtype=float)])
-    if not np.isfinite(corners).all():
-        raise ValueError("a coordinate is not finite")
-    if starts != sorted(starts) or not 0 <= starts[0] <= starts[-1] <= len(corners):
-        raise ValueError("a part begins outside its shape")
     found: list[Polygon] = []
-    begun = None  # kind of the ring that the next ones may be holes of
-    for part, kind in zip(np.split(corners, starts[1:]), shape.partTypes):
+    outline = None  # kind of the last ring that may have holes
+    for part, kind in zip(_parts(shape, getattr(shape, "z", ())), getattr(shape, "partTypes", ())):
         if kind in (_STRIP, _FAN):
             found += [[part[[0 if kind == _FAN else i, i + 1, i + 2]]]
                       for i in range(len(part) - 2)]
-            begun = None
+            outline = None
             continue
         ring = part[:-1] if len(part) > 1 and (part[0] == part[-1]).all() else part
-        if begun is not None and _FOLLOWS.get(kind) == begun:
+        if outline is not None and _FOLLOWS.get(kind) == outline:
             found[-1].append(ring)
         else:
             found.append([ring])
-            begun = kind
+            outline = kind
     return found
+
+
+def _parts(shape: Any, *others: Any) -> list[np.ndarray]:
+    """Return the corners x, y (and others, such as z) of each part of a shape.
+
+    Raises:
+        ValueError: a coordinate is not finite, or a part begins outside the shape.
+    """
+    starts = list(shape.parts)
+    corners = np.column_stack([
+        np.array([point[:2] for point in shape.points], dtype=float).reshape(-1, 2),
+        *(np.array(values, dtype=float) for values in others)])
+    if not np.isfinite(corners).all():
+        raise ValueError("a coordinate is not finite")
+    if starts != sorted(starts) or starts and not 0 <= starts[0] <= starts[-1] <= len(corners):
+        raise ValueError("a part begins outside its shape")
+    return np.split(corners, starts[1:])
 
 
 def read_shapefile(path: Path, crs: str | None = None, wanted: Sequence[str] = ()) -> MapFile:
@@ -111,7 +118,8 @@ def read_shapefile(path: Path, crs: str | None = None, wanted: Sequence[str] = (
     Args:
         path: `.shp` file with `.dbf` and `.prj` beside it, or `.zip` archive of one or more.
         crs: coordinate reference system of a file without `.prj`; None: refuse it.
-        wanted: names of those in an archive; none: those that hold buildings, see `choose_layers`.
+        wanted: names of Shapefiles in an archive; empty: those that hold buildings, see
+            `choose_layers`.
 
     Raises:
         BadInput: no such file, one of the three missing, cut off or damaged, or too large.
@@ -148,12 +156,13 @@ def read_shapefile(path: Path, crs: str | None = None, wanted: Sequence[str] = (
 
 
 def _kind(files: Mapping[str, bytes]) -> int:
-    """Return the type of a Shapefile's shapes [1]; -1 of one that is too short to have one."""
+    """Return the type of a Shapefile's shapes [1]; -1 if the file is too short."""
     head = files[".shp"][32:36]
     return int.from_bytes(head, "little") if len(head) == 4 else -1
 
 
 def _columns(path: Path, name: str, files: Mapping[str, bytes]) -> list[str]:
+    """Return the names of a Shapefile's columns; none without a .dbf."""
     shapefile = _pyshp(path)
     if ".dbf" not in files:
         return []
@@ -166,7 +175,7 @@ def _columns(path: Path, name: str, files: Mapping[str, bytes]) -> list[str]:
 
 
 def _beside(path: Path) -> dict[str, bytes]:
-    """Return the parts of a Shapefile in a folder."""
+    """Read the files of a Shapefile in a folder: suffix -> content."""
     files = {".shp": read_bytes(path, "Shapefile")}
     size = len(files[".shp"])
     for suffix in _PARTS[1:]:
@@ -181,7 +190,7 @@ def _beside(path: Path) -> dict[str, bytes]:
 
 
 def _archived(path: Path) -> dict[str, dict[str, bytes]]:
-    """Return name and parts of each Shapefile in a ZIP archive."""
+    """Read the Shapefiles in a ZIP archive: name -> suffix -> content."""
     layers: dict[str, dict[str, bytes]] = {}
     names: list[str] = []
     read = 0
@@ -210,10 +219,12 @@ def _archived(path: Path) -> dict[str, dict[str, bytes]]:
 
 
 def _text(data: bytes) -> str:
+    """Decode a .prj or .cpg file."""
     return data.decode("utf-8-sig", "replace").strip("\0 \r\n\t")
 
 
 def _pyshp(path: Path) -> Any:
+    """Return the package pyshp; BadInput if it is not installed."""
     return optional_package(
         "shapefile", f"{path}: Shapefiles are read with the package pyshp, which is not installed; "
                      "install it with `pip install 'radiotwin[gis]'`")
@@ -245,7 +256,7 @@ def _rows(path: Path, name: str, files: Mapping[str, bytes], convert: Callable[[
 
 
 def _check_records(subject: str, data: bytes) -> int:
-    """Return the number of shapes, after a walk from header to header through a `.shp` file."""
+    """Return the number of shapes of a `.shp` file, whose record headers are checked one by one."""
     if len(data) < _HEADER or struct.unpack(">i", data[:4])[0] != _MAGIC:
         raise BadInput(f"{subject} is not a readable Shapefile (its .shp begins otherwise); export "
                        "it again")
@@ -268,21 +279,16 @@ def _check_records(subject: str, data: bytes) -> int:
 
 
 def _area(shape: Any) -> BaseGeometry | None:
-    """Return the polygons of a shape: rings that run as its largest are outlines, others holes.
+    """Return the polygons of a shape: rings oriented as its largest are outlines, others holes.
 
-    Outlines run clockwise [1]; some writers reverse them.
+    Outlines run clockwise [1]; some writers reverse all rings.
     """
-    starts = list(shape.parts)
-    corners = np.array([point[:2] for point in shape.points], dtype=float).reshape(-1, 2)
-    if not np.isfinite(corners).all():
-        raise ValueError("a coordinate is not finite")
-    if starts != sorted(starts) or starts and not 0 <= starts[0] <= starts[-1] <= len(corners):
-        raise ValueError("a ring begins outside its shape")
-    if len(corners) > OUTLINE_CORNERS.limit:  # refused, unless it lies outside of what is kept
-        return shapely.Polygon(corners)
-    rings = [ring for ring in np.split(corners, starts[1:]) if len(ring) > 3]
+    parts = _parts(shape)
+    if sum(map(len, parts)) > OUTLINE_CORNERS.limit:  # refused later, if it is in the box
+        return shapely.Polygon(np.concatenate(parts))
+    rings = [ring for ring in parts if len(ring) > 3]
     turns = np.array([_turn(ring) for ring in rings])
-    if turns.max(initial=0.0) > -turns.min(initial=0.0):  # the largest is an outline: all reversed
+    if turns.max(initial=0.0) > -turns.min(initial=0.0):  # the largest is reversed: so are all
         turns = -turns
     outlines = [shapely.Polygon(ring) for ring, turn in zip(rings, turns) if turn <= 0]
     holes = [ring for ring, turn in zip(rings, turns) if turn > 0]
@@ -299,7 +305,7 @@ def _area(shape: Any) -> BaseGeometry | None:
 
 
 def _with_courtyards(area: shapely.MultiPolygon) -> BaseGeometry:
-    """Return an area whose polygons in its largest one are holes: writers may turn all alike."""
+    """Make the polygons within the largest one holes: some writers orient all rings alike."""
     parts = sorted(area.geoms, key=lambda part: -part.area)
     if area.is_valid or parts[0].bounds != area.bounds:
         return area
@@ -308,6 +314,6 @@ def _with_courtyards(area: shapely.MultiPolygon) -> BaseGeometry:
 
 
 def _turn(ring: np.ndarray) -> float:
-    """Return twice the area of a ring, positive where it runs counter-clockwise."""
+    """Return twice the signed area of a ring, positive if it runs counter-clockwise."""
     x, y = (ring - ring[0]).T
     return float((x[:-1] * y[1:] - x[1:] * y[:-1]).sum())

@@ -1,8 +1,8 @@
-"""Prisms of buildings in the local frame, from areas with tags or from shells in three dimensions.
+"""Buildings as prisms in the local frame, from areas with tags or from shells; their contacts.
 
 Closed shells become solids like the extruded ones, so that coincident walls of neighbours are
-united. Open ones are kept as they are, and reported. Each building stands on the flat ground, with
-its lowest point: where the file has terrain below it, that is left out.
+united. Open ones are kept unchanged, and reported. The lowest point of each building is put on the
+flat ground: terrain of the file itself is not used.
 """
 
 from collections.abc import Sequence
@@ -32,25 +32,24 @@ from radiotwin.scene.readers.heights import KNOWN, MAX_HEIGHT_M, Height, HeightC
 from radiotwin.scene.surfaces import Surfaces
 
 GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do
-MIN_OVERLAP_M2 = 1.0  # [m²], that is reported
-_CHUNK = 64  # prisms: bounds the pairs that are found at once
-_PAIRS_AT_ONCE = 10_000
+MIN_OVERLAP_M2 = 1.0  # [m²], smaller overlaps are not reported
+_CHUNK, _PAIRS_AT_ONCE = 64, 10_000  # prisms, and pairs of them, at once: bound the memory
 SLIVER_AREA_M2 = 1.0  # [m²]
 SLIVER_WIDTH_M = 0.3  # [m], mean width; the thickness of one wall
-MIN_COVERED_SHARE = 0.9  # of an outline that its parts cover for it to be left out
-HEADROOM_M = 2.5  # [m] above the ground: a building that begins higher, with all parts, is named
+MIN_COVERED_SHARE = 0.9  # an outline is left out if its parts cover at least this share
+HEADROOM_M = 2.5  # [m], a building that begins higher above the ground is reported
 Area = tuple[Feature, shapely.MultiPolygon]
-_WALL_SINE = 0.02  # of a triangle's area, seen from above, below which it belongs to a wall
-_DECIMALS = 4  # of corners [m]: those that are equal are one, as in `meshes.WELD_M`
+_WALL_SINE = 0.02  # a triangle with a smaller share of its area seen from above is of a wall
+_DECIMALS = 4  # of corners [m]: equal ones are welded, as by `meshes.WELD_M`
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Surfaces of a building that its file has in three dimensions, in the local frame [m].
+    """Surfaces of a building from a 3D model, in the local frame [m].
 
     Attributes:
-        solid: where they are closed, else None.
-        mesh: (v, 3) corners and (f, 3) faces where they are not, else None.
+        solid: the solid if the surfaces are closed, else None.
+        mesh: (v, 3) corners and (f, 3) faces if they are open, else None.
     """
 
     solid: Manifold | None
@@ -59,17 +58,16 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Prism:
-    """A solid with vertical walls and a flat roof, or with a body of its own.
+    """A building or part of one, with vertical walls and a flat roof, or with a body.
 
     Attributes:
-        name: of the feature; several prisms may share one.
-        area: one valid polygon in the local frame, or of a body what it covers [m].
+        name: name of the feature; several prisms may share one.
+        area: one valid polygon in the local frame; with a body, its footprint [m].
         height: bottom and top, and their source.
-        material: of its surfaces.
-        material_from: the tag that the material follows from, or `default`.
-        body: its surfaces; None: walls and a roof over its area.
-        site: area of the whole building that it is part of, whose ground its height counts from;
-            None: its own.
+        material: material of its surfaces.
+        material_from: tag that the material follows from, or `default`.
+        body: surfaces of a 3D model; None: vertical walls and a flat roof over the area.
+        site: footprint of the whole building, whose ground the height counts from; None: the area.
         ground_m: height of that ground above the datum [m].
     """
 
@@ -83,7 +81,7 @@ class Prism:
     ground_m: float = 0.0
 
     def overlaps_in_height(self, other: "Prism") -> bool:
-        """Return whether both share some height."""
+        """Return whether the vertical extents of two prisms overlap."""
         top_m = min(self.height.top_m, other.height.top_m)
         return top_m > max(self.height.bottom_m, other.height.bottom_m)
 
@@ -92,14 +90,14 @@ def make_prisms(
     features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float,
     height_column: HeightColumn | None = None
 ) -> tuple[list[Prism], list[Problem]]:
-    """Make prisms from buildings and their parts, parts first, and list the defects.
+    """Make prisms from buildings and their parts, parts first; also return the problems.
 
     Args:
         features: buildings and parts.
-        origin: of the local frame.
+        origin: origin of the local frame.
         table: materials by tag.
-        default_height_m: of a building whose tags give no height [m].
-        height_column: column that goes before all known ones.
+        default_height_m: height of a building without a usable one [m].
+        height_column: column of heights that the user named; None: known ones.
     """
     defects = _Defects()
     areas = _clean(features, origin, defects)
@@ -122,7 +120,7 @@ def make_prisms(
         material, material_from = table.material_of(feature.tags)
         prisms += [Prism(feature.name, polygon, height, material, material_from, site=site)
                    for polygon in shapely.get_parts(area)]
-        if not building.is_part:  # what a part without its outline stands on is not known
+        if not building.is_part:  # a part without an outline may stand on something else
             lowest_m[building.name] = min(lowest_m.get(building.name, np.inf), height.bottom_m)
     for name, bottom_m in lowest_m.items():
         if bottom_m > HEADROOM_M:
@@ -131,7 +129,7 @@ def make_prisms(
 
 
 class _Defects:
-    """Defects of features, gathered by kind."""
+    """Collects the names of features by the kind of their defect."""
 
     _KINDS: ClassVar[dict[str, tuple[Severity, str]]] = {
         "invalid": ("fixed", "outline(s) cut or touched themselves: taken apart"),
@@ -167,15 +165,17 @@ class _Defects:
         self.names: dict[str, list[str]] = {}
 
     def add(self, kind: str, name: str) -> None:
+        """Add a feature with a defect of a kind."""
         self.names.setdefault(kind, []).append(name)
 
     def problems(self) -> list[Problem]:
+        """Return one problem for each kind of defect."""
         return [problem for kind, (severity, text) in self._KINDS.items()
                 for problem in problems_of(self.names.get(kind, ()), text, severity)]
 
 
 def _clean(features: Sequence[Feature], origin: Origin, defects: _Defects) -> list[Area]:
-    """Return features with their cleaned areas in the local frame, without empty ones."""
+    """Return the features with their cleaned areas in the local frame, without empty areas."""
     areas = shapely.transform([feature.area for feature in features],
                               lambda points: np.column_stack(to_local(origin, *points.T)))
     return [(feature, kept) for feature, area in zip(features, areas)
@@ -184,7 +184,7 @@ def _clean(features: Sequence[Feature], origin: Origin, defects: _Defects) -> li
 
 def _clean_one(feature: Feature, area: BaseGeometry,
                defects: _Defects) -> shapely.MultiPolygon | None:
-    """Return the valid polygons of an area without slivers; None if none is left."""
+    """Return the polygons of an area [m], repaired and rounded, without slivers, or None."""
     invalid = not area.is_valid
     area, shared_m2 = _united(area)
     if area.area < GRID_M**2:
@@ -206,28 +206,28 @@ def _clean_one(feature: Feature, area: BaseGeometry,
 
 
 def _united(area: BaseGeometry) -> tuple[shapely.MultiPolygon, float]:
-    """Return the valid polygons of an area, and the area by which its parts overlap.
+    """Return the valid polygons of an area, and the area by which its polygons overlap [m²].
 
-    A courtyard is a ring of its polygon [1]: a polygon in another one is built, too.
+    A polygon inside another one is united with it: a courtyard would be a ring of the polygon [1].
 
     [1] OGC 06-103r4, Simple feature access, section 6.1.14 (MultiPolygon).
     """
-    whole = _polygons(area)
-    if whole.is_valid:
-        return whole, 0.0
-    parts = [shapely.make_valid(polygon) for polygon in whole.geoms]
+    polygons = _polygons(area)
+    if polygons.is_valid:
+        return polygons, 0.0
+    parts = [shapely.make_valid(polygon) for polygon in polygons.geoms]
     united = _polygons(shapely.union_all(parts) if len(parts) > 1 else parts[0])
     return united, sum(part.area for part in parts) - united.area
 
 
 def _polygons(area: BaseGeometry) -> shapely.MultiPolygon:
-    """Return the polygons of any geometry."""
+    """Return the polygons in any geometry."""
     flat = shapely.get_parts(shapely.get_parts(area))
     return shapely.MultiPolygon([part for part in flat if part.geom_type == "Polygon"])
 
 
 def _touches_itself(polygon: shapely.Polygon) -> bool:
-    """Return whether two rings, or one ring twice, go through one point."""
+    """Return whether the rings of a polygon pass any point twice."""
     rings = (polygon.exterior, *polygon.interiors)
     points = np.concatenate([shapely.get_coordinates(ring)[:-1] for ring in rings])
     return len(np.unique(points, axis=0)) < len(points)
@@ -272,25 +272,25 @@ def _resolve_parts(
 
 
 def _inherit(part: Feature, whole: Feature) -> Feature:
-    """Return a part with the tags of its building that it lacks, except the bottom."""
+    """Add the tags of a building to a part of it that lacks them, except those of the bottom."""
     tags = {key: value for key, value in whole.tags.items()
             if key not in ("min_height", "building:min_level")}
     known = [column.name for column in KNOWN]
-    own = next((row for row, name in enumerate(known) if name in part.tags), None)
-    # What would take precedence over what the part itself has, or be added to it
-    for name in () if own is None else (*known[:own], "roof:height", "roof:levels"):
+    row = next((row for row, name in enumerate(known) if name in part.tags), None)
+    # Tags that would precede the height of the part, or be added to it
+    for name in () if row is None else (*known[:row], "roof:height", "roof:levels"):
         tags.pop(name, None)
     return replace(part, tags=tags | dict(part.tags))
 
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Pairs of prisms that touch or overlap in the plane, and in height touch or overlap.
+    """Pairs of prisms that touch or overlap, in the plane and in height.
 
     Attributes:
-        pairs: (n, 2) indices of prisms, the lower one first.
-        shared_m2: (n,) area of their common part [m²].
-        shared_m: (n,) length of its outline, or of the common wall [m].
+        pairs: (n, 2) indices of prisms, the lower index first.
+        shared_m2: (n,) common area [m²].
+        shared_m: (n,) length of the common area's outline, or of the common wall [m].
     """
 
     pairs: np.ndarray
@@ -344,7 +344,13 @@ def find_overlaps(prisms: Sequence[Prism],
 
 def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: MaterialTable
                       ) -> tuple[list[Prism], list[Problem]]:
-    """Make a prism with a body from each feature, which all have shells, and list the defects."""
+    """Make a prism with a body from each feature with a shell; also return the problems.
+
+    Args:
+        features: features with shells.
+        origin: origin of the local frame.
+        table: materials by tag.
+    """
     prisms: list[Prism] = []
     defects, faces_so_far = _Defects(), 0
     shells = [feature.shell for feature in features if feature.shell is not None]
@@ -375,7 +381,7 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
 
 
 def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
-    """Return prisms with `site` set to the area of their whole building."""
+    """Set `site` of prisms to the united areas of all prisms of the same name."""
     areas: dict[str, list[BaseGeometry]] = {}
     for prism in prisms:
         areas.setdefault(prism.name, []).append(prism.area)
@@ -384,22 +390,26 @@ def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
 
 
 def elevation_fact(features: Sequence[Feature]) -> str:
-    """Return the report's line on the elevations of the ground below buildings with shells."""
+    """Format the range of the ground's elevations below buildings with shells, for the report."""
     ground_m = [feature.shell.ground_m for feature in features if feature.shell is not None]
     return (f"buildings begin at {min(ground_m):.1f} to {max(ground_m):.1f} m above the file's "
             "vertical datum; each was put on the ground")
 
 
 def _triangulate(shell: Shell, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cut the polygons of a shell, whose points (n, 3) are at `points_m`, into triangles.
+    """Cut the polygons of a shell into triangles.
+
+    Args:
+        shell: surfaces of a building.
+        points_m: (n, 3) its points in the local frame [m].
 
     Returns:
-        (v, 3) corners in the local frame, above the ground of the building [m], and (f, 3) faces.
+        (v, 3) corners, with heights above the building's ground [m], and (f, 3) faces.
     """
     vertices = np.round(points_m - [0, 0, shell.ground_m], _DECIMALS)
     vertices, same = np.unique(vertices, axis=0, return_inverse=True)
     same = same.reshape(-1)
-    whole: dict[int, list[np.ndarray]] = {}  # outlines without holes, by their corners
+    outlines: dict[int, list[np.ndarray]] = {}  # number of corners -> polygons without holes
     faces, seen = [np.zeros((0, 3), dtype=np.int64)], set()
     for polygon in filter(None, shell.polygons):
         rings = [same[ring] for ring in polygon]
@@ -411,17 +421,17 @@ def _triangulate(shell: Shell, points_m: np.ndarray) -> tuple[np.ndarray, np.nda
         corners = np.concatenate(rings)
         CORNERS.check(len(corners), "the map")
         if len(rings) == 1:
-            whole.setdefault(len(corners), []).append(corners)
+            outlines.setdefault(len(corners), []).append(corners)
         elif len(rings[0]) > 2:
             ends = np.cumsum([len(ring) for ring in rings]).tolist()
             faces.append(corners[cut_polygon(vertices[corners], ends)])
-    faces += [triangulate(vertices, np.array(group)) for count, group in whole.items()
+    faces += [triangulate(vertices, np.array(group)) for count, group in outlines.items()
               if count > 2]
     return vertices, np.concatenate(faces)
 
 
 def _footprint(vertices: np.ndarray, faces: np.ndarray, name: str) -> shapely.MultiPolygon:
-    """Return what a building covers, seen from above."""
+    """Return the footprint of a building: its faces seen from above, without walls."""
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     level = np.abs(normals[:, 2]) > _WALL_SINE * np.linalg.norm(normals, axis=1)
@@ -430,17 +440,15 @@ def _footprint(vertices: np.ndarray, faces: np.ndarray, name: str) -> shapely.Mu
     plan = corners[level][:, :, :2]
     check_crowding(np.concatenate([plan.min(axis=1), plan.max(axis=1)], axis=1), name)
     flat: Any = shapely.polygons(plan)
-    area = shapely.union_all(shapely.set_precision(flat, GRID_M))
-    parts = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
-    return shapely.MultiPolygon(parts)
+    return _polygons(shapely.union_all(shapely.set_precision(flat, GRID_M)))
 
 
 def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
-    """Return the surfaces, as a solid where they are closed, and whether they are."""
+    """Return surfaces as a solid if they are closed, else as a mesh; also whether they are."""
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     solid = closed_solid(vertices, faces)
-    if solid is None:  # surfaces that stand beside a solid may face either way
+    if solid is None:  # surfaces of a multi-surface may face either way
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         trimesh.repair.fix_winding(mesh)
         faces = np.asarray(mesh.faces)
@@ -453,9 +461,9 @@ def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
 
 
 def closed_solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold | None:
-    """Return the solid that triangles enclose; None where they do not.
+    """Return the solid that triangles enclose; None if they are not closed.
 
-    manifold3d reads beyond its memory where an edge has no partner.
+    Closedness is tested first: manifold3d reads beyond its memory if an edge has no partner.
     """
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     faces = faces[distinct]

@@ -1,4 +1,4 @@
-"""Coordinate reference systems that files name, and their coordinates in degrees."""
+"""Coordinate reference systems of files: lookup by name, and conversion to longitude, latitude."""
 
 import re
 from collections.abc import Callable
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 WGS84 = ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::4326")
-# Names in GML and CityJSON: URN, URI, and lists of a horizontal and a vertical system
+# EPSG codes in names of GML and CityJSON: URN, URI, lists of a horizontal and a vertical system
 _EPSG = re.compile(r"EPSG(?::|/)(?:[\d.]*(?::|/))?(\d{4,6})(?!\d)", re.IGNORECASE)
 _EPSG_OLD = re.compile(r"epsg\.xml#(\d{4,6})$", re.IGNORECASE)
 # Names of the German states' survey (AdV, "ETRS89_UTM32*DE_DHHN2016_NH")
@@ -23,10 +23,10 @@ _MARGIN_DEG = 1.0  # around the area of use that a system declares
 
 
 def find_system(path: Path, name: str) -> "CRS":
-    """Find a system by `AUTHORITY:CODE`, URN, title of PROJ's database, or WKT.
+    """Look up a system that a file names; see `radiotwin.geo.reference_system`.
 
     Raises:
-        BadInput: it is not known, or a name that could open a file.
+        BadInput: the name is unknown, or of a form that could open a file.
     """
     from pyproj.exceptions import CRSError
 
@@ -38,10 +38,10 @@ def find_system(path: Path, name: str) -> "CRS":
 
 
 def degrees_from(path: Path, system: "CRS") -> Callable[[np.ndarray], np.ndarray]:
-    """Return a conversion of (n, 2) east and north to (n, 2) longitude and latitude [degrees].
+    """Return a function from (n, 2) east, north to (n, 2) longitude, latitude [degrees].
 
     Raises:
-        BadInput: now or when it is used, the system cannot be converted.
+        BadInput: the system cannot be converted; also raised by the function.
     """
     from pyproj import Transformer
     from pyproj.exceptions import ProjError
@@ -64,22 +64,22 @@ def degrees_from(path: Path, system: "CRS") -> Callable[[np.ndarray], np.ndarray
 
 
 def chosen_system(path: Path, named: str | None, declared: str | None) -> str | None:
-    """Return the system of a file: the one that it names, else the one that the user declared.
+    """Return the name of a file's system: the one in the file, else the one the user declared.
 
     Raises:
-        BadInput: they differ.
+        BadInput: both are given and differ.
     """
     if named is None or declared is None:
         return declared if named is None else named
-    own, other = (plane_of(find_city_system(path, name)) for name in (named, declared))
-    if not own.equals(other, ignore_axis_order=True):
-        raise BadInput(f"{path} is in {own.name[:80]!r}, and --crs says {other.name[:80]!r}; leave "
-                       "--crs out, or correct the file if its system is wrong")
+    in_file, by_user = (plane_of(find_city_system(path, name)) for name in (named, declared))
+    if not in_file.equals(by_user, ignore_axis_order=True):
+        raise BadInput(f"{path} is in {in_file.name[:80]!r}, and --crs says {by_user.name[:80]!r}; "
+                       "leave --crs out, or correct the file if its system is wrong")
     return named
 
 
 def check_declared_system(name: str) -> None:
-    """Raise BadInput unless the user's name is that of a coordinate reference system."""
+    """Raise BadInput if --crs is no known coordinate reference system."""
     try:
         find_system(Path(), name)
     except BadInput:
@@ -88,13 +88,13 @@ def check_declared_system(name: str) -> None:
 
 
 def find_city_system(path: Path, name: str) -> "CRS":
-    """Find the system of a 3D city model, as GML and CityJSON name it.
+    """Look up a system by a name as in GML and CityJSON.
 
     Such names are `urn:ogc:def:crs:EPSG::25832`, `https://www.opengis.net/def/crs/EPSG/0/7415`,
     `urn:ogc:def:crs,crs:EPSG::25832,crs:EPSG::7837`, `urn:adv:crs:ETRS89_UTM32`.
 
     Raises:
-        BadInput: it is not known.
+        BadInput: the name is unknown.
     """
     if found := _EPSG.search(name) or _EPSG_OLD.search(name):
         return find_system(path, f"EPSG:{found[1]}")
@@ -107,7 +107,7 @@ def find_city_system(path: Path, name: str) -> "CRS":
 
 
 def vertical_unit_m(system: "CRS") -> float:
-    """Return the unit of elevations [m]; where the system names none, that of its plane."""
+    """Return the unit of a system's elevations [m]; if it has none, the unit of its plane."""
     axes = system.axis_info
     if len(axes) > 2:
         return float(axes[2].unit_conversion_factor)
@@ -115,7 +115,7 @@ def vertical_unit_m(system: "CRS") -> float:
 
 
 def plane_unit_m(system: "CRS") -> float:
-    """Return the unit of east and north [m]; 1 of a geographic system."""
+    """Return the unit of a system's east and north [m]; 1 if it is geographic."""
     plane = plane_of(system)
     axes = plane.axis_info
     return 1.0 if plane.is_geographic or not axes else float(axes[0].unit_conversion_factor)
@@ -124,15 +124,15 @@ def plane_unit_m(system: "CRS") -> float:
 def to_degrees(path: Path, system: "CRS", points: np.ndarray) -> np.ndarray:
     """Convert points (n, 2) of a 3D city model to longitude and latitude [degrees].
 
-    Standards want a system's own order of axes, many programs write east before north. The
-    points tell: they lie in the area that the system is meant for.
+    Standards require the system's order of axes, but many programs write east before north. The
+    order is taken in which the points lie in the system's area of use.
 
     Raises:
-        BadInput: in neither order the points lie where the system is used.
+        BadInput: the points lie outside the system's area of use in both orders.
     """
     convert = degrees_from(path, plane_of(system))
-    is_own_north_first = system.is_geographic and system.to_authority() != ("OGC", "CRS84")
-    orders = [points[:, ::-1], points] if is_own_north_first else [points, points[:, ::-1]]
+    north_first = system.is_geographic and system.to_authority() != ("OGC", "CRS84")
+    orders = [points[:, ::-1], points] if north_first else [points, points[:, ::-1]]
     area = system.area_of_use
     for ordered in orders:
         degrees = convert(ordered)

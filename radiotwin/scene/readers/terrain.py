@@ -1,13 +1,13 @@
-"""The ground of a scene from a map: flat, or a terrain that buildings stand on.
+"""The ground of a scene from a map: flat, or terrain from a GeoTIFF that buildings stand on.
 
-Heights are from a GeoTIFF, at the nodes of a grid in the local frame. GDAL opens the file with the
-driver for GeoTIFF alone, so a file that is something else under its name (a VRT, which names other
-files or servers) is refused, and looks at no file beside it. It reads windows in full resolution:
-for others it would open the overviews that a file names.
+Heights are read at the nodes of a grid in the local frame. GDAL may use only its GeoTIFF driver, so
+another file under that name (a VRT, which names other files or servers) is refused, and it looks at
+no file beside it. It reads windows in full resolution: for others it would open the overviews that
+a file names.
 
-Triangles approximate the heights, refined greedily [1]: a Delaunay triangulation [2] of few nodes
-takes in, round by round, the node of each triangle that is farthest from it, until none is farther
-than a tolerance or there are as many triangles as are wanted.
+Triangles approximate the heights by greedy refinement [1]: a Delaunay triangulation [2] of few
+nodes is extended, round by round, by the node of each triangle that is farthest from it, until all
+are within a tolerance, or the number of triangles reaches its maximum.
 
 [1] Garland, Heckbert, "Fast polygonal approximation of terrains and height fields", CMU-CS-95-181,
     1995.
@@ -45,11 +45,11 @@ from radiotwin.scene.readers.systems import find_system, plane_unit_m
 if TYPE_CHECKING:
     from pyproj import CRS
 
-MAX_NODES = 400_000  # of the grid, which is wider than the raster's where that has more
-MIN_SPACING_M = 1.0
+MAX_NODES = 400_000  # of the grid; its spacing is increased accordingly
+MIN_SPACING_M = 1.0  # of the grid
 MARGIN_PIXELS = 2  # around the grid, for the interpolation at its border
-HEIGHTS_M = (-500.0, 9_000.0)  # on land; what is outside was meant to be no height
-MIN_KNOWN = 0.5  # share of the nodes that the raster must have a height for
+HEIGHTS_M = (-500.0, 9_000.0)  # of land; other values mean "no data"
+MIN_KNOWN = 0.5  # least share of the nodes that the raster has a height for
 _FEET = dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048) | dict.fromkeys(
     ("us survey foot", "us survey feet", "us_survey_foot", "us_survey_feet", "us-ft", "ftus",
      "foot_us"), 1200 / 3937)
@@ -58,10 +58,10 @@ _GDAL = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO",
          "GTIFF_REPORT_COMPD_CS": "YES", "GDAL_CACHEMAX": 2**26}
 Bounds = tuple[float, float, float, float]
 BORDER_NODES = 8  # of the first triangulation, along each side
-TOLERANCE_M = 0.5  # of the triangles: better than most terrain models are
-MAX_FACES = 20_000
-SKIRT_M = 1.0  # that walls reach below the lowest ground under them, so that no gap opens
-SAMPLE_M = 2.0  # along outlines: on a slope of 45 degrees the ground falls by a skirt in half of it
+TOLERANCE_M = 0.5  # of the triangles: most terrain models are less accurate
+MAX_FACES = 20_000  # triangles of the ground
+SKIRT_M = 1.0  # walls begin this far below the lowest ground under them, so that no gap opens
+SAMPLE_M = 2.0  # of the ground along outlines: between samples, a slope of 45 degrees falls 1 m
 FLAT_FACT = "flat, at z = 0: a map holds no terrain (--terrain FILE.tif adds one)"
 
 
@@ -73,10 +73,10 @@ class HeightGrid:
         x_m: (nx,) east coordinates, ascending [m].
         y_m: (ny,) north coordinates, ascending [m].
         height_m: (ny, nx) heights above the zero of the vertical reference [m].
-        filled: share of the nodes that the source has no height for; they have the nearest one.
-        reference: name of the vertical reference, for people.
-        kind: of the reference.
-        notes: on how the source was read.
+        filled: share of the nodes without data, which were filled with the nearest height.
+        reference: name of the vertical reference.
+        kind: kind of the reference.
+        notes: warnings about the raster.
     """
 
     x_m: np.ndarray
@@ -95,7 +95,7 @@ class GroundMesh:
     Attributes:
         vertices: (v, 3) [m].
         faces: (f, 3) indices of vertices, counter-clockwise seen from above.
-        max_error_m: largest distance of a node of the grid from the triangles, upwards [m].
+        max_error_m: largest vertical distance of a grid node from the triangles [m].
         rms_error_m: root mean square of these distances [m].
     """
 
@@ -105,27 +105,27 @@ class GroundMesh:
     rms_error_m: float
 
 
-def triangulate(grid: HeightGrid, tolerance_m: float, max_faces: int) -> GroundMesh:
+def approximate(grid: HeightGrid, tolerance_m: float, max_faces: int) -> GroundMesh:
     """Approximate the heights of a grid by few triangles.
 
     Args:
         grid: heights; at least 2 x 2 nodes.
-        tolerance_m: distance of a node from the triangles that is small enough [m].
-        max_faces: number of triangles that is not exceeded by more than the borders' first ones.
+        tolerance_m: allowed vertical distance of a node from the triangles [m].
+        max_faces: maximum number of triangles, but for those of the first triangulation.
 
     Returns:
         Triangles whose corners are nodes of the grid; they cover its rectangle without gaps.
     """
     height_m = np.asarray(grid.height_m, dtype=float)
     rows, columns = np.indices(height_m.shape)
-    # Whole numbers: nodes in a line stay in a line, and the rectangle has no notches
+    # In whole numbers: nodes in a line stay exactly in a line, so the rectangle has no notches
     node = np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
     z_m, chosen = height_m.ravel(), _border(height_m.shape)
     while True:
         mesh = Delaunay(node[chosen])
         triangle, error_m = _errors(mesh, node, z_m, chosen)
         room = (max_faces - len(mesh.simplices)) // 2  # a node in a triangle makes two more
-        worst = _worst_of_each(triangle, error_m, tolerance_m)[:max(room, 0)]
+        worst = _worst_nodes(triangle, error_m, tolerance_m)[:max(room, 0)]
         if not len(worst):
             break
         chosen = np.union1d(chosen, worst)
@@ -136,7 +136,7 @@ def triangulate(grid: HeightGrid, tolerance_m: float, max_faces: int) -> GroundM
 
 
 def _border(shape: tuple[int, ...]) -> np.ndarray:
-    """Return the (n,) flat indices of some nodes along the border, the corners among them."""
+    """Return the flat indices (n,) of up to `BORDER_NODES` nodes along each side of a grid."""
     across, up = (np.unique(np.linspace(0, size - 1, min(size, BORDER_NODES)).round().astype(int))
                   for size in (shape[1], shape[0]))
     return np.unique(np.concatenate([across, (shape[0] - 1) * shape[1] + across,
@@ -144,28 +144,28 @@ def _border(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _upward(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the (f, 3) triangles of points (n, 2) counter-clockwise, without flat ones."""
+    """Orient triangles (f, 3) of points (n, 2) counter-clockwise, and drop those without area."""
     a, b, c = points[faces].swapaxes(0, 1)
     double_area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     faces = np.where((double_area < 0)[:, None], faces[:, ::-1], faces)
-    return faces[np.abs(double_area) > 0.5].astype(np.int64)  # of whole numbers: 0, or 1 and more
+    return faces[np.abs(double_area) > 0.5].astype(np.int64)  # an integer: 0, or at least 1
 
 
 def _errors(mesh: Delaunay, node: np.ndarray, z_m: np.ndarray,
             chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (n,) triangle that each node lies in, and its distance from it, upwards [m]."""
+    """Return the triangle (n,) that each node lies in, and its vertical distance from it [m]."""
     triangle = mesh.find_simplex(node)
     affine = mesh.transform[triangle]
     share = np.einsum("nij,nj->ni", affine[:, :2], node - affine[:, 2])
     share = np.column_stack([share, 1 - share.sum(axis=1)])
     at_m = np.einsum("ni,ni->n", share, z_m[chosen][mesh.simplices[triangle]])
-    error_m = np.nan_to_num(np.abs(at_m - z_m))  # not a number: in a flat triangle of the border
+    error_m = np.nan_to_num(np.abs(at_m - z_m))  # NaN: in a triangle without area on the border
     error_m[chosen] = 0.0
     return triangle, error_m
 
 
-def _worst_of_each(triangle: np.ndarray, error_m: np.ndarray, tolerance_m: float) -> np.ndarray:
-    """Return the farthest node of each triangle that has one beyond a tolerance, worst first."""
+def _worst_nodes(triangle: np.ndarray, error_m: np.ndarray, tolerance_m: float) -> np.ndarray:
+    """Return the farthest node of each triangle, if beyond the tolerance, the worst first."""
     order = np.argsort(-error_m, kind="stable")
     order = order[error_m[order] > tolerance_m]
     _, first = np.unique(triangle[order], return_index=True)
@@ -173,15 +173,20 @@ def _worst_of_each(triangle: np.ndarray, error_m: np.ndarray, tolerance_m: float
 
 
 def read_heights(path: Path, origin: Origin, box_m: Bounds, unit: str | None = None) -> HeightGrid:
-    """Read the heights of an area (x_min, x_max, y_min, y_max) [m], brought to a grid.
+    """Read the terrain heights of an area from a GeoTIFF, averaged or interpolated to a grid.
 
-    They are above the zero of the file's vertical reference, averaged or interpolated. A node
-    without one, where the file has no data, has that of the nearest pixel which has one. The unit,
-    `m` or `ft`, is that of a file which names none; None: metres, unless its plan is in feet.
+    Nodes without data get the height of the nearest pixel with data.
+
+    Args:
+        path: GeoTIFF.
+        origin: origin of the local frame.
+        box_m: (x_min, x_max, y_min, y_max) of the area [m].
+        unit: unit of a file that names none, `m` or `ft`; None: metres, unless its plan is in feet.
 
     Raises:
-        BadInput: rasterio is not installed; not a GeoTIFF, or one without a system, with several
-            bands, or of numbers that are no heights; too large; or it does not cover the area.
+        BadInput: rasterio is not installed; not a GeoTIFF; a file without a coordinate reference
+            system, with several bands, of impossible numbers, or too large; or it does not cover
+            the area.
     """
     with _opened(path) as file:
         system = _system(path, file)
@@ -248,6 +253,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _check(path: Path, file: Any) -> None:
+    """Raise BadInput for several bands, pixels that are no numbers, large blocks, or overviews."""
     if file.count != 1:
         raise BadInput(f"{path} has {file.count} bands, as a picture has; give a GeoTIFF with one "
                        "band of heights (`gdal_translate -b 1` takes out the first)")
@@ -263,6 +269,7 @@ def _check(path: Path, file: Any) -> None:
 
 
 def _system(path: Path, file: Any) -> "CRS":
+    """Return the coordinate reference system of a raster; BadInput if it is not georeferenced."""
     if file.crs is None or file.transform.is_identity:
         raise BadInput(f"{path} does not say where on the earth it lies (no coordinate reference "
                        "system, or no position); export it as a GeoTIFF with both")
@@ -272,7 +279,7 @@ def _system(path: Path, file: Any) -> "CRS":
 
 
 def _pixels_of(file: Any, system: "CRS", origin: Origin) -> Any:
-    """Return the function from x, y in the local frame [m] to column and row of the raster."""
+    """Return a function from x, y in the local frame [m] to column and row of the raster."""
     from pyproj import Transformer
 
     transformer = Transformer.from_crs("EPSG:4326", system.to_2d(), always_xy=True)
@@ -289,7 +296,10 @@ def _pixels_of(file: Any, system: "CRS", origin: Origin) -> Any:
 
 def _vertical(path: Path, file: Any, system: "CRS",
               declared: str | None) -> tuple[float, str, Vertical]:
-    """Return the factor to metres, the name of the vertical reference, and its kind."""
+    """Return the factor of heights to metres, the name of their vertical reference, and its kind.
+
+    `declared` is the unit that the user gave: `m`, `ft`, or None.
+    """
     vertical = next((part for part in system.sub_crs_list if part.is_vertical), None)
     axis = vertical.axis_info[0] if vertical is not None else (
         system.axis_info[2] if len(system.axis_info) == 3 else None)
@@ -322,7 +332,12 @@ def _vertical(path: Path, file: Any, system: "CRS",
 
 def _nodes(file: Any, system: "CRS", origin: Origin,
            box_m: Bounds) -> tuple[np.ndarray, np.ndarray, int, float]:
-    """Return the grid's lines [m], how many pixels go to one along each, and a pixel's size [m]."""
+    """Choose the nodes of the grid.
+
+    Returns:
+        x (nx,) and y (ny,) of the nodes [m], the number of pixels per node along each axis, and the
+        side of a pixel [m].
+    """
     from pyproj import Transformer
 
     x_min, x_max, y_min, y_max = box_m
@@ -330,9 +345,9 @@ def _nodes(file: Any, system: "CRS", origin: Origin,
     to_degrees = Transformer.from_crs(system.to_2d(), "EPSG:4326", always_xy=True)
     to_system = Transformer.from_crs("EPSG:4326", system.to_2d(), always_xy=True)
     centre = np.array(to_system.transform(*to_geographic(origin, *middle)))
-    forth = file.transform
-    beside = np.array([[0, 0], [forth.a, forth.d], [forth.b, forth.e]]) + centre
-    x_m, y_m = to_local(origin, *to_degrees.transform(*beside.T))
+    affine = file.transform
+    corners = np.array([[0, 0], [affine.a, affine.d], [affine.b, affine.e]]) + centre  # of a pixel
+    x_m, y_m = to_local(origin, *to_degrees.transform(*corners.T))
     pixel_m2 = abs((x_m[1] - x_m[0]) * (y_m[2] - y_m[0]) - (x_m[2] - x_m[0]) * (y_m[1] - y_m[0]))
     pixel_m = float(np.sqrt(pixel_m2)) if np.isfinite(pixel_m2) else 0.0
     if not pixel_m > 0:
@@ -346,9 +361,19 @@ def _nodes(file: Any, system: "CRS", origin: Origin,
 
 def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray, every: int,
             pixel: float) -> tuple[np.ndarray, tuple[int, int], int]:
-    """Return the mean heights of squares of pixels, the first row and column, and zeros left out.
+    """Read the part of a raster around some pixels, averaged over squares of pixels.
 
-    A square without data is not a number. The size of a pixel is in the unit of heights.
+    Args:
+        path: file, for messages.
+        file: raster, opened.
+        column: columns of the pixels to read.
+        row: rows of these pixels.
+        every: side of a square, in pixels.
+        pixel: side of a pixel, in the unit of heights.
+
+    Returns:
+        Mean heights of the squares (NaN without data), row and column of the first pixel, and the
+        number of zeros that were taken for no data.
     """
     finite = np.isfinite(column) & np.isfinite(row)
     bounds = []
@@ -371,7 +396,7 @@ def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray, every: i
             start, end = top + first * every, min(top + (first + count) * every, bottom)
             part = file.read(1, window=((start, end), (left, right)), masked=True)
             values = np.full((count * every, columns * every), np.nan)
-            with np.errstate(invalid="ignore"):  # NaN that signal
+            with np.errstate(invalid="ignore"):  # signalling NaN
                 values[:end - start, :right - left] = np.ma.filled(part.astype(float), np.nan)
             if file.nodata is None:
                 void = zero_voids(values, pixel / scale)
@@ -383,7 +408,7 @@ def _window(path: Path, file: Any, column: np.ndarray, row: np.ndarray, every: i
 
 
 def _means(values: np.ndarray, every: int) -> np.ndarray:
-    """Return the means of squares of pixels, without those that are not finite."""
+    """Return the means over squares of `every` x `every` pixels, of finite values only."""
     squares = values.reshape(values.shape[0] // every, every, values.shape[1] // every, every)
     known = np.isfinite(squares)
     count = known.sum(axis=(1, 3))
@@ -392,6 +417,7 @@ def _means(values: np.ndarray, every: int) -> np.ndarray:
 
 
 def _uncovered(path: Path, origin: Origin, box_m: Bounds, share: float) -> BadInput:
+    """Return the error that a raster covers only a share of the area."""
     x_min, x_max, y_min, y_max = box_m
     west, south = (float(value) for value in to_geographic(origin, x_min, y_min))
     east, north = (float(value) for value in to_geographic(origin, x_max, y_max))
@@ -405,10 +431,10 @@ class Ground:
     """The ground of a scene.
 
     Attributes:
-        vertices, faces: of its shape [m].
-        fact: on it, for a report.
-        config: for `scene.toml`; None: flat.
-        problems: on how it was read.
+        vertices, faces: (v, 3) [m] and (f, 3) of its shape.
+        fact: description for the report.
+        config: entry of `scene.toml`; None: flat.
+        problems: problems of the raster.
     """
 
     vertices: np.ndarray
@@ -420,14 +446,14 @@ class Ground:
 
 def make_ground(terrain: Path | None, origin: Origin, box_m: Bounds, shape: str,
                 unit: str | None = None) -> Ground:
-    """Return the ground of an area, above its datum.
+    """Make the ground of an area, with heights above the scene's datum.
 
     Args:
-        terrain: GeoTIFF of heights; None: the ground is flat.
-        origin: of the local frame; an altitude other than 0 becomes the datum of a terrain.
-        box_m: (x_min, x_max, y_min, y_max) [m].
-        shape: name of its shape.
-        unit: of the heights of a file that names none, `m` or `ft`.
+        terrain: GeoTIFF of heights; None: flat ground.
+        origin: origin of the local frame; an altitude other than 0 becomes the datum of a terrain.
+        box_m: (x_min, x_max, y_min, y_max) of the area [m].
+        shape: name of the ground's shape.
+        unit: unit of heights in a file that names none, `m` or `ft`.
 
     Raises:
         BadInput: the raster cannot be used, or the declared altitude is above the lowest ground.
@@ -438,12 +464,12 @@ def make_ground(terrain: Path | None, origin: Origin, box_m: Bounds, shape: str,
         return Ground(corners, np.array([[0, 1, 2], [0, 2, 3]]))
     grid = read_heights(terrain, origin, box_m, unit)
     low_m = round(float(grid.height_m.min()), 3)
-    # Of 0 m, an origin declares no altitude
+    # An altitude of 0 m counts as not declared
     datum_m = origin.altitude_m or float(np.floor(low_m)) or -1.0
     if datum_m > low_m:
         raise BadInput(f"the altitude of --origin, {datum_m:g} m, is above the lowest ground of "
                        f"the scene, {low_m:.1f} m; give one at or below it, or none")
-    mesh = triangulate(grid, TOLERANCE_M, MAX_FACES)
+    mesh = approximate(grid, TOLERANCE_M, MAX_FACES)
     config = TerrainConfig(shape=shape, source=source_text(str(terrain))[:300], datum_m=datum_m,
                            reference=grid.reference[:200], kind=grid.kind)
     problems = [warning(f"{terrain}: {note}") for note in grid.notes]
@@ -464,6 +490,7 @@ def make_ground(terrain: Path | None, origin: Origin, box_m: Bounds, shape: str,
 
 
 def _fact(grid: HeightGrid, mesh: GroundMesh, datum_m: float) -> str:
+    """Describe a terrain for the report: range, vertical reference, datum, triangles, error."""
     above = {"geoid": "above the geoid", "ellipsoid": "above the ellipsoid",
              "unknown": "reference not declared"}[grid.kind]
     name = f"{grid.reference}, " if grid.kind != "unknown" else ""
@@ -474,17 +501,17 @@ def _fact(grid: HeightGrid, mesh: GroundMesh, datum_m: float) -> str:
 
 
 def stand_on(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
-    """Put buildings on a terrain; flat ground leaves them as they are.
+    """Move buildings up to a terrain; on flat ground they stay.
 
-    Heights of OpenStreetMap count from the lowest point where the building meets the ground [1], as
-    those of most 3D city models do: so do those of all its parts. A wall from the ground begins
-    `SKIRT_M` below that point.
+    Heights of OpenStreetMap, and of most 3D city models, count from the lowest point where the
+    building meets the ground [1], those of its parts, too. Walls that begin at the ground are
+    extended `SKIRT_M` below that point.
 
     [1] https://wiki.openstreetmap.org/wiki/Key:height
     """
     if ground.config is None:
         return list(prisms)
-    # Parts of a building share its site, of which the ground is looked up once
+    # Parts of a building share its site: the ground is looked up once for all
     sites = {id(site): site for site in (prism.site or prism.area for prism in prisms)}
     lowest_m = dict(zip(sites, _lowest_ground_m(list(sites.values()), ground).tolist()))
     stood = []
@@ -500,7 +527,7 @@ def stand_on(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
 
 
 def _lowest_ground_m(areas: Sequence[shapely.Geometry], ground: Ground) -> np.ndarray:
-    """Return the (n,) lowest height of a terrain under polygons in its rectangle [m]."""
+    """Return the lowest height (n,) of a terrain under polygons [m]."""
     surface = CityMap(ground.vertices, ground.faces,
                       terrain=np.ones(len(ground.faces), dtype=bool))
     outlines = shapely.segmentize(shapely.boundary(np.asarray(areas, dtype=object)), SAMPLE_M)

@@ -1,8 +1,8 @@
-"""Areas of vegetation in OpenStreetMap, as volumes that a scene declares.
+"""Vegetation of OpenStreetMap as areas that a scene declares, with heights.
 
-Woods (`natural=wood`, `landuse=forest`), parks (`leisure=park`) and rows of trees
-(`natural=tree_row`) [1]. Heights are those of `height` tags; of areas without one, of the forest
-that ITU-R P.833-10 was measured in, and less where trees stand apart.
+These are woods (`natural=wood`, `landuse=forest`), parks (`leisure=park`) and rows of trees
+(`natural=tree_row`) [1]. Heights are from `height` tags; otherwise woods are as high as the forest
+of the measurements of ITU-R P.833-10, and trees of parks and rows lower.
 
 [1] https://wiki.openstreetmap.org/wiki/Key:natural
 """
@@ -23,14 +23,15 @@ from radiotwin.scene.vegetation import VegetationConfig
 TAGS = {("natural", "wood"): "wood", ("landuse", "forest"): "wood", ("leisure", "park"): "park",
         ("natural", "tree_row"): "tree_row"}
 """Tag -> kind of vegetation."""
-HEIGHT_M = {"wood": 16.0, "park": 10.0, "tree_row": 10.0}  # of tree tops, where no tag has it
+HEIGHT_M = {"wood": 16.0, "park": 10.0, "tree_row": 10.0}  # of tree tops without a tag
 MAX_HEIGHT_M = 120.0  # the tallest tree has 116 m
 ROW_WIDTH_M = 6.0  # of the crowns along a row
-SIMPLIFIED_M, MIN_AREA_M2 = 1.0, 50.0  # what outlines may be off; less is a garden
+SIMPLIFIED_M = 1.0  # tolerance of simplified outlines
+MIN_AREA_M2 = 50.0  # smaller areas are gardens, and left out
 
 
 def kind_of(tags: Mapping[str, str]) -> str | None:
-    """Return the kind of vegetation that tags of OpenStreetMap describe; None: none.
+    """Return the kind of vegetation that tags of OpenStreetMap describe, or None.
 
     >>> kind_of({"landuse": "forest"}), kind_of({"natural": "water"})
     ('wood', None)
@@ -41,14 +42,13 @@ def kind_of(tags: Mapping[str, str]) -> str | None:
 def make_vegetation(features: Sequence[Feature], origin: Origin,
                     box_m: tuple[float, float, float, float]
                     ) -> tuple[list[VegetationConfig], list[Problem]]:
-    """Make volumes from areas and lines, cut to a box x_min, x_max, y_min, y_max [m].
+    """Make vegetation from areas and lines, cut to a box (x_min, x_max, y_min, y_max) [m].
 
-    There is one for each polygon that is left, of which several may share a name. What was left out
-    is reported.
+    Each remaining polygon is one entry; several may share a name. Also returns a warning if some
+    were left out.
     """
     x_min, x_max, y_min, y_max = box_m
     box = shapely.box(x_min, y_min, x_max, y_max)
-
     found = []
     for feature in features:
         kind = kind_of(feature.tags)
@@ -68,8 +68,8 @@ def make_vegetation(features: Sequence[Feature], origin: Origin,
 
 
 def _largest(found: list[VegetationConfig]) -> tuple[list[VegetationConfig], list[Problem]]:
-    """Return as many areas as a scene may declare, the largest first, and a warning of the rest."""
-    size_m2 = [_area_m2(each) for each in found]
+    """Return the largest areas, as many as a scene may declare, and a warning about the others."""
+    size_m2 = [_area_m2(area) for area in found]
     order = sorted(range(len(found)), key=lambda row: -size_m2[row])
     corners = np.cumsum([sum(map(len, found[row].rings_m)) for row in order])
     kept = int(np.searchsorted(corners, VEGETATION_CORNERS.limit, side="right"))
@@ -81,19 +81,21 @@ def _largest(found: list[VegetationConfig]) -> tuple[list[VegetationConfig], lis
 
 
 def _area_m2(declared: VegetationConfig) -> float:
+    """Return the size of an area of vegetation without its clearings [m²]."""
     return shapely.Polygon(declared.rings_m[0], declared.rings_m[1:]).area
 
 
 def vegetation_fact(declared: Sequence[VegetationConfig]) -> str:
-    """Return how much vegetation there is, a line for a report."""
+    """Format number and size of the vegetation's areas, for the report."""
     area_m2 = dict.fromkeys(HEIGHT_M, 0.0)
-    for each in declared:
-        area_m2[each.kind] += _area_m2(each)
+    for area in declared:
+        area_m2[area.kind] += _area_m2(area)
     kinds = ", ".join(f"{kind.replace('_', ' ')}: {total / 1e4:,.1f} ha"
                       for kind, total in area_m2.items() if total)
     return f"{len(declared):,} areas ({kinds}), which paths are not traced through"
 
 
 def _height_m(tags: Mapping[str, str], kind: str) -> float:
+    """Return the height of vegetation by its tag, else by its kind [m]."""
     height_m = parse_length_m(tags.get("height", ""))
     return height_m if 0 < height_m <= MAX_HEIGHT_M else HEIGHT_M[kind]

@@ -109,7 +109,7 @@ def test_cut_off(town, at):
     (".shp", 104, struct.pack(">i", -60), "shape 1 is cut off"),  # a record that leads backwards
     (".shp", 144, struct.pack("<i", 2**31 - 1), "not a readable Shapefile"),  # rings
     (".shp", 148, struct.pack("<i", 2**31 - 1), "not a readable Shapefile"),  # corners
-    (".shp", 152, struct.pack("<i", -7), "a ring begins outside"),
+    (".shp", 152, struct.pack("<i", -7), "a part begins outside"),
     (".shp", 160, struct.pack("<d", float("nan")), "not finite"),
     (".dbf", 4, struct.pack("<I", 2**32 - 1), "2 shapes, but 4,294,967,295 rows")])
 def test_damaged_numbers(town, suffix, offset, number, message):
