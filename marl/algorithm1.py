@@ -35,8 +35,8 @@ from radiotwin.scene import Scene
 from radiotwin.twin import Twin, fit_twin
 from radiotwin.twin.shadowing import with_shadowing
 
-TWINS = {"nn": "segmented_nn", "log-distance": "log_distance", "kriging": "regression_kriging",
-         "raytrace": "raytrace", "path-kriging": "path_kriging"}
+TWINS = {"nn": "segmented_nn", "log-distance": "log_distance", "kriging": "kriging",
+         "paths": "paths", "path_kriging": "path_kriging"}
 """Name of a twin on the command line -> model of `fit_twin`."""
 FLIGHTS = ("measuring_flights", "training_flights", "selection_flights")
 """Columns of the log: real flights by what they were for."""

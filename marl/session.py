@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from marl.event_log import EventLog
 
 TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin",
-              "raytrace": "ray-traced twin", "path-kriging": "twin of a map that may be wrong",
+              "paths": "ray-traced twin", "path_kriging": "twin of a map that may be wrong",
               "truth": "the truth"}
 NO_FLIGHTS = dict.fromkeys(("real_episodes", *FLIGHTS), 0) | {"real_ratio": np.nan}
 FLIGHTS_SAY = "Real flights: to measure + to train + to choose between policies"

@@ -138,10 +138,10 @@ class RunSettings(BaseModel):
     truth: Literal["traced", "segmented"] = Field(
         "traced", description="map of the real flights: SCENE/truth.nc, or the paper's "
         "statistical truth")
-    twin: Literal["nn", "log-distance", "kriging", "raytrace", "path-kriging", "truth"] = Field(
-        "nn", description="model of the twin that is trained in; raytrace: paths over the 3D map, "
-        "minutes a round; path-kriging: the same over a map that may be wrong; truth: a perfect "
-        "twin, in which training flights count as real ones")
+    twin: Literal["nn", "log-distance", "kriging", "paths", "path_kriging", "truth"] = Field(
+        "nn", description="model of the twin that is trained in; paths: follows paths over the 3D "
+        "map, minutes a round; path_kriging: the same over a map that may be wrong; truth: a "
+        "perfect twin, in which training flights count as real ones")
     twin_shadowing: Literal["fitted", "slot"] = Field(
         "fitted", description="how long the twin's error lasts in a simulated flight: fitted to "
         "its residuals, or one slot; preset paper: slot")

@@ -41,7 +41,7 @@ HIDDEN = ("antenna_pattern:1", "device_position_error:1", "excess_attenuation:1"
 NULLS = ("nothing:0", "nothing:1", "nothing:2", "nothing:3")
 FOREIGN = ("city00-w0-c0", "city00-w0-c3", "city01-w0-c1", "city01-w1-c2", "city02-w1-c1",
            "city02-w1-c3")
-MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging",
+MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "kriging",
           "path_kriging", "p1411", "cost231_wi", "cost231_wi_metropolitan",
           "tr36777_uma", "tr36777_umi", "al_hourani_urban", "al_hourani_suburban")
 QUICK = ("import", "fit", "map", "coverage")  # beginnings of the steps that `--quick` runs

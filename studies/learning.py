@@ -25,9 +25,9 @@ CITIES = ("rbm", "rdm")
 PAPER_MAPS = ("runs/paper_rbm", "runs/paper_rdm")  # made by studies.paper_maps
 LABELS = {"fedqmix-nn": "model-aided FedQMIX", "qmix-nn": "model-aided QMIX",
           "qmix-log-distance": "model-aided QMIX, log-distance twin",
-          "qmix-truth": "QMIX on real episodes", "fedqmix-raytrace": "FedQMIX, ray-traced twin",
+          "qmix-truth": "QMIX on real episodes", "fedqmix-paths": "FedQMIX, ray-traced twin",
           "iql-truth": "IQL on real episodes", "planner-nn": "planner in the NN twin",
-          "planner-raytrace": "planner in the ray-traced twin",
+          "planner-paths": "planner in the ray-traced twin",
           "greedy": "greedy, distinct targets, true positions", "random": "random"}
 LEVELS = ("greedy", "random")  # need no real episode
 ENOUGH = 0.95  # of what both learners reach at least
@@ -86,7 +86,7 @@ def named_cases(scenes: tuple[str, ...], truth: str, kinds: dict[str, dict[str, 
 
 def curve_cases(seed: int) -> dict[str, dict]:
     """Return all algorithms in the ray-traced cities and on the paper's maps."""
-    in_truth, after_one = {"twin": "truth"}, {"twin": "raytrace", "real_episodes": 1}
+    in_truth, after_one = {"twin": "truth"}, {"twin": "paths", "real_episodes": 1}
     kinds: dict[str, dict[str, Any]] = {
         "fedqmix-nn": {"algorithm": "fedqmix"}, "qmix-nn": {"algorithm": "qmix"},
         "qmix-log-distance": {"algorithm": "qmix", "twin": "log-distance"},
@@ -94,8 +94,8 @@ def curve_cases(seed: int) -> dict[str, dict]:
         "iql-truth": {"algorithm": "iql"} | in_truth,
         "planner-nn": {"algorithm": "planner"},
         **{name: {"algorithm": name, "real_episodes": 1} | in_truth for name in LEVELS}}
-    traced = kinds | {"planner-raytrace": {"algorithm": "planner"} | after_one,
-                      "fedqmix-raytrace": {"algorithm": "fedqmix", "episodes": 8000} | after_one}
+    traced = kinds | {"planner-paths": {"algorithm": "planner"} | after_one,
+                      "fedqmix-paths": {"algorithm": "fedqmix", "episodes": 8000} | after_one}
     return named_cases(CITIES, "traced", traced) | named_cases(PAPER_MAPS, "segmented", kinds)
 
 

@@ -33,7 +33,7 @@ from tests.undeclared.cases import case
 
 FLIGHTS, BATCH = 150, 32  # side by side; in an update
 LIMIT_DB = -115.0  # of detection, of the synthetic levels
-MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging")
+MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "kriging")
 
 
 def measure_speed(seed: int, settings: dict) -> dict:
@@ -172,7 +172,7 @@ def _channel_fit(rng: np.random.Generator, scene: Scene, settings: dict) -> dict
     for name in MODELS:
         model = channel_named(name)()
         found[f"{name}, fit [s]"] = _wall_s(3, model.fit, links, level_db, LIMIT_DB, 0)
-        sample = many.select(slice(0, 20_000)) if name == "regression_kriging" else many
+        sample = many.select(slice(0, 20_000)) if name == "kriging" else many
         taken_s = _wall_s(3, model.predict, sample)
         found[f"{name}, prediction [million links/s]"] = 1e-6 * len(sample) / taken_s
     return found
@@ -209,11 +209,11 @@ def _close_loop(rng: np.random.Generator, scene: Scene, settings: dict) -> dict[
     hidden = case("nothing", settings["world"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        fit_s = _seconds(1, partial(fit_twin, model="raytrace", seed=0), hidden.measurements,
+        fit_s = _seconds(1, partial(fit_twin, model="paths", seed=0), hidden.measurements,
                          hidden.scene)
         loop_s = _seconds(1, close_loop, hidden.measurements, hidden.scene)
     return {"links": len(hidden.measurements.table), "close-loop [CPU s]": loop_s,
-            "one fit of the base raytrace [CPU s]": fit_s, "ratio": loop_s / fit_s}
+            "one fit of the model paths [CPU s]": fit_s, "ratio": loop_s / fit_s}
 
 
 PARTS: dict[str, tuple[Callable[..., dict[str, float]], dict[str, int]]] = {

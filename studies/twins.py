@@ -38,13 +38,13 @@ from studies.runner import Study
 from studies.tables import markdown, number, over_seeds, quantiles, with_sd, worlds
 
 MODELS = {"nn": "segmented_nn", "segmented": "segmented_log_distance",
-          "log-distance": "log_distance", "raytrace": "raytrace"}
+          "log-distance": "log_distance", "paths": "paths"}
 """Name of a twin -> model of `fit_twin`; `corrected` and `truth` besides."""
 TWINS = {"nn": "segmented network (NN)", "segmented": "segmented log-distance",
-         "log-distance": "log-distance", "raytrace": "ray-traced (paths over the map)",
+         "log-distance": "log-distance", "paths": "ray-traced (paths over the map)",
          "corrected": "corrected (after `close-loop`)", "truth": "the truth"}
-QUALITY = {"segmented_nn": "NN", "log_distance": "log-distance", "regression_kriging": "kriging",
-           "raytrace": "ray-traced twin"}
+QUALITY = {"segmented_nn": "NN", "log_distance": "log-distance", "kriging": "kriging",
+           "paths": "ray-traced twin"}
 PUBLISHED = {("rbm", 5): "15 m; 10 % above 100 m", ("rbm", 1): "22 m; 38 % above 100 m"}
 """Median position error of the published code, by scene and real episodes."""
 REPLAYS = 10  # of a sequence of actions in a twin, whose shadowing differs from time to time
@@ -61,7 +61,7 @@ def quality_cases(seed: int) -> dict[str, dict]:
     """Return each model after 1 to 10 real episodes; paths, which take minutes, after 1 and 5."""
     return {f"{scene}-{model}": {
         "scene": scene, "truth": "traced", "model": model, "noise_db": 1.0,
-        "survey_flights": [1, 5] if model == "raytrace" else [1, 2, 3, 5, 10]}
+        "survey_flights": [1, 5] if model == "paths" else [1, 2, 3, 5, 10]}
         for scene in ("rbm", "rdm") for model in QUALITY}
 
 

@@ -32,7 +32,7 @@ from studies.wrong_cities import SIDE_M, Building, city_scene, true_city, wrong_
 CITIES = range(5)
 CLEAR_M = {"anchor": 6.0, "unknown": 1.0}  # from walls; no surveyor has an anchor in a house
 STEP_M = 6.0  # of the flight
-SIMPLE = ("raytrace", "segmented_nn", "regression_kriging")
+SIMPLE = ("paths", "segmented_nn", "kriging")
 COMBINED = "path_kriging"
 CLASSES = ("all", "LoS", "NLoS")
 SDS = 1.645  # about the mean, that hold 90 % of a normal distribution
@@ -269,7 +269,7 @@ def maps_table(rows: pd.DataFrame) -> str:
         "RMSE over held-out links, root mean square over worlds")
     located = []
     for title, part in lines:
-        for model in (COMBINED, "raytrace", "regression_kriging"):
+        for model in (COMBINED, "paths", "kriging"):
             error_m, radius_m = (np.array([value for each in part[model]
                                            for value in each["devices"][key]], dtype=float)
                                  for key in ("error_m", "radius_m"))
@@ -307,9 +307,9 @@ def maps_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     return {"maps": tables.with_legend(figure, panels, 5)}
 
 
-BARS = {"raytrace": "paths alone", "segmented_nn": "network", "regression_kriging": "kriging",
+BARS = {"paths": "paths alone", "segmented_nn": "network", "kriging": "kriging",
         COMBINED: "path_kriging"}
-WITH_RADII = ("raytrace", COMBINED)
+WITH_RADII = ("paths", COMBINED)
 
 
 def _held(rows: pd.DataFrame, model: str) -> float:

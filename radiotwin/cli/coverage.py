@@ -36,7 +36,7 @@ def coverage(
         ] = Path("coverage"),
     model: Annotated[str | None, typer.Option(
         help="Where SOURCE is a scene: a published law (p1411, tr36777_uma, tr36777_umi, "
-             "al_hourani_urban (…), cost231_wi (…)), or raytrace: paths over the 3D map, which "
+             "al_hourani_urban (…), cost231_wi (…)), or paths: follows paths over the map, which "
              "takes far longer [p1411].")] = None,
     transmitters: Annotated[Path | None, typer.Option(
         metavar="TABLE", help="Transmitters in place of the twin's or the scene's devices: device, "

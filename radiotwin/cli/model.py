@@ -37,8 +37,8 @@ def fit(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the twin.")] = Path("twin"),
     model: Annotated[str, typer.Option(
         help="auto: the one with the least held-out error of log_distance, "
-             "segmented_log_distance, segmented_nn, regression_kriging. Or raytrace: paths over "
-             "the 3D map, also to find devices in narrow streets; takes minutes. "
+             "segmented_log_distance, segmented_nn, kriging. Or paths: follows paths over the 3D "
+             "map, also to find devices in narrow streets; takes minutes. "
              "path_kriging: the same over a map that may be wrong. Or a "
              "published law, which needs no anchor: tr36777_uma, tr36777_umi, al_hourani_urban "
              "(_suburban, _dense_urban, _high_rise), p1411, cost231_wi (_metropolitan).")
@@ -168,9 +168,9 @@ def compare(
     held_out: Annotated[int, typer.Option(
         help="Number of the last flights that are held out of the fits.")] = 1,
     devices: DeviceTable = None,
-    raytrace: Annotated[bool, typer.Option(
-        "--raytrace", help="Compare the model raytrace, too: paths over the 3D map. Takes minutes.")
-        ] = False,
+    paths: Annotated[bool, typer.Option(
+        "--paths", help="Compare the model paths, too, which follows paths over the 3D map. Takes "
+                        "minutes.")] = False,
     also: Annotated[list[Path] | None, typer.Option(
         help="A twin's folder, or (with --truth) a radio map, to compare with the models; may be "
              "repeated.")] = None,
@@ -200,7 +200,7 @@ def compare(
     split_flights(data, held_out)  # refuses before a map is read
     truth_map = read_truth(world, truth) if truth else None
     with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
-        comparison = compare_held_out(data, world, truth_map, held_out=held_out, raytrace=raytrace,
+        comparison = compare_held_out(data, world, truth_map, held_out=held_out, paths=paths,
                                       also=also or [], seed=seed, executor=executor)
     notice(pieces.progress)
     write_comparison_folder(comparison, world, out, truth_map)

@@ -92,7 +92,7 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene | Path | str,
 
     Args:
         source: of the gains: a twin, a radio map of the scene, or the name of a published law,
-            or `raytrace` for paths over the 3D map.
+            or `paths` for paths over the 3D map.
         scene: 3D map and radio.
         transmitters: None: the twin's devices, or those that the scene declares.
         settings: None: the defaults.
@@ -219,7 +219,7 @@ def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Tra
         settings.height_m or DEFAULT_HEIGHT_M)
     if isinstance(source, Twin):
         return grid, source_of_twin(source, scene, transmitters)
-    if source == "raytrace" and settings.indoor_loss_db is not None:
+    if source == "paths" and settings.indoor_loss_db is not None:
         raise BadInput("no path over the map goes into a building, so there is nothing that an "
                        "indoor loss could be taken off; leave --indoor-loss-db out, or take a law "
                        "or a twin")

@@ -55,7 +55,7 @@ def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -
     """Return the source for a scene without measurements.
 
     Args:
-        model: name of a published law, or `raytrace` for paths over the map.
+        model: name of a published law, or `paths` for paths over the map.
         scene: 3D map.
         transmitters: each with a frequency.
 
@@ -69,8 +69,8 @@ def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -
         source = _source_of_law(kind, city, transmitters)
     else:
         raise BadInput(f"model {model!r} is learnt from measurements, and a scene has none: fit a "
-                       "twin with it and give that, or take raytrace, or a published law, such as "
-                       "p1411, tr36777_umi, al_hourani_urban or cost231_wi")
+                       "twin with it and give that, or take the model paths, or a published law, "
+                       "such as p1411, tr36777_umi, al_hourani_urban or cost231_wi")
     if scene.uav_antenna is None:
         return source
     return replace(source, notes=lambda receiver_m: [
@@ -141,7 +141,7 @@ def _source_of_paths(city: CityMap, transmitters: Sequence[Transmitter]) -> Gain
         return [f"{percent(value)} of the links {what} the loss along the profile of ground and "
                 "roofs (ITU-R P.526-15, Sec. 4.5)" for what, value in share.items() if value]
 
-    return GainSource("raytrace: paths over the 3D map, powers added", predict, notes)
+    return GainSource("paths over the 3D map, powers added", predict, notes)
 
 
 def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:

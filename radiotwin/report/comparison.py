@@ -95,7 +95,7 @@ class ComparisonRecord(Record):
 
 def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
                      scene: Scene | Path | str, truth: RadioMap | None = None, *,
-                     held_out: int = 1, raytrace: bool = False, also: Sequence[Path | str] = (),
+                     held_out: int = 1, paths: bool = False, also: Sequence[Path | str] = (),
                      seed: int = 0, executor: Executor | None = None) -> Comparison:
     """Compare all channel models on the last flights, which none of them is fitted to.
 
@@ -106,7 +106,7 @@ def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
         scene: where they were flown, or its folder.
         truth: the whole map to judge on, too; None: there is none.
         held_out: number of the last flights.
-        raytrace: compare the model `raytrace`, too; takes minutes.
+        paths: compare the model `paths`, too; takes minutes.
         also: folders of twins and, with a truth, files of radio maps, to compare with the models.
         seed: of all fits.
         executor: where the models are fitted; None: in this process.
@@ -119,7 +119,7 @@ def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
     train, test = split_flights(as_measurements(measurements, scene), held_out)
     twins, maps = _judge_also([Path(path) for path in also], truth, test.flights)
     models = (*DEFAULT_MODELS, *published_models(scene.config.radio.frequency_hz),
-              *["raytrace"] * raytrace)
+              *["paths"] * paths)
     return compare_models(train, test, scene, truth, seed=seed, models=models, twins=twins,
                           maps=maps, executor=executor)
 

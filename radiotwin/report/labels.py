@@ -47,7 +47,8 @@ PARAMETERS = {  # of any effect; what only one has, is in its `parameter_labels`
 SUFFIXES = {"_db_km": "dB/km", "_db_m": "dB/m", "_deg": "°", "_db": "dB", "_dbm": "dBm",
             "_m": "m", "_s": "s"}
 MODELS = {"log_distance": "log-distance", "segmented_log_distance": "segmented log-distance",
-          "segmented_nn": "segmented NN", "regression_kriging": "regression kriging",
+          "segmented_nn": "segmented NN", "kriging": "kriging",
+          "regression_kriging": "kriging",
           "extra_trees": "extra trees", "hist_gradient_boosting": "gradient boosting",
           "trees_of_levels": "extra trees, blanks included",
           "boosting_of_levels": "gradient boosting, blanks included",

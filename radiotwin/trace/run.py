@@ -274,12 +274,12 @@ def warn_of_terrain(city: CityMap, device_m: np.ndarray, positions_m: np.ndarray
     if hidden:
         warnings.warn(f"behind terrain lie {percent(hidden / no_path.size)} of the links, and no "
                       "path was found to them: Sionna RT diffracts once, so that what rounded "
-                      "hills hide comes out not detected; coverage --model raytrace has a loss "
+                      "hills hide comes out not detected; coverage --model paths has a loss "
                       "along terrain (ITU-R P.526)", stacklevel=3)
     if far:
         warnings.warn(f"{percent(far / no_path.size)} of the links are longer than "
                       f"{FAR_M / 1e3:g} km: Sionna RT's Earth is flat, so that gains beyond the "
-                      "horizon are too high; coverage --model raytrace has the round Earth",
+                      "horizon are too high; coverage --model paths has the round Earth",
                       stacklevel=3)
 
 

@@ -21,7 +21,7 @@ from radiotwin.scene.footing import moved_outdoors
 from radiotwin.twin import Twin, fit_twin
 
 # Models that are compared unless others are named.
-DEFAULT_MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging")
+DEFAULT_MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "kriging")
 # Published laws that `radiotwin compare` adds: nothing is fitted, so they cost only the search.
 PUBLISHED_MODELS = ("tr36777_uma", "tr36777_umi", "al_hourani_urban", "p1411", "cost231_wi")
 WORKER_BYTES = 3 * 2**30  # of a process that fits a model

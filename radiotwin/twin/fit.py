@@ -54,10 +54,10 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
     Args:
         measurements: links to anchors and unknown devices; of a file or a data frame, too.
         scene: its map and extent, and the receivers' sensitivity; or its folder.
-        model: name of a channel model (`radiotwin.propagation.laws.channel_models`); `raytrace`
-            stands for `image_paths`, which follows paths over the 3D map, and `path_kriging` allows
-            for errors of that. `auto` is the one of `selection.CHEAP` with the least held-out
-            error; then `segmented_nn` locates the devices.
+        model: name of a channel model (`radiotwin.propagation.laws.channel_models`); `paths`
+            follows paths over the 3D map, and `path_kriging` allows for errors of that. `auto` is
+            the one of `selection.CHEAP` with the least held-out error; then `segmented_nn` locates
+            the devices.
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
         allow_indoor: whether unknown devices may be inside buildings.

@@ -93,7 +93,7 @@ def fit_paths(links: Links, scene: Scene, law: Twin, relocation: Relocation) -> 
         relocation: the search, which remembers what it followed.
 
     Returns:
-        a twin with the channel `image_paths`, whose levels are still to be fitted.
+        a twin with the channel `paths`, whose levels are still to be fitted.
     """
     # To be found from there, with all that is known of deep shadow, unreliable devices count, too.
     channel = _image_paths(links, law, law.device_m)

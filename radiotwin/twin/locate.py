@@ -27,7 +27,7 @@ from radiotwin.twin.twin import Twin
 
 NOT_BY_PATHS = ("and following paths from every position where a device may be takes too long: "
                 "locate uses its law of distance and line of sight alone. close-loop --base twin "
-                "makes one whose effects it uses, too, and fit --model raytrace locates devices "
+                "makes one whose effects it uses, too, and fit --model paths locates devices "
                 "along paths")
 MAX_NAMED = 5  # receivers in a note
 MAX_PROBES = 2000  # links by which a channel's error scale is looked up

@@ -17,7 +17,7 @@ from radiotwin.propagation.laws.segmented_nn import BLOCK_M
 
 AUTO = "auto"
 HELD_OUT, LOCATED_BY = "held_out", "located_by"  # in the provenance of a twin
-CHEAP = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging")
+CHEAP = ("log_distance", "segmented_log_distance", "segmented_nn", "kriging")
 UNTRIED = "segmented_log_distance"  # taken where too few links are there to hold any out
 FOLDS, MIN_FLIGHTS = 3, 3
 ALIKE = 0.04  # of the mean squared error, 2 % of the RMSE: too little to prefer a complex model

@@ -49,7 +49,7 @@ def test_the_map_is_one_that_others_can_read(chain):
 def test_the_comparison_has_every_model_against_both_judges(chain):
     record = json.loads((chain / "comparison" / "compare.json").read_text())
     scores = pd.DataFrame(record["scores"])
-    models = {"log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging",
+    models = {"log_distance", "segmented_log_distance", "segmented_nn", "kriging",
               *published_models(2.4e9)}
     for against, names in (("held-out flights", models | {"twin"}), ("whole map", models | {"twin", "twin.nc"})):
         part = scores[scores["against"] == against]
@@ -97,18 +97,18 @@ def test_a_twin_by_paths_is_made_and_used_as_any_other(chain, run):
     devices[devices["device"].isin(["d0", "d2", "d5"])].to_csv(chain / "few" / "devices.csv", index=False)
     survey[survey["device"].isin(["d0", "d2", "d5"])].to_csv(chain / "few" / "measurements.csv", index=False)
     for arguments, says in (
-        ("fit few/measurements.csv --scene scene --model raytrace -o by-paths", "by-paths (raytrace)"),
+        ("fit few/measurements.csv --scene scene --model paths -o by-paths", "by-paths (paths)"),
         ("map by-paths --scene scene -o by-paths.nc", "3 devices"),
-        ("compare few/measurements.csv --scene scene --raytrace --also by-paths -o few/comparison", "by-paths"),
+        ("compare few/measurements.csv --scene scene --paths --also by-paths -o few/comparison", "by-paths"),
     ):
         result = run(arguments, cwd=chain)
         assert result.returncode == 0 and says in result.stdout + result.stderr, result.stderr
     with xr.open_dataset(chain / "by-paths.nc", engine="h5netcdf") as dataset:
-        assert dataset.attrs["source"] == "twin:image_paths"
+        assert dataset.attrs["source"] == "twin:paths"
     twin = json.loads((chain / "by-paths" / "twin.json").read_text())
     found = next(device for device in twin["devices"] if device["device"] == "d2")
     assert np.hypot(found["x_m"] - 80, found["y_m"] - 200) < 10
     scores = pd.read_csv(chain / "few" / "comparison" / "scores.csv")
-    assert {"segmented_nn", "raytrace", "by-paths"} <= set(scores["model"])
+    assert {"segmented_nn", "paths", "by-paths"} <= set(scores["model"])
     refused = run("locate few/measurements.csv --twin by-paths --scene scene -o nowhere.csv", cwd=chain)
-    assert refused.returncode == 2 and "fit --model raytrace" in refused.stderr
+    assert refused.returncode == 2 and "fit --model paths" in refused.stderr

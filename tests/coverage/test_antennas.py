@@ -81,7 +81,7 @@ def test_coverage_is_the_sum_of_both_paths_through_the_antenna(plain, gain_dbi, 
     azimuth_deg, paths = rays_by_hand(receiver_m)
     expected = sum(power * 10 ** (gain_dbi(azimuth_deg - BORESIGHT_DEG, leaving_deg) / 10) for leaving_deg, _, power in paths)
     mast = Transmitter("mast", MAST_M, 0.0, antenna_of(gain_dbi), frequency_hz=FREQUENCY_HZ)
-    gain_db, _ = source_over("raytrace", plain, [mast]).predict(0, receiver_m, np.arange(POINTS))
+    gain_db, _ = source_over("paths", plain, [mast]).predict(0, receiver_m, np.arange(POINTS))
     np.testing.assert_allclose(gain_db, 10 * np.log10(expected), atol=0.02)
 
 
@@ -124,5 +124,5 @@ def test_positions_that_are_tried_are_heard_through_both_antennas(plain):
 def test_the_antenna_of_the_uavs_is_said_not_to_be_used(plain, monkeypatch):
     mast = Transmitter("mast", MAST_M, 0.0, frequency_hz=FREQUENCY_HZ)
     monkeypatch.setitem(plain.__dict__, "uav_antenna", antenna_of(dipole_dbi))
-    for model in ("raytrace", "al_hourani_urban"):
+    for model in ("paths", "al_hourani_urban"):
         assert "for its UAVs is not used" in " ".join(source_over(model, plain, [mast]).notes(points(1.5)))

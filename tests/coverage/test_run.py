@@ -200,7 +200,7 @@ def test_paths_over_the_map_go_through_the_antenna(build, house):
                       np.array([[15.0, 0.0, -10.0, 0.0]] * 2))
     scene = build(house(-120, -100, -100, 100, 40), devices=[("a", 0.0, 0.0, 10.0)])
     settings, place = CoverageSettings(step_m=50.0, extent_m=(-200, 300, -25, 25)), np.array([0, 0, 10.0])
-    plain, turned = (predict_coverage("raytrace", scene, [Transmitter("a", place, 30.0, antenna)], settings)
+    plain, turned = (predict_coverage("paths", scene, [Transmitter("a", place, 30.0, antenna)], settings)
                      for antenna in (None, Antenna(pattern, azimuth_deg=90.0)))
     distance_m = math.hypot(275.0, 8.5)
     direct_dbm = 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(distance_m)
@@ -208,7 +208,7 @@ def test_paths_over_the_map_go_through_the_antenna(build, house):
     behind_dbm = power_at(plain, -175.0, 0.0)  # over two edges, or not at all
     assert math.isnan(behind_dbm) or behind_dbm < 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(175.0) - 10.0
     assert power_at(turned, 275.0, 0.0) - power_at(plain, 275.0, 0.0) == pytest.approx(15.0, abs=0.3)
-    assert "coverage_probability" not in plain.dataset and plain.summary["model"].startswith("raytrace")
+    assert "coverage_probability" not in plain.dataset and plain.summary["model"].startswith("paths")
 
 
 def test_receivers_stand_on_uneven_ground(build, twin_of):
@@ -331,7 +331,7 @@ def test_without_a_gain_indoors_there_is_nothing_to_take_a_loss_off(build, house
     scene = build(house(100, 100, 300, 200, 20), devices=[("a", -200.0, 0.0, 30.0)])
     settings = CoverageSettings(step_m=50.0, indoor_loss_db=15.0)
     with pytest.raises(BadInput, match="goes into a building"):
-        predict_coverage("raytrace", scene, settings=settings)
+        predict_coverage("paths", scene, settings=settings)
 
 
 def test_of_a_power_without_a_deviation_nothing_is_certain():

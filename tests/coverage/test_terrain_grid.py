@@ -35,7 +35,7 @@ def test_behind_a_rounded_hill_is_a_loss_along_its_profile(build):
     """A ridge with a crest radius of 500 m, at whose folds no path diffracts: nothing was received, without a word."""
     scene = build(ground_z_m=lambda x, y: 10 + 20 * np.exp(-(x**2) / 2 / 500 / 20) + 0 * y, terrain=True)
     settings = CoverageSettings(step_m=20.0, extent_m=(200, 400, -40, 40))
-    coverage = predict_coverage("raytrace", scene, MAST, settings)
+    coverage = predict_coverage("paths", scene, MAST, settings)
     power_dbm = coverage.dataset["received_power_dbm"].values
     distance_m = np.hypot(coverage.grid.x_m + 300, coverage.grid.y_m[:, None])
     loss_db = 30 - power_dbm - 20 * np.log10(4 * np.pi * distance_m * 2e9 / 299_792_458)
@@ -46,7 +46,7 @@ def test_behind_a_rounded_hill_is_a_loss_along_its_profile(build):
 def test_cells_behind_a_house_alone_are_counted_not_filled(build, house):
     """Over flat ground only paths count: in a yard between walls of 60 m there is none, and the note says how many cells."""
     walls = [house(-45, -45, 45, -35, 60), house(-45, 35, 45, 45, 60), house(-45, -35, -35, 35, 60), house(35, -35, 45, 35, 60)]
-    coverage = predict_coverage("raytrace", build(*walls), [Transmitter("a", np.array([-300.0, 0, 2]), 30.0)],
+    coverage = predict_coverage("paths", build(*walls), [Transmitter("a", np.array([-300.0, 0, 2]), 30.0)],
                                 CoverageSettings(step_m=10.0, extent_m=(-30, 30, -30, 30)))
     missing = int(np.isnan(coverage.dataset["received_power_dbm"]).sum())
     assert missing > 0 and any(f"({missing:,}) receive nothing" in each for each in coverage.summary["notes"])
@@ -54,7 +54,7 @@ def test_cells_behind_a_house_alone_are_counted_not_filled(build, house):
 
 def test_beyond_5_km_the_earth_is_round(build):
     """20 km at 10 and 1.5 m, 2.4 GHz: 126.1 dB of free space and 31.0 around the Earth (P.526-15, Sec. 3); -123 dB on a flat one."""
-    coverage = predict_coverage("raytrace", build(half_m=25e3, frequency_hz=2.4e9), [Transmitter("a", np.array([0.0, 0, 10]), 30.0)],
+    coverage = predict_coverage("paths", build(half_m=25e3, frequency_hz=2.4e9), [Transmitter("a", np.array([0.0, 0, 10]), 30.0)],
                                 CoverageSettings(step_m=20.0, extent_m=(4_000, 20_020, -10, 10)))
     gain_db = coverage.dataset["received_power_dbm"].values[0] - 30
     assert gain_db[-1] == pytest.approx(-157.1, abs=0.3)

@@ -30,7 +30,7 @@ COMMANDS = (
     "radiotwin survey scene --truth segmented --flights 2 -o survey/measurements.csv",
     "radiotwin fit survey/measurements.csv --scene scene --model log_distance -o twin",
     "radiotwin fit survey/measurements.csv --scene scene --model segmented_nn -o twin_nn",
-    "radiotwin fit survey/measurements.csv --scene scene --model regression_kriging -o twin_kriging",
+    "radiotwin fit survey/measurements.csv --scene scene --model kriging -o twin_kriging",
     "radiotwin map twin --scene scene -o map.nc",
     "radiotwin compare survey/measurements.csv --scene scene -o comparison",
     "radiotwin close-loop open/measurements.csv --base log-distance -o loop",

@@ -109,11 +109,11 @@ def test_a_learner_may_train_in_a_twin_that_follows_paths(small_scene, tmp_path)
     text = scene.read_text()
     unknown = text.count('"unknown"')
     scene.write_text(text.replace('"unknown"', '"anchor"', unknown - 1))  # to look for each takes seconds
-    status, out, err = run("--scene scene " + SMALL + "--real-episodes 1 --twin raytrace --compare none "
+    status, out, err = run("--scene scene " + SMALL + "--real-episodes 1 --twin paths --compare none "
                            "--algorithm qmix --out result", tmp_path)
     assert status == 0, err
     twin = json.loads((tmp_path / "result" / "twin" / "twin.json").read_text())
-    assert twin["channel"]["model"] == "image_paths" and len(twin["provenance"]["flights"]) == 1
+    assert twin["channel"]["model"] == "paths" and len(twin["provenance"]["flights"]) == 1
     assert all(0 < float(row["truth_ratio"]) <= 1 for row in metrics(tmp_path / "result" / "metrics.csv"))
 
 
@@ -131,7 +131,7 @@ def flat(value):
     ("--scene nowhere", ["nowhere", "radiotwin build-scene"]),
     ("--episodes 0", ["--episodes 0", "≥ 1"]),
     ("--compare true", ["--compare true", "none|twins|truth"]),
-    ("--twin magic", ["--twin magic", "nn|log-distance|kriging|raytrace|path-kriging|truth"]),
+    ("--twin magic", ["--twin magic", "nn|log-distance|kriging|paths|path_kriging|truth"]),
     ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|heuristic|policy|planner|belief|random"]),
     ("--fly-again true", ["No such option: --fly-again"]),
     ("--batch 64 --replay 32", ["replay 32", "64"]),

@@ -54,7 +54,7 @@ def test_algorithm_1_has_a_row_for_each_round_and_the_seed_decides(small_scene):
 @pytest.mark.slow
 def test_a_twin_is_judged_by_the_truth(small_scene):
     settings = {f"small-{model}": {"model": model, "survey_flights": [1, 3], "noise_db": 1.0}
-                for model in ("segmented_nn", "log_distance", "regression_kriging")}
+                for model in ("segmented_nn", "log_distance", "kriging")}
     rows = rows_of(twins.judge_twin, small_scene, settings)
     curves = rows.set_index("name")["curve"]
     network, line = curves["small-segmented_nn"], curves["small-log_distance"]

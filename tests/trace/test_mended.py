@@ -156,7 +156,7 @@ def test_a_mast_on_a_roof_has_one_gain_whatever_computes_it(tmp_path):
     listed = list_paths(scene, points_m)
     power = np.bincount(listed["link_of_path"], 10 ** (listed["path_gain_db"].to_numpy() / 10), 6).reshape(3, 2)
     covered_dbm = [float(predict_coverage(
-        "raytrace", scene, [Transmitter("mast", device_m, tx_power_dbm=0.0)],
+        "paths", scene, [Transmitter("mast", device_m, tx_power_dbm=0.0)],
         CoverageSettings(step_m=10.0, height_m=z_m, extent_m=(x_m - 5, x_m + 5, -5.0, 5.0))
     ).dataset["received_power_dbm"].item()) for device_m in scene.device_m for x_m in points_m[:, 0]]
     assert traced_db == pytest.approx(expected_db, abs=0.1)

@@ -36,7 +36,7 @@ def tables(small_scene, truth, flown):
     """`tables(executor)` compares three models: what is written, as text."""
     def compared(executor=None):
         found = compare_models(*split_flights(flown, 1), small_scene, truth, seed=0, executor=executor,
-                               models=("log_distance", "segmented_nn", "regression_kriging"))
+                               models=("log_distance", "segmented_nn", "kriging"))
         return found.scores.to_csv(), found.locations.to_csv(), found.predictions.to_csv()
     return compared
 

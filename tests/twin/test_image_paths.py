@@ -17,7 +17,7 @@ from radiotwin.twin.localize import Relocation
 def twin(narrow_street, tmp_path_factory):
     """The twin, loaded from its folder."""
     folder = tmp_path_factory.mktemp("raytraced") / "twin"
-    fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0).save(folder)
+    fit_twin(narrow_street.measured, narrow_street.scene, model="paths", seed=0).save(folder)
     return Twin.load(folder)
 
 
@@ -51,7 +51,7 @@ def test_an_earlier_twin_saves_most_of_the_search(narrow_street, twin, monkeypat
         return follow(self, city, position_m, *others)
 
     monkeypatch.setattr(Relocation, "follow", counted)
-    again = fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0, start=twin)
+    again = fit_twin(narrow_street.measured, narrow_street.scene, model="paths", seed=0, start=twin)
     for before, after in zip(twin.devices, again.devices):
         assert np.hypot(before.x_m - after.x_m, before.y_m - after.y_m) <= 1.5
     assert 0 < len(positions) < 20  # at least that many cells are tried where nothing is known
@@ -64,12 +64,12 @@ def test_a_map_that_does_not_explain_the_levels_is_warned_of(narrow_street):
     anchors = flown.select(flown.is_anchor[flown.device_index])
     measured = Measurements(anchors.table, narrow_street.measured.devices)
     with pytest.warns(UserWarning, match="explain these levels worse than a law"):
-        fit_twin(measured, scene, model="raytrace", seed=0)
+        fit_twin(measured, scene, model="paths", seed=0)
 
 
 def test_paths_do_not_go_indoors(narrow_street):
     with pytest.raises(BadInput, match="outside buildings only"):
-        fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0, allow_indoor=True)
+        fit_twin(narrow_street.measured, narrow_street.scene, model="paths", seed=0, allow_indoor=True)
 
 
 def test_what_was_not_heard_is_not_invented(narrow_street):
@@ -81,7 +81,7 @@ def test_what_was_not_heard_is_not_invented(narrow_street):
     table.loc[np.flatnonzero(mine)[3:], "gain_db"] = np.nan
     some = Measurements(table[mine | los].reset_index(drop=True), measured.devices)
     with pytest.warns(UserWarning, match=r"only 0 links without line of sight .* others, [56]\.\d dB") as warned:
-        twin = fit_twin(some, scene, model="raytrace", seed=0)
+        twin = fit_twin(some, scene, model="paths", seed=0)
     assert not any("worse than a law" in str(each.message) for each in warned)
     los_db, nlos_db = twin.fitted.level_coefficients[:2]
     assert los_db == nlos_db == pytest.approx(6.0, abs=0.6)
@@ -95,7 +95,7 @@ def test_a_killed_fit_goes_on_and_ends_equal_to_the_bit(narrow_street, tmp_path,
     put = pieces.PieceStore.put
 
     def files(folder):
-        fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0).save(folder)
+        fit_twin(narrow_street.measured, narrow_street.scene, model="paths", seed=0).save(folder)
         return [(folder / name).read_bytes() for name in ("twin.json", "channel.safetensors")]
 
     def killed(self, name, *args):

@@ -88,7 +88,7 @@ def test_bad_input_is_one_message(run, tmp_path, open_ground, role, twin, messag
     assert not (tmp_path / "located.csv").exists()
 
 
-@pytest.mark.parametrize("model", ["segmented_log_distance", "regression_kriging", "raytrace"])
+@pytest.mark.parametrize("model", ["segmented_log_distance", "kriging", "paths"])
 def test_a_twin_of_fit_locates_a_device_that_it_has_not_seen(run, tmp_path, small_scene, model):
     truth = segmented_truth(small_scene)
     fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).save(tmp_path / "all" / "measurements.csv")
@@ -105,7 +105,7 @@ def test_a_twin_of_fit_locates_a_device_that_it_has_not_seen(run, tmp_path, smal
     done = run(f"locate new/measurements.csv --scene {small_scene.folder} --twin twin -o located.csv", tmp_path)
     assert done.returncode == 0, done.stderr
     located, true_m = pd.read_csv(tmp_path / "located.csv"), data.device_m[anchors[-1]]
-    said = "the twin follows paths" if model == "raytrace" else "may be farther away than their radii say"
+    said = "the twin follows paths" if model == "paths" else "may be farther away than their radii say"
     assert located["device"].tolist() == [lost] and said in done.stdout and "no link is to devices d1, d2, d3, d4\n" in done.stdout
     assert np.hypot(located["x_m"][0] - true_m[0], located["y_m"][0] - true_m[1]) < 20.0
 

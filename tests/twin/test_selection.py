@@ -38,10 +38,10 @@ def shadows(distance_m, los, receiver_m, rng):
 
 @pytest.mark.parametrize("level_at, best, worse", [
     (line, "log_distance", ()), (classes, "segmented_log_distance", ("log_distance",)),
-    (shadows, "regression_kriging", ("log_distance", "segmented_log_distance"))])
+    (shadows, "kriging", ("log_distance", "segmented_log_distance"))])
 def test_the_simplest_model_within_a_standard_error_of_the_least_error_is_the_best(level_at, best, worse):
     links, flight, level_db = links_with(level_at)
-    models = ("log_distance", "segmented_log_distance", "regression_kriging")
+    models = ("log_distance", "segmented_log_distance", "kriging")
     found = HeldOut.of(links, flight, level_db, None, 0, models)
     assert found.by == "flight" and found.best == best and list(found.rmse_db) == list(models)
     assert found.rmse_db[best] < (6.0 if level_at is shadows else 2.4)

@@ -53,7 +53,7 @@ def test_share_and_length_are_estimated_from_the_residuals(seed):
 def test_the_correlation_of_an_interpolating_twin_is_that_of_its_own_field(small_scene, tmp_path):
     truth = segmented_truth(small_scene)
     measurements = fly_survey(small_scene, truth, flights=1, pattern="random-waypoint", seed=0)
-    for model in ("regression_kriging", "segmented_log_distance"):
+    for model in ("kriging", "segmented_log_distance"):
         twin = fit_twin(measurements, small_scene, model=model, seed=0)
         radio_map = twin.radio_map(small_scene)
         found = with_shadowing(radio_map, twin, measurements, small_scene.config.gain_limit_db, 0).dataset.attrs
@@ -62,7 +62,7 @@ def test_the_correlation_of_an_interpolating_twin_is_that_of_its_own_field(small
         assert share * np.exp(-small_scene.lattice.step_m / length_m) < 0.1
         assert share == 0 or length_m >= small_scene.lattice.step_m
         assert "shadowing_share" not in radio_map.dataset.attrs
-        if model == "regression_kriging":
+        if model == "kriging":
             twin.channel.field.share, twin.channel.field.length_m = 0.7, 70.0
             with_shadowing(radio_map, twin, measurements, -120.0, 0).save(tmp_path / "map.nc")
             attributes = RadioMap.load(tmp_path / "map.nc").dataset.attrs

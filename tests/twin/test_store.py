@@ -21,7 +21,7 @@ STORED = Path(__file__).parent / "stored"
 NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)
 
 
-@pytest.mark.parametrize("model", ["log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging"])
+@pytest.mark.parametrize("model", ["log_distance", "segmented_log_distance", "segmented_nn", "kriging"])
 def test_saved_and_loaded_it_predicts_the_same(small_scene, flown, tmp_path, model):
     twin = fit_twin(flown, small_scene, model=model, seed=0)
     twin.save(tmp_path / "twin")

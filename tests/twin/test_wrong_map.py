@@ -60,7 +60,7 @@ def test_over_a_shifted_map_it_predicts_better_than_paths_alone(narrow_street, s
                        pattern="random-waypoint", seed=5, noise_db=0.0)
     anchors = [each.device for each in twin.devices if each.role == "anchor"]
     flown = flown.select(flown.table["device"].isin(anchors).to_numpy())
-    paths = fit_twin(narrow_street.measured, scene, model="raytrace", seed=0)
+    paths = fit_twin(narrow_street.measured, scene, model="paths", seed=0)
     own, theirs = (np.sqrt(np.nanmean((predict(each, scene, flown) - flown.level_db) ** 2)) for each in (twin, paths))
     assert own < 0.8 * theirs and own < 2.5
 

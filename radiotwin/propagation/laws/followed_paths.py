@@ -213,7 +213,7 @@ def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, 
     """Yield for each device the rows of its links, its cached paths, and the links' rows there."""
     city = geometry.city
     if city is None:
-        raise BadInput("the channel image_paths follows paths over a 3D map, and none is given; "
+        raise BadInput("the model paths follows paths over a 3D map, and none is given; "
                        "give it with --scene")
     devices, first, count = np.unique(geometry.device, return_index=True, return_counts=True)
     batch = np.cumsum(count) // BATCH_LINKS

@@ -156,7 +156,7 @@ class ImagePaths(ChannelModel):
         diffuse: gain of the diffuse power at 100 m [dB], and its path loss exponent.
     """
 
-    name = "image_paths"
+    name = "paths"
     uses_map = True
     follows_paths = True
 

@@ -389,7 +389,7 @@ class RegressionKriging(ChannelModel):
     position, and all other receivers share one.
     """
 
-    name = "regression_kriging"
+    name = "kriging"
     uses_map = True
 
     def __init__(self) -> None:

@@ -38,7 +38,6 @@ BUILT_IN: tuple[type[ChannelModel], ...] = (
     LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging, ImagePaths, PathKriging,
     UrbanMacro, UrbanMicro, AlHouraniSuburban, AlHouraniUrban, AlHouraniDenseUrban,
     AlHouraniHighRise, P1411, WalfischIkegami, WalfischIkegamiMetropolitan)
-ALIASES = {"raytrace": ImagePaths.name}  # names in command-line options
 _registered: dict[str, type[ChannelModel]] = {}
 BESIDE = "beside/"  # prefix of arrays in the file that do not belong to the model
 # Distances and heights [m] at which a decoded model must predict finite levels.
@@ -77,16 +76,14 @@ def channel_models() -> dict[str, type[ChannelModel]]:
 
 
 def channel_named(name: str) -> type[ChannelModel]:
-    """Return the class of a channel model by its name or alias.
+    """Return the class of a channel model by its name.
 
     Raises:
         BadInput: no such model is installed.
     """
     models = channel_models()
-    name = ALIASES.get(name, name)
     if name not in models:
-        allowed = [*(each for each in models if each not in ALIASES.values()), *ALIASES]
-        raise BadInput(f"channel model {name!r} is unknown; allowed are {', '.join(allowed)}")
+        raise BadInput(f"channel model {name!r} is unknown; allowed are {', '.join(models)}")
     return models[name]
 
 

@@ -27,7 +27,7 @@ def models(fitted_nn):
     found = {kind.name: kind().fit(links, data.level_db, -120.0, seed=0)
              for kind in MODELS.values() if not kind.follows_paths and kind.name != network.name}
     near = PathKriging()
-    near.diffuse, near.kriging, near.weight = (-93.0, 3.5), found["regression_kriging"], np.array([0.3, 0.8])
+    near.diffuse, near.kriging, near.weight = (-93.0, 3.5), found["kriging"], np.array([0.3, 0.8])
     near.field, near.map_error = near.kriging.field, MapError((1.5, 1.0, 2.0), (0.0, 0.0, 1.0))
     return found | {network.name: network, near.name: near,
                     ImagePaths.name: ImagePaths(found["segmented_log_distance"], (-93.0, 3.5))}
