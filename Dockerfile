@@ -9,6 +9,9 @@ WORKDIR /src
 COPY constraints.txt ./
 # The CPU build of torch: PyPI's for Linux brings gigabytes of CUDA. Nothing else is taken from that index.
 RUN pip install --no-deps --index-url https://download.pytorch.org/whl/cpu "$(grep '^torch==' constraints.txt)"
+# .git is not copied: --build-arg VERSION=1.2.3 is the version that the package has then.
+ARG VERSION=0.1.0
+ENV SETUPTOOLS_SCM_PRETEND_VERSION_FOR_RADIOTWIN=$VERSION
 COPY pyproject.toml setup.py MANIFEST.in README.md LICENSE ./
 COPY radiotwin ./radiotwin
 COPY marl ./marl

@@ -12,13 +12,15 @@ VENV ?= .venv
 PIP_ARGS ?=
 TORCH_INDEX ?=
 TESTS ?=
-EXTRAS := test
+RUN_EXTRAS := trace,train
+TEST_EXTRAS := test
 CONSTRAINTS := constraints.txt
 
 FAST_TESTS := $(addprefix tests/,effects geo importing inference io links maps propagation scene test_layout.py)
 
 BIN := $(VENV)/bin
-INSTALLED := $(VENV)/.installed
+INSTALLED := $(VENV)/.installed-$(RUN_EXTRAS)
+TESTABLE := $(VENV)/.installed-$(TEST_EXTRAS)
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
 PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	if $$python -c '$(NEW_ENOUGH)' 2> /dev/null; then echo $$python; break; fi; done)
@@ -45,33 +47,33 @@ help:
 demo: llvm
 	$(BIN)/radiotwin demo
 
-test: $(INSTALLED)
-	@$(MAKE) --no-print-directory llvm \
+test: $(TESTABLE)
+	@$(MAKE) --no-print-directory RUN_EXTRAS=$(TEST_EXTRAS) llvm \
 	|| echo "make test: without a libLLVM the tests that trace rays are skipped; all the others run." >&2
 	$(PYTEST) -m "not slow" $(TESTS)
 
-test-all: $(INSTALLED)
+test-all: $(TESTABLE)
 	$(PYTEST) $(TESTS)
 
 # Flower pins older versions of typer, rich, packaging and protobuf than constraints.txt has.
 test-flower:
-	$(MAKE) --no-print-directory VENV=$(VENV)-flower EXTRAS=test,flower CONSTRAINTS=constraints-flower.txt \
-		$(VENV)-flower/.installed
+	$(MAKE) --no-print-directory VENV=$(VENV)-flower TEST_EXTRAS=test,flower CONSTRAINTS=constraints-flower.txt \
+		$(VENV)-flower/.installed-test,flower
 	OMP_NUM_THREADS=1 $(VENV)-flower/bin/python -m pytest --numprocesses 0 tests/marl/test_flower.py tests/marl/test_client.py
 
-lint: $(INSTALLED)
+lint: $(TESTABLE)
 	$(BIN)/ruff check
 	$(BIN)/mypy
 
 # mypy takes one core for most of this time; the tests have the other.
-check: $(INSTALLED)
+check: $(TESTABLE)
 	@$(MAKE) --no-print-directory -j 2 lint fast
 
-fast: $(INSTALLED)
+fast: $(TESTABLE)
 	$(PYTEST) -m "not slow and not llvm and not seconds" $(FAST_TESTS)
 
 # In a folder of its own, where the examples leave what they make.
-docs: $(INSTALLED)
+docs: $(TESTABLE)
 	$(BIN)/python -m pip install --disable-pip-version-check -q $(PIP_ARGS) -c constraints.txt -e '.[docs]'
 	mkdir -p build/docs
 	cd build/docs && OMP_NUM_THREADS=1 $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml -d $(CURDIR)/site
@@ -81,11 +83,11 @@ bench: llvm
 	$(BIN)/python -m studies speed --out build/speed
 
 # The second run does nothing, until what is to be installed has changed.
-$(INSTALLED): pyproject.toml $(CONSTRAINTS)
+$(VENV)/.installed-%: pyproject.toml $(CONSTRAINTS)
 	@$(BIN)/python -m pip --version > /dev/null 2>&1 || $(MAKE) --no-print-directory $(VENV)
 	@[ -z "$(TORCH_INDEX)" ] || $(BIN)/python -m pip install --disable-pip-version-check --no-deps \
 		--index-url "$(TORCH_INDEX)" "$$(grep '^torch==' $(CONSTRAINTS))"
-	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c $(CONSTRAINTS) -e '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c $(CONSTRAINTS) -e '.[$*]'
 	@touch $@
 
 # Debian and Ubuntu keep the module venv in a package of its own.

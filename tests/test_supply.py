@@ -60,18 +60,28 @@ def test_all_is_every_extra_of_a_user(project):
     extras = project["optional-dependencies"]
     (every,) = extras["all"]
     assert set(re.fullmatch(r"radiotwin\[(.*)\]", every)[1].split(",")) == extras.keys() - {"all", "docs", "flower", "test"}
-    listed = re.findall(r"^\| `(\w+)`(?:, `(\w+)`)? \|", (ROOT / "docs" / "install.md").read_text().split("**Extras**")[1], re.MULTILINE)
+    listed = re.findall(r"^\| `(\w+)`(?:, `(\w+)`)? \|", (ROOT / "docs" / "install.md").read_text().split("**Without an extra**")[1], re.MULTILINE)
     assert {name for names in listed for name in names if name} == extras.keys()
 
 
 def test_the_conda_recipe_has_the_dependencies(project):
     conda = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
-    run = (ROOT / "recipe" / "recipe.yaml").read_text().split("  run:\n")[1].split("\n\n")[0]
-    named = dict(re.findall(r"(?:- |then: )(?!if:)([\w.-]+) >=([\d.]+)$", run, re.MULTILINE))
-    specs = [re.match(r"([\w.-]+)>=([\d.]+)", each).groups() for each in project["dependencies"]]
-    assert named == {conda.get(name, name): version for name, version in specs} | {
-        "python": project["requires-python"].removeprefix(">=")}
-    assert f'version: "{project["version"]}"' in (ROOT / "recipe" / "recipe.yaml").read_text()
+    recipe = (ROOT / "recipe" / "recipe.yaml").read_text()
+    run, extra = recipe.split("  run:\n")[1].split("\n\n")[0].split("  run_constraints:\n")
+    extras = project["optional-dependencies"]
+    for text, requirements in ((run, [*project["dependencies"], f"python{project['requires-python']}"]),
+                               (extra, [*extras["trace"], *extras["nn"], *extras["train"]])):
+        specs = dict(re.match(r"([\w.-]+)>=([\d.]+)", each).groups() for each in requirements if not each.startswith("radiotwin["))
+        assert dict(re.findall(r"(?:- |then: )(?!if:)([\w.-]+) >=([\d.]+)$", text, re.MULTILINE)) == {
+            conda.get(name, name): version for name, version in specs.items()}
+
+
+def test_a_tree_without_git_has_one_version_everywhere():
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
+    version = tools["setuptools_scm"]["fallback_version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f'default="{version}"' in (ROOT / "recipe" / "recipe.yaml").read_text()
+    assert f"ARG VERSION={version}\n" in (ROOT / "Dockerfile").read_text()
 
 
 def test_every_budget_is_in_the_table():

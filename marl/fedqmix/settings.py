@@ -96,7 +96,7 @@ def write_app(shared: Shared, parties: list[dict[str, Any]], folder: Path) -> No
     app = {"publisher": "radiotwin", "config": shared.config(),
            "components": {"serverapp": "marl.fedqmix.flower_app:server_app",
                           "clientapp": "marl.fedqmix.flower_app:client_app"}}
-    project = {"name": "fedqmix", "version": __version__, "license": "Apache-2.0",
+    project = {"name": "fedqmix", "version": __version__.partition("+")[0], "license": "Apache-2.0",
                "description": "Federated QMIX of radiotwin", "dependencies": []}
     with atomic_file(folder / "app" / "pyproject.toml") as file:
         file.write(tomli_w.dumps({"project": project, "tool": {"flwr": {"app": app}}}).encode())

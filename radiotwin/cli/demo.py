@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, optional_package
 from radiotwin.maps.survey import fly_survey
 from radiotwin.report import read_run, write_comparison_folder, write_picture, write_report
 from radiotwin.runtime.cuda import Device
@@ -38,11 +38,13 @@ def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed:
         RunFailed: no libLLVM for tracing.
     """
     folder = Path(folder)
+    solver = SolverSettings.of_quality("default", compute_device=device)
+    optional_package("torch", "the demo also learns a network, which needs torch; install it with "
+                              "`pip install 'radiotwin[nn]'`")
     scene = _scene(source, folder / "scene", seed, on_progress)
     on_progress(f"2 tracing {len(scene.config.devices)} devices × "
                 f"{len(scene.lattice.positions_m)} positions with Sionna RT")
-    truth = trace_map(scene, SolverSettings.of_quality("default", compute_device=device),
-                      scene.folder / "truth.nc")
+    truth = trace_map(scene, solver, scene.folder / "truth.nc")
     write_picture(truth, scene, folder / "truth.png")
     on_progress(f"3 flying {FLIGHTS} flights of {len(scene.config.uavs)} UAVs")
     measurements = fly_survey(scene, truth, flights=FLIGHTS, pattern="random-waypoint", seed=seed)

@@ -147,6 +147,8 @@ def _check_packages(diagnosis: Diagnosis) -> Rows:
         try:
             rows.append((name, version(name)))
         except PackageNotFoundError:
+            if extra and extra[1] in ("docs", "test"):  # which no command needs
+                continue
             rows.append((name, f"not installed (extra '{extra[1]}')" if extra else "MISSING"))
             if not extra and ";" not in requirement:
                 diagnosis.problems.append(f"the package {name} is missing: pip install "

@@ -144,8 +144,8 @@ def map_(
     with open_model(twin) as source:
         written = export_map(source, world, out, devices=split_names(devices),
                              altitudes_m=_altitudes(altitudes), name=str(twin), tell=notice)
-    say(f"wrote {out}: {len(written.devices)} devices on {written.lattice.shape} positions "
-        "(z, y, x)")
+    z, y, x = written.lattice.shape
+    say(f"wrote {out}: {len(written.devices)} devices, {z} altitudes of {x} by {y} positions")
 
 
 def _altitudes(text: str | None) -> list[float] | None:

@@ -308,10 +308,10 @@ def fit_base(links: Links, scene: Scene | None, folds: Folds, base: str = "auto"
                 names.append(RaytraceBase.name)
             else:
                 links = links.with_notes(
-                    f"Paths were followed on {FIRST_LOOK_LINKS} links of anchors only. There the "
-                    f"held-out error is {abs(gain_db):.2f} dB "
-                    f"{'smaller' if gain_db > 0 else 'larger'} than without them; the paths of all "
-                    f"links are followed from {MIN_GAIN_DB} dB less on, or with --base raytrace.")
+                    f"Reflected paths are not part of the base: on {FIRST_LOOK_LINKS} links of "
+                    f"anchors they make the held-out error {abs(gain_db):.2f} dB "
+                    f"{'smaller' if gain_db > 0 else 'larger'}, and {MIN_GAIN_DB} dB less is "
+                    "asked for. --base raytrace takes them all the same.")
     bases = make_bases(scene, seed)
     models, parts = {}, training_parts(links, folds)
     for name in names:

@@ -117,12 +117,14 @@ def _position_warnings(measurements: Measurements, devices: str | None) -> Itera
     if len(low):
         table = Path(devices).name if devices else "a table of devices"
         yield (f"{len(low)} of {len(measurements.devices)} devices have no height "
-               f"({some(low)}): give it in {table} (above_ground_m); "
-               "without a 3D map they count as 1.5 m above the ground, with one they are refused")
+               f"({some(low)}): give it in {table} (column above_ground_m). `fit` over a 3D map "
+               "needs it; without a map 1.5 m is taken")
     unknown = int((~measurements.is_anchor).sum())
     if unknown:
-        yield (f"{unknown} of {len(measurements.devices)} devices have no position: their role is "
-               "unknown, they are to be found")
+        anchors = ("" if measurements.is_anchor.any() else
+                   ", but needs some of known position: give them with --devices TABLE")
+        yield (f"{unknown} of {len(measurements.devices)} devices have no position: `fit` locates "
+               f"them{anchors}")
 
 
 def _name_warnings(measurements: Measurements) -> Iterator[str]:

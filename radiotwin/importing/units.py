@@ -74,7 +74,8 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
     typed = cells.dtype.kind == "M"  # Parquet has typed times
     if time_format is None and not typed:
         raise BadInput(f"{source.path}: column {spec}: time_format is not given; {ALLOWED}. The "
-                       f"values look like {shown(cells.iloc[0])} to {shown(cells.iloc[-1])}")
+                       f"values look like {shown(cells.iloc[0])} to {shown(cells.iloc[-1])}. "
+                       "If they carry no offset from UTC, give time_zone, too")
     if time_format in EPOCH_S and not typed:
         time_s = source.numbers(spec, "time") * EPOCH_S[time_format]
         return _plausible(source, spec, cells, time_s)

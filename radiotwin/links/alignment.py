@@ -118,9 +118,9 @@ def in_known_frame(measurements: Measurements, origin: Origin | None, owner: str
         return measurements
     converted = measurements.in_frame(origin)
     moved_m = np.nanmedian(converted.receiver_m - measurements.receiver_m, axis=0)
-    warnings.warn(f"the measurements are in the frame about {origin_text(old)}, {owner} in that "
-                  f"about {origin_text(origin)}: positions are converted (moved by "
-                  f"{moved_m[0]:+.1f} m east, {moved_m[1]:+.1f} m north)", stacklevel=3)
+    warnings.warn(f"the measurements count x and y from {origin_text(old)}, {owner} from "
+                  f"{origin_text(origin)}: positions are converted (moved by {moved_m[0]:+.1f} m "
+                  f"east, {moved_m[1]:+.1f} m north)", stacklevel=3)
     return converted
 
 

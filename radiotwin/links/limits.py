@@ -267,8 +267,8 @@ def _reason_to_ignore(links: Links, declared_db: float) -> str | None:
 def _declared_text(links: Links, declared_db: float) -> str:
     """Return words for a declared limit: its value, and where it is declared."""
     of = "sensitivity_dbm less tx_power_dbm" if links.is_gain else "sensitivity_dbm"
-    return (f"the declared limit of detection, {declared_db:g} {links.level_unit} ({of} of "
-            "scene.toml; the default, if nobody set it),")
+    return (f"the declared limit of detection, {declared_db:g} {links.level_unit} ({of} in "
+            "scene.toml),")
 
 
 def _usual_db(links: Links, rows: list[np.ndarray], found: list[LimitEstimate | None],
@@ -357,7 +357,7 @@ def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
         if below:
             lie = (f"{below:,} of {len(read_db):,} readings ({percent(below / len(read_db))}) lie "
                    f"below it, down to {read_db.min():g}")
-        notes.append(f"{_declared_text(links, declared_db)} is not that of the readings: {lie}. "
+        notes.append(f"{_declared_text(links, declared_db)} does not fit the readings: {lie}. "
                      f"{_used_instead(links, limits_db, found, other)}")
     elif len(known_db) and np.ptp(known_db) > DIFFER_DB:
         low, high = (links.receiver_names[int(np.flatnonzero(limits_db == end)[0])]

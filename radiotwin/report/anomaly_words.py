@@ -144,10 +144,10 @@ COLUMNS = ("group", "possible causes", "statistic", "against its peers", "90 % i
 
 def seen_from(report: dict) -> str:
     """Say from how far off a device, receiver or flight would have been said; else empty."""
-    found = [f"a {each['family']} from {each['size']:.1f} dB"
+    found = [f"a {each['family']} that is {each['size']:.1f} dB off"
              for each in report.get("seen_from", [])
              if each["family"] in ENDS and each["statistic"] == "level"]
-    return f"Would surely have been seen: {join_names(found)} on." if found else ""
+    return f"This would have been seen: {join_names(found)}, or more." if found else ""
 
 
 def seen_rows(report: dict) -> list[list[str]]:

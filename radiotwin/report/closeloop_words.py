@@ -389,13 +389,13 @@ def _sizes(report: dict) -> str:
     whole_db = report["error"]["before"]["rmse_db"]
     if step is None or None in (step["rest_db"], step["noise_db"], whole_db):
         return ""
-    alike = ("errors of the map and of its materials do" if _has_map(report) else
-             "shadowing does")
+    alike = "errors of the map and its materials" if _has_map(report) else "shadowing"
     both_db = hypot(step["rest_db"], step["noise_db"])
     places_db, single_db = (whole_db * each / both_db if both_db else 0.0
                             for each in (step["rest_db"], step["noise_db"]))
-    return (f"Of the base's {number(whole_db)} dB, roughly {number(places_db)} dB belong to "
-            f"places, as {alike}, and {number(single_db)} dB to single readings (squares add up).")
+    return (f"Of the base's {number(whole_db)} dB, roughly {number(places_db)} dB repeat at a "
+            f"place ({alike}), and {number(single_db)} dB differ from reading to reading (squares "
+            "add up).")
 
 
 def _has_map(report: dict) -> bool:

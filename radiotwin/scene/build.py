@@ -177,8 +177,8 @@ def print_report(report: BuildReport, console: Console) -> None:
     facts.add_row("radio", f"{report.frequency_hz / 1e9:g} GHz" + "   (default: --frequency-hz or "
                   "--measurements)" * (report.frequency_hz == BuildOptions().frequency_hz)
                   + f"; bandwidth {_RADIO.bandwidth_hz / 1e6:g} MHz, noise "
-                  f"{_RADIO.noise_dbm:g} dBm, power {_RADIO.tx_power_dbm:g} dBm, least "
-                  f"{_RADIO.sensitivity_dbm:g} dBm   (defaults: table radio of scene.toml)")
+                  f"{_RADIO.noise_dbm:g} dBm, power {_RADIO.tx_power_dbm:g} dBm, weakest "
+                  f"level {_RADIO.sensitivity_dbm:g} dBm   (defaults: table radio of scene.toml)")
     for subject, finding in report.facts:
         facts.add_row(subject, escape(finding))
     print_table(facts, console)

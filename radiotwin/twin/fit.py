@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, MissingPackage
 from radiotwin.links import join_links, prepare_links
 from radiotwin.links.alignment import as_measurements
 from radiotwin.links.checks import (
@@ -23,7 +23,7 @@ from radiotwin.propagation.laws import channel_named
 from radiotwin.propagation.laws.image_paths import ImagePaths
 from radiotwin.propagation.laws.path_kriging import PathKriging
 from radiotwin.propagation.laws.published import PublishedLaw
-from radiotwin.propagation.laws.segmented_nn import SegmentedNN
+from radiotwin.propagation.laws.segmented_nn import SegmentedNN, require_torch
 from radiotwin.runtime.execution import Executor
 from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import NO_ANCHOR, anchors_links, fit_links
@@ -57,7 +57,7 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
         model: name of a channel model (`radiotwin.propagation.laws.channel_models`); `paths`
             follows paths over the 3D map, and `path_kriging` allows for errors of that. `auto` is
             the one of `selection.CHEAP` with the least held-out error; then `segmented_nn` locates
-            the devices.
+            the devices, if torch is installed.
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
         allow_indoor: whether unknown devices may be inside buildings.
@@ -100,11 +100,20 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
     if links.has_boresights:
         warnings.warn("azimuth_deg and tilt_deg are used by close-loop alone where no column "
                       "antenna names the file of a pattern", stacklevel=2)
-    held_out = None
+    held_out, locator = None, None
     if compare or model == AUTO:
+        models: tuple[str, ...] = CHEAP
+        try:
+            require_torch()
+            locator = SegmentedNN if model == AUTO else None
+        except MissingPackage:
+            models = tuple(name for name in CHEAP if name != SegmentedNN.name)
+            warnings.warn(f"{SegmentedNN.name} is not among the models compared, and locates no "
+                          "device: it needs torch (`pip install 'radiotwin[nn]'`)", stacklevel=2)
         of_anchors = np.isin(links.device, sorted(links.anchors))
         geometry, level_db, limit_db = anchors_links(links)
-        held_out = HeldOut.of(geometry, links.flight[of_anchors], level_db, limit_db, seed)
+        held_out = HeldOut.of(geometry, links.flight[of_anchors], level_db, limit_db, seed,
+                              models)
         if model == AUTO:
             channel = channel_named(UNTRIED if held_out is None else held_out.best)
     if along_paths:
@@ -112,16 +121,15 @@ def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scen
         twin = fit(links, scene, seed, start, executor)
     else:
         settings = LocalizeSettings(allow_indoor=allow_indoor)
-        twin = fit_links(links, scene, channel, seed, start, settings,
-                         locator=SegmentedNN if model == AUTO else None)
+        twin = fit_links(links, scene, channel, seed, start, settings, locator=locator)
     twin.provenance.update(flights=flights, seed=seed)
     if not along_paths:  # which would be followed once more
         twin.provenance[MAP_ERRORS] = asdict(MapErrors.of(twin, links, seed))
         twin.provenance[LAW] = law_parameters(twin.channel, *anchors_links(links), seed)
     if held_out is not None:
         twin.provenance[HELD_OUT] = held_out.record
-    if model == AUTO and not measurements.is_anchor.all():
-        twin.provenance[LOCATED_BY] = SegmentedNN.name
+    if locator is not None and not measurements.is_anchor.all():
+        twin.provenance[LOCATED_BY] = locator.name
     return replace(twin, scene=scene)
 
 

@@ -21,10 +21,10 @@ from radiotwin.twin.localize import LawError, LocalizeSettings, TwinDevice, loca
 from radiotwin.twin.model.model import FittedModel
 from radiotwin.twin.twin import Twin, measured_heights
 
-NO_ANCHOR = ("no anchor: every device has the role unknown, and a channel is learned from devices "
-             "whose positions are known; give at least one device x_m, y_m and the role anchor in "
-             "devices.csv (in Python, Measurements(frame, devices)), or take a published law, such "
-             "as tr36777_uma, which is not learned")
+NO_ANCHOR = ("no anchor: the channel is learned from devices of known position, and there is "
+             "none. Give positions of one or more to `radiotwin import --devices TABLE`, or in "
+             "devices.csv (x_m, y_m, role anchor; in Python, Measurements(frame, devices)); or "
+             "take a published law, such as tr36777_uma, which is not learned")
 MAX_POWER_APART_DB = 3.0  # between declared and fitted powers; more hints at a loss
 
 

@@ -473,12 +473,10 @@ class Twin(Summarised):
             return np.array([radio.tx_power_dbm for radio in self.declared.radios])
         radio = scene.config.radio
         if not radio.declares_power:
-            warnings.warn(f"the twin's levels are received powers, and gains are what they are "
-                          f"above the transmit power: the default of "
-                          f"{scene.folder / 'scene.toml'} is taken, {radio.tx_power_dbm:g} dBm. If "
-                          "the devices send at another power, write it there as tx_power_dbm, or "
-                          "in devices.csv before the twin is fitted; gains are off by the "
-                          "difference, and levels are not", stacklevel=3)
+            warnings.warn(f"gains are levels minus the transmit power, which nobody declared: "
+                          f"{radio.tx_power_dbm:g} dBm is assumed. Levels in dBm do not depend on "
+                          f"it, gains do. Declare tx_power_dbm in {scene.folder / 'scene.toml'}, "
+                          "or for each device in devices.csv before `fit`", stacklevel=3)
         return np.full(len(self), radio.tx_power_dbm)
 
     def warn_of_another_scene(self, scene: Scene, scene_hash: str) -> None:

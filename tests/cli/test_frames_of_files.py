@@ -40,7 +40,7 @@ def test_a_known_frame_is_converted_and_told(run, folder):
     assert same.returncode == 0 and converted.returncode == 0, converted.stderr
     assert "positions are converted" not in same.stderr
     said = " ".join(converted.stderr.split())
-    assert "the measurements are in the frame about 47.52, 8.72" in said and "positions are converted" in said
+    assert "the measurements count x and y from 47.52, 8.72" in said and "positions are converted" in said
     assert positions(folder, "t2") == pytest.approx(positions(folder, "t1"), abs=0.1)
 
 

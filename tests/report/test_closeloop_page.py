@@ -73,8 +73,8 @@ def page(content, folder):
     ("none", "No group of links stands out, and no cause was found (probability 0.70).", "nothing stands out"),
     ("undecided", "Undecided: these measurements do not tell the cause. Likeliest: nothing is missing (0.70) and antenna pattern "
      "(0.29). The residual is 3.00 dB RMSE and depends on time in flight. To settle it: fly around the device at one distance and "
-     "one height. Of the base&#39;s 3.00 dB, roughly 2.68 dB belong to places, as shadowing does, and 1.34 dB to single readings "
-     "(squares add up). That much at places is not said to be nothing.", "undecided"),
+     "one height. Of the base&#39;s 3.00 dB, roughly 2.68 dB repeat at a place (shadowing), and 1.34 dB differ from reading to "
+     "reading (squares add up). That much at places is not said to be nothing.", "undecided"),
     ("located",
      "Device d3 reads 5.6 dB (5.1 to 6.1) less than the other device (0.99). Its cause is open: power, cable or antenna of the "
      "device (0.70); vegetation (0.25).</p>\n<p>The residual is 3.00 dB RMSE and depends on time in flight.",
@@ -164,7 +164,7 @@ def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
     blanks = page(report(effects=[DRIFT | {"size_db": nothing}]), tmp_path)
     assert "It changes no level, only which links are blank." in blanks
     assert "by – dB" not in blanks
-    assert "belong to places" in closeloop_summary(report("none"))
+    assert "repeat at a place" in closeloop_summary(report("none"))
 
 
 @pytest.mark.parametrize("ends, sentence, in_lead", [
@@ -286,7 +286,7 @@ def test_what_was_not_looked_for_is_said_and_parts_of_the_error_are_no_larger_th
     text = closeloop_summary(unnamed)
     assert "Likeliest: something that is not in the catalogue (0.43) and antenna pattern (0.34). The" in text
     assert "Not looked for, as there is no heading_deg: body shadowing (loss around the body)." in text
-    assert "Of the base's 3.00 dB, roughly 2.97 dB belong to places" in text and "and 0.41 dB to" in text  # 9 to 1.25
+    assert "Of the base's 3.00 dB, roughly 2.97 dB repeat at a place" in text and "and 0.41 dB differ" in text  # 9 to 1.25
     assert "Not looked for" not in closeloop_summary(report("undecided"))
 
 
@@ -302,9 +302,9 @@ def test_what_is_left_without_a_name_beside_the_effects_is_said(likelihood, is_s
 def test_errors_of_a_map_are_spoken_of_where_there_is_one(verdict):
     without = report(verdict, base="log-distance")
     hidden = {"by_los": {"nlos": {"before": SCORES, "after": SCORES}}}
-    assert "the map" not in closeloop_summary(without) and "shadowing does" in closeloop_summary(without)
+    assert "the map" not in closeloop_summary(without) and "(shadowing)" in closeloop_summary(without)
     for given in ({"inputs": {"scene": "city"}}, {"base": "raytrace"}, {"error": without["error"] | hidden}):
-        assert "errors of the map and of its materials" in closeloop_summary(without | given)
+        assert "errors of the map and its materials" in closeloop_summary(without | given)
 
 
 def test_a_last_resort_is_not_called_an_explanation(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, MissingPackage
 from radiotwin.links import LinkGeometry
 from radiotwin.propagation.laws.registry import encode_channel
 from radiotwin.twin import fit_twin
@@ -84,3 +84,14 @@ def test_of_readings_too_few_to_hold_any_out_the_segmented_law_is_learnt(small_s
     heard = flown.table["device"].isin(anchors[:2]).to_numpy() & np.isfinite(flown.level_db)
     twin = fit_twin(flown.select(heard & (np.cumsum(heard) <= 28)), small_scene)
     assert twin.channel.name == "segmented_log_distance" and HeldOut.kept(twin.provenance) is None
+
+
+def test_without_torch_the_best_of_the_other_models_predicts_and_locates(small_scene, flown, monkeypatch):
+    def absent():
+        raise MissingPackage("no torch")
+
+    monkeypatch.setattr("radiotwin.twin.fit.require_torch", absent)
+    with pytest.warns(UserWarning, match=r"segmented_nn is not among the models .*radiotwin\[nn\]"):
+        twin = fit_twin(flown, small_scene)
+    assert list(HeldOut.kept(twin.provenance).rmse_db) == ["log_distance", "segmented_log_distance", "regression_kriging"]
+    assert "located_by" not in twin.provenance and np.isfinite(twin.device_m).all()

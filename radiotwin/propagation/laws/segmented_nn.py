@@ -70,8 +70,8 @@ class TrainingData:
     fold: np.ndarray
 
 
-def _torch() -> Any:
-    """Import torch; raise BadInput if it is not installed."""
+def require_torch() -> Any:
+    """Import torch; raise MissingPackage if it is not installed."""
     return optional_package(
         "torch", "the channel model segmented_nn needs torch, which is not installed; install it "
                  "with `pip install 'radiotwin[nn]'`, or take another --model")
@@ -223,7 +223,7 @@ class SegmentedNN(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        _torch()
+        require_torch()
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         law_db, law_sd_db = self.law.predict(links)
@@ -287,7 +287,7 @@ class SegmentedNN(ChannelModel):
 
     def _tabulate(self) -> None:
         """Tabulate the networks' mean residual [dB] over the boxes of NLoS and LoS data."""
-        torch = _torch()
+        torch = require_torch()
         weights = {name: torch.as_tensor(array) for name, array in self.weights.items()}
         self._table = np.zeros((2, TABLE, TABLE))
         for s, line in enumerate((self.law.nlos, self.law.los)):
