@@ -93,5 +93,5 @@ def test_without_torch_the_best_of_the_other_models_predicts_and_locates(small_s
     monkeypatch.setattr("radiotwin.twin.fit.require_torch", absent)
     with pytest.warns(UserWarning, match=r"segmented_nn is not among the models .*radiotwin\[nn\]"):
         twin = fit_twin(flown, small_scene)
-    assert list(HeldOut.kept(twin.provenance).rmse_db) == ["log_distance", "segmented_log_distance", "regression_kriging"]
+    assert list(HeldOut.kept(twin.provenance).rmse_db) == ["log_distance", "segmented_log_distance", "kriging"]
     assert "located_by" not in twin.provenance and np.isfinite(twin.device_m).all()
