@@ -1,4 +1,4 @@
-"""Effects that a channel model may lack: one file an effect, one base class a stage, a registry."""
+"""Effects that a channel model may lack: base classes by stage, parameters, catalogue, registry."""
 
 from radiotwin.effects.base import (
     DetectionEffect,

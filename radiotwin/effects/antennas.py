@@ -1,11 +1,11 @@
-"""Antennas that effects share: how patterns vary and are reported, and sector antennas.
+"""Antenna patterns that effects share: sector antennas, and patterns fixed to a receiver's body.
 
 A sector antenna has the pattern of 3GPP TR 38.901 V17, Table 7.3-1: horizontally −min(12 (φ /
 φ_3dB)², A_max), vertically −min(12 ((θ − tilt) / θ_3dB)², A_max), together no less than −A_max. The
-maximum gain is the device's level and is fitted with it. With a 3D map each path has the gain of
-the direction in which it leaves the device. Power on paths that are not followed, which is fitted
-too, has the mean of the pattern. Where the paths over the map explain less than the straight line
-to the receiver, as over a map with guessed heights, the gain is that of the straight line.
+maximum gain is part of the device's fitted level. With a 3D map each path has the gain of the
+direction in which it leaves the device; the power on paths that are not followed is fitted and has
+the mean gain of the pattern. If the direction of the straight line explains the levels better (e.g.
+over a map with guessed heights), that direction is used.
 """
 
 import math
@@ -32,12 +32,12 @@ from radiotwin.effects.places import Correction, FoundAntenna
 from radiotwin.links import Links
 from radiotwin.propagation.laws.followed_paths import Rays
 
-MIN_LINKS = 100  # of a device whose antenna is looked for
-MIN_NATS = 4.0  # that a pattern must gain to be proposed
-MAX_PROPOSE_LINKS = 300  # of a device, from which its pattern is proposed
-LEVEL_SD_DB = 15.0  # prior standard deviation of the maximum gain, beside the channel's
-MIN_HEADING_SD = 0.05  # of its sine and cosine together; below it, the heading counts as constant
-# Grid of patterns that are tried first: flat ones, then the best of those with (tilt, beamwidth).
+MIN_LINKS = 100  # of a device, to fit its antenna
+MIN_NATS = 4.0  # log-likelihood gain above which a pattern is proposed
+MAX_PROPOSE_LINKS = 300  # of a device, drawn at random for the proposal
+LEVEL_SD_DB = 15.0  # prior standard deviation of the maximum gain about the channel's level
+MIN_HEADING_SD = 0.05  # sd of sine plus cosine below which the heading counts as constant
+# Grid of trial patterns: patterns flat in elevation, then the best of them with (tilt, beamwidth).
 BEAMWIDTHS_DEG = (65.0, 110.0)
 FRONT_TO_BACK_DB = (12.0, 25.0)
 VERTICALS_DEG = ((0.0, 360.0), (0.0, 15.0), (-6.0, 15.0), (-12.0, 15.0), (0.0, 40.0),
@@ -46,17 +46,17 @@ AROUND_DEG = np.arange(0.0, 360.0, 5.0)  # azimuths over which a pattern is aver
 
 
 def vary_patterns(effect: Effect, end: str) -> Variation:
-    """Return how the patterns of several antennas, or bodies, may be refined, each by itself.
+    """Build the search space of an effect with one pattern per device or receiver.
 
     Args:
-        effect: whose parameters have them.
-        end: "devices" or "receivers": the parameter that has them by index.
+        effect: the effect with its patterns.
+        end: "devices" or "receivers": the parameter that holds the patterns by index.
     """
     patterns = getattr(effect.params, end)
     members, fields = len(patterns), quantities(next(iter(patterns.values())))
     values = np.array([[getattr(pattern, name) for name in fields]
                        for pattern in patterns.values()])
-    steps, low, high = (np.tile([each[key] for each in fields.values()], members)
+    steps, low, high = (np.tile([field[key] for field in fields.values()], members)
                         for key in ("step", "low", "high"))
 
     def changed(numbers: np.ndarray) -> Any:
@@ -72,28 +72,28 @@ def vary_patterns(effect: Effect, end: str) -> Variation:
 def report_patterns(patterns: Mapping[int, EffectParams], params_sd: np.ndarray,
                     names: Sequence[str], prefix: str = "",
                     with_scattered: bool = True) -> dict[str, Parameter]:
-    """Return the parameters of patterns, by name.
+    """Return the reported parameters of fitted patterns by name.
 
     Args:
-        patterns: k patterns as fitted, by index of their device or receiver.
-        params_sd: (k r,) standard deviation of each of their r parameters.
-        names: of the devices or receivers.
-        prefix: of the parameters' names.
-        with_scattered: whether the last one counts: the power on paths that are not followed.
+        patterns: k fitted patterns by index of their device or receiver.
+        params_sd: (k r,) standard deviations of their r parameters each.
+        names: names of the devices or receivers.
+        prefix: prefix of the parameters' names.
+        with_scattered: False drops the last parameter, the power on paths that are not followed.
     """
     reported = {}
     for (member, pattern), sd in zip(patterns.items(), np.reshape(params_sd, (len(patterns), -1)),
                                      strict=True):
-        for (field, each), field_sd in zip(quantities(pattern).items(), sd, strict=True):
-            reported[f"{prefix}{field}[{names[member]}]"] = Parameter.normal(
-                getattr(pattern, field), field_sd, each["unit"], Allowed.of(each))
+        for (name, field), field_sd in zip(quantities(pattern).items(), sd, strict=True):
+            reported[f"{prefix}{name}[{names[member]}]"] = Parameter.normal(
+                getattr(pattern, name), field_sd, field["unit"], Allowed.of(field))
         if not with_scattered:
             reported.popitem()
     return reported
 
 
 class BodyFrameEffect(GainEffect):
-    """Receivers with patterns that are fixed to their bodies: `Params` has them by index."""
+    """An effect with one pattern per receiver, fixed to its body; see `Params.receivers`."""
 
     settled_by = "fly the same track in both directions"
     figure = "pattern"
@@ -137,16 +137,16 @@ class SectorPattern(EffectParams):
 
 def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray,
                       pattern: SectorPattern) -> np.ndarray:
-    """Return the gain relative to the maximum [dB].
+    """Compute the gain of a sector antenna relative to its maximum (3GPP TR 38.901) [dB].
 
     Args:
-        azimuth_deg: (…,) direction, clockwise from north [deg].
-        elevation_deg: (…,) direction, up [deg].
-        pattern: of the antenna.
+        azimuth_deg: (…,) azimuth, clockwise from north [deg].
+        elevation_deg: (…,) elevation, up [deg].
+        pattern: parameters of the antenna.
     """
     max_db = pattern.front_to_back_db
     turn = azimuth_deg - pattern.azimuth_deg
-    off = turn - 360 * np.round(turn / 360)  # as of a remainder, which takes ten times as long
+    off = turn - 360 * np.round(turn / 360)  # ten times as fast as a remainder
     above = elevation_deg - pattern.tilt_deg
     horizontal_db = np.minimum(12 * (off / pattern.beamwidth_deg) ** 2, max_db)
     vertical_db = np.minimum(12 * (above / pattern.vertical_beamwidth_deg) ** 2, max_db)
@@ -154,16 +154,16 @@ def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray,
 
 
 def linear(gain_db: np.ndarray) -> np.ndarray:
-    """Return gains [dB] as ratios of power; in single precision faster than a power of 10."""
+    """Convert gains [dB] to power ratios; in single precision faster than a power of 10."""
     return np.exp(gain_db * (math.log(10) / 10))
 
 
 class Departures(NamedTuple):
-    """Directions in which links leave their device.
+    """Directions of departure of the rays of links at their device.
 
     Attributes:
-        rays: at the device.
-        azimuth_deg, elevation_deg: (p,) of the rays.
+        rays: p rays at the device.
+        azimuth_deg, elevation_deg: (p,) directions of the rays [deg].
     """
 
     rays: Rays
@@ -172,14 +172,14 @@ class Departures(NamedTuple):
 
     @classmethod
     def of(cls, links: Links, rows: np.ndarray, straight: bool) -> "Departures":
-        """Return those of some links, which are followed over the map unless they are straight."""
+        """Find the departures of some links: of paths over the map, or of the straight lines."""
         rays = Rays.of(links.select(rows), of_device=True, straight=straight)
         east, north, up = rays.direction.T
         return cls(rays, np.degrees(np.arctan2(east, north)),
                    np.degrees(np.arcsin(np.clip(up, -1, 1))))
 
     def offset_db(self, pattern: SectorPattern) -> np.ndarray:
-        """Return (n,) what a pattern adds to each link [dB]."""
+        """Compute the gain (n,) of a pattern over the rays of each link [dB]."""
         gain = linear(sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern))
         at_tilt = np.full(len(AROUND_DEG), pattern.tilt_deg)
         mean_gain = np.mean(linear(sector_pattern_db(AROUND_DEG, at_tilt, pattern)))
@@ -187,7 +187,7 @@ class Departures(NamedTuple):
 
 
 class SectorEffect(GainEffect):
-    """Devices with sector antennas."""
+    """Base of effects that give devices sector antennas."""
 
     name = "antenna_pattern"
     in_words = "directions of the device's antenna"
@@ -232,9 +232,9 @@ class SectorEffect(GainEffect):
 
 
 def eligible_devices(links: Links) -> list[int]:
-    """Return devices with enough links and a declared position.
+    """List the devices with enough links and a declared position.
 
-    One that was located wrongly from these very measurements may look as if it had an antenna.
+    A device that these measurements located wrongly may seem to have a directive antenna.
     """
     return [device for device in frequent_labels(links.device, MIN_LINKS)
             if device in links.anchors]

@@ -1,4 +1,4 @@
-"""Small helpers that many effects share: ends of links, members, powers and curves."""
+"""Helpers that effects share: cache per links, heights of ends, subsamples, powers, curves."""
 
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -10,25 +10,25 @@ from radiotwin.errors import BadInput
 from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
 
-NEPERS = np.log(10) / 10  # of power in a decibel
-MIN_POWER = 1e-290  # of which a logarithm is taken
+NEPERS = np.log(10) / 10  # natural logarithm of power per decibel
+MIN_POWER = 1e-290  # smallest argument of a logarithm
 
 
 class LinkCache:
-    """Values derived from links, kept for as long as those links are in use."""
+    """Cache of values derived from links, kept for as long as those links are in use."""
 
     def __init__(self) -> None:
         self._known: WeakKeyDictionary[Links, dict] = WeakKeyDictionary()
 
     def get(self, links: Links, key: Hashable, derive: Callable[[], Any]) -> Any:
-        """Return the value of `derive`, called once for these links and this key."""
+        """Return the value of `derive()`, which is called once for these links and this key."""
         known = self._known.setdefault(links, {})
         if key not in known:
             known[key] = derive()
         return known[key]
 
     def __reduce__(self) -> tuple[type, tuple[()]]:
-        """Leave all behind on the way to another process: weak references cannot be sent."""
+        """Pickle as an empty cache: weak references cannot be sent to another process."""
         return type(self), ()
 
     def state(self) -> None:
@@ -36,10 +36,10 @@ class LinkCache:
 
 
 def city_of(links: Links, effect: str) -> CityMap:
-    """Return the 3D map that an effect needs.
+    """Return the 3D map of links; `effect` is the name of the effect that needs it.
 
     Raises:
-        BadInput: there is none.
+        BadInput: there is no map.
     """
     if links.city is None:
         raise BadInput(f"the effect {effect} needs a 3D map, and none is given; give it with "
@@ -49,12 +49,12 @@ def city_of(links: Links, effect: str) -> CityMap:
 
 def ends_above(links: Links, place_m: Sequence[float],
                rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends (n, 3) of links, heights above the ground below one place [m].
+    """Return both ends (n, 3) of links, z above the ground at one place [m].
 
     Args:
-        links: with a 3D map or without, where the ground is at z = 0.
-        place_m: x and y [m].
-        rows: of the links.
+        links: links; without a 3D map the ground is at z = 0.
+        place_m: x and y of the place [m].
+        rows: n rows of the links.
     """
     ends_m = links.device_m[links.device[rows]], links.receiver_m[rows]
     if links.city is None or links.city.terrain is None:
@@ -65,11 +65,11 @@ def ends_above(links: Links, place_m: Sequence[float],
 
 def ends_above_ground(links: Links, rows: np.ndarray | slice = slice(None)
                       ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends (n, 3) of links, each with its height above the ground below it [m].
+    """Return both ends (n, 3) of links, z above the ground below each end [m].
 
     Args:
-        links: with a 3D map or without, where the ground is at z = 0.
-        rows: of the links.
+        links: links; without a 3D map the ground is at z = 0.
+        rows: n rows of the links.
     """
     ends_m = links.device_m[links.device[rows]].copy(), links.receiver_m[rows].copy()
     if links.city is not None and links.city.terrain is not None:
@@ -79,9 +79,9 @@ def ends_above_ground(links: Links, rows: np.ndarray | slice = slice(None)
 
 
 def subsample(rows: np.ndarray, maximum: int) -> np.ndarray:
-    """Return at most `maximum` of the rows (n,), in order, drawn at random and always the same.
+    """Draw at most `maximum` of the rows (n,) at random with a fixed seed, in order.
 
-    Every k-th would not do: devices, receivers and slots take turns in a file.
+    Every k-th row would be biased: devices, receivers and slots take turns in a file.
     """
     if len(rows) <= maximum:
         return rows
@@ -89,30 +89,30 @@ def subsample(rows: np.ndarray, maximum: int) -> np.ndarray:
 
 
 def one_hot(index: np.ndarray, members: list[int]) -> np.ndarray:
-    """Return (n, len(members)): 1 where the index (n,) is the member's, else 0."""
+    """Build the indicator matrix (n, members): 1 if the index (n,) is the member, else 0."""
     return (index[:, None] == np.asarray(members)[None]).astype(float)
 
 
 def frequent_labels(index: np.ndarray, minimum: int) -> list[int]:
-    """Return the labels of (n,) that occur at least `minimum` times, in order."""
+    """List the values of an index (n,) that occur at least `minimum` times, in order."""
     values, counts = np.unique(index, return_counts=True)
     return [int(value) for value, count in zip(values, counts, strict=True) if count >= minimum]
 
 
 def squares_about_mean(values: np.ndarray, weight: np.ndarray) -> float:
-    """Return the weighted squares of values (n,) about their weighted mean."""
+    """Compute the weighted sum of squares of values (n,) about their weighted mean."""
     return weight @ (values - weight @ values / weight.sum()) ** 2
 
 
 def add_power(level_db: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the level of the sum of two powers, and its slope in the first level.
+    """Add a power to a level.
 
     Args:
-        level_db: (n,) first power [dB].
-        power: (n,) second power, in units of that of 0 dB.
+        level_db: (n,) level [dB].
+        power: (n,) added power, linear; 1 is 0 dB.
 
     Returns:
-        (n,) [dB], and (n,) slope.
+        (n,) level of the sum [dB], and (n,) its derivative with respect to `level_db`.
     """
     first = np.maximum(np.exp(level_db * NEPERS), MIN_POWER)
     total = first + power
@@ -120,22 +120,22 @@ def add_power(level_db: np.ndarray, power: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def curve_columns(value: np.ndarray, knots: int, circular: bool) -> np.ndarray:
-    """Return columns (n, ≤ knots) of a curve over values (n,), 0 where they are unknown."""
+    """Build columns (n, ≤ knots) of a piecewise linear curve over values (n,); 0 if unknown."""
     places = curve_knots(value[np.isfinite(value)], knots, circular)
     return curve_basis(value, np.array(places), circular)
 
 
 def curve_knots(value: np.ndarray, count: int, circular: bool) -> list[float]:
-    """Return knots round the circle, or at evenly spaced quantiles of the values."""
+    """Place knots evenly on the circle [deg], or at evenly spaced quantiles of the values."""
     if circular:
         return (np.arange(count) * 360.0 / count).tolist()
     return np.unique(np.quantile(value, (np.arange(count) + 0.5) / count)).tolist()
 
 
 def curve_basis(value: np.ndarray, knots: np.ndarray, circular: bool) -> np.ndarray:
-    """Return the piecewise linear basis (n, knots) of values (n,).
+    """Build the piecewise linear basis (n, knots) of values (n,).
 
-    It is constant beyond the outer knots, and zero where the value is unknown.
+    Constant beyond the outer knots; 0 if the value is unknown.
     """
     known = np.isfinite(value)
     filled = np.where(known, value, knots[0])

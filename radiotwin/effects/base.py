@@ -1,15 +1,16 @@
-"""The contract of effects: causes that change levels, proposed from residuals and fitted.
+"""Contract of effects: base class, stages, terms of the regression, and the view of residuals.
 
-An effect belongs to one stage. In this order a level passes through them:
+An effect is a cause that changes levels. It acts in one stage; a level passes them in this order:
 
-    paths      power that is added to what the channel predicts, before any gain
-    gain       decibels that are added
-    receiver   what the receiver makes of the level that arrives
-    limit      below which level a link is blank
-    detection  which links are blank, or weaker, now and then whatever their level
+    paths      adds power to the channel's prediction, before any gain
+    gain       adds decibels
+    receiver   maps the arriving level to the reading
+    limit      sets the limit of detection, below which a link is blank
+    detection  blanks or weakens links at random, independent of their level
 
-What an effect sees of the training links is a `ResidualView`. All that the loop and the pages ask
-of an effect is a method or an attribute here, with a default; `docs/add-an-effect.md` lists them.
+An effect proposes parameters from a `ResidualView` of the training links. Everything that the loop
+and the pages need from an effect is a method or an attribute of `Effect`, with a default;
+`docs/add-an-effect.md` lists them.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from radiotwin.effects.params import (
     quantities,
 )
 from radiotwin.effects.places import Correction, Mark
-from radiotwin.inference.student import Losses
+from radiotwin.inference.student import DOF, Losses
 from radiotwin.links import Links, design_effect, evidence_blocks
 
 if TYPE_CHECKING:
@@ -48,14 +49,14 @@ class Term:
     """Contribution of an effect to the mean level of n links, for given parameters.
 
     Attributes:
-        offset_db: (n,) added as it is [dB].
-        columns: (n, q) added times coefficients, which the regression fits.
+        offset_db: (n,) fixed part [dB].
+        columns: (n, q) design matrix of the part that the regression fits.
         prior_sd_db: (q,) prior standard deviation of each coefficient around zero.
-        inputs: (n, …) what the effect's `response` needs of each link; None = nothing.
-        random_effect_sd_db: (n,) standard deviation of what it adds to each link by itself [dB];
-            None = nothing.
-        unheard_sd_db: (n,) standard deviation of a level that links have in common and of which
-            nothing was learnt, as of a device without a reading [dB]; None = all are known.
+        inputs: (n, …) input of the effect's `response` for each link; None = no response.
+        random_effect_sd_db: (n,) standard deviation of an independent random effect of each link
+            [dB]; None = none.
+        unheard_sd_db: (n,) standard deviation of a level shared by links for which no reading
+            exists, e.g. of a device that was never heard [dB]; None = none.
     """
 
     offset_db: np.ndarray
@@ -67,47 +68,47 @@ class Term:
 
     @property
     def acts(self) -> np.ndarray:
-        """(n,) bool, links whose level it may change."""
+        """(n,) bool, links whose level the term may change."""
         return (self.offset_db != 0) | (self.columns != 0).any(axis=1)
 
     def select(self, rows: np.ndarray) -> Term:
-        """Return the term of the links of a mask or an index array."""
+        """Select the term of some links by a mask or indices."""
         inputs, scatter_db, unheard_db = (
-            None if each is None else each[rows]
-            for each in (self.inputs, self.random_effect_sd_db, self.unheard_sd_db))
+            None if values is None else values[rows]
+            for values in (self.inputs, self.random_effect_sd_db, self.unheard_sd_db))
         return Term(self.offset_db[rows], self.columns[rows], self.prior_sd_db, inputs,
                     scatter_db, unheard_db)
 
     @classmethod
     def of_columns(cls, columns: np.ndarray, prior_sd_db: float) -> Term:
-        """Return a term that is all linear: columns (n, q)."""
+        """Build a term of fitted columns (n, q), all with one prior standard deviation [dB]."""
         sd_db = np.full(columns.shape[1], float(prior_sd_db))
         return cls(np.zeros(len(columns)), columns, sd_db)
 
     @classmethod
     def of_offset(cls, offset_db: np.ndarray) -> Term:
-        """Return a term without coefficients: (n,) [dB]."""
+        """Build a term of a fixed offset (n,) [dB], without coefficients."""
         return cls(offset_db, np.zeros((len(offset_db), 0)), np.zeros(0))
 
     @classmethod
     def of_inputs(cls, inputs: np.ndarray) -> Term:
-        """Return a term that adds nothing and carries inputs (n, …) of a response."""
+        """Build a term that adds 0 dB and carries the inputs (n, …) of the effect's response."""
         n = len(inputs)
         return cls(np.zeros(n), np.zeros((n, 0)), np.zeros(0), inputs)
 
 
-# Levels of the channel that a term is made of: quick ones, those of paths that are known already,
-# or those of paths that are followed anew.
+# How a term gets the channel's levels: by the quick law, from paths followed before, or by
+# following paths again.
 Levels = Literal["quick", "known_paths", "exact"]
 
 
 class Change(NamedTuple):
-    """A change in time of one receiver or device.
+    """A change of one receiver or device at one time.
 
     Attributes:
-        end: (n,) index of the receiver, or the device, of each link.
-        member: the one that changed.
-        when_s: from when on it is otherwise [s].
+        end: (n,) index of the receiver, or of the device, of each link.
+        member: index of the one that changed.
+        when_s: time of the change [s].
     """
 
     end: np.ndarray
@@ -116,43 +117,42 @@ class Change(NamedTuple):
 
 
 class Effect(ABC):
-    """One effect of the catalogue. Subclass one of the stages below, not this.
+    """One effect of the catalogue; subclass one of the stages below.
 
     Attributes:
-        name: as in `closeloop.json`.
-        variant: which of several physical forms of that name.
-        in_words: what is said to be the cause where it is one; "" = its name.
-        stage: where in the chain it acts, see the module.
-        Params: its parameters, a subclass of `EffectParams`.
+        name: name in `closeloop.json`.
+        variant: physical form, if the name has several.
+        in_words: how the cause is called in a sentence; "" = its name.
+        stage: stage of the chain, see the module.
+        Params: class of its parameters, a subclass of `EffectParams`.
         figure: key of the figure that shows it (`radiotwin.report`); "" = residual against the
-            variable that it acts through.
-        nlos_only: acts on links without line of sight only.
-        confused_with: names of effects that may look alike.
-        repeatable: whether there may be several, each found in a step of its own.
-        sparse: whether each of its coefficients belongs to one end, and any few may be there.
-        of_device: whether it is a device's own level or antenna, which another need not have.
+            variable that it depends on.
+        nlos_only: whether it acts only on links without line of sight.
+        confused_with: names of effects with similar residuals.
+        repeatable: whether there may be several; each step of the search finds one.
+        sparse: whether each coefficient belongs to one device or receiver, and most may be zero.
+        of_device: whether it belongs to one device (its level or antenna).
         of_receiver: whether it belongs to a receiver.
-        is_cause: whether it is a physical cause, not merely a description of what is left.
+        is_cause: whether it is a physical cause, not only a description of the residual.
         within_flights: whether it acts at certain times only, so that other flights do not show it:
-            it is scored on devices, or blocks of ground, that are held out in all flights.
-        is_declared: whether the tables declare it, or every map has it, so that only its numbers
-            are open: it is no candidate cause but a part of the base, where held-out links gain by
-            it.
-        in_paths: whether a base that follows paths has it, so that it is no candidate there.
-        always_exact: whether `exactly` may be asked of every candidate, not only of what is kept.
-        uses: columns of the measurements that it reads and that no map has, such as `quality`.
+            then it is scored on devices, or blocks of ground, held out in all flights.
+        is_declared: whether the tables declare it, or every map has it. Then it is no candidate
+            cause: it is part of the base if it lowers the held-out error.
+        in_paths: whether a base that follows paths contains it; then it is no candidate there.
+        always_exact: whether every candidate may be refined by `exactly`, not only the kept ones.
+        uses: columns of the measurements that it reads and that maps lack, e.g. `quality`.
         needs_map: whether its term needs the 3D map.
-        settled_by: what to measure, to settle whether it is there; "the device" is replaced by the
+        settled_by: measurement that would confirm or exclude it; "the device" is replaced by the
             device's name.
-        parameter_labels: printed names of reported parameters (without the member), where those
-            made from their own names do not do.
-        acts_on: families of groups (`radiotwin.closeloop.scan`) that it may be the cause of.
-        of_groups: whether it is looked for only where a group stands out.
-        calibrated_like: name of the effect whose calibration it takes where it has none of its own,
-            because it has not been traced; "" = it is judged as effects are on the whole.
-        params: of one that was found, an instance of `Params`; the catalogue's own have none.
-        levels: which levels of the channel its term asks for, see `Levels`.
-        of_links: what it has derived from links, whatever its parameters.
+        parameter_labels: printed names of reported parameters (without the member), if not made
+            from their keys.
+        acts_on: families of groups (`radiotwin.closeloop.scan`) that it may cause to stand out.
+        of_groups: whether it is searched only for a group that stands out.
+        calibrated_like: effect whose calibration of the evidence it uses if it has none itself;
+            "" = the calibration over all effects.
+        params: fitted parameters, an instance of `Params`; the catalogue's instances have none.
+        levels: how its term gets the channel's levels, see `Levels`.
+        of_links: cache of values derived from links that do not depend on its parameters.
     """
 
     name: ClassVar[str]
@@ -193,22 +193,22 @@ class Effect(ABC):
 
     @property
     def entry(self) -> Effect:
-        """The effect of the catalogue that this one was found by, or itself."""
+        """The effect of the catalogue that proposed this one, or itself."""
         return vars(self).get("_entry", self)
 
     def with_params(self, params: EffectParams, levels: Levels | None = None) -> Self:
-        """Return the effect with parameters; `levels` None: as this one has them."""
+        """Return a copy of the effect with parameters; `levels` None: unchanged."""
         found = copy(self)
         found.params, found.levels = params, levels or self.levels
         vars(found)["_entry"] = self.entry
         return found
 
     def changed(self, **update: Any) -> Self:
-        """Return the effect with some parameters changed, which are not checked."""
+        """Return a copy of the effect with some parameters changed, without validation."""
         return self.with_params(self.params.model_copy(update=update))
 
     def record(self) -> dict[str, Any]:
-        """Return what files have of it, for JSON: name, variant, params, and unusual `levels`."""
+        """Return its record for JSON: name, variant, params, and `levels` if not the default."""
         usual = self.levels == type(self).levels
         return {"name": self.name, "variant": self.variant,
                 "params": self.params.model_dump(mode="json")} | (
@@ -216,53 +216,53 @@ class Effect(ABC):
 
     @property
     def is_exact(self) -> bool:
-        """Whether its term is of paths that are followed anew."""
+        """Whether its term follows paths again, see `Levels`."""
         return self.levels == "exact"
 
     def is_same(self, other: Effect | None) -> bool:
-        """Return whether another one of this kind has the same parameters and kind of levels."""
+        """Check whether another effect of this class has the same parameters and `levels`."""
         return other is not None and self.params == other.params and self.levels == other.levels
 
     @classmethod
     def of_variant(cls, variant: str) -> Effect | None:
-        """Return the effect in the form that a twin's file names; None if it has no such form."""
+        """Return a new effect of a variant named in a twin's file; None if it has no such one."""
         return cls() if variant == cls.variant else None
 
     def unavailable(self, links: Links) -> str | None:
-        """Return why the data do not allow this effect to be looked for; None where they do.
+        """Return why the links do not allow a search for this effect; None if they do.
 
-        By default, because it needs a map and there is none.
+        By default: the effect needs a map, and there is none.
         """
         return "there is no 3D map" if self.needs_map and links.city is None else None
 
     def kind(self) -> Any:
-        """Return of which kind its parameters are: a search begins at the best of each kind."""
+        """Return a label of its parameters; a search starts from the best proposal of each."""
         return None
 
     def propose(self, view: ResidualView) -> list[Any]:
-        """Return parameters worth trying, best first; empty where the residual does not fit.
+        """Propose parameters from the residuals, best first; empty if nothing fits.
 
-        By default, every parameter's default.
+        By default the default parameters.
         """
         return [self.Params()]
 
     def propose_like(self, view: ResidualView) -> list[Any]:
-        """Return the same for a part of the data, once all of it has led to this effect."""
+        """Propose parameters for one fold, given that all links led to this effect."""
         return self.propose(view)
 
     @abstractmethod
     def term(self, links: Links, level_at: LevelAt) -> Term:
-        """Return what it adds to the mean level of n links.
+        """Compute the contribution of the effect to the mean level of n links.
 
         Args:
             links: n links.
-            level_at: the channel's levels of other links, such as with devices elsewhere.
+            level_at: predicts the channel's levels for any links, e.g. with moved devices.
         """
 
     def variation(self) -> Variation | None:
-        """Return how the parameters may be refined; None where they are fixed.
+        """Return the parameters as numbers for a search; None if they are fixed.
 
-        By default, every parameter made with `quantity` is, within its bounds.
+        By default all parameters made with `quantity`, within their bounds.
         """
         fields = quantities(self.Params)
         if not fields:
@@ -278,105 +278,104 @@ class Effect(ABC):
         return Variation(values, steps, low, high, varied)
 
     def is_on_maps(self) -> bool:
-        """Return whether a map, which has neither receivers nor times, is drawn with it."""
+        """Check whether maps, which have neither receivers nor times, contain the effect."""
         return not self.of_receiver
 
     def between_flights(self) -> Effect | None:
-        """Return the effect as one that changes between flights; None: it is no change in time.
+        """Return a variant restricted to changes between flights; None: no change in time.
 
-        Held-out flights do not show such a change, so it is looked for in a search of its own.
+        Held-out flights do not show such a change, so it has a separate search.
         """
         return None
 
     def change(self, links: Links) -> Change | None:
-        """Return what changed, and when; None: it is no change in time."""
+        """Return which end changed and when; None: no change in time."""
         return None
 
     def reading_offsets_db(self, coefficients: np.ndarray) -> dict[int, float]:
-        """Return how much more receivers read than others, by index [dB]; by default nothing.
+        """Return receiver index -> offset of its readings [dB]; by default empty.
 
-        A receiver hears the same signals, so its limit of detection moves with its readings.
+        The limit of detection of a receiver shifts with its readings.
 
         Args:
-            coefficients: (q,) of the columns of its term.
+            coefficients: (q,) fitted coefficients of its term.
         """
         return {}
 
     def reach(self, links: Links) -> np.ndarray | None:
-        """Return which (n,) links similar parameters may act on; None for any."""
+        """Return the mask (n,) of links that similar parameters may act on; None: any link."""
         return None
 
     def exactly(self) -> Effect | None:
-        """Return the same, asking the channel for exact levels; None where nothing changes."""
+        """Return the effect with exact levels, see `Levels`; None if nothing would change."""
         return None
 
     def corrected_map(self, city: CityMap) -> CityMap:
-        """Return the map as the effect has it; by default the same object."""
+        """Return the map corrected by the effect; by default the same object."""
         return city
 
     def neg_log_prior(self) -> float:
-        """Return how much less likely parameters are than the likeliest, before data [nats].
+        """Compute the negative log prior of the parameters, 0 at its maximum [nats].
 
-        By default, of every parameter with a `prior_sd`, normal around its default.
+        By default normal around the default, for parameters with a `prior_sd`.
         """
         return sum(0.5 * ((getattr(self.params, name) - each["default"]) / each["prior_sd"]) ** 2
                    for name, each in quantities(self.Params).items() if each["prior_sd"])
 
     def implausible(self, coefficients: np.ndarray) -> str | None:
-        """Return why what was fitted cannot be this effect; None where it can.
+        """Return why the fitted values are physically impossible for this effect; None if possible.
 
         Args:
-            coefficients: (q,) of the columns of its term.
+            coefficients: (q,) fitted coefficients of its term.
         """
         return None
 
     def contradicted(self, links: Links) -> str | None:
-        """Return what in the map of n links speaks against it as fitted; None for nothing."""
+        """Return why the map of the links contradicts the fitted effect; None if it does not."""
         return None
 
     def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
-        """Return names of effects that n links cannot tell from it, as no two ends of it part.
+        """Return names of effects that these links cannot distinguish from it.
+
+        E.g. the offset of a device that only one receiver heard is that of the receiver, too.
 
         Args:
-            links: that it was fitted to.
-            parameters: what was found, as of `parameters`.
+            links: links of the fit.
+            parameters: reported parameters, see `parameters`.
         """
         return []
 
     def contradicted_declarations(self, links: Links) -> list[str]:
-        """Return what of the tables its fit contradicts, a sentence each; by default nothing."""
+        """Return one sentence for each declared value that the fit contradicts; default none."""
         return []
 
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
-        """Return what was found, by name; by default every parameter made with `quantity`."""
-        return {name: Parameter.normal(getattr(self.params, name), sd, each["unit"],
-                                       Allowed.of(each))
-                for (name, each), sd in zip(quantities(self.Params).items(), estimate.params_sd,
-                                            strict=True)}
+        """Return the reported parameters by name; by default those made with `quantity`."""
+        return {name: Parameter.normal(getattr(self.params, name), sd, field["unit"],
+                                       Allowed.of(field))
+                for (name, field), sd in zip(quantities(self.Params).items(), estimate.params_sd,
+                                             strict=True)}
 
     def mark(self, links: Links) -> Mark | None:
-        """Return how maps mark where it is; None where it has no place."""
+        """Return the mark of its place on maps; None if it has no place."""
         return None
 
     def correction(self, links: Links) -> Correction:
-        """Return what it says of the declared scene, to be corrected; by default nothing.
-
-        A device that it moves is not where it was declared.
-        """
+        """Return the corrections of the declared scene that follow from it; by default none."""
         return Correction()
 
     def typical_patterns(self, view: ResidualView) -> Iterable[Pattern]:
-        """Return what typical effects of this kind would change, over the links of a view.
+        """Yield the changes of levels by typical effects of this kind, for a view's links.
 
-        From each follows the least size that would have been found; by default there is none, and
-        nothing is said of what was not found.
+        The smallest size that would have been detected follows from each. By default none: then
+        no detectable size is reported.
         """
         return ()
 
     def like(self, other: Any) -> Effect:
-        """Return the same cause in the form closest to another effect of this kind.
+        """Return this effect with the equivalent parameters closest to another one's.
 
-        For parameters of which several forms mean the same, such as a box turned by 90°.
+        Several parameters may mean the same, e.g. a box turned by 90° with its sides exchanged.
         """
         return self
 
@@ -387,7 +386,7 @@ class GainEffect(Effect):
     stage = "gain"
 
     def gain_db(self, links: Links) -> np.ndarray:
-        """Return what it adds to each link (n,) [dB]; a loss is negative."""
+        """Compute the gain added to each link (n,) [dB]; a loss is negative."""
         raise NotImplementedError(f"{type(self).__name__} defines neither gain_db nor term")
 
     def term(self, links: Links, level_at: LevelAt) -> Term:
@@ -396,92 +395,92 @@ class GainEffect(Effect):
 
 
 class _ResponseEffect(Effect):
-    """An effect that maps one level to another; override `inputs`, or `term` that carries them."""
+    """An effect with a response, level in -> level out; override `inputs`, or `term`."""
 
     def inputs(self, links: Links) -> np.ndarray:
-        """Return what `response` needs of each link (n, …)."""
+        """Compute the inputs (n, …) of `response` for each link."""
         raise NotImplementedError(f"{type(self).__name__} defines neither inputs nor term")
 
     @abstractmethod
     def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what becomes of mean levels.
+        """Map mean levels before the stage to those behind it.
 
         Args:
-            level_db: (n,) [dB].
-            inputs: (n, …) of the links.
+            level_db: (n,) level before [dB].
+            inputs: (n, …) from `inputs`.
 
         Returns:
-            (n,) [dB], and its slope in `level_db` (n,), above zero.
+            (n,) level behind [dB], and (n,) its derivative with respect to `level_db`, positive.
         """
 
     def term(self, links: Links, level_at: LevelAt) -> Term:
-        """Return a term that adds nothing and carries the inputs."""
+        """Return a term that adds 0 dB and carries the inputs."""
         return Term.of_inputs(self.inputs(links))
 
 
 class PathEffect(_ResponseEffect):
-    """An effect that adds power to what the channel predicts, before any gain."""
+    """An effect that adds power to the channel's prediction, before any gain."""
 
     stage = "paths"
 
 
 class ReceiverEffect(_ResponseEffect):
-    """An effect of the receiver's on the level that arrives."""
+    """An effect of the receiver on the arriving level, such as a noise floor."""
 
     stage = "receiver"
     of_receiver = True
 
 
 class _BlankingEffect(Effect):
-    """An effect of the receiver's that leaves levels as they are."""
+    """An effect of the receiver on detection, without a term of the mean level."""
 
     of_receiver = True
 
     def term(self, links: Links, level_at: LevelAt) -> Term:
-        """Return a term that adds nothing."""
+        """Return a term of 0 dB."""
         return Term.of_offset(np.zeros(len(links)))
 
 
 class DetectionEffect(_BlankingEffect):
-    """An effect that loses links, or some of their level, now and then whatever their level."""
+    """An effect that blanks links, or lowers their level, at random."""
 
     stage = "detection"
 
     @abstractmethod
     def losses(self, links: Links) -> Losses:
-        """Return what becomes of n links; each value (n,), probabilities below 1."""
+        """Compute the probabilities of blanks and drops of n links, (n,) each and below 1."""
 
 
 class LimitEffect(_BlankingEffect):
-    """An effect that leaves levels as they are and makes links blank below a level."""
+    """An effect that sets the limit of detection."""
 
     stage = "limit"
 
     @abstractmethod
     def limits_db(self, links: Links) -> np.ndarray:
-        """Return the level (n,) below which links are blank; -inf where the declared one holds."""
+        """Compute the limit of detection (n,) [dB]; -inf where the declared one holds."""
 
 
 class LevelAt(Protocol):
-    """Levels (n,) [dB] that the channel predicts for other links, such as with moved devices."""
+    """Predictor of the channel's levels for any links, e.g. with moved devices."""
 
     def __call__(self, links: Links, exact: bool = False) -> np.ndarray:
-        """Return them quickly, or exactly (following paths, where the channel does)."""
+        """Predict the levels (n,) [dB]; `exact`: by following paths, if the channel can."""
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualView:
-    """Training links, and the residual of the model so far.
+    """Training links and the residuals of the model so far.
 
     Attributes:
         links: n links.
-        residual_db: (n,) measured minus predicted [dB]; of blanks, how far below the prediction
-            they lie at least.
+        residual_db: (n,) measured minus predicted [dB]; for a blank the least residual that fits
+            it, at most 0.
         scale_db: (n,) scale of the errors [dB].
         mean_db: (n,) predicted level [dB].
-        level_at: the channel's levels of other links, such as with devices elsewhere.
-        found: the effects so far.
-        group: (n,) bool, links that read otherwise than their peers; None: any may.
+        level_at: predicts the channel's levels for any links.
+        found: effects in the model.
+        group: (n,) bool, links of the group that stands out from its peers; None: no such group.
     """
 
     links: Links
@@ -493,10 +492,10 @@ class ResidualView:
     group: np.ndarray | None = None
 
     def of_group(self, group: np.ndarray) -> ResidualView:
-        """Return the view with a residual only where the cause of a group (n,) may act.
+        """Set the residual to 0 on links that the cause of a group (mask (n,)) cannot affect.
 
-        That is on all links of the device, the receiver or the flight that the group has in common;
-        all others are the reference. Everywhere, where it has none of them in common.
+        A cause may act on all links of the device and receiver that the group has in common, or
+        else of its flight; if it has none in common, on all links.
         """
         links = self.links
         ends = [label == label[group][0] for label in (links.device, links.receiver)
@@ -509,56 +508,57 @@ class ResidualView:
         return found
 
     def in_group(self, label: np.ndarray) -> list[int]:
-        """Return the labels (n,) of the group's links, in order; all labels without a group."""
+        """List the distinct labels (n,) of the group's links in order; without a group, all."""
         return np.unique(label if self.group is None else label[self.group]).tolist()
 
     def found_params(self, name: str, parameter: str) -> list[Any]:
-        """Return the values of a parameter of the effects of that name that were found before."""
-        return [getattr(each.params, parameter) for each in self.found
-                if each.name == name and hasattr(each.params, parameter)]
+        """List the values of a parameter of the effects of that name in the model."""
+        return [getattr(effect.params, parameter) for effect in self.found
+                if effect.name == name and hasattr(effect.params, parameter)]
 
     @cached_property
     def design_effect(self) -> float:
-        """How many links count as one, because links close to each other err alike."""
+        """Number of links that count as one, as errors of nearby links are correlated."""
         return design_effect(evidence_blocks(self.links), self.residual_db / self.scale_db)
 
     @cached_property
     def weight(self) -> np.ndarray:
-        """(n,) weight of each link's square [1/dB²].
+        """(n,) robust weight of each squared residual [1/dB²].
 
-        1 / variance, less for outliers, divided by the design effect: sums of weighted squares are
-        nats that can be believed.
+        1 / variance, reduced for outliers (Student's t) and divided by the design effect: half of
+        the weighted sum of squares is a log-likelihood [nats].
         """
         z = self.residual_db / self.scale_db
-        return 5.0 / (4.0 + z * z) / self.scale_db**2 / self.design_effect
+        return (DOF + 1) / (DOF + z * z) / self.scale_db**2 / self.design_effect
 
     def gain_nats(self, rows: np.ndarray, change_db: np.ndarray) -> np.ndarray:
-        """Return how much likelier links become if their mean changes (r,) [nats].
+        """Compute the log-likelihood gain (r,) of links if their mean level changes [nats].
 
-        With heavy tails before and after: `weight` knows the old outliers only, and a change makes
-        others. A blank is satisfied with any level that is below the limit of detection.
+        By Student's t before and after, as a change makes new outliers that `weight` does not know.
+        A blank fits any level below the limit of detection.
 
         Args:
-            rows: (r,) links.
-            change_db: (r,) change of the mean [dB].
+            rows: (r,) indices of links.
+            change_db: (r,) change of the mean level [dB].
         """
         scale_db, blank = self.scale_db[rows], np.isnan(self.links.level_db[rows])
         before = (self.residual_db[rows] / scale_db) ** 2
-        # That of a blank is cut off at 0; how far it may rise, its distance to the limit says.
+        # A blank has residual 0 until its mean exceeds the limit, `spare_db` above the prediction.
         spare_db = self.links.limit_db[rows] - self.mean_db[rows]
         spare_db = np.where(np.isfinite(spare_db), spare_db, np.inf)
-        # It may be blank for another reason than its level, by as much as its residual is less.
+        # Probability that it is blank because of its level: the residual was multiplied by it.
         share = np.where(spare_db < 0, self.residual_db[rows] / np.minimum(spare_db, -1e-9), 1.0)
         rest_db = np.where(blank, share * np.minimum(spare_db - change_db, 0.0),
                            self.residual_db[rows] - change_db)
         after = (rest_db / scale_db) ** 2
-        return 2.5 * (np.log1p(before / 4.0) - np.log1p(after / 4.0)) / self.design_effect
+        return 0.5 * (DOF + 1) * (np.log1p(before / DOF)
+                                  - np.log1p(after / DOF)) / self.design_effect
 
     def score(self, term: Term) -> float:
-        """Return how much a term would help [nats].
+        """Compute the log-likelihood gain of a term, approximately [nats].
 
-        Half of the drop of the weighted squares, after its coefficients and a level for each class
-        of line of sight are fitted.
+        Half of the reduction of the weighted sum of squares, with the term's coefficients and one
+        level per class of line of sight fitted.
         """
         weight = self.weight
         target = self.residual_db - term.offset_db
@@ -571,6 +571,7 @@ class ResidualView:
 
 def _weighted_squares(columns: np.ndarray, prior_sd: np.ndarray, target: np.ndarray,
                       weight: np.ndarray) -> float:
+    """Compute the weighted residual sum of squares after a ridge regression on columns."""
     weighted = columns.T * weight
     precision = 1.0 / np.square(prior_sd) + 1e-9
     moments = weighted @ target

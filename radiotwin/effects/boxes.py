@@ -1,4 +1,4 @@
-"""Boxes that obstruct links, where they would explain missing power, and buildings of a 3D map."""
+"""Box geometry: where links cross boxes, knife-edge losses, back-projection, buildings of a map."""
 
 from functools import lru_cache
 from typing import Annotated, NamedTuple
@@ -16,15 +16,15 @@ from radiotwin.propagation import terrain
 from radiotwin.runtime.compiled import njit
 from radiotwin.scene.citymap import HEIGHT_SD_M, CityMap
 
-SAMPLE_M = 5.0  # between points on a link, while it is back-projected
+SAMPLE_M = 5.0  # spacing of the points of a link in the back-projection
 CELL_M = 12.5  # side of a cell of the back-projection
-HEIGHTS_M = (6.0, 9.0, 12.0, 16.0, 22.0, 30.0, 40.0, 52.0, 66.0, 85.0, 110.0)  # that are tried
-MIN_APART_M = 25.0  # between the best cells
-CHUNK, MAX_POINTS = 2000, 4_000_000  # links, and points on them, at a time: bounds memory
-P_MISS = 0.4  # probability that a link through a cell misses the box there, which is smaller
-MIN_SHARE = 0.1  # of the links through a box, to be more than a few
-GRAZING_DB = 6.0  # loss of a way that touches an edge
-SAME_PLACE_M = 10.0  # devices of one mast
+HEIGHTS_M = (6.0, 9.0, 12.0, 16.0, 22.0, 30.0, 40.0, 52.0, 66.0, 85.0, 110.0)  # trial heights
+MIN_APART_M = 25.0  # least distance between the best cells
+CHUNK, MAX_POINTS = 2000, 4_000_000  # links, and their points, per pass: bounds memory
+P_MISS = 0.4  # probability that a link through a cell misses the box in it, which is smaller
+MIN_SHARE = 0.1  # share of the links through a box below which they count as none
+GRAZING_DB = 6.0  # loss at a knife edge that the ray just touches
+SAME_PLACE_M = 10.0  # largest distance between devices of one mast
 BESIDE_UNKNOWN = ("only links of devices whose positions are estimated pass it: they may be "
                   "elsewhere")
 WELD_M = 0.05  # vertices closer together belong to one building
@@ -48,19 +48,19 @@ class Box(NamedTuple):
 
     @staticmethod
     def allowed(field: str, low: float, high: float) -> Allowed:
-        """Return the values that a field may have within bounds; half a turn changes nothing."""
+        """Return the allowed values of a field; the turn has a period of 180°."""
         return Allowed(period=180.0) if field == "turn_deg" else Allowed(low, high)
 
     def straightened(self) -> "Box":
-        """Return the same box with a turn of at most 45° to each side."""
+        """Return the same box with a turn within ±45°, sides exchanged if needed."""
         return self.like(self._replace(turn_deg=0.0))
 
     def turned_by(self, turn_deg: float) -> "Box":
-        """Return a box turned counter-clockwise [deg], with a turn of at most 90° to each side."""
+        """Rotate the box counter-clockwise [deg]; its turn stays within ±90°."""
         return self._replace(turn_deg=(self.turn_deg + turn_deg + 90.0) % 180.0 - 90.0)
 
     def like(self, other: "Box") -> "Box":
-        """Return the same box with the turn that is closest to that of another one."""
+        """Return the same box with the equivalent turn closest to another box's."""
         quarters = round((other.turn_deg - self.turn_deg) / 90.0)
         sides = (self.length_m, self.width_m)[::-1 if quarters % 2 else 1]
         return self._replace(length_m=sides[0], width_m=sides[1],
@@ -68,20 +68,20 @@ class Box(NamedTuple):
 
     @property
     def axes(self) -> np.ndarray:
-        """(2, 2) unit vectors along its length and its width."""
+        """(2, 2) unit vectors along its length and along its width."""
         turn = np.radians(self.turn_deg)
         return np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
 
     @property
     def outline_m(self) -> np.ndarray:
-        """(5, 2) corners from above, the last one like the first [m]."""
+        """(5, 2) x and y of the corners, the last one equal to the first [m]."""
         corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * 0.5 * (
             self.length_m, self.width_m)
         return corners @ self.axes + (self.x_m, self.y_m)
 
 
 def grid_around(box: Box, margin_m: float, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return x and y (count, count) of points on the ground of a box, and so far around it [m]."""
+    """Return x and y (count, count) of grid points over a box's footprint and a margin [m]."""
     turn, share = np.radians(box.turn_deg), (np.arange(count) + 0.5) / count - 0.5
     along_m, across_m = np.meshgrid(share * (box.length_m + 2 * margin_m),
                                      share * (box.width_m + 2 * margin_m))
@@ -90,7 +90,7 @@ def grid_around(box: Box, margin_m: float, count: int) -> tuple[np.ndarray, np.n
 
 
 def stands_on(box: Box, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
-    """Return whether a box stands on points of the ground, of any shape."""
+    """Check which points x, y (any shape) are in the footprint of a box."""
     turn, east_m, north_m = np.radians(box.turn_deg), x_m - box.x_m, y_m - box.y_m
     along_m = east_m * np.cos(turn) + north_m * np.sin(turn)
     across_m = north_m * np.cos(turn) - east_m * np.sin(turn)
@@ -98,15 +98,15 @@ def stands_on(box: Box, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
 
 
 class Crossing(NamedTuple):
-    """How n links cross a box; NaN where a link's ground track does not.
+    """Geometry of n links that cross a box, (n,) each; NaN if the ground track misses the box.
 
     Attributes:
-        inside_m: (n,) length of the link within the box; 0 where it passes above.
-        enter_over_m, leave_over_m: (n,) height of the roof above the link where it enters and where
-            it leaves; negative where the link passes above.
-        left_m, right_m: (n,) how far the box reaches across the link's track to each side.
-        before_m, between_m, behind_m: (n,) distance along the ground from the first end to where
-            the link enters, from there to where it leaves, and on to the second end.
+        inside_m: length of the link within the box; 0 if it passes above.
+        enter_over_m, leave_over_m: height of the roof above the link at entry and at exit;
+            negative if the link passes above.
+        left_m, right_m: lateral extent of the box to each side of the link's track.
+        before_m, between_m, behind_m: ground distances from the first end to the entry, from entry
+            to exit, and from the exit to the second end.
     """
 
     inside_m: np.ndarray
@@ -120,10 +120,10 @@ class Crossing(NamedTuple):
 
 
 def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
-    """Return how links cross a box.
+    """Compute where links cross a box.
 
     Args:
-        box: on the ground.
+        box: box on the ground.
         a_m: (n, 3) first ends [m].
         b_m: (n, 3) second ends [m].
     """
@@ -137,7 +137,7 @@ def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
 def _crossing(start: np.ndarray, end: np.ndarray, start_z_m: np.ndarray, end_z_m: np.ndarray,
               length_m: np.ndarray, half_length_m: float, half_width_m: float, height_m: float
               ) -> np.ndarray:
-    """Return the rows of `Crossing` (8, n) of links from (n, 2) to (n, 2) in the box's axes [m]."""
+    """Compute the fields of `Crossing` (8, n); start and end (n, 2) in the box's axes [m]."""
     found = np.full((8, len(start)), np.nan)
     found[0] = 0.0
     for i in range(len(start)):
@@ -169,7 +169,7 @@ def _crossing(start: np.ndarray, end: np.ndarray, start_z_m: np.ndarray, end_z_m
 
 @njit(cache=True, error_model="numpy")
 def _shares_within(start: float, step: float, half: float) -> tuple[float, float]:
-    """Return the shares of a way along one axis at which it enters and leaves -half to half."""
+    """Return the fractions of a way at which one coordinate enters and leaves ±half."""
     if abs(step) < 1e-9:  # at right angles to the axis: within all the way, or never
         return (-np.inf, np.inf) if abs(start) <= half else (np.inf, -np.inf)
     one, other = (-half - start) / step, (half - start) / step
@@ -179,7 +179,7 @@ def _shares_within(start: float, step: float, half: float) -> tuple[float, float
 @njit(cache=True, error_model="numpy")
 def _share_below(start_z_m: float, rise_m: float, enter: float, leave: float,
                  height_m: float) -> float:
-    """Return the share of a link between `enter` and `leave` that is below a height."""
+    """Return the fraction of a link, between fractions enter and leave, below a height."""
     if abs(rise_m) < 1e-9:
         return leave - enter if start_z_m < height_m else 0.0
     roof = (height_m - start_z_m) / rise_m
@@ -187,48 +187,48 @@ def _share_below(start_z_m: float, rise_m: float, enter: float, leave: float,
 
 
 def devices_through(box: Box, links: Links) -> np.ndarray:
-    """Return how many of the links of each device (k,) pass a box."""
+    """Count the links of each device (k,) that pass through a box."""
     inside = cross(box, *ends_above(links, box[:2])).inside_m > 0
     return np.bincount(links.device[inside], minlength=len(links.device_m))
 
 
 def is_beside_unknown(through: np.ndarray, links: Links) -> bool:
-    """Return whether nearly all links through a box are of devices of estimated positions.
+    """Check whether nearly all links through a box belong to devices of estimated position.
 
     Args:
-        through: (k,) how many of each device's links pass it, see `devices_through`.
-        links: all of them.
+        through: (k,) links of each device through the box, from `devices_through`.
+        links: all links.
     """
     return bool(through[sorted(links.anchors)].sum() < MIN_SHARE * through.sum())
 
 
 def is_seen_from_one_place(through: np.ndarray, links: Links) -> bool:
-    """Return whether nearly all links through a box are of devices that stand together.
+    """Check whether nearly all links through a box belong to devices at one place.
 
-    Along their lines a large box far away hides what a small one nearby does. Arguments as of
-    `is_beside_unknown`.
+    Seen from one place, a large box far away hides the same links as a small one nearby. Arguments
+    as in `is_beside_unknown`.
     """
     away_m = np.linalg.norm((links.device_m - links.device_m[through.argmax()])[:, :2], axis=1)
     return bool(through[away_m > SAME_PLACE_M].sum() < MIN_SHARE * through.sum())
 
 
 def near_box(box: Box, a_m: np.ndarray, b_m: np.ndarray, within_m: float) -> np.ndarray:
-    """Return whether (n,) links' ground tracks come that near to a box [m]."""
+    """Check which links (n,) have a ground track within some distance of a box [m]."""
     larger = box._replace(length_m=box.length_m + 2 * within_m, width_m=box.width_m + 2 * within_m)
     return np.isfinite(cross(larger, a_m, b_m).left_m)
 
 
 def obstruction_nats(residual_db: np.ndarray, scale_db: np.ndarray,
                      losses_db: tuple[float, ...]) -> np.ndarray:
-    """Return how much likelier residuals are if a box may obstruct the link [nats].
+    """Compute the log-likelihood gain (n,) of residuals if a box may obstruct the link [nats].
 
-    "May": a cell of the search is larger than the box, and a link through it misses the box with
-    probability `P_MISS`. So a link without a loss is only weak evidence against a box.
+    A cell of the search is larger than the box, so a link through the cell misses the box with
+    probability `P_MISS`: a link without a loss is only weak evidence against a box.
 
     Args:
-        residual_db: (n,) [dB].
-        scale_db: (n,) of the errors [dB].
-        losses_db: that a box may cause, equally likely.
+        residual_db: (n,) residuals [dB].
+        scale_db: (n,) scale of the errors [dB].
+        losses_db: losses behind a box, equally probable [dB].
     """
     def density(value_db: np.ndarray) -> np.ndarray:
         return (1 + (value_db / scale_db) ** 2 / DOF) ** (-0.5 * (DOF + 1))
@@ -237,38 +237,41 @@ def obstruction_nats(residual_db: np.ndarray, scale_db: np.ndarray,
     return np.log(P_MISS + (1 - P_MISS) * lossy / density(residual_db))
 
 
-def best_cells(centres_m: np.ndarray, total: np.ndarray,
+def best_cells(centres_m: np.ndarray, total_nats: np.ndarray,
                count: int) -> list[tuple[np.ndarray, int, float]]:
-    """Return the centre, index of the height and nats of the best cells that are apart.
+    """Pick the cells of highest gain, at least `MIN_APART_M` from each other.
 
     Args:
-        centres_m: (m, 2) of the cells [m].
-        total: (m, heights) [nats].
-        count: of cells at most.
+        centres_m: (m, 2) centres of the cells [m].
+        total_nats: (m, heights) from `back_project` [nats].
+        count: largest number of cells.
+
+    Returns:
+        centre, index of the height and gain [nats] of each cell, best first.
     """
     found: list[tuple[np.ndarray, int, float]] = []
-    for cell in np.argsort(-total.max(axis=1)):
+    for cell in np.argsort(-total_nats.max(axis=1)):
         if all(np.linalg.norm(centres_m[cell] - other[0]) > MIN_APART_M for other in found):
-            height = int(total[cell].argmax())
-            found.append((centres_m[cell], height, float(total[cell, height])))
+            height = int(total_nats[cell].argmax())
+            found.append((centres_m[cell], height, float(total_nats[cell, height])))
         if len(found) == count:
             break
     return found
 
 
 def back_project(a_m: np.ndarray, b_m: np.ndarray,
-                 gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sum what links gain from a box over the cells of the ground that they pass.
+                 nats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sum the links' gains from an obstruction over the ground cells that they pass.
 
-    The sum is greatest where a box would obstruct the links that gain from one and no others.
+    The sum is greatest where a box would obstruct the links with missing power and no others.
 
     Args:
         a_m: (n, 3) first ends [m].
         b_m: (n, 3) second ends [m].
-        gain: (n,) if the link is obstructed [nats]; negative where a box there would be wrong.
+        nats: (n,) log-likelihood gain if the link is obstructed, see `obstruction_nats`.
 
     Returns:
-        (m, 2) centres of the cells [m], and (m, heights) the sum over the links that pass each cell
+        (m, 2) centres of the cells [m], and (m, heights) sum over the links that pass each cell
         below each of `HEIGHTS_M` [nats].
     """
     low = np.floor(np.minimum(a_m, b_m)[:, :2].min(axis=0) / CELL_M).astype(int)
@@ -283,13 +286,13 @@ def back_project(a_m: np.ndarray, b_m: np.ndarray,
         cell = np.floor(points[..., :2] / CELL_M).astype(int) - low
         flat = cell[..., 0] * shape[1] + cell[..., 1]
         link = np.broadcast_to(np.arange(len(points))[:, None], flat.shape)
-        # Of each link and cell the lowest point.
+        # Keep the lowest point of each link in each cell.
         key = (link * total.shape[1] + flat).ravel()
         height_m = points[..., 2].ravel()
         order = np.lexsort((height_m, key))
         lowest = order[np.r_[True, np.diff(key[order]) > 0]]
         height_m, cells = height_m[lowest], flat.ravel()[lowest]
-        value = gain[part][link.ravel()[lowest]]
+        value = nats[part][link.ravel()[lowest]]
         for row, top_m in enumerate(HEIGHTS_M):
             under = height_m < top_m
             total[row] += np.bincount(cells[under], weights=value[under], minlength=total.shape[1])
@@ -299,13 +302,13 @@ def back_project(a_m: np.ndarray, b_m: np.ndarray,
 
 def knife_edge_db(over_m: np.ndarray, first_m: np.ndarray | float, second_m: np.ndarray | float,
                   wavelength_m: float) -> np.ndarray:
-    """Return the loss over a knife edge (ITU-R P.526-15, Eq. 26) [dB].
+    """Compute the diffraction loss (n,) over a knife edge (ITU-R P.526-15, Eq. 26) [dB].
 
     Args:
         over_m: (n,) height of the edge above the straight line [m].
         first_m: (n,) distance of the edge from the first end [m].
         second_m: (n,) distance of the edge from the second end [m].
-        wavelength_m: of the radio [m].
+        wavelength_m: wavelength [m].
     """
     near, far = np.maximum(first_m, 1.0), np.maximum(second_m, 1.0)
     return terrain.knife_edge_db(over_m * np.sqrt(2 * (near + far) / (wavelength_m * near * far)))
@@ -314,36 +317,36 @@ def knife_edge_db(over_m: np.ndarray, first_m: np.ndarray | float, second_m: np.
 def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray,
                  before_m: np.ndarray | float, between_m: np.ndarray | float,
                  behind_m: np.ndarray | float, wavelength_m: float) -> np.ndarray:
-    """Return the loss over two knife edges in a row, of which either may be the higher [dB].
+    """Compute the diffraction loss (n,) over two knife edges in a row [dB].
 
     ITU-R P.526-15, Sec. 4.4.1, second method, Eq. 37-42.
 
     Args:
         first_over_m: (n,) height of the first edge above the straight line [m].
-        second_over_m: (n,) height of the second edge above it [m].
+        second_over_m: (n,) height of the second edge above the straight line [m].
         before_m: (n,) distance from the first end to the first edge [m].
         between_m: (n,) distance between the edges [m].
         behind_m: (n,) distance from the second edge to the second end [m].
-        wavelength_m: of the radio [m].
+        wavelength_m: wavelength [m].
     """
     a, b, c = np.maximum(before_m, 1.0), np.maximum(between_m, 0.1), np.maximum(behind_m, 1.0)
-    whole = a + b + c
-    first, second = (h * np.sqrt(2 * whole / (wavelength_m * near * (whole - near)))
+    total = a + b + c
+    first, second = (h * np.sqrt(2 * total / (wavelength_m * near * (total - near)))
                      for h, near in ((first_over_m, a), (second_over_m, a + b)))
     leads = first > second
     main_over_m = np.where(leads, first_over_m, second_over_m)
     main_near = np.where(leads, a, a + b)
-    # The other edge, above the line from the main one to the end behind it; where the main one is
-    # below the straight line, that line is the way.
-    own, beyond = np.where(leads, second_over_m, first_over_m), np.where(leads, c, a)
-    other_over_m = own - np.maximum(main_over_m, 0.0) * beyond / (b + beyond)
-    loss_db = knife_edge_db(main_over_m, main_near, whole - main_near, wavelength_m)
+    # Height of the other edge above the line from the top of the main edge to the end behind the
+    # other edge; above the straight line if the main edge is below that.
+    straight_m, beyond = np.where(leads, second_over_m, first_over_m), np.where(leads, c, a)
+    other_over_m = straight_m - np.maximum(main_over_m, 0.0) * beyond / (b + beyond)
+    loss_db = knife_edge_db(main_over_m, main_near, total - main_near, wavelength_m)
     other_db = knife_edge_db(other_over_m, b, beyond, wavelength_m)
     p, q = np.maximum(first, second), np.minimum(first, second)
-    alpha = np.arctan(np.sqrt(b * whole / (a * c)))
+    alpha = np.arctan(np.sqrt(b * total / (a * c)))
     with np.errstate(divide="ignore", invalid="ignore"):
         share = np.where(q > 0, np.maximum(q / p, 0.0) ** (2 * p), 0.0)
-    # Edges close together are one, also where the way passes just above both.
+    # Edges close together act as one, also if the ray passes just above both.
     share = np.where(p > 0, share, np.minimum(loss_db, other_db) / GRAZING_DB)
     correction_db = (12 - 20 * np.log10(2 / (1 - alpha / np.pi))) * share
     return loss_db + np.maximum(other_db - correction_db, 0.0)
@@ -351,14 +354,14 @@ def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray,
 
 @lru_cache(maxsize=4)
 def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
-    """Group faces that are connected.
+    """Find the buildings of a map: the connected components of its faces.
 
     Args:
-        city: a map with f faces.
+        city: map with f faces.
 
     Returns:
-        (f,) index of each face's building, and (buildings, 3) centre x, y and height of each [m];
-        read-only, as they are kept for the next call.
+        (f,) building of each face, and (buildings, 3) x and y of the centre, and z of the top [m];
+        read-only, as they are cached.
     """
     welded = np.round(city.vertices / WELD_M).astype(np.int64)
     vertex = np.unique(welded, axis=0, return_inverse=True)[1].ravel()
@@ -375,7 +378,7 @@ def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
 
 
 def building_extents_m(city: CityMap, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the greatest x, y and z (buildings, 3) of faces by their label (f,)."""
+    """Compute the least and the greatest x, y and z (buildings, 3) of faces by label (f,) [m]."""
     corners_m = city.vertices[city.faces]
     low_m = np.full((label.max() + 1, 3), np.inf)
     high_m = -low_m
@@ -385,13 +388,9 @@ def building_extents_m(city: CityMap, label: np.ndarray) -> tuple[np.ndarray, np
 
 
 def building_height_sds_m(city: CityMap) -> np.ndarray:
-    """Return the standard deviation of the mapped height of each building, a storey at least.
+    """Compute the standard deviation of the mapped height of each building (buildings,) [m].
 
-    Args:
-        city: a map.
-
-    Returns:
-        (buildings,), as `buildings` numbers them [m]
+    The mean over its faces, but at least `HEIGHT_SD_M` (a storey), which is also the default.
     """
     label, centres_m = buildings(city)
     if city.height_sd_m is None:
@@ -399,5 +398,5 @@ def building_height_sds_m(city: CityMap) -> np.ndarray:
     known = np.isfinite(city.height_sd_m)
     faces = np.bincount(label[known], minlength=len(centres_m))
     sums = np.bincount(label[known], weights=city.height_sd_m[known], minlength=len(centres_m))
-    # With less, other shadows beside a roof are fitted by small errors of its height.
+    # With a smaller one, small errors of a roof's height would fit other shadows near it.
     return np.maximum(sums / np.maximum(faces, 1), HEIGHT_SD_M)

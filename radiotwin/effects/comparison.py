@@ -1,7 +1,6 @@
-"""Residuals compared with those of other flights at the same places.
+"""Compare residuals with those of other flights at the same place, which share the map's errors.
 
-What a map or a channel gets wrong at a place, it gets wrong on every flight over it. What is left
-after the comparison belongs to the flight, the receiver or the time.
+The remaining difference is due to the flight, the receiver or the time.
 """
 
 from functools import lru_cache
@@ -14,20 +13,20 @@ from radiotwin.inference.gaussian import robust_sd
 from radiotwin.links import Links, correlation_length_m
 from radiotwin.links.correlation import devices_move, median_step_m
 
-NEIGHBOURS = 24  # nearest links that are looked at, of which some are of other flights
-MIN_OTHERS = 2  # links of other flights, for a comparison
-MIN_STEPS = 2.0  # between positions, that still count as one place
-MAX_REACH_M = 60.0
-VIEWS = 8  # whose comparison is remembered
-MAX_Z, MIN_SD_DB = 4.0, 0.3  # of a value, over the scatter of its class; of that scatter
+NEIGHBOURS = 24  # nearest links that are searched for links of other flights
+MIN_OTHERS = 2  # links of other flights needed for a comparison
+MIN_STEPS = 2.0  # steps between readings that still count as one place
+MAX_REACH_M = 60.0  # largest radius of a place
+VIEWS = 8  # number of views whose comparison is cached
+MAX_Z, MIN_SD_DB = 4.0, 0.3  # clip of a value [sd of its class], and least such sd [dB]
 
 
 @lru_cache(maxsize=VIEWS)
 def compared_db(view: ResidualView) -> np.ndarray:
-    """Return residuals (n,) minus the median of other flights at the same place [dB]; read-only.
+    """Subtract from residuals (n,) the median of other flights at the same place [dB].
 
-    The same place: the same device (of devices that move: the same receiver) within the
-    correlation length of the residual. NaN where no other flight was.
+    Same place: same device (same receiver, if devices move) within the residual's correlation
+    length. NaN if no other flight was there; read-only, as it is cached.
     """
     links, z = view.links, view.residual_db / view.scale_db
     reach_m = min(max(correlation_length_m(links, z), MIN_STEPS * median_step_m(links)),
@@ -39,15 +38,15 @@ def compared_db(view: ResidualView) -> np.ndarray:
     for member in np.unique(fixed):
         rows = np.flatnonzero(fixed == member)
         if len(rows) > MIN_OTHERS:
-            result[rows] = view.residual_db[rows] - _elsewhen_db(
+            result[rows] = view.residual_db[rows] - _other_flights_db(
                 end_m[rows], links.flight[rows], view.residual_db[rows], reach_m)
     result.setflags(write=False)  # kept for the next effect that asks
     return result
 
 
-def _elsewhen_db(position_m: np.ndarray, flight: np.ndarray, residual_db: np.ndarray,
-                 reach_m: float) -> np.ndarray:
-    """Return the median (r,) of the residuals of other flights nearby; NaN where there are few."""
+def _other_flights_db(position_m: np.ndarray, flight: np.ndarray, residual_db: np.ndarray,
+                      reach_m: float) -> np.ndarray:
+    """Compute the median residual (r,) of other flights within reach; NaN if too few are."""
     count = min(NEIGHBOURS, len(position_m))
     distance_m, near = cKDTree(position_m).query(position_m, count, distance_upper_bound=reach_m)
     distance_m, near = distance_m.reshape(len(position_m), -1), near.reshape(len(position_m), -1)
@@ -62,27 +61,31 @@ def _elsewhen_db(position_m: np.ndarray, flight: np.ndarray, residual_db: np.nda
 
 
 def compared_where_possible_db(view: ResidualView) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals (n,) as `compared_db`, elsewhere as they are [dB]; and where compared."""
+    """Return `compared_db` (n,), or the residual itself if NaN; and the mask of the former."""
     rest_db = compared_db(view)
     known = np.isfinite(rest_db)
     return np.where(known, rest_db, view.residual_db), known
 
 
 def by_precision(view: ResidualView, rest_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (n,) [dB] without outliers, and what each counts (n,) [1/dB²].
+    """Centre and clip residuals in each class of sight, and weight them by inverse variance.
 
-    Links with line of sight scatter by one or two decibels, others by ten: what all have in common
-    shows in the former, and a median over both hides it. A link counts by the scatter of its class
-    and as `MAX_Z` times that at most; links that err alike count as one.
+    Links with line of sight scatter by 1 to 2 dB, others by 10 dB: a common change shows in the
+    former, and a median over both would hide it. Values are clipped at `MAX_Z` standard deviations
+    of their class; weights are divided by the design effect.
 
     Args:
         view: n links.
-        rest_db: (n,) compared residuals; NaN = unknown, which counts nothing.
+        rest_db: (n,) compared residuals; NaN = unknown, weight 0.
+
+    Returns:
+        (n,) values [dB], and (n,) weights [1/dB²].
     """
     value_db, weight = np.zeros((2, len(rest_db)))
-    says = np.isfinite(view.links.level_db) | (view.residual_db < 0)  # a blank that was due
+    # A blank has information only if its predicted level is above the limit.
+    informative = np.isfinite(view.links.level_db) | (view.residual_db < 0)
     for members in (view.links.los, ~view.links.los):
-        rows = np.flatnonzero(members & says & np.isfinite(rest_db))
+        rows = np.flatnonzero(members & informative & np.isfinite(rest_db))
         if len(rows):
             centred_db = rest_db[rows] - np.median(rest_db[rows])
             sd_db = max(robust_sd(rest_db[rows]), MIN_SD_DB)
@@ -92,38 +95,37 @@ def by_precision(view: ResidualView, rest_db: np.ndarray) -> tuple[np.ndarray, n
 
 
 def mean_by_precision(value_db: np.ndarray, weight: np.ndarray) -> float:
-    """Return the weighted mean [dB]; 0 where nothing counts."""
+    """Compute the weighted mean [dB]; 0 if all weights are 0."""
     total = weight.sum()
     return float(weight @ value_db / total) if total > 0 else 0.0
 
 
 def share_alike(label: np.ndarray, value_db: np.ndarray, weight: np.ndarray, minimum: int,
                 least_db: float) -> float:
-    """Return the share of members whose weighted mean is beyond a level, with its sign.
+    """Compute the share of members whose weighted mean exceeds a threshold, in its direction.
 
     Args:
         label: (n,) device or receiver.
-        value_db: (n,) [dB].
-        weight: (n,) of each.
-        minimum: values of a member, to count.
-        least_db: level; negative: means below it count.
+        value_db: (n,) values [dB].
+        weight: (n,) weights.
+        minimum: least number of values of a member.
+        least_db: threshold [dB]; if negative, means below it are counted.
 
     Returns:
-        from 0 to 1; 0 where no member has values enough.
+        0 to 1; 0 if no member has enough values.
     """
     means = [mean_by_precision(value_db[label == member], weight[label == member])
              for member, count in zip(*np.unique(label, return_counts=True), strict=True)
              if count >= minimum]
-    return float(np.mean([np.sign(least_db) * each > abs(least_db) for each in means])) \
-        if means else 0.0
+    return float(np.mean(np.sign(least_db) * np.array(means) > abs(least_db))) if means else 0.0
 
 
 def flight_mask(links: Links, receiver: int | None, flight: str | None) -> np.ndarray:
-    """Return (n,) bool, links of a receiver on a flight of that name; None: of all."""
-    mine = np.ones(len(links), dtype=bool)
+    """Return the mask (n,) of a receiver's links on a flight of that name; None: any."""
+    mask = np.ones(len(links), dtype=bool)
     if receiver is not None:
-        mine &= links.receiver == receiver
+        mask &= links.receiver == receiver
     if flight is not None:
         named = [number for number, name in enumerate(links.flight_names) if str(name) == flight]
-        mine &= np.isin(links.flight, named)
-    return mine
+        mask &= np.isin(links.flight, named)
+    return mask

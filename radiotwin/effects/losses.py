@@ -1,13 +1,12 @@
-"""The most that gas, rain (ITU-R P.676, P.838) and woodland (P.833-10) take, by frequency.
+"""Upper bounds of attenuation by gas, rain (ITU-R P.676, P.838) and woodland (P.833-10).
 
-Gas and rain are a small table of published specific attenuations, so that no result depends on an
-optional package. Compared with the package `itur` by its test: between rows it is less than 4 %
-below that.
+Gas and rain: a table of published specific attenuations, so that no result depends on an optional
+package. A test compares it with the package `itur`: between rows it is less than 4 % lower.
 
-Woodland with one terminal in it is Sec. 2.1 of the recommendation; of its forests the one that was
-measured over the widest range of frequencies, 105.9 to 2117.5 MHz (mixed, trees of 16 m). Beyond it
-the power laws are extrapolated; that of the greatest loss to half and to twice that range only,
-because at higher frequencies scattering and paths around the crowns bound the loss.
+Woodland: one terminal in it, Sec. 2.1 of the recommendation, the forest measured over the widest
+range of frequencies, 105.9 to 2117.5 MHz (mixed, trees of 16 m). Outside, the power laws are
+extrapolated; that of the greatest loss only to half and to twice the range, because at higher
+frequencies scattering and paths around the crowns bound the loss.
 """
 
 import numpy as np
@@ -42,36 +41,36 @@ TABLE = np.array([
     (390.0, 154.63, 36.705), (410.0, 74.621, 36.423), (430.0, 111.06, 36.160),
     (448.0, 1207.7, 35.939), (450.0, 886.77, 35.915)])
 MEASURED_HZ = (105.9e6, 2117.5e6)
-# Specific attenuation at the ends of that range [dB/m]; a power law between them is within 13 % of
-# all five values of the recommendation.
-MEASURED_DB_M, SLOPE = (0.04, 0.34), 0.7144
+# Specific attenuation at the lower end of that range [dB/m], and exponent of the power law to the
+# upper end (0.34 dB/m), which is within 13 % of all five values of the recommendation.
+LOWEST_DB_M, SLOPE = 0.04, 0.7144
 # The greatest loss is A_1 f^alpha [dB], f in MHz.
 A_1_DB, ALPHA = 1.37, 0.42
-MAX_FACTOR = 2.0  # beyond the range, that this is extrapolated
-UNKNOWN_MAX_LOSS_DB = 25.0  # where the frequency is unknown: that at 1 GHz
+MAX_FACTOR = 2.0  # factor beyond the range up to which the greatest loss is extrapolated
+UNKNOWN_MAX_LOSS_DB = 25.0  # greatest loss at 1 GHz, used if the frequency is unknown
 
 
 def max_gas_db_km(frequency_hz: float) -> float:
-    """Return the specific attenuation [dB/km] of hot, humid air at sea level (ITU-R P.676)."""
+    """Compute the specific attenuation of hot, humid air at sea level (ITU-R P.676) [dB/km]."""
     return _interpolated(frequency_hz, 1)
 
 
 def max_rain_db_km(frequency_hz: float) -> float:
-    """Return the specific attenuation [dB/km] of rain of 150 mm/h (ITU-R P.838)."""
+    """Compute the specific attenuation of rain of 150 mm/h (ITU-R P.838) [dB/km]."""
     return _interpolated(frequency_hz, 2)
 
 
 def _interpolated(frequency_hz: float, column: int) -> float:
-    """Return a column between its rows, straight in logarithms; outside, that of the nearest row.
+    """Interpolate a column of `TABLE` in log-log; outside, the nearest row.
 
-    Below 1 GHz less is lost than there, so that it still is the most.
+    Below 1 GHz attenuation is lower than at 1 GHz, so the value is still an upper bound.
     """
     return float(np.exp(np.interp(np.log(frequency_hz / 1e9), np.log(TABLE[:, 0]),
                                   np.log(TABLE[:, column]))))
 
 
 def max_loss_db(frequency_hz: float) -> float:
-    """Return the greatest loss A_m of a link into woodland [dB], also where nothing is known."""
+    """Compute the greatest loss A_m of a link into woodland [dB]; NaN Hz: that at 1 GHz."""
     if not np.isfinite(frequency_hz):
         return UNKNOWN_MAX_LOSS_DB
     low_hz, high_hz = MEASURED_HZ[0] / MAX_FACTOR, MEASURED_HZ[1] * MAX_FACTOR
@@ -79,5 +78,5 @@ def max_loss_db(frequency_hz: float) -> float:
 
 
 def specific_db_m(frequency_hz: float) -> float:
-    """Return the specific attenuation of the first metres of woodland [dB/m]."""
-    return MEASURED_DB_M[0] * (frequency_hz / MEASURED_HZ[0]) ** SLOPE
+    """Compute the specific attenuation of the first metres of woodland [dB/m]."""
+    return LOWEST_DB_M * (frequency_hz / MEASURED_HZ[0]) ** SLOPE

@@ -1,4 +1,4 @@
-"""Ends of links that are elsewhere: the channel predicts again, lines of sight included."""
+"""Base of effects with an end at another position: the channel predicts the links again from it."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import Effect, GainEffect, LevelAt, ResidualView, Term
 from radiotwin.links import Links
 
-MIN_LINKS = 60  # of an end that is moved about
-MAX_ENDS = 60  # that are moved about, or it takes too long
-MIN_NATS = 6.0  # that a move must gain to be proposed
-MAX_PROPOSE_LINKS = 600  # of an end, on which moves are tried
+MIN_LINKS = 60  # of an end whose position is tested
+MAX_ENDS = 60  # ends whose positions are tested; more take too long
+MIN_NATS = 6.0  # log-likelihood gain above which a move is proposed
+MAX_PROPOSE_LINKS = 600  # of an end, drawn at random to test moves
 
 
 class MovedEnd(GainEffect):
-    """An end that is not where its links have it; one step finds one, the worst."""
+    """A device or receiver at another position than given; each step finds the worst one."""
 
     repeatable = True
-    always_exact = True  # a map's streets are what shows where it was
+    always_exact = True  # paths along streets determine the position
     params: Any
 
     @override
@@ -33,17 +33,18 @@ class MovedEnd(GainEffect):
 
     @abstractmethod
     def rows(self, links: Links) -> np.ndarray:
-        """Return the rows (r,) of the links of that end."""
+        """Return the rows (r,) of the moved end's links."""
 
     @abstractmethod
     def moved(self, links: Links) -> Links:
-        """Return links of that end with it where it is."""
+        """Return these links with the end at its new position."""
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
         offset_db, rows = np.zeros(len(links)), self.rows(links)
-        mine = links.select(rows)
-        offset_db[rows] = level_at(self.moved(mine), self.is_exact) - level_at(mine, self.is_exact)
+        given = links.select(rows)
+        offset_db[rows] = level_at(self.moved(given), self.is_exact) \
+            - level_at(given, self.is_exact)
         return Term.of_offset(offset_db)
 
     @override
@@ -51,21 +52,21 @@ class MovedEnd(GainEffect):
         return self.with_params(self.params, "exact")
 
     def best_move(self, view: ResidualView, ends: Iterable[list[Any]]) -> list[Any]:
-        """Return the parameters with which links gain most; none where they gain too little.
+        """Return the parameters of the move with the highest gain; empty if below `MIN_NATS`.
 
         Args:
             view: residuals.
-            ends: of each end that may be elsewhere, parameters with the moves that are tried.
+            ends: list of trial parameters for each end.
         """
         links, best, most_nats = view.links, [], MIN_NATS
         for moves in ends:
-            every = self.with_params(moves[0]).rows(links)
-            rows = subsample(every, MAX_PROPOSE_LINKS)
-            mine, share = links.select(rows), len(every) / len(rows)
-            before_db = view.level_at(mine)
+            all_rows = self.with_params(moves[0]).rows(links)
+            rows = subsample(all_rows, MAX_PROPOSE_LINKS)
+            given, times = links.select(rows), len(all_rows) / len(rows)
+            before_db = view.level_at(given)
             for params in moves:
-                change_db = view.level_at(self.with_params(params).moved(mine)) - before_db
-                nats = share * view.gain_nats(rows, change_db).sum()
+                change_db = view.level_at(self.with_params(params).moved(given)) - before_db
+                nats = times * view.gain_nats(rows, change_db).sum()
                 if nats > most_nats:
                     best, most_nats = [params], nats
         return best

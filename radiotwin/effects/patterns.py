@@ -1,6 +1,6 @@
-"""Typical patterns: how an effect of a given size changes the levels of the measured links.
+"""Typical patterns: changes of the measured links' levels by a typical effect of some size.
 
-From them follows how large an effect would have had to be, to be seen
+The smallest detectable size of an effect follows from them
 (`radiotwin.closeloop.verdict.sensitivity`).
 """
 
@@ -14,27 +14,27 @@ from radiotwin.effects.arrays import ends_above_ground, frequent_labels
 from radiotwin.effects.boxes import Box, cross
 from radiotwin.links import Links
 
-MAX_MEMBERS = 5  # devices, receivers or flights of which the median is taken
-MAX_PLACES = 3  # and of boxes in the way, whose search takes longer
-MIN_LINKS = 30  # of each
-WIDE_M = 20.0  # width of what hides links
-PLACES, SHARES = 40, (0.1, 0.3, 0.5, 0.7, 0.9)  # links that it may stand on, and how far along
-# What patterns are of, in the order in which they are listed.
+MAX_MEMBERS = 5  # devices, receivers or flights over which the median is taken
+MAX_PLACES = 3  # the same for boxes, whose search takes longer
+MIN_LINKS = 30  # links of a member, or through a box
+WIDE_M = 20.0  # width of a typical obstacle
+PLACES, SHARES = 40, (0.1, 0.3, 0.5, 0.7, 0.9)  # links with an obstacle, and its places along them
+# Kinds of patterns in the order of the report.
 KINDS = ("receiver", "device", "flight", "distance", "attitude", "direction", "position", "place",
          "building")
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """A change of levels, as an effect of each size makes it.
+    """A change of levels as a function of the size of an effect.
 
     Attributes:
         kind: one of `KINDS`; any other is listed last.
-        unit: of its size: dB, dB/km or m.
-        what: its size is of.
-        change_db: (n,) of the links' levels, of size 1.
-        move_db: the same of a size, where that is not in proportion.
-        low, high: least and largest size that the effect may have.
+        unit: unit of the size: dB, dB/km or m.
+        what: description of the size, for the report.
+        change_db: (n,) change of the links' levels at size 1 [dB].
+        move_db: size -> change (n,) [dB], if not proportional to the size.
+        low, high: range of sizes that the effect may have.
     """
 
     kind: str
@@ -47,31 +47,34 @@ class Pattern:
 
     @property
     def rank(self) -> int:
-        """Place of its kind in the list."""
+        """Position of its kind in `KINDS`."""
         return KINDS.index(self.kind) if self.kind in KINDS else len(KINDS)
 
     def of_size_db(self, size: float) -> np.ndarray:
-        """Return what an effect of a size changes (n,)."""
+        """Compute the change of the levels (n,) by an effect of some size [dB]."""
         return size * self.change_db if self.move_db is None else self.move_db(size)
 
 
 def members(label: np.ndarray) -> list[np.ndarray]:
-    """Return masks (n,) of some labels with links enough, if there are two at least."""
+    """Return masks (n,) of up to `MAX_MEMBERS` labels with enough links; empty if only one has."""
     frequent = frequent_labels(label, MIN_LINKS)
     if len(frequent) < 2:
         return []
-    return [label == each for each in frequent[_spread(len(frequent), MAX_MEMBERS)]]
+    return [label == member for member in frequent[_spread(len(frequent), MAX_MEMBERS)]]
 
 
 def timed_members(links: Links, label: np.ndarray) -> list[np.ndarray]:
-    """Return those of `members` of whose links most have a time, and not all the same."""
+    """Return those masks of `members` with times for most links, not all at one time."""
     timed = np.isfinite(links.time_s)
-    return [mine for mine in members(label)
-            if timed[mine].mean() > 0.5 and np.ptp(links.time_s[mine & timed]) != 0]
+    return [mask for mask in members(label)
+            if timed[mask].mean() > 0.5 and np.ptp(links.time_s[mask & timed]) != 0]
 
 
-def crossed(links: Links, high_m: float) -> Iterator[np.ndarray]:
-    """Yield lengths (n,) of links with line of sight in boxes that such a link passes [m]."""
+def lengths_in_boxes(links: Links, high_m: float) -> Iterator[np.ndarray]:
+    """Yield the length (n,) of each link with line of sight inside a typical box [m].
+
+    Boxes are `WIDE_M` wide and stand on such links; up to `MAX_PLACES`, from few to many links.
+    """
     rows = np.flatnonzero(links.los)
     a_m, b_m = ends_above_ground(links, rows)
     passed = np.linspace(0, len(rows) - 1, min(PLACES, len(rows))).astype(int)
@@ -83,12 +86,12 @@ def crossed(links: Links, high_m: float) -> Iterator[np.ndarray]:
         if np.count_nonzero(inside_m) >= MIN_LINKS:
             found.append(inside_m)
     found.sort(key=np.count_nonzero)
-    for each in found[_spread(len(found), MAX_PLACES)]:
-        every_m = np.zeros(len(links))
-        every_m[rows] = each
-        yield every_m
+    for inside_m in found[_spread(len(found), MAX_PLACES)]:
+        length_m = np.zeros(len(links))
+        length_m[rows] = inside_m
+        yield length_m
 
 
 def _spread(count: int, maximum: int) -> slice:
-    """Return which of so many to take, evenly from first to last, `maximum` of them at most."""
+    """Return a slice that takes every k-th of `count` items, at most `maximum` in all."""
     return slice(None, None, -(-count // maximum) or 1)

@@ -1,4 +1,4 @@
-"""Where an effect is: what it corrects in the declared scene, and how maps mark it.
+"""Corrections of the declared scene by effects, and marks of effects on maps.
 
 `radiotwin.closeloop.output.corrected_scene` writes the scene with the corrections, and
 `radiotwin.report.map_figures` draws the marks.
@@ -15,14 +15,14 @@ from radiotwin.effects.params import Length, Metres
 
 
 class Roof(NamedTuple):
-    """A roof of the map, and how much higher it is than the map says.
+    """A roof whose height differs from the map.
 
     Attributes:
-        building: index, as `radiotwin.effects.boxes.buildings` numbers them.
+        building: index from `radiotwin.effects.boxes.buildings`.
         x_m, y_m, height_m: centre and height on the map [m].
-        offset_m: how much higher the one is that predicts links best [m].
+        offset_m: height that predicts the links best minus mapped height [m].
         offset_sd_m: standard deviation of `true_offset_m` [m].
-        common_m: what the other roofs have in common of it, which is the model's [m].
+        common_m: part of `offset_m` common to all other roofs, an error of the model [m].
     """
 
     building: int
@@ -40,14 +40,13 @@ class Roof(NamedTuple):
 
 
 class FoundAntenna(NamedTuple):
-    """An antenna that a device turned out to have.
+    """A directive antenna found for a device.
 
     Attributes:
-        kind: as "sector antenna".
-        azimuth_deg: direction of its boresight, clockwise from north.
-        beamwidth_deg: horizontal width between the points 3 dB below the maximum.
-        gain_db: azimuth from the boresight and elevation (n,) [deg] -> gain (n,), up to a constant
-            [dB].
+        kind: printed kind, e.g. "sector antenna".
+        azimuth_deg: direction of the boresight, clockwise from north [deg].
+        beamwidth_deg: horizontal 3 dB beamwidth [deg].
+        gain_db: azimuth from the boresight and elevation (n,) [deg] -> relative gain (n,) [dB].
     """
 
     kind: str
@@ -58,14 +57,14 @@ class FoundAntenna(NamedTuple):
 
 @dataclass(frozen=True)
 class Correction:
-    """What one effect says of the declared scene.
+    """Corrections of the declared scene by one effect.
 
     Attributes:
-        boxes: buildings that the map lacks.
-        gone: buildings of the map that are not there, as `buildings` numbers them.
-        roofs: that are off.
-        moves_m: index of a device -> its true minus its declared position, east and north [m].
-        antennas: index of a device -> what it has.
+        boxes: buildings missing on the map.
+        gone: indices of mapped buildings that do not exist, from `buildings`.
+        roofs: roofs of another height.
+        moves_m: device index -> true minus declared position, east and north [m].
+        antennas: device index -> antenna.
     """
 
     boxes: tuple[Box, ...] = ()
@@ -77,14 +76,14 @@ class Correction:
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """How a map marks where an effect is: by an outline, an area, an arrow, or else a cross.
+    """Mark of an effect on a map: an outline, an area, an arrow, or by default a cross.
 
     Attributes:
-        text: beside it.
-        at_m: (2,) its place, x and y; an arrow ends there [m].
-        outline_m: (k, 2) corners of an outline, the last one like the first [m].
+        text: label.
+        at_m: (2,) x and y of the place, or of the tip of an arrow [m].
+        outline_m: (k, 2) corners of an outline, the last one equal to the first [m].
         faces_m: (f, 3, 2) triangles of an area [m].
-        from_m: (2,) where an arrow begins [m].
+        from_m: (2,) start of an arrow [m].
     """
 
     text: str

@@ -1,7 +1,7 @@
-"""Every effect that is looked for: the built-in catalogue, and what installed packages add.
+"""Registry of effects: the built-in catalogue, those of installed packages, and registered ones.
 
-A package adds effects under the entry-point group `radiotwin.effects`; a script adds one with
-`register`. Candidates compete by what held-out links say, so the order means nothing.
+A package adds effects under the entry-point group `radiotwin.effects`, a script with `register`.
+Candidates compete by their held-out errors, so the order has no effect.
 """
 
 from radiotwin.effects.base import Effect
@@ -46,21 +46,21 @@ BUILT_IN: tuple[type[Effect], ...] = (
     ReceiverPositionError, ReceiverClockOffset, MissingObstacle, RemovedObstacle, BuildingEntry,
     Foliage, MappedVegetation, WallReflection, Diffraction, GroundReflection, Interference,
     LockLoss, FaultyFlight, Episode, RoofHeights, UncertainSight)
-LAST_RESORTS: tuple[type[Effect], ...] = (UnexplainedTrend,)  # no candidates: they fit anything
+LAST_RESORTS: tuple[type[Effect], ...] = (UnexplainedTrend,)  # not candidates: would fit anything
 
 _registered: list[type[Effect]] = []
 
 
 def register(effect: type[Effect]) -> type[Effect]:
-    """Add an effect to the catalogue of this process; usable as a decorator.
+    """Add an effect class to the catalogue of this process; usable as a decorator.
 
     Raises:
-        BadInput: not an effect, or its name and variant are taken.
+        BadInput: it is not an effect, or its name and variant are taken.
     """
     if not (isinstance(effect, type) and issubclass(effect, Effect)):
         raise BadInput(f"{effect!r} is not a subclass of radiotwin.effects.Effect")
     if effect not in _registered:
-        taken = {(each.name, each.variant): each for each in (*BUILT_IN, *_registered)}
+        taken = {(other.name, other.variant): other for other in (*BUILT_IN, *_registered)}
         if (effect.name, effect.variant) in taken:
             other = taken[effect.name, effect.variant]
             raise BadInput(
@@ -71,29 +71,29 @@ def register(effect: type[Effect]) -> type[Effect]:
 
 
 def catalogue() -> tuple[type[Effect], ...]:
-    """Return all effects: built-in, of installed packages, and registered.
+    """List all effect classes: built-in, of installed packages, and registered.
 
-    Warns where a package's effect cannot be loaded, and goes on without it.
+    Warns if an effect of a package cannot be loaded, and leaves it out.
     """
     load_plugins(ENTRY_POINTS, register, "effect")
     return (*BUILT_IN, *_registered)
 
 
 def trend_over(variable: str) -> Effect:
-    """Return the last resort: a curve over a variable of `residual_variables`."""
+    """Return the effect of last resort: a curve over a variable of `residual_variables`."""
     return UnexplainedTrend(variable)
 
 
 def effects_named(name: str) -> list[type[Effect]]:
-    """Return all forms of an effect; none where no such effect is installed."""
+    """List all variants of an effect; empty if none is installed."""
     return [effect for effect in (*catalogue(), *LAST_RESORTS) if effect.name == name]
 
 
 def effect_named(name: str, variant: str) -> Effect:
-    """Return a new instance of an effect.
+    """Return a new instance of an effect by name and variant, as a twin's file has them.
 
     Raises:
-        BadInput: no such effect is installed, or one that describes the same otherwise.
+        BadInput: no effect of that name is installed, or none of that variant.
     """
     named = effects_named(name)
     for effect in named:

@@ -8,8 +8,8 @@ import pytest
 from radiotwin.effects.catalogue.declared_sectors import (
     GROUP_SD_DB,
     level_groups,
-    own_sd_db,
     unheard_sd_db,
+    unshared_sd_db,
 )
 from radiotwin.links.sites import antenna_of, relatives_of
 from radiotwin.twin.model.correlated_shadowing import Relatives, RelativesState
@@ -103,7 +103,7 @@ def test_levels_are_nested_in_masts_and_directions():
     links = links_of(np.random.default_rng(0), 1)
     groups = level_groups(links, list(range(9)))
     assert groups == [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1], [2, 3], [4, 5], [6, 7]]
-    assert own_sd_db(list(range(9)), groups).tolist() == [3.0] * 8 + [pytest.approx(np.sqrt(27))]  # a mast for itself
+    assert unshared_sd_db(list(range(9)), groups).tolist() == [3.0] * 8 + [pytest.approx(np.sqrt(27))]  # a mast for itself
     assert level_groups(links, [0, 2, 8]) == [[0, 2]]  # of three directions two are on a mast
     assert level_groups(links, [0, 1]) == [[0, 1], [0, 1]]  # a mast of one direction
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from radiotwin.closeloop.crossfit import make_bases
-from radiotwin.effects.catalogue.roof_heights import RoofHeights, beside_the_others, surely_off
+from radiotwin.effects.catalogue.roof_heights import RoofHeights, surely_off, with_model_error
 from radiotwin.effects.params import QUANTILE_90
 from radiotwin.effects.places import Roof
 from radiotwin.errors import BadInput
@@ -90,14 +90,14 @@ def test_what_all_roofs_have_in_common_is_the_models_and_no_roofs():
     outside = 0
     for _ in range(50):
         seem_m = rng.normal(-1.4, 1.0, 10)
-        roofs = beside_the_others([Roof(number, 0.0, 0.0, 20.0, off_m, 0.3) for number, off_m in enumerate(seem_m)])
+        roofs = with_model_error([Roof(number, 0.0, 0.0, 20.0, off_m, 0.3) for number, off_m in enumerate(seem_m)])
         outside += len(surely_off(roofs))
         assert [roof.offset_m for roof in roofs] == seem_m.tolist()  # which predict best
     assert outside <= 0.1 * 500
-    *others, high = beside_the_others([*(Roof(number, 0.0, 0.0, 20.0, off_m, 0.3) for number, off_m in enumerate(seem_m)),
+    *others, high = with_model_error([*(Roof(number, 0.0, 0.0, 20.0, off_m, 0.3) for number, off_m in enumerate(seem_m)),
                                        Roof(10, 0.0, 0.0, 12.0, 9.0, 0.5)])
     assert surely_off([*others, high])[0] is high and high.true_offset_m == pytest.approx(10.4, abs=1.0)
-    (alone,) = beside_the_others([Roof(0, 0.0, 0.0, 20.0, 2.5, 0.3)])
+    (alone,) = with_model_error([Roof(0, 0.0, 0.0, 20.0, 2.5, 0.3)])
     assert alone.true_offset_m == 2.5 and not surely_off([alone])
 
 

@@ -1,12 +1,11 @@
-"""The receiver's body is in the way: loss depends on the direction of arrival in the body frame.
+"""`body_shadowing`: the receiver's body (airframe, car) attenuates arrivals from its direction.
 
-The loss is greatest where the body is, nothing on the opposite side, and in between
-depth ((1 + cos angle) / 2)^k, with the angle between the arrival and the body, in azimuth and
-elevation together. Its width is where half of the depth is left: k = 1, the first harmonic, is 180°
-wide, and a large k is a normal curve. Airframe shadowing is described by Khawaja et al., 'A survey
-of air-to-ground propagation channel modeling for unmanned aerial vehicles', IEEE COMST 21(3), 2019.
-With a 3D map each path has the loss of the direction from which it comes; a link that no path
-reaches has that of the straight line.
+Loss = depth ((1 + cos angle) / 2)^k, with the angle between arrival and body; 0 on the opposite
+side. The width is the full angle at half the depth: k = 1, the first harmonic, is 180° wide, and a
+large k approaches a normal curve. Airframe shadowing is described by Khawaja et al., 'A survey of
+air-to-ground propagation channel modeling for unmanned aerial vehicles', IEEE COMST 21(3), 2019.
+With a 3D map each path has the loss of its direction of arrival; a link without any path has that
+of the straight line.
 """
 
 from functools import partial
@@ -16,7 +15,13 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import BodyFrameEffect, linear, report_patterns
+from radiotwin.effects.antennas import (
+    MIN_LINKS,
+    MIN_NATS,
+    BodyFrameEffect,
+    linear,
+    report_patterns,
+)
 from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import (
@@ -31,15 +36,13 @@ from radiotwin.effects.patterns import Pattern
 from radiotwin.links import Links
 from radiotwin.propagation.laws.followed_paths import Rays
 
-MIN_LINKS = 100  # of a receiver, detected and with a heading
-MIN_NATS = 4.0  # that a body must gain to be proposed
-DEPTH_SD_DB = 16.0  # prior of the depth, which steadies the proposal
+DEPTH_SD_DB = 16.0  # prior standard deviation of the depth in the proposal, a ridge
 SEARCH_STEP_DEG, SEARCHED_WIDTHS_DEG = 15.0, (60.0, 120.0, 180.0)
-MAX_LINKS = 2000  # that the search looks at
+MAX_LINKS = 2000  # drawn at random for the proposal
 
 
 class Body(EffectParams):
-    """Where the body is, seen from one receiver's antenna, and what it takes."""
+    """Direction, width and loss of a body as seen from the receiver's antenna."""
 
     depth_db: float = quantity(0.0, unit="dB", low=0.0, high=40.0, step=2.0,
                                description="Loss of what arrives through its middle.")
@@ -51,13 +54,13 @@ class Body(EffectParams):
                                 description="Angle across, within which half of it is lost.")
 
     def loss_db(self, arrival: np.ndarray) -> np.ndarray:
-        """Return the loss (n,) [dB], of arrivals (n, 3) as unit vectors right, nose, top."""
+        """Compute the loss (n,) [dB] of arrivals, unit vectors (n, 3) along right, nose, top."""
         middle = _directions(self.azimuth_deg, self.elevation_deg)
-        return self.depth_db * _share(arrival @ middle, self.width_deg)
+        return self.depth_db * _relative_loss(arrival @ middle, self.width_deg)
 
 
 class BodyShadowing(BodyFrameEffect):
-    """Receivers that lose more on one side."""
+    """Receivers whose body attenuates arrivals from one side."""
 
     name = "body_shadowing"
     acts_on = ("receiver", "direction")
@@ -89,7 +92,7 @@ class BodyShadowing(BodyFrameEffect):
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
-        """Return also what all links proposed: every link bears on it, in each part alike."""
+        """Propose anew, and also the parameters from all links, which one fold hardly changes."""
         return [*self.propose(view), self.params]
 
     @override
@@ -117,12 +120,12 @@ class BodyShadowing(BodyFrameEffect):
 
 
 class _Arrivals(NamedTuple):
-    """Directions from which links arrive at their receiver.
+    """Directions of arrival of n links in the body frame: unit vectors along right, nose, top.
 
     Attributes:
-        rays: of the paths.
-        direction: (p, 3) of the rays along right, nose and top of the receiver.
-        straight: (n, 3) of the straight lines, likewise.
+        rays: p rays of the paths at the receiver.
+        direction: (p, 3) towards where each ray comes from.
+        straight: (n, 3) along the straight line to the device.
     """
 
     rays: Rays
@@ -131,43 +134,46 @@ class _Arrivals(NamedTuple):
 
     @classmethod
     def of(cls, links: Links, rows: np.ndarray) -> "_Arrivals":
-        """Return those of some links, which are followed over the map."""
+        """Find the arrivals of some links, with paths over the map."""
         links = links.select(rows)
         rays = Rays.of(links, of_device=False)
         return cls(rays, _in_body(links, rays), _straight(links))
 
     def gain_db(self, body: Body) -> np.ndarray:
-        """Return (n,) what the body adds to each link [dB]."""
+        """Compute the gain (n,), at most 0, of each link by a body [dB]."""
         along_db = self.rays.through_antenna_db(linear(-body.loss_db(self.direction)))
         return np.where(np.isnan(along_db), -body.loss_db(self.straight), along_db)
 
 
 def _straight(links: Links) -> np.ndarray:
-    """Return unit vectors (n, 3) towards the devices, along right, nose and top of the receiver."""
+    """Compute unit vectors (n, 3) towards the devices in the receivers' body frame."""
     return _in_body(links, Rays.of(links, of_device=False, straight=True))
 
 
 def _in_body(links: Links, rays: Rays) -> np.ndarray:
-    """Return directions of rays (p, 3) along right, nose and top of the receiver."""
+    """Transform the directions of rays (p, 3) to the receivers' body frame."""
     axes = links.receiver_axes.astype(rays.direction.dtype)
     return np.einsum("pij,pj->pi", axes[rays.link], rays.direction)
 
 
 def _directions(azimuth_deg: np.ndarray | float, elevation_deg: np.ndarray | float) -> np.ndarray:
-    """Return unit vectors (..., 3) along right, nose and top."""
+    """Convert azimuth and elevation in the body frame to unit vectors (..., 3)."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     return np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation),
                      np.sin(elevation)], axis=-1)
 
 
-def _share(cosine: np.ndarray, width_deg: float) -> np.ndarray:
-    """Return the share of the depth that is lost, by the cosine of the angle to the middle."""
+def _relative_loss(cosine: np.ndarray, width_deg: float) -> np.ndarray:
+    """Compute loss over depth from the cosine of the angle to the body's middle."""
     exponent = np.log(0.5) / (2 * np.log(np.cos(np.radians(width_deg / 4))))
     return np.clip((1 + cosine) / 2, 0.0, 1.0) ** exponent
 
 
 def _best_body(view: ResidualView, rows: np.ndarray) -> Body | None:
-    """Return the body that fits links best, a level beside it; None if it gains little."""
+    """Return the body of a grid that fits the residuals best; None if it gains too little.
+
+    The level and, by ridge regression, the depth are fitted for each direction and width.
+    """
     few = subsample(rows, MAX_LINKS)
     weight = view.weight[few] * (len(rows) / len(few))
     residual_db, total = view.residual_db[few], weight.sum()
@@ -178,7 +184,7 @@ def _best_body(view: ResidualView, rows: np.ndarray) -> Body | None:
     cosine = _straight(view.links.select(few)) @ _directions(azimuth_deg, elevation_deg).T
     best, most_nats = None, MIN_NATS
     for width_deg in SEARCHED_WIDTHS_DEG:
-        share = _share(cosine, width_deg)
+        share = _relative_loss(cosine, width_deg)
         share -= weight @ share / total
         moment = np.maximum(-(weight * residual_db) @ share, 0.0)
         precision = weight @ share**2 + DEPTH_SD_DB**-2

@@ -1,12 +1,12 @@
-"""Receivers or devices inside buildings of the map: the loss of a wave that enters (ITU-R P.2109).
+"""`building_entry`: loss of links with one end inside a building of the map (ITU-R P.2109).
 
-The recommendation has the distribution of the loss over buildings and places in them. The median of
-one of its two classes of buildings is what a link loses at first; how much more or less it is here
-is fitted, with the spread of the distribution as the prior.
+The recommendation gives the distribution of the loss over buildings and places in them. The loss is
+the median for one of its two classes of buildings plus a fitted offset, whose prior is the spread
+of that distribution. The scatter from place to place is fitted, too.
 
-Receivers' positions are off by metres, so each has a probability to be inside (`chance_inside`),
-and loses that share: the mean over both cases. One on the pavement loses some of it, too, unless it
-has line of sight. How much the loss scatters from place to place is fitted as well.
+Positions of receivers have errors of metres, so each has a probability to be inside
+(`chance_inside`), and its mean loss is that share of the entry loss; a link with line of sight has
+none.
 """
 
 from dataclasses import replace
@@ -23,11 +23,11 @@ from radiotwin.effects.params import EffectParams, Estimate, Parameter, quantity
 from radiotwin.links import Links
 from radiotwin.links.checks import chance_inside
 
-MIN_LINKS = 30  # with one end inside
-MIN_HZ, MAX_HZ = 80e6, 100e9  # of the recommendation
-MIN_LOSS_DB = 1.0  # less is none: 1 % of traditional buildings cost below 1.6 dB, at 2.4 GHz
-START_SD_DB = 5.0  # of the search for the scatter
-MAX_PROBABILITY = 0.99  # of the loss: a greater one is something else
+MIN_LINKS = 30  # with one end inside a building
+MIN_HZ, MAX_HZ = 80e6, 100e9  # range of the recommendation
+MIN_LOSS_DB = 1.0  # 1 % of traditional buildings lose below 1.6 dB, at 2.4 GHz
+START_SD_DB = 5.0  # start value of the scatter
+MAX_PROBABILITY = 0.99  # quantile of the entry loss above which a fitted loss is implausible
 
 
 class _Class(NamedTuple):
@@ -52,13 +52,13 @@ CLASSES: dict[Building, _Class] = {
 
 def entry_loss_db(frequency_hz: float, elevation_deg: np.ndarray | float, building: Building,
                   probability: float = 0.5) -> np.ndarray:
-    """Return the building entry loss (n,) [dB] (ITU-R P.2109-2, Eqs. 1 to 10).
+    """Compute a quantile (n,) of the building entry loss (ITU-R P.2109-2, Eqs. 1 to 10) [dB].
 
     Args:
-        frequency_hz: of the radio, 80 MHz to 100 GHz [Hz].
+        frequency_hz: carrier frequency, 80 MHz to 100 GHz [Hz].
         elevation_deg: (n,) elevation of the path at the facade [deg]; its sign does not matter.
         building: class of the building.
-        probability: share of the buildings, and of the places in them, where the loss is less.
+        probability: probability that the loss is lower, over buildings and places in them.
     """
     c, log_f = CLASSES[building], np.log10(frequency_hz / 1e9)
     horizontal_db = c.r + c.s * log_f + c.t * log_f**2
@@ -70,7 +70,7 @@ def entry_loss_db(frequency_hz: float, elevation_deg: np.ndarray | float, buildi
 
 
 class BuildingEntry(GainEffect):
-    """Links with one end inside a building lose on the way in."""
+    """Entry loss of links with one end inside a building."""
 
     name = "building_entry"
     in_words = "loss into buildings"
@@ -143,16 +143,16 @@ class BuildingEntry(GainEffect):
 
     @staticmethod
     def _loss_db(params: Params, coefficients: np.ndarray) -> float:
-        """Return the fitted loss of a horizontal path [dB]."""
+        """Compute the fitted entry loss of a horizontal path [dB]."""
         return float(entry_loss_db(params.frequency_hz, 0.0, params.building) + coefficients[0])
 
     def _chance(self, links: Links) -> np.ndarray:
-        """Return the probability (n,) that one end is inside a building and the other outside."""
+        """Compute the probability (n,) that exactly one end is inside a building; cached."""
         def derive() -> np.ndarray:
             city = city_of(links, self.name)
             device = city.inside(links.device_m)[links.device]
             receiver = city.inside(links.receiver_m).astype(float)
-            measured = links.receiver >= 0  # others are points of a map, whose places are exact
+            measured = links.receiver >= 0  # the others are points of a map, known exactly
             receiver[measured] = chance_inside(city, links.receiver_m[measured])
             return np.where(links.los, 0.0, np.where(device, 1 - receiver, receiver))
         return self.of_links.get(links, None, derive)

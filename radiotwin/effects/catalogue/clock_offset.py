@@ -1,9 +1,8 @@
-"""Levels and positions recorded by two clocks that differ.
+"""`receiver_clock_offset`: a constant delay between the clocks of levels and positions.
 
-Each level belongs to the position of the receiver a little earlier or later than its row says. A
-receiver that moves at v is then d = v t away from its given position along its track, and so in
-another direction whenever it turns. The channel predicts again with the receiver there, lines of
-sight included.
+Each level belongs to the receiver's position some time before or after that of its row: at speed v
+and offset t, d = v t along the track. The channel predicts the level again from that position,
+including the line of sight.
 """
 
 import numpy as np
@@ -24,14 +23,14 @@ from radiotwin.effects.params import (
 )
 from radiotwin.links import Links
 
-MIN_SPEED_M_S = 0.3  # below it, positions that jitter look like a movement
-# How far a receiver moves between the two times [m]: tried, first step and bound of the search.
+MIN_SPEED_M_S = 0.3  # below it, jitter of positions looks like movement
+# Displacements along the track [m]: trial values; first step and bound of the search.
 TRIED_M = (4.0, 8.0, 15.0, 25.0, 40.0, 60.0, 85.0)
 STEP_M, MAX_M = 3.0, 120.0
 
 
 class ReceiverClockOffset(MovedEnd):
-    """A clock offset of all positions of a receiver; one step finds one receiver, the worst."""
+    """Clock offset of one receiver's positions; each step finds the worst receiver."""
 
     name = "receiver_clock_offset"
     in_words = "a wrong clock of the receiver"
@@ -96,7 +95,7 @@ class ReceiverClockOffset(MovedEnd):
 
 
 def _speeds_m_s(links: Links) -> dict[int, float]:
-    """Return the mean speed while moving of each receiver that moves and has enough links [m/s]."""
+    """Compute receiver -> mean speed while moving [m/s], for moving receivers with enough links."""
     moving = {}
     for receiver in frequent_labels(links.receiver[np.isfinite(links.time_s)], MIN_LINKS):
         length_m = duration_s = 0.0
@@ -111,10 +110,7 @@ def _speeds_m_s(links: Links) -> dict[int, float]:
 
 
 def _at_other_time(links: Links, receiver: int, offset_s: float) -> Links:
-    """Return links of one receiver, moved to where its tracks have it `offset_s` later.
-
-    Links without a time stay.
-    """
+    """Move the receiver of its links along its tracks by a time; links without a time stay."""
     receiver_m = links.receiver_m.copy()
     timed = np.flatnonzero(np.isfinite(links.time_s))
     order = timed[np.argsort(links.flight[timed], kind="stable")]

@@ -1,10 +1,9 @@
-"""A receiver less sensitive than the others: its links are blank below a limit of its own.
+"""`noise_floor_censoring`: a receiver with a higher limit of detection than the others.
 
-A blank then means "below that limit" (Tobin 1958, 'Estimation of relationships for limited
-dependent variables', Econometrica 26) and not "below the usual one". Receivers whose limits hardly
-differ, and a declared limit that is wrong, are no effect: `radiotwin.links.limits` sees to them. A
-receiver with readings below a limit has another one: what is blank was lost for another reason,
-such as that no way leads there.
+Its blanks mean "below that limit" (Tobin 1958, 'Estimation of relationships for limited dependent
+variables', Econometrica 26), not "below the usual one". Small differences, and a wrong declared
+limit, are handled in `radiotwin.links.limits`. A limit above some of the receiver's readings is
+rejected: its blanks have another reason, e.g. no path.
 """
 
 import numpy as np
@@ -16,11 +15,11 @@ from radiotwin.effects.params import Decibels, EffectParams, Estimate, Parameter
 from radiotwin.links import Links
 from radiotwin.links.limits import MIN_NATS, contradict_limit, receiver_limit
 
-MIN_RISE_DB = 2.0  # above the usual limit
+MIN_RISE_DB = 2.0  # least excess over the usual limit
 
 
 class DetectionLimit(LimitEffect):
-    """A limit for each receiver whose blanks become likelier by it."""
+    """A higher limit of detection for each receiver whose blanks it explains better."""
 
     name = "noise_floor_censoring"
     in_words = "a limit of detection"
@@ -28,7 +27,7 @@ class DetectionLimit(LimitEffect):
     parameter_labels = {"limit": "limit of detection"}
     variant = "a receiver's own limit of detection"
     confused_with = ("lock_loss", "missing_obstacle", "receiver_gain_offset")
-    nlos_only = True  # as good as: over a map, links with line of sight are far above a limit
+    nlos_only = True  # links with line of sight are far above any limit
 
     class Params(EffectParams):
         """Limits of receivers."""
@@ -49,13 +48,13 @@ class DetectionLimit(LimitEffect):
         links, found, sd_db = view.links, {}, {}
         seen = np.isfinite(links.level_db)
         for receiver in np.unique(links.receiver):
-            mine = links.receiver == receiver
-            usual_db = float(np.median(links.limit_db[mine]))
-            limit = receiver_limit(links.level_db[mine], view.mean_db[mine], view.scale_db[mine],
+            rows = links.receiver == receiver
+            usual_db = float(np.median(links.limit_db[rows]))
+            limit = receiver_limit(links.level_db[rows], view.mean_db[rows], view.scale_db[rows],
                                    view.design_effect, usual_db)
             if (limit is not None and limit.is_sure and limit.limit_db > usual_db + MIN_RISE_DB
                     and (np.isinf(usual_db) or limit.over_declared_nats > MIN_NATS)
-                    and not contradict_limit(links.level_db[mine & seen], limit.limit_db)):
+                    and not contradict_limit(links.level_db[rows & seen], limit.limit_db)):
                 found[int(receiver)], sd_db[int(receiver)] = limit.limit_db, limit.sd_db
         return [self.Params(receivers=found, sd_db=sd_db)] if found else []
 

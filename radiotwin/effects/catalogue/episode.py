@@ -1,10 +1,10 @@
-"""Something that takes from levels between two times: rain, a wet antenna, a plug that was loose.
+"""`episode`: a loss between two times, such as rain, a wet antenna or a loose plug.
 
 A loss [dB], or an attenuation along the path [dB/km] (ITU-R P.838, 'Specific attenuation model for
 rain'), of one receiver or of all. The times are the two change points between which the residual,
-compared with that of other flights at the same places, differs most from the rest (circular binary
-segmentation, Olshen et al. 2004, Biostatistics 5); no other window of that length may differ like
-that.
+compared with other flights at the same places, differs most from the rest (circular binary
+segmentation, Olshen et al. 2004, Biostatistics 5). It is proposed only if no other window of that
+length differs as much.
 """
 
 from collections.abc import Iterator
@@ -37,29 +37,29 @@ from radiotwin.effects.patterns import Pattern, timed_members
 from radiotwin.links import Links, evidence_blocks
 from radiotwin.links.sites import site_of
 
-MIN_LINKS = 60  # with a time, of a receiver or a flight
-MIN_INSIDE = 20  # links between the two times, and outside
-MAX_INSIDE = 0.5  # share of the links between the two times: more are the usual state
-MIN_NATS = 10.0  # that an episode must gain to be proposed
-MIN_DB = 1.5  # mean change; a smaller one changes no decision
-INTERVAL_NATS = 2.0  # below the best: a change point's 90 % interval is wider than a mean's (1.35)
-BINS = 160  # of times, whose ends are tried
-FEW_WINDOWS = 6  # of the same length elsewhere: too few to say how much they differ
-APART = 2.5  # then it must explain so many times what any other window does
-MAX_P_VALUE = 0.01  # that one of the windows differs like that by chance
-MIN_DEVIATION_SD = 0.3  # between windows; independent links have 1
-MIN_MEMBER_LINKS = 5  # of a device or receiver in the episode, to be asked whether it agrees
-MIN_KNOWN, MIN_SITES = 0.5, 4  # share that is compared, or else sites of devices there must be
-LOW_M, MIN_PLACES = 10.0, 20  # height of receivers in streets, and places that they must have been
-MIN_MEMBERS = 0.7  # share of them that must agree: it acts on all
-MIN_OVERLAP = 0.3  # of what two windows span together, for them to be one episode
-SAME_SHARE = 0.9  # of a flight's links: an episode of one receiver that long is a faulty flight
-TYPICAL = 0.1  # share of the time
+MIN_LINKS = 60  # links with a time of a receiver or a flight
+MIN_INSIDE = 20  # least number of links in the window
+MAX_INSIDE = 0.5  # largest share of the links in the window: more are the usual state
+MIN_NATS = 10.0  # log-likelihood gain above which an episode is proposed
+MIN_DB = 1.5  # least mean change; a smaller one changes no decision
+INTERVAL_NATS = 2.0  # drop at the ends of a change point's 90 % interval (of a mean: 1.35)
+BINS = 160  # trial times in the first pass
+FEW_WINDOWS = 6  # other windows of the same length below which a t test is too weak
+GAIN_RATIO = 2.5  # then it must gain so many times as much as any other window
+MAX_P_VALUE = 0.01  # that any of the windows differs as much by chance
+MIN_DEVIATION_SD = 0.3  # least sd between windows; independent links have 1
+MIN_MEMBER_LINKS = 5  # of a device or receiver in the window, to test whether it agrees
+MIN_KNOWN, MIN_SITES = 0.5, 4  # share of compared links, or else number of sites, that is needed
+LOW_M, MIN_PLACES = 10.0, 20  # height of receivers in streets; such need so many places
+MIN_MEMBERS = 0.7  # share of devices, and of receivers, that must agree: it acts on all
+MIN_OVERLAP = 0.3  # overlap over union of two windows that are the same episode
+SAME_SHARE = 0.9  # share of one flight's links from which on it is a faulty flight instead
+TYPICAL = 0.1  # share of the time of a typical episode
 PRIOR_SD_DB, PRIOR_SD_DB_KM = 15.0, 30.0
 
 
 class _Window(NamedTuple):
-    """Links between two times: how much likelier, when (and between which times), in which form."""
+    """A window of time with a loss: gain [nats], start and end with 90 % intervals [s], form."""
 
     nats: float
     start_s: float
@@ -70,7 +70,7 @@ class _Window(NamedTuple):
 
 
 class Episode(GainEffect):
-    """A loss or an attenuation between two times; a step finds the strongest."""
+    """A loss or an attenuation between two times; each step finds the strongest."""
 
     name = "episode"
     in_words = "something that lasted for a while, such as rain"
@@ -123,23 +123,24 @@ class Episode(GainEffect):
                 params = self._proposed(links, value_db, weight, known, receiver, flight)
                 if params is not None:
                     found.append(params)
-        return [each for _, each in sorted(found, key=lambda each: -each[0])[:2]]
+        return [params for _, params in sorted(found, key=lambda pair: -pair[0])[:2]]
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
-        # The times are found anew: those of all links would be known from what is held out.
+        # The times are estimated again: those from all links would contain the held-out ones.
         value_db, weight = by_precision(view, compared_where_possible_db(view)[0])
         rows = _timed_rows(view.links, self.params.receiver, self.params.flight)
         window = _strongest(view.links, value_db, weight, rows) \
             if len(rows) >= MIN_LINKS else None
         if window is None or not _is_same(window, self.params):
             return []
-        return [self.params.model_copy(update={key: value for key, value in window._asdict().items()
-                                          if key not in ("nats", "form")})]
+        return [self.params.model_copy(update={
+            key: value for key, value in window._asdict().items() if key not in ("nats", "form")})]
 
     def _proposed(self, links: Links, value_db: np.ndarray, weight: np.ndarray,
                   known: np.ndarray, receiver: int | None, flight: str | None,
                   ) -> tuple[float, Params] | None:
+        """Return gain [nats] and parameters of the best episode; None if it does not stand out."""
         rows = _timed_rows(links, receiver, flight)
         window = _strongest(links, value_db, weight, rows) if len(rows) >= MIN_LINKS else None
         if window is None or window.nats < MIN_NATS:
@@ -149,9 +150,9 @@ class Episode(GainEffect):
                              **{key: value for key, value in window._asdict().items()
                                 if key != "nats"})
         inside = _inside(links, params)
-        stands_out = _agrees(links, value_db, weight, known, rows, inside) \
-            and not _is_another(links, params, inside) \
-            and _is_alone(links, value_db, weight, rows, inside, window.nats)
+        stands_out = _most_members_agree(links, value_db, weight, known, rows, inside) \
+            and not _is_step_or_flight(links, params, inside) \
+            and _is_unique(links, value_db, weight, rows, inside, window.nats)
         return (window.nats, params) if stands_out else None
 
     @override
@@ -178,13 +179,13 @@ class Episode(GainEffect):
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
         links = view.links
-        for mine in timed_members(links, links.receiver):
-            # Of the time that it measured: half-way may be between two flights.
-            start_s, end_s = np.nanquantile(links.time_s[mine],
+        for of_receiver in timed_members(links, links.receiver):
+            # Quantiles of the readings' times: half of the duration may be between two flights.
+            start_s, end_s = np.nanquantile(links.time_s[of_receiver],
                                             [0.5 - TYPICAL / 2, 0.5 + TYPICAL / 2])
             during = (links.time_s >= start_s) & (links.time_s <= end_s)
             yield Pattern("receiver", "dB", f"over {100 * TYPICAL:.0f} % of the time of one "
-                          "receiver", -1.0 * (mine & during), low=MIN_DB)
+                          "receiver", -1.0 * (of_receiver & during), low=MIN_DB)
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
@@ -204,32 +205,37 @@ class Episode(GainEffect):
 
 
 def _is_same(window: _Window, params: Any) -> bool:
-    """Return whether a window is mostly that of an episode: else it is of something else."""
-    both_s = min(window.end_s, params.end_s) - max(window.start_s, params.start_s)
-    either_s = max(window.end_s, params.end_s) - min(window.start_s, params.start_s)
-    return both_s >= 0 and both_s >= MIN_OVERLAP * either_s
+    """Check whether a window overlaps an episode's enough to be the same."""
+    overlap_s = min(window.end_s, params.end_s) - max(window.start_s, params.start_s)
+    union_s = max(window.end_s, params.end_s) - min(window.start_s, params.start_s)
+    return overlap_s >= 0 and overlap_s >= MIN_OVERLAP * union_s
 
 
 def _inside(links: Links, params: Any) -> np.ndarray:
-    """Return (n,) bool, links that an episode acts on."""
+    """Return the mask (n,) of links that an episode acts on."""
     with np.errstate(invalid="ignore"):
         between = (links.time_s >= params.start_s) & (links.time_s <= params.end_s)
     return between & flight_mask(links, params.receiver, params.flight)
 
 
 def _timed_rows(links: Links, receiver: int | None, flight: str | None) -> np.ndarray:
-    """Return the rows of a receiver on a flight (None: of all) that have a time."""
+    """List the rows with a time of a receiver on a flight (None: any)."""
     return np.flatnonzero(flight_mask(links, receiver, flight) & np.isfinite(links.time_s))
 
 
-def _strongest(links: Links, every_db: np.ndarray, weights: np.ndarray,
+def _strongest(links: Links, values_db: np.ndarray, weights: np.ndarray,
                rows: np.ndarray) -> _Window | None:
-    """Return the window in which a loss, or an attenuation, explains most of compared residuals.
+    """Find the window with the highest gain by a loss or an attenuation, among rows (r,).
 
-    Among rows (r,) of n links. Twice: over the whole time, then over finer ends around what was
-    found.
+    Two passes: coarse times over all of the data, then all times near the ends that were found.
+
+    Args:
+        links: n links.
+        values_db: (n,) compared residuals [dB].
+        weights: (n,) their weights [1/dB²].
+        rows: (r,) rows with a time.
     """
-    time_s, rest_db, weight = links.time_s[rows], every_db[rows], weights[rows]
+    time_s, rest_db, weight = links.time_s[rows], values_db[rows], weights[rows]
     distance_km = links.distance_m[rows] / 1000
     times_s = np.unique(time_s)
     ends = times_s[np.unique(np.linspace(0, len(times_s) - 1, BINS).round().astype(int))]
@@ -237,8 +243,8 @@ def _strongest(links: Links, every_db: np.ndarray, weights: np.ndarray,
     if best is None or len(ends) == len(times_s):
         return best
     coarse = np.max(np.diff(np.searchsorted(times_s, ends)))
-    near = [np.abs(np.arange(len(times_s)) - np.searchsorted(times_s, each)) <= coarse
-            for each in (best.start_s, best.end_s)]
+    near = [np.abs(np.arange(len(times_s)) - np.searchsorted(times_s, end_s)) <= coarse
+            for end_s in (best.start_s, best.end_s)]
     ends = times_s[near[0] | near[1]]
     return _best_window(np.unique(np.r_[times_s[0], ends, times_s[-1]]), time_s, rest_db, weight,
                         distance_km) or best
@@ -246,7 +252,7 @@ def _strongest(links: Links, every_db: np.ndarray, weights: np.ndarray,
 
 def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, weight: np.ndarray,
                  distance_km: np.ndarray) -> _Window | None:
-    """Return the best window from one of some times to just before another."""
+    """Find the best window from one trial time to just before another; None if none is allowed."""
     cell = np.searchsorted(ends_s, time_s, side="right") - 1
     count = _sums(cell, np.ones(len(cell)), len(ends_s))
     inside = count[None, :] - count[:, None]
@@ -262,18 +268,18 @@ def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, we
     for form, shape in shapes.items():
         wx, wxx, wxd = (_sums(cell, weight * value, len(ends_s)) for value in
                         (shape, shape**2, shape * centred))
-        x, xx, xd = (each[None, :] - each[:, None] for each in (wx, wxx, wxd))
+        x, xx, xd = (sums[None, :] - sums[:, None] for sums in (wx, wxx, wxd))
         prior = PRIOR_SD_DB if form == "loss" else PRIOR_SD_DB_KM
         power = np.maximum(xx - x**2 / total, 0) + prior**-2
-        # The logarithm pays for the choice among the windows.
+        # The logarithm is the penalty for the choice among the windows.
         nats = np.where(allowed & (xx > 0), 0.5 * xd**2 / power, -np.inf) - np.log(allowed.sum())
-        nats = np.where(xd < 0, nats, -np.inf)  # what comes and goes takes away
+        nats = np.where(xd < 0, nats, -np.inf)  # an episode is a loss
         start, end = np.unravel_index(int(nats.argmax()), nats.shape)
         if nats[start, end] > (-np.inf if best is None else best.nats):
             likely = nats > nats[start, end] - INTERVAL_NATS
             starts, stops = np.flatnonzero(likely[:, end]), np.flatnonzero(likely[start])
             last_s = np.r_[-np.inf, np.maximum.accumulate(_last_s(cell, time_s, len(ends_s)))]
-            # It began after the reading before its first one, and ended before the next one.
+            # It began after the last reading before it, and ended before the next one after it.
             best = _Window(
                 float(nats[start, end]), float(ends_s[start]), float(last_s[end]),
                 (float(last_s[starts[0]] if starts[0] else ends_s[0]), float(ends_s[starts[-1]])),
@@ -282,84 +288,86 @@ def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, we
 
 
 def _sums(cell: np.ndarray, value: np.ndarray, cells: int) -> np.ndarray:
-    """Return sums (cells + 1,) of the values (n,) in the cells before each."""
+    """Compute cumulative sums (cells + 1,) of values (n,) over their cells."""
     return np.r_[0.0, np.cumsum(np.bincount(cell, weights=value, minlength=cells))]
 
 
 def _last_s(cell: np.ndarray, time_s: np.ndarray, cells: int) -> np.ndarray:
-    """Return the last time (cells,) in each cell [s]; -inf in an empty one."""
+    """Find the last time (cells,) in each cell [s]; -inf in an empty one."""
     last_s = np.full(cells, -np.inf)
     np.maximum.at(last_s, cell, time_s)
     return last_s
 
 
-def _agrees(links: Links, value_db: np.ndarray, weight: np.ndarray, known: np.ndarray,
-            rows: np.ndarray, inside: np.ndarray) -> bool:
-    """Return whether most devices, and most receivers, show the change.
+def _most_members_agree(links: Links, value_db: np.ndarray, weight: np.ndarray, known: np.ndarray,
+                        rows: np.ndarray, inside: np.ndarray) -> bool:
+    """Check whether most devices, and most receivers, show the change in the window.
 
-    Where no other flight was, there must be several sites: what a map lacks hides few at once, but
-    all sectors of a mast. From who is in a street it hides all, and so there must be many places.
+    Without other flights at these places an obstacle could be the cause: it hides few sites at
+    once, so several sites must agree; it hides all of them from a street, so receivers at street
+    level must have been at many places.
     """
-    mine, others = rows[inside[rows]], rows[~inside[rows]]
-    if known[mine].mean() < MIN_KNOWN:
-        devices = frequent_labels(links.device[mine], MIN_MEMBER_LINKS)
+    during, others = rows[inside[rows]], rows[~inside[rows]]
+    if known[during].mean() < MIN_KNOWN:
+        devices = frequent_labels(links.device[during], MIN_MEMBER_LINKS)
         sites = {min(site_of(links, device)) for device in devices}
-        pieces = np.unique(np.column_stack([links.device, evidence_blocks(links)])[mine], axis=0)
+        pieces = np.unique(np.column_stack([links.device, evidence_blocks(links)])[during], axis=0)
         places = np.median(np.unique(pieces[:, 0], return_counts=True)[1])
-        if len(sites) < MIN_SITES or (places < MIN_PLACES and _is_low(links, mine)):
+        if len(sites) < MIN_SITES or (places < MIN_PLACES and _is_low(links, during)):
             return False
     outside_db = mean_by_precision(value_db[others], weight[others])
-    change_db = mean_by_precision(value_db[mine], weight[mine]) - outside_db
+    change_db = mean_by_precision(value_db[during], weight[during]) - outside_db
     if abs(change_db) < MIN_DB:
         return False
-    return all(share_alike(label[mine], value_db[mine] - outside_db, weight[mine],
+    return all(share_alike(label[during], value_db[during] - outside_db, weight[during],
                            MIN_MEMBER_LINKS, 0.3 * change_db) >= MIN_MEMBERS
                for label in (links.device, links.receiver)
-               if np.bincount(label[mine]).max() >= MIN_MEMBER_LINKS)
+               if np.bincount(label[during]).max() >= MIN_MEMBER_LINKS)
 
 
 def _is_low(links: Links, rows: np.ndarray) -> bool:
+    """Check whether the median height of receivers above the ground is below `LOW_M`."""
     place_m = links.receiver_m[rows]
     ground_m = 0.0 if links.city is None else links.city.ground_height_m(*place_m[:, :2].T)
     return bool(np.median(place_m[:, 2] - ground_m) < LOW_M)
 
 
-def _is_another(links: Links, params: Any, inside: np.ndarray) -> bool:
-    """Return whether it is a step in time of one receiver, or all of one of its flights."""
+def _is_step_or_flight(links: Links, params: Any, inside: np.ndarray) -> bool:
+    """Check whether an episode of one receiver is rather a step in time or one whole flight."""
     if params.receiver is None:
         return False
-    mine = links.receiver == params.receiver
+    of_receiver = links.receiver == params.receiver
     if params.flight is None:
-        timed_s = links.time_s[mine & np.isfinite(links.time_s)]
+        timed_s = links.time_s[of_receiver & np.isfinite(links.time_s)]
         if params.start_s <= timed_s.min() or params.end_s >= timed_s.max():
             return True
-    covered = np.unique(links.flight[inside])
-    whole = [inside[mine & (links.flight == each)].mean() > SAME_SHARE for each in covered]
-    return len(covered) == 1 and whole[0]
+    flights = np.unique(links.flight[inside])
+    return len(flights) == 1 and bool(
+        inside[of_receiver & (links.flight == flights[0])].mean() > SAME_SHARE)
 
 
-def _is_alone(links: Links, value_db: np.ndarray, weight: np.ndarray, rows: np.ndarray,
-              inside: np.ndarray, nats: float) -> bool:
-    """Return whether no other window differs as much.
+def _is_unique(links: Links, value_db: np.ndarray, weight: np.ndarray, rows: np.ndarray,
+               inside: np.ndarray, nats: float) -> bool:
+    """Check whether no other window differs as much.
 
-    None of the same length (Student's t); where it is so long that there are few of these, none
-    of any length, by far.
+    By Student's t against windows of the same length; if there are fewer than `FEW_WINDOWS`, by the
+    gain against the best other window of any length.
     """
     order = rows[np.lexsort((links.time_s[rows], links.flight[rows] * links.time_restarts))]
-    own = inside[order]
-    others = order[~own]
-    windows = int(len(others) // own.sum())
+    during = inside[order]
+    others = order[~during]
+    windows = int(len(others) // during.sum())
     if windows < FEW_WINDOWS:
         other = _strongest(links, value_db, weight, others)
-        return other is None or nats > APART * max(other.nats, MIN_NATS)
+        return other is None or nats > GAIN_RATIO * max(other.nats, MIN_NATS)
     usual_db = mean_by_precision(value_db[others], weight[others])
 
     def deviation(rows: np.ndarray) -> float:
-        """Over what it would be of independent links: windows see different devices."""
+        """Compute the mean deviation over its sd for independent links (windows differ in size)."""
         return float(weight[rows] @ (value_db[rows] - usual_db)
                      / np.sqrt(max(weight[rows].sum(), 1e-9)))
 
-    usual = np.array([deviation(each) for each in np.array_split(others, windows)])
-    change = abs(deviation(order[own]) - float(usual.mean()))
+    usual = np.array([deviation(window) for window in np.array_split(others, windows)])
+    change = abs(deviation(order[during]) - float(usual.mean()))
     sd = max(float(usual.std(ddof=1)), MIN_DEVIATION_SD) * np.sqrt(1 + 1 / windows)
     return bool(2 * t.sf(change / sd, windows - 1) * (windows + 1) <= MAX_P_VALUE)

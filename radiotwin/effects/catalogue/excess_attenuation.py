@@ -1,10 +1,10 @@
-"""Loss in proportion to distance: gas, rain, haze, or vegetation everywhere.
+"""`excess_attenuation`: loss proportional to path length, by gas, rain, haze or vegetation.
 
-Specific attenuation γ [dB/km] times path length [km] (ITU-R P.676-12, P.838-3, P.833-10). Its
-density may fall with height as exp(-z / h), as that of water vapour does (ITU-R P.835-6, Sec. 1.2).
+Specific attenuation γ [dB/km] times path length [km] (ITU-R P.676-12, P.838-3, P.833-10). It may
+fall with height as exp(-z / h), as the density of water vapour does (ITU-R P.835-6, Sec. 1.2).
 
-Where the frequency is known, it is bounded by what there is to absorb: humid air and rain of 150
-mm/h at all heights, and woodland everywhere, as far as the profile lies below the tops of trees.
+If the frequency is known, γ is bounded by that of humid air plus rain of 150 mm/h at all heights,
+plus woodland for the part of the profile below the tops of trees.
 """
 
 import numpy as np
@@ -18,16 +18,16 @@ from radiotwin.effects.patterns import Pattern
 from radiotwin.links import Links
 
 PRIOR_SD_DB_KM = 30.0  # wide: heavy rain at 60 GHz is 15 dB/km
-SCALE_HEIGHTS_M = (5000.0, 150.0, 50.0)  # to begin with: the atmosphere, haze, vegetation
+SCALE_HEIGHTS_M = (5000.0, 150.0, 50.0)  # start values: atmosphere, haze, vegetation
 MIN_HEIGHT_M, MAX_HEIGHT_M = 15.0, 5000.0
 TREES_M = 30.0  # height of tall trees
-HEIGHT_SD = 2.0  # of the logarithm of a scale height: a weak prior
+HEIGHT_SD = 2.0  # weak prior, sd of log(scale height)
 # ITU-R P.833-10 calls its specific attenuations typical: species, density and water differ widely.
-DENSEST = 2.0  # woodland, relative to the typical one
+DENSEST = 2.0  # specific attenuation of the densest woodland over the typical one
 
 
 class ExcessAttenuation(GainEffect):
-    """A specific attenuation that the channel's exponent does not cover."""
+    """A specific attenuation, with a scale height, on all links."""
 
     name = "excess_attenuation"
     in_words = "attenuation along the whole way"
@@ -70,7 +70,7 @@ class ExcessAttenuation(GainEffect):
 
     @override
     def neg_log_prior(self) -> float:
-        # Receivers that fly at one height do not tell: of profiles that fit alike, the lower one.
+        # Flights at one height do not determine it: prefer the lower of profiles that fit equally.
         return 0.5 * (np.log(self.params.scale_height_m / TREES_M) / HEIGHT_SD) ** 2
 
     @override
@@ -107,14 +107,14 @@ class ExcessAttenuation(GainEffect):
 
 
 def max_at_ground_db_km(frequency_hz: float, scale_height_m: float) -> float:
-    """Return the most that air, rain and woodland take at the ground [dB/km].
+    """Compute the upper bound of the specific attenuation at the ground [dB/km].
 
-    Woodland takes straight up what trees of `TREES_M` take. A profile stands for it with the share
-    of its density that lies below their tops: one that reaches high is air.
+    Gas plus rain plus woodland; the latter such that a vertical path through the profile loses as
+    much below `TREES_M` as through trees of that height.
 
     Args:
-        frequency_hz: of the radio [Hz].
-        scale_height_m: over which the density falls to 1/e [m].
+        frequency_hz: carrier frequency [Hz].
+        scale_height_m: height over which the density falls to 1/e [m].
     """
     relative = TREES_M / scale_height_m
     woodland_db_km = 1000 * DENSEST * specific_db_m(frequency_hz) * relative * -np.expm1(-relative)

@@ -1,15 +1,15 @@
-"""A flight whose readings disagree with all others: a loose plug, a wrong set-up.
+"""`faulty_flight`: one flight whose readings disagree with all others (loose plug, wrong set-up).
 
-Its readings have an offset, follow the prediction with another slope (0: not at all), and scatter
-more (a random effect beside the error scale). So they no longer corrupt what is learnt of others.
+Its readings get an offset, another slope in the predicted level (0: no relation), and additional
+scatter (a random effect), so that they do not bias other estimates.
 
 A flight stands out if its level, compared with other flights at the same places, is an outlier
-among the flights of its receiver, or its scatter or its roughness (the scatter from one reading of
-a device to its next) among all flights: Student's t with the pooled standard deviation of all
-others, corrected for the number of flights and of statistics (Grubbs 1969, 'Procedures for
-detecting outlying observations in samples', Technometrics 11). Other receivers' readings of the
-same flight are no peers: where all of them are off, the fault is one of the flight. Maps that are
-wrong make the scatter of flights differ; roughness they hardly change.
+among the flights of its receiver, or if its scatter or its roughness (the scatter between
+successive readings of a device) is one among all flights: Student's t with the pooled standard
+deviation of all others, corrected for the number of flights and statistics (Grubbs 1969,
+'Procedures for detecting outlying observations in samples', Technometrics 11). Other receivers on
+the same flight are not peers: if all of them are outliers, the fault is that of the flight. Wrong
+maps change the scatter of flights but hardly their roughness.
 """
 
 from collections.abc import Iterator
@@ -41,36 +41,36 @@ from radiotwin.inference.gaussian import robust_sd
 from radiotwin.links import Links
 
 MIN_LINKS = 30  # of a receiver on a flight, at places where other flights were
-MIN_FLIGHTS = 3  # of a receiver: of two whose levels differ, either may be the faulty one
-MIN_ALL_FLIGHTS = 4  # of all receivers, for one that scatters more to stand out
-MIN_DEVICE_LINKS = 5  # of a device, to be asked whether it agrees
-MIN_DEVICES = 0.7  # share of the devices that must agree: a fault of the receiver acts on all
+MIN_FLIGHTS = 3  # of a receiver: if only two levels differ, either flight may be faulty
+MIN_ALL_FLIGHTS = 4  # of all receivers, for an outlier of the scatter
+MIN_DEVICE_LINKS = 5  # of a device, to test whether it agrees
+MIN_DEVICES = 0.7  # share of devices that must agree: a fault of the receiver acts on all
 MIN_OFFSET_DB = 2.0  # a smaller one changes no decision
-FAR_SD, MIN_USUAL_SD_DB = 4.0, 0.5  # of flights' levels, robust: what is farther is no usual one
-MIN_SCATTER = 1.5  # times the others'
+FAR_SD, MIN_USUAL_SD_DB = 4.0, 0.5  # levels beyond so many robust sd (at least so large) are far
+MIN_SCATTER = 1.5  # least scatter relative to other flights
 MIN_SCATTER_DB = 1e-3
-# Of flights' levels, log scatters and log roughnesses, before any is seen, and the flights that it
-# counts for (Smyth 2004, 'Linear models and empirical Bayes methods', Stat. Appl. Genet. Mol. Biol.
-# 3): of three flights, two do not tell how much flights differ. In 30 campaigns over cities with
-# wrong maps, the levels of one receiver's flights had a standard deviation of 0.37 dB in the
-# median, of 0.78 in one of ten and more; this prior has 0.68 and 1.4, as other worlds are others.
+# Prior sd of flights' levels [dB], of log scatters and log roughnesses, and their degrees of
+# freedom (Smyth 2004, 'Linear models and empirical Bayes methods', Stat. Appl. Genet. Mol. Biol.
+# 3): two or three flights do not determine it. In 30 campaigns over cities with wrong maps, the
+# levels of one receiver's flights had an sd of 0.37 dB in the median and 0.78 dB at the 90 %
+# quantile; this prior has 0.68 and 1.4, to cover other worlds.
 PRIOR_LEVEL_SD_DB, PRIOR_LOG_SD, PRIOR_FREEDOM = 0.6, (0.35, 0.25), 3
-STATISTICS = 4  # that are tested
+STATISTICS = 4  # number of tests per flight: two levels, scatter, roughness
 MAX_P_VALUE = 0.02  # corrected for the number of flights
-PRIOR_SD_DB = 15.0
-RELATION_SD = 0.5  # of the slope that is lost or gained
+PRIOR_SD_DB = 15.0  # of the offset
+RELATION_SD = 0.5  # prior sd of the change of slope
 
 
 @dataclass(frozen=True)
 class _Flight:
-    """A receiver's flight with its levels and scatters; NaN: not known.
+    """Statistics of one receiver's flight; NaN: unknown.
 
     Attributes:
-        receiver, flight: which.
+        receiver, flight: indices.
         rows: its detected links.
-        levels_db: of its residuals, compared with other flights at the same places and as they
-            are, over the median of the receiver's flights; NaN where its devices disagree.
-        log_scatters: of what comparison leaves, and from reading to reading.
+        levels_db: level of the compared residuals (see `compared_db`) and of the residuals, minus
+            the median over the receiver's flights [dB]; NaN if its devices disagree.
+        log_scatters: log scatter of the compared residuals, and log roughness [log dB].
     """
 
     receiver: int
@@ -81,7 +81,7 @@ class _Flight:
 
 
 class FaultyFlight(GainEffect):
-    """One flight that disagrees with all others; a step finds the worst."""
+    """One flight that disagrees with all others; each step finds the worst."""
 
     name = "faulty_flight"
     in_words = "a fault on that flight"
@@ -120,21 +120,21 @@ class FaultyFlight(GainEffect):
                          view.found_params(self.name, "flight"), strict=True))
         flights = _flights(view)
         found: dict[int, list[tuple[float, float, _Flight]]] = {}
-        for each in flights:
-            name = str(view.links.flight_names[each.flight])
-            if (each.receiver, name) in known or (None, name) in known:
+        for flight in flights:
+            name = str(view.links.flight_names[flight.flight])
+            if (flight.receiver, name) in known or (None, name) in known:
                 continue
-            p_value, scatter_db = _disagreement(each, flights, view.links)
-            stands_out = view.group is not None and view.group[each.rows].any()
+            p_value, scatter_db = _disagreement(flight, flights, view.links)
+            stands_out = view.group is not None and view.group[flight.rows].any()
             if stands_out or (view.group is None and p_value * len(flights) <= MAX_P_VALUE):
-                found.setdefault(each.flight, []).append((p_value, scatter_db, each))
+                found.setdefault(flight.flight, []).append((p_value, scatter_db, flight))
         if not found:
             return []
-        worst = min(found.values(), key=lambda faults: min(each[0] for each in faults))
-        receivers = {each.receiver for each in flights if each.flight == worst[0][2].flight}
-        if not 1 < len(receivers) == len(worst):  # not all of them: the worst one
-            worst = [min(worst, key=lambda each: each[0])]
-        rows = np.concatenate([each.rows for _, _, each in worst])
+        worst = min(found.values(), key=lambda faults: min(p_value for p_value, _, _ in faults))
+        receivers = {flight.receiver for flight in flights if flight.flight == worst[0][2].flight}
+        if not 1 < len(receivers) == len(worst):  # not all its receivers: the worst one
+            worst = [min(worst, key=lambda fault: fault[0])]
+        rows = np.concatenate([flight.rows for _, _, flight in worst])
         return [self.Params(
             receiver=worst[0][2].receiver if len(worst) == 1 else None,
             flight=str(view.links.flight_names[worst[0][2].flight]),
@@ -143,8 +143,8 @@ class FaultyFlight(GainEffect):
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
-        there = flight_mask(view.links, self.params.receiver, self.params.flight)
-        return [self.params] if there.sum() >= MIN_LINKS else []
+        on_flight = flight_mask(view.links, self.params.receiver, self.params.flight)
+        return [self.params] if on_flight.sum() >= MIN_LINKS else []
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
@@ -162,11 +162,11 @@ class FaultyFlight(GainEffect):
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
         links = view.links
         flights = members(links.track)
-        between = [mine for mine in flights if not is_first_or_last(
-            int(links.receiver[mine][0]), int(links.flight[mine][0]), links)]
-        for mine in between or flights:  # a first or last one may be a step in time
+        between = [mask for mask in flights if not is_first_or_last(
+            int(links.receiver[mask][0]), int(links.flight[mask][0]), links)]
+        for mask in between or flights:  # a first or last one may be a step in time
             yield Pattern("flight", "dB", "a constant of one flight of one receiver, "
-                                          "neither its first nor its last", -1.0 * mine)
+                                          "neither its first nor its last", -1.0 * mask)
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
@@ -182,68 +182,72 @@ class FaultyFlight(GainEffect):
 
 
 def _flights(view: ResidualView) -> list[_Flight]:
+    """Compute the statistics of each receiver's flights with enough detected links."""
     links = view.links
     seen = np.isfinite(links.level_db)
     pairs = np.unique(np.column_stack([links.receiver, links.flight])[seen], axis=0)
     rows = [np.flatnonzero(seen & (links.receiver == receiver) & (links.flight == flight))
             for receiver, flight in pairs]
-    residuals_db = [np.where(seen, each, np.nan) for each in (compared_db(view), view.residual_db)]
-    levels_db = np.column_stack([_levels_db(*by_precision(view, each), rows, pairs[:, 0], links)
-                                 for each in residuals_db])
+    residuals_db = [np.where(seen, values_db, np.nan)
+                    for values_db in (compared_db(view), view.residual_db)]
+    levels_db = np.column_stack([_levels_db(*by_precision(view, values_db), rows, pairs[:, 0],
+                                            links) for values_db in residuals_db])
     found = []
-    for (receiver, flight), mine, level_db in zip(pairs.tolist(), rows, levels_db, strict=True):
-        if len(mine) >= MIN_LINKS:
-            scatters_db = (_robust_sd(residuals_db[0][mine]), _robust_sd(
-                _from_reading_to_reading_db(view.residual_db[mine], links.select(mine))))
-            logs = [float(np.log(max(each, MIN_SCATTER_DB))) for each in scatters_db]
-            found.append(_Flight(receiver, flight, mine, (level_db[0], level_db[1]),
+    for (receiver, flight), of_flight, level_db in zip(pairs.tolist(), rows, levels_db,
+                                                       strict=True):
+        if len(of_flight) >= MIN_LINKS:
+            steps_db = _steps_db(view.residual_db[of_flight], links.select(of_flight))
+            logs = [float(np.log(max(_robust_sd(values_db), MIN_SCATTER_DB)))
+                    for values_db in (residuals_db[0][of_flight], steps_db)]
+            found.append(_Flight(receiver, flight, of_flight, (level_db[0], level_db[1]),
                                  (logs[0], logs[1])))
     return found
 
 
 def _levels_db(value_db: np.ndarray, weight: np.ndarray, rows: list[np.ndarray],
                receiver: np.ndarray, links: Links) -> np.ndarray:
-    """Return levels (f,) of flights over those of the same receiver; NaN if devices disagree."""
-    known = [mine[weight[mine] > 0] for mine in rows]
-    level_db = np.array([mean_by_precision(value_db[mine], weight[mine])
-                         if len(mine) >= MIN_LINKS else np.nan for mine in known])
-    for each in np.unique(receiver):  # what a receiver always has is no fault of one of its flights
-        same = (receiver == each) & np.isfinite(level_db)
+    """Compute levels (f,) of flights minus their receiver's median; NaN if devices disagree."""
+    known = [of_flight[weight[of_flight] > 0] for of_flight in rows]
+    level_db = np.array([mean_by_precision(value_db[of_flight], weight[of_flight])
+                         if len(of_flight) >= MIN_LINKS else np.nan for of_flight in known])
+    for index in np.unique(receiver):  # a constant of the receiver is no fault of one flight
+        same = (receiver == index) & np.isfinite(level_db)
         level_db[same] -= np.median(level_db[same]) if same.any() else 0.0
-    for number, (mine, own_db) in enumerate(zip(known, level_db.tolist(), strict=True)):
-        if abs(own_db) >= MIN_OFFSET_DB and not _devices_agree(
-                value_db[mine], weight[mine], own_db, links.device[mine]):
+    for number, (of_flight, flight_db) in enumerate(zip(known, level_db.tolist(), strict=True)):
+        if abs(flight_db) >= MIN_OFFSET_DB and not _devices_agree(
+                value_db[of_flight], weight[of_flight], flight_db, links.device[of_flight]):
             level_db[number] = np.nan
     return level_db
 
 
 def _devices_agree(value_db: np.ndarray, weight: np.ndarray, level_db: float,
                    device: np.ndarray) -> bool:
-    """Return whether most devices show what the flight as a whole shows."""
-    if len(np.unique(device)) > len(device) / MIN_DEVICE_LINKS:  # positions of one that moves
+    """Check whether most devices show the level of the flight."""
+    if len(np.unique(device)) > len(device) / MIN_DEVICE_LINKS:  # positions of a moving device
         return True
     return share_alike(device, value_db, weight, MIN_DEVICE_LINKS, 0.4 * level_db) >= MIN_DEVICES
 
 
 def _robust_sd(values: np.ndarray) -> float:
-    """Return the standard deviation of normal values (n,); NaN where few are known."""
+    """Estimate the standard deviation of values (n,) robustly; NaN if too few are known."""
     known = values[np.isfinite(values)]
     return robust_sd(known) if len(known) >= MIN_LINKS else np.nan
 
 
-def _from_reading_to_reading_db(residual_db: np.ndarray, links: Links) -> np.ndarray:
-    """Return how far readings are from the one before of the same device, over sqrt(2) [dB]."""
+def _steps_db(residual_db: np.ndarray, links: Links) -> np.ndarray:
+    """Compute differences of successive residuals of the same device, over sqrt(2) [dB]."""
     order = np.lexsort((links.time_s, links.device))
     same = np.diff(links.device[order]) == 0
     return np.diff(residual_db[order])[same] / np.sqrt(2)
 
 
 def _disagreement(flight: _Flight, flights: list[_Flight], links: Links) -> tuple[float, float]:
-    """Return the p-value of a flight's disagreement, and the scatter that it adds [dB]."""
-    others = [each for each in flights if each.flight != flight.flight]
-    noisy = [_excess(own, np.array([each.log_scatters[kind] for each in others]), prior_sd)
-             for kind, (own, prior_sd) in enumerate(zip(flight.log_scatters, PRIOR_LOG_SD,
-                                                        strict=True))]
+    """Compute the p-value of a flight's disagreement, and its additional scatter [dB]."""
+    others = [other for other in flights if other.flight != flight.flight]
+    noisy = [_excess_scatter(log_scatter, np.array([other.log_scatters[kind] for other in others]),
+                             prior_sd)
+             for kind, (log_scatter, prior_sd) in enumerate(zip(flight.log_scatters, PRIOR_LOG_SD,
+                                                                strict=True))]
     p_value, added_db = min(noisy)
     if not is_first_or_last(flight.receiver, flight.flight, links):
         p_value = min(p_value, *(_offset_p_value(flight, others, kind, links)
@@ -251,13 +255,13 @@ def _disagreement(flight: _Flight, flights: list[_Flight], links: Links) -> tupl
     return min(STATISTICS * p_value, 1.0), min(added_db, 50.0)
 
 
-def _excess(own: float, usual: np.ndarray, prior_sd: float) -> tuple[float, float]:
-    """Return the p-value of a log scatter against others (m,), and the scatter added [dB]."""
+def _excess_scatter(log_scatter: float, usual: np.ndarray, prior_sd: float) -> tuple[float, float]:
+    """Compute the p-value of a log scatter against others (m,), and the additional scatter [dB]."""
     usual = usual[np.isfinite(usual)]
-    if np.isnan(own) or len(usual) < MIN_FLIGHTS - 1:
+    if np.isnan(log_scatter) or len(usual) < MIN_FLIGHTS - 1:
         return 1.0, 0.0
-    excess = own - float(np.median(usual))
-    added_db = np.sqrt(max(np.exp(2 * own) - np.exp(2 * np.median(usual)), 0.0))
+    excess = log_scatter - float(np.median(usual))
+    added_db = np.sqrt(max(np.exp(2 * log_scatter) - np.exp(2 * np.median(usual)), 0.0))
     if excess <= np.log(MIN_SCATTER):
         return 1.0, float(added_db)
     freedom = len(usual) - 1
@@ -267,29 +271,29 @@ def _excess(own: float, usual: np.ndarray, prior_sd: float) -> tuple[float, floa
 
 
 def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: Links) -> float:
-    """Return the p-value of a flight's level against others'; 1 if it is small or unknown."""
-    known = [each for each in others if np.isfinite(each.levels_db[kind])]
-    level_db = np.array([each.levels_db[kind] for each in known])
-    receiver = np.array([each.receiver for each in known])
+    """Compute the p-value of a flight's level against others'; 1 if it is small or unknown."""
+    known = [other for other in others if np.isfinite(other.levels_db[kind])]
+    level_db = np.array([other.levels_db[kind] for other in known])
+    receiver = np.array([other.receiver for other in known])
     same = receiver == flight.receiver
     if same.sum() < MIN_FLIGHTS - 1:
         return 1.0
-    own_db = flight.levels_db[kind] - float(np.median(level_db[same]))
-    if not abs(own_db) >= MIN_OFFSET_DB:
+    offset_db = flight.levels_db[kind] - float(np.median(level_db[same]))
+    if not abs(offset_db) >= MIN_OFFSET_DB:
         return 1.0
-    # A first or last flight that is far off is a step in time, and says nothing of how much the
-    # others differ: one of 20 dB would hide a fault of 15.
+    # A first or last flight far from the others is a step in time and must not widen their usual
+    # spread: a step of 20 dB would hide a fault of 15 dB.
     far = np.abs(level_db) > FAR_SD * max(robust_sd(level_db), MIN_USUAL_SD_DB)
-    usual = ~far | [not is_first_or_last(each.receiver, each.flight, links) for each in known]
+    usual = ~far | [not is_first_or_last(other.receiver, other.flight, links) for other in known]
     freedom = max(int(usual.sum()) - len(np.unique(receiver[usual])), 0) + PRIOR_FREEDOM
     sum_of_squares = (level_db[usual]**2).sum() + PRIOR_FREEDOM * PRIOR_LEVEL_SD_DB**2
-    return float(2 * t.sf(abs(own_db) / np.sqrt(sum_of_squares / freedom), freedom))
+    return float(2 * t.sf(abs(offset_db) / np.sqrt(sum_of_squares / freedom), freedom))
 
 
 def is_first_or_last(receiver: int, flight: int, links: Links) -> bool:
-    """Return whether a level that is off may as well be a step in time, before or after it."""
-    times = {number: time_s[0] for (each, number), (time_s, _) in links.tracks.items()
-             if each == receiver}
+    """Check whether a flight is the receiver's first or last, so that it may be a step in time."""
+    times = {number: time_s[0] for (index, number), (time_s, _) in links.tracks.items()
+             if index == receiver}
     if links.time_restarts or flight not in times:
         return False
     return times[flight] in (min(times.values()), max(times.values()))

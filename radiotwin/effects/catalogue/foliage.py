@@ -1,9 +1,8 @@
-"""Vegetation that the map does not show.
+"""`foliage`: a box of vegetation that the map does not show.
 
-Loss of d metres through it: A_m (1 − exp(−γ d / A_m)), which saturates (ITU-R P.833-10, Eq. 1), at
-most at that recommendation's own A_m of the frequency. It is located by back-projection. A grove
-that only links of one device pass cannot be located along these links: the box then gives the
-direction in which it lies.
+Loss over d metres inside: A_m (1 − exp(−γ d / A_m)), saturating (ITU-R P.833-10, Eq. 1), with A_m
+up to that of the recommendation at the frequency. It is located by back-projection. If only links
+of one device pass it, its distance along them is unknown, and the box gives its direction only.
 """
 
 from collections.abc import Iterator
@@ -29,20 +28,20 @@ from radiotwin.effects.boxes import (
 )
 from radiotwin.effects.losses import UNKNOWN_MAX_LOSS_DB, max_loss_db
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
-from radiotwin.effects.patterns import WIDE_M, Pattern, crossed
+from radiotwin.effects.patterns import WIDE_M, Pattern, lengths_in_boxes
 from radiotwin.effects.places import Mark
 from radiotwin.links import Links
 
-MIN_NATS = 6.0  # that a cell must gain to be proposed
-MAX_CELLS = 3  # that are proposed, with each of `SIDES_M`
-SIDES_M = (25.0, 55.0)  # of a proposed box
-MIN_HEIGHT_M, MAX_PROPOSED_HEIGHT_M = 3.0, 26.0  # of tree tops
-LOSSES_DB = (3.0, 6.0, 9.0, 12.0, 16.0, 20.0)  # of a link through it, equally likely
-TYPICAL_HEIGHT_M = 10.0
+MIN_NATS = 6.0  # log-likelihood gain above which a cell is proposed
+MAX_CELLS = 3  # proposed cells, each with all `SIDES_M`
+SIDES_M = (25.0, 55.0)  # sides of a proposed box
+MIN_HEIGHT_M, MAX_PROPOSED_HEIGHT_M = 3.0, 26.0  # height of tree tops
+LOSSES_DB = (3.0, 6.0, 9.0, 12.0, 16.0, 20.0)  # loss of a link through it, equally probable
+TYPICAL_HEIGHT_M = 10.0  # of a grove whose detectable loss is reported
 
 
 class VegetationLoss(NamedTuple):
-    """Law of the loss over the metres inside.
+    """Loss as a function of the metres inside, A_m (1 − exp(−γ d / A_m)).
 
     Attributes:
         specific_db_m: specific attenuation γ [dB/m].
@@ -54,7 +53,7 @@ class VegetationLoss(NamedTuple):
 
 
 class Foliage(GainEffect):
-    """A box of vegetation; one step finds one."""
+    """A box of vegetation; each step finds one."""
 
     name = "foliage"
     in_words = "vegetation"
@@ -79,15 +78,16 @@ class Foliage(GainEffect):
     def propose(self, view: ResidualView) -> list[Params]:
         links = view.links
         nats = obstruction_nats(view.residual_db, view.scale_db, LOSSES_DB) / view.design_effect
-        centres_m, total = back_project(*ends_above_ground(links), nats)
+        centres_m, total_nats = back_project(*ends_above_ground(links), nats)
         allowed = [i for i, height_m in enumerate(HEIGHTS_M)
                    if MIN_HEIGHT_M <= height_m <= MAX_PROPOSED_HEIGHT_M]
         ceiling_db = max_loss_db(links.frequency_hz)
         law = VegetationLoss(max_db=min(VegetationLoss().max_db, ceiling_db))
         return [self.Params(box=Box(x_m, y_m, side_m, side_m, HEIGHTS_M[allowed[height]], 0.0),
                             law=law, ceiling_db=ceiling_db)
-                for (x_m, y_m), height, gain in best_cells(centres_m, total[:, allowed], MAX_CELLS)
-                if gain > MIN_NATS for side_m in SIDES_M]
+                for (x_m, y_m), height, cell_nats in best_cells(
+                    centres_m, total_nats[:, allowed], MAX_CELLS)
+                if cell_nats > MIN_NATS for side_m in SIDES_M]
 
     @override
     def gain_db(self, links: Links) -> np.ndarray:
@@ -121,7 +121,7 @@ class Foliage(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
-        for inside_m in crossed(view.links, TYPICAL_HEIGHT_M):
+        for inside_m in lengths_in_boxes(view.links, TYPICAL_HEIGHT_M):
             yield Pattern("place", "dB", f"of a grove {WIDE_M:.0f} m wide and "
                           f"{TYPICAL_HEIGHT_M:.0f} m high, through its middle",
                           -np.minimum(inside_m / WIDE_M, 1.0),

@@ -1,4 +1,4 @@
-"""A gain that changes with time: a receiver or a device warms up, ages, or changes at one moment.
+"""`receiver_drift`, `device_drift`: a gain that changes with time, by warm-up, ageing or a step.
 
 Warm-up as a first-order thermal lag, A exp(−t / τ) since switch-on (amplifier gain falls linearly
 with temperature, and temperature follows first-order cooling); ageing as a slope in time; a step at
@@ -29,33 +29,34 @@ from radiotwin.effects.patterns import Pattern, timed_members
 from radiotwin.links import Links
 from radiotwin.links.sites import inseparable_end
 
-MIN_LINKS = 60  # of a receiver or device, with a time
-MIN_FLIGHTS = 3  # that a device was heard on: within a flight, time and position change together
+MIN_LINKS = 60  # links with a time of a receiver or device
+MIN_FLIGHTS = 3  # of a device: within a flight, time and position change together
 MAX_DEVICES = 200  # bounds the time of the search
-MIN_NATS = 5.0  # that a drift must gain to be proposed
-MIN_SIDE = 20  # links before and after a step
-MIN_GAP_SD = 3.0  # of a step's size, in standard deviations from flight to flight
-MAX_PROPOSALS = 2  # members: how much a drift explains shows once all else is fitted again
-PRIOR_SD_DB = 10.0
+MIN_NATS = 5.0  # log-likelihood gain above which a drift is proposed
+MIN_SIDE = 20  # least number of links before and after a step
+MIN_GAP_SD = 3.0  # least size of a step [standard deviations between flights]
+MAX_PROPOSALS = 2  # receivers or devices proposed in one step of the search
+PRIOR_SD_DB = 10.0  # of the amplitude, and of a constant beside it
 MAX_LOG_S = 9.0  # natural logarithm of the longest time constant [s]
-TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
-MIN_CONSTANT_S = 1e-3  # of a warm-up that is read
+TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)  # trial values
+MIN_CONSTANT_S = 1e-3  # least time constant that is accepted in a twin's file
 WARM_UPS = ("warm_up", "warm_up_each_flight")
 
 
 class Drift(NamedTuple):
-    """The form of a drift in time.
+    """Form of a drift in time.
 
     Attributes:
         form: warm-up since the first measurement or since each take-off, ageing, or a step.
-        number: time constant of a warm-up, middle of the ageing, or time of the step [s].
+        number: time constant of a warm-up, mid-time of ageing, or time of the step [s].
     """
 
     form: Literal["warm_up", "warm_up_each_flight", "ageing", "step"]
     number: Seconds
 
 
-def _possible(drifts: dict[int, Drift]) -> dict[int, Drift]:
+def _check_constants(drifts: dict[int, Drift]) -> dict[int, Drift]:
+    """Raise if a warm-up has a time constant below `MIN_CONSTANT_S`."""
     if any(drift.form in WARM_UPS and drift.number < MIN_CONSTANT_S for drift in drifts.values()):
         raise ValueError(f"a warm-up takes {MIN_CONSTANT_S:g} s or more")
     return drifts
@@ -67,10 +68,10 @@ class _DriftParams(EffectParams):
 
 
 class _GainDrift(GainEffect):
-    """A drift of one receiver or device, in the form that explains its links best.
+    """Base of drifts: one receiver or device, in the form that fits its links best.
 
     Attributes:
-        forms: that it may have.
+        forms: allowed forms.
         end: "receiver" or "device".
     """
 
@@ -84,19 +85,22 @@ class _GainDrift(GainEffect):
     params: _DriftParams
 
     def __init__(self, between_flights: bool = False) -> None:
+        """Make the effect; `between_flights` restricts it to changes between flights."""
         super().__init__()
         self._between_flights = between_flights
 
     @property
     def _forms(self) -> tuple[str, ...]:
-        # What each flight repeats is no difference between flights.
-        again = "warm_up_each_flight" if self._between_flights else None
-        return tuple(form for form in self.forms if form != again)
+        # A warm-up on each flight is no difference between flights.
+        excluded = "warm_up_each_flight" if self._between_flights else None
+        return tuple(form for form in self.forms if form != excluded)
 
     def index(self, links: Links) -> np.ndarray:
+        """Return the index (n,) of each link's receiver, or device."""
         return getattr(links, self.end)
 
     def drifts(self) -> dict[int, Drift]:
+        """Return index of the receiver, or device -> its drift."""
         return getattr(self.params, f"{self.end}s")
 
     @override
@@ -106,12 +110,12 @@ class _GainDrift(GainEffect):
     @override
     def change(self, links: Links) -> Change:
         member, drift = next(iter(self.drifts().items()))
-        # Flights are before or after it, whole: a warm-up is over, by two thirds, after its
-        # constant.
+        # A warm-up counts as a change at its time constant, when two thirds of it are over.
         when_s = drift.number + (links.first_s if drift.form == "warm_up" else 0.0)
         return Change(self.index(links), member, when_s)
 
     def _members(self, links: Links) -> list[int]:
+        """List the receivers, or devices, with enough links."""
         return frequent_labels(self.index(links)[np.isfinite(links.time_s)], MIN_LINKS)
 
     @override
@@ -126,42 +130,43 @@ class _GainDrift(GainEffect):
     def propose(self, view: ResidualView) -> list[Any]:
         known = {member for drifts in view.found_params(self.name, f"{self.end}s")
                  for member in drifts}
-        return self._best(view, sorted(set(self._members(view.links)) - known))
+        return self._proposals(view, sorted(set(self._members(view.links)) - known))
 
     @override
     def propose_like(self, view: ResidualView) -> list[Any]:
-        # Whether this member drifts is the question, and not whether any does.
-        return self._best(view, list(self.drifts()))
+        # The fold must confirm the drift of this member, not of any other.
+        return self._proposals(view, list(self.drifts()))
 
-    def _best(self, view: ResidualView, members: list[int]) -> list[Any]:
+    def _proposals(self, view: ResidualView, members: list[int]) -> list[Any]:
+        """Propose the drifts of these members with the highest gains."""
         links, found = view.links, []
         for member in members:
             rows = np.flatnonzero((self.index(links) == member) & np.isfinite(links.time_s))
             if not len(rows):  # a fold may have none of its links
                 continue
             nats, form, number = max(
-                each for each in _candidates(links.select(rows), view.residual_db[rows],
-                                             view.weight[rows], self._between_flights)
-                if each[1] in self._forms)
+                candidate for candidate in _candidates(
+                    links.select(rows), view.residual_db[rows], view.weight[rows],
+                    self._between_flights) if candidate[1] in self._forms)
             if nats > MIN_NATS:
-                # Other links must not change these times.
+                # The drift must not depend on the times of the links that it is applied to.
                 keep = form == "ageing" or not self.of_receiver
                 span_s = (links.first_s, links.last_s) if keep else None
                 found.append((nats, self.Params.model_validate(
                     {f"{self.end}s": {member: (form, float(number))}, "span_s": span_s})))
-        return [params for _, params in sorted(found, key=lambda each: -each[0])[:MAX_PROPOSALS]]
+        return [params for _, params in sorted(found, key=lambda pair: -pair[0])[:MAX_PROPOSALS]]
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
         params = self.params
         columns, time_s = [], links.time_s
-        if not self.of_receiver and params.span_s:  # a map has no time: it is of the latest state
+        if not self.of_receiver and params.span_s:  # a map, without times, shows the latest state
             time_s = np.where(np.isnan(time_s), params.span_s[1], time_s)
         for member, drift in self.drifts().items():
-            mine = (self.index(links) == member) & np.isfinite(time_s)
-            columns.append(np.where(mine, _shape(drift, links, time_s, params.span_s), 0.0))
-            # An offset of its own, or the drift would have to model a constant error, too.
-            columns.append(mine.astype(float))
+            rows = (self.index(links) == member) & np.isfinite(time_s)
+            columns.append(np.where(rows, _shape(drift, links, time_s, params.span_s), 0.0))
+            # Plus a constant, or the drift would have to model a constant error, too.
+            columns.append(rows.astype(float))
         return Term.of_columns(np.column_stack(columns), PRIOR_SD_DB)
 
     @override
@@ -187,10 +192,10 @@ class _GainDrift(GainEffect):
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
         time_s = view.links.time_s
-        for mine in timed_members(view.links, self.index(view.links)):
-            first_s, last_s = np.nanmin(time_s[mine]), np.nanmax(time_s[mine])
+        for mask in timed_members(view.links, self.index(view.links)):
+            first_s, last_s = np.nanmin(time_s[mask]), np.nanmax(time_s[mask])
             ramp = np.nan_to_num((time_s - first_s) / (last_s - first_s))
-            yield Pattern(self.end, "dB", f"from first to last of one {self.end}", mine * ramp)
+            yield Pattern(self.end, "dB", f"from first to last of one {self.end}", mask * ramp)
 
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
@@ -210,7 +215,7 @@ class _GainDrift(GainEffect):
 
 
 class ReceiverDrift(_GainDrift):
-    """A receiver that warms up, once or on each flight, ages, or has changed."""
+    """A receiver whose gain changes by warm-up (once or on each flight), ageing or a step."""
 
     name = "receiver_drift"
     in_words = "gain of the receiver that changes with time"
@@ -224,14 +229,14 @@ class ReceiverDrift(_GainDrift):
     class Params(_DriftParams):
         """Drifts of receivers."""
 
-        receivers: Annotated[dict[ReceiverIndex, Drift], AfterValidator(_possible)] = Field(
+        receivers: Annotated[dict[ReceiverIndex, Drift], AfterValidator(_check_constants)] = Field(
             min_length=1, description="Drift of each receiver, by index.")
 
     params: Params
 
 
 class DeviceDrift(_GainDrift):
-    """A device whose battery discharges or that has changed."""
+    """A device whose power changes by ageing (a battery that discharges) or a step."""
 
     name = "device_drift"
     in_words = "power of the device that changes with time"
@@ -244,7 +249,7 @@ class DeviceDrift(_GainDrift):
     class Params(_DriftParams):
         """Drifts of devices."""
 
-        devices: Annotated[dict[DeviceIndex, Drift], AfterValidator(_possible)] = Field(
+        devices: Annotated[dict[DeviceIndex, Drift], AfterValidator(_check_constants)] = Field(
             min_length=1, description="Drift of each device, by index.")
 
     params: Params
@@ -265,7 +270,7 @@ class DeviceDrift(_GainDrift):
 
 def _shape(drift: Drift, links: Links, time_s: np.ndarray,
            span_s: tuple[float, float] | None) -> np.ndarray:
-    """Return the change (n,) at times (n,), with an amplitude of 1."""
+    """Compute the drift (n,) at times (n,) [s] for an amplitude of 1."""
     form, number = drift
     if form == "warm_up":
         return np.exp(-(time_s - links.first_s) / number)
@@ -277,9 +282,9 @@ def _shape(drift: Drift, links: Links, time_s: np.ndarray,
     return (time_s - number) / max(high - low, 1.0)
 
 
-def _gap_s(links: Links, mine: np.ndarray, when_s: float) -> tuple[float, float]:
-    """Return the times of the readings before and after a step: it was somewhere between."""
-    time_s = links.time_s[mine & np.isfinite(links.time_s) & np.isfinite(links.level_db)]
+def _gap_s(links: Links, rows: np.ndarray, when_s: float) -> tuple[float, float]:
+    """Return the times of the last reading before and the first one after a step [s]."""
+    time_s = links.time_s[rows & np.isfinite(links.time_s) & np.isfinite(links.level_db)]
     before, after = time_s[time_s < when_s], time_s[time_s >= when_s]
     return (float(before.max()) if len(before) else when_s,
             float(after.min()) if len(after) else when_s)
@@ -287,9 +292,10 @@ def _gap_s(links: Links, mine: np.ndarray, when_s: float) -> tuple[float, float]
 
 def _candidates(links: Links, residual_db: np.ndarray, weight: np.ndarray,
                 between_flights: bool) -> Iterator[tuple[float, str, float]]:
-    """Yield (nats, form, number) of each form that the times of one member's links allow.
+    """Yield (gain [nats], form, number) of each drift that one member's times allow.
 
-    Steps, if so asked, between flights only: within one, places change with time.
+    `between_flights` restricts steps to gaps between flights: within one, position changes with
+    time.
     """
     time_s, comparable = links.time_s, not links.time_restarts
     yield 0.0, "step", float(time_s.mean())
@@ -318,7 +324,7 @@ def _candidates(links: Links, residual_db: np.ndarray, weight: np.ndarray,
         total, moment = sums[0][-1], sums[1][-1]
         before, moment_before = sums[0][gaps], sums[1][gaps]
         step_db = moment_before / before - (moment - moment_before) / (total - before)
-        # The logarithm pays for the choice among the gaps.
+        # The logarithm is the penalty for the choice among the gaps.
         value = 0.5 * step_db**2 * before * (total - before) / total - np.log(len(gaps))
         best = int(value.argmax())
         when_s = 0.5 * (time_s[order][gaps[best]] + time_s[order][gaps[best] + 1])
@@ -329,7 +335,7 @@ def _candidates(links: Links, residual_db: np.ndarray, weight: np.ndarray,
 
 def _step_sd_db(after: np.ndarray, flight: np.ndarray, residual_db: np.ndarray,
                 weight: np.ndarray) -> float:
-    """Return the standard deviation of a step [dB], from how flights on one side of it differ."""
+    """Estimate the standard deviation of a step from the scatter of flights on each side [dB]."""
     cell = np.unique(np.column_stack([flight, after]), axis=0, return_inverse=True)[1].ravel()
     mass = np.bincount(cell, weights=weight)
     mean = np.bincount(cell, weights=weight * residual_db) / mass

@@ -1,4 +1,4 @@
-"""Constant gain errors: a device radiates, or a receiver reads, more or less than declared.
+"""`device_gain_offset`, `receiver_gain_offset`: constant gain errors of devices or receivers.
 
 Cable and connector loss, antenna efficiency, transmit power and calibration add constants to the
 link budget (ITU-R P.341, 'The concept of transmission loss for radio links').
@@ -27,13 +27,13 @@ from radiotwin.links import Links
 from radiotwin.links.sites import inseparable_end
 
 PRIOR_SD_DB = 10.0  # wide: an error of a cable, a connector or a declared power
-MIN_LINKS = 30  # of a member; fewer do not outweigh shadowing
+MIN_LINKS = 30  # of a device or receiver; with fewer, shadowing dominates
 MAX_MEMBERS = 200  # bounds the number of coefficients
 MIN_OFFSET_DB = 0.5  # accuracy of good power meters
 
 
 class _GainOffset(GainEffect):
-    """An offset for each member of a kind of end."""
+    """Base of effects with one gain offset per device, or per receiver."""
 
     figure = "intervals"
     sparse = True
@@ -49,6 +49,7 @@ class _GainOffset(GainEffect):
     params: Params
 
     def _index(self, links: Links) -> np.ndarray:
+        """Return the index (n,) of each link's device, or receiver."""
         return getattr(links, self.end)
 
     @override
@@ -75,6 +76,7 @@ class _GainOffset(GainEffect):
         return self._of_members(view, sorted(set(members) & set(self.params.members)))
 
     def _of_members(self, view: ResidualView, members: list[int]) -> list[Params]:
+        """Propose offsets of these members, with the sd of their mean residuals as the spread."""
         index = self._index(view.links)
         if not members:
             return []
@@ -93,14 +95,14 @@ class _GainOffset(GainEffect):
     def same_as(self, links: Links, parameters: Mapping[str, Parameter]) -> list[str]:
         names = getattr(links, f"{self.end}_names")
         largest = max(self.params.members,
-                      key=lambda each: abs(parameters[f"offset_db[{names[each]}]"].value))
+                      key=lambda member: abs(parameters[f"offset_db[{names[member]}]"].value))
         other = inseparable_end(links, self.end, {largest})
         return [] if other is None else [self.name.replace(self.end, other)]
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
-        for mine in members(self._index(view.links)):
-            yield Pattern(self.end, "dB", f"a constant of one {self.end}", mine * 1.0,
+        for mask in members(self._index(view.links)):
+            yield Pattern(self.end, "dB", f"a constant of one {self.end}", mask * 1.0,
                           low=MIN_OFFSET_DB)
 
     @override
@@ -120,13 +122,13 @@ class _GainOffset(GainEffect):
         if len(order) > 1:
             contrast -= contrast[median].copy()
         sd_db, names = estimate.sd_of(contrast), getattr(links, f"{self.end}_names")
-        return {f"offset_db[{names[member]}]": Parameter.normal(value_db, each_sd_db, "dB")
-                for member, value_db, each_sd_db in zip(
+        return {f"offset_db[{names[member]}]": Parameter.normal(value_db, value_sd_db, "dB")
+                for member, value_db, value_sd_db in zip(
                     self.params.members, contrast @ estimate.coefficients, sd_db)}
 
 
 class DeviceGainOffset(_GainOffset):
-    """Devices that radiate more or less than the others do."""
+    """Devices that radiate more or less power than the others."""
 
     name = "device_gain_offset"
     in_words = "power, cable or antenna of the device"
@@ -145,7 +147,7 @@ class DeviceGainOffset(_GainOffset):
 
 
 class ReceiverGainOffset(_GainOffset):
-    """Receivers that read more or less than the others do."""
+    """Receivers whose readings are higher or lower than the others'."""
 
     name = "receiver_gain_offset"
     in_words = "gain, cable or antenna of the receiver"
@@ -168,5 +170,5 @@ class ReceiverGainOffset(_GainOffset):
 
 
 def _relative_db(coefficients: np.ndarray) -> np.ndarray:
-    """Return offsets (q,) relative to their median; one by itself is relative to all others."""
+    """Subtract from offsets (q,) their median; a single one is relative to all other members."""
     return coefficients - np.median(coefficients) if len(coefficients) > 1 else coefficients

@@ -1,13 +1,13 @@
-"""The ray that bounces off the ground interferes with the direct one.
+"""`ground_reflection`: interference of the direct ray with the one reflected by the ground.
 
 Two rays over a plane earth (Goldsmith 2005, 'Wireless Communications', Sec. 2.4.1): the field
 relative to the direct ray's is 1 + s R exp(-2 (k σ sin ψ)²) (d / d') exp(-j k (d' - d)), with d'
 from the device's image, R Fresnel's coefficient for vertical polarisation over medium dry ground
 (ITU-R P.2040-4, Table 3), ψ the angle between ray and ground, and the exponential for a surface of
-roughness σ (Ament 1953, 'Toward a theory of reflection by a rough surface', Proc. IRE 41). Heights
-that are known to σ only blur the fringes by the same factor, on average.
+roughness σ (Ament 1953, 'Toward a theory of reflection by a rough surface', Proc. IRE 41). An error
+σ of the heights blurs the fringes by the same factor on average.
 
-On a terrain the plane is that which touches it where the ray bounces.
+On terrain the plane is the tangent plane at the point of reflection.
 """
 
 import numpy as np
@@ -30,21 +30,21 @@ from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import permittivity
 
 MIN_LINKS = 100  # with line of sight
-MIN_NATS = 4.0  # that a ground must gain to be proposed
-MAX_PROPOSE_LINKS = 3000  # on which grounds are tried
+MIN_NATS = 4.0  # log-likelihood gain above which a ground is proposed
+MAX_PROPOSE_LINKS = 3000  # drawn at random for the proposal
 MAX_PROPOSALS = 2
-# Grid that is tried; roughness and height in wavelengths, the height within MAX_HEIGHT_M.
+# Grid of trial values; roughness and height in wavelengths, the height within MAX_HEIGHT_M.
 STRENGTHS = (0.3, 0.6, 1.0)
 ROUGHNESSES = (0.05, 0.2)
 HEIGHTS = np.arange(-32, 33) / 8
-MAX_HEIGHT_M = 0.5  # of the ground, above or below the declared one
+MAX_HEIGHT_M = 0.5  # largest height of the ground above or below the declared one
 MAX_STRENGTH = 2.0  # of metal at steep angles, relative to medium dry ground
-MIN_END_HEIGHT_M = 0.1  # of both ends above the ground
-SLOPE_M = 5.0  # to each side of the bounce, that the slope of a terrain is taken over
-BOUNCE_ROUNDS = 8  # in which the point of a bounce on a terrain is found
-OFF_GROUND_M = 1.0  # of the point in the plane, where the terrain is too curved for one
-BOUNCE_M = 0.2  # height of the bounce in its lines of sight, which the ground would block
-DEEPEST_DB = -30.0  # fringe that is ever measured
+MIN_END_HEIGHT_M = 0.1  # least height of both ends above the ground
+SLOPE_M = 5.0  # half of the distance over which the slope of the terrain is taken
+BOUNCE_ROUNDS = 8  # iterations to find the point of reflection on terrain
+OFF_GROUND_M = 1.0  # distance of that point from the terrain above which there is no reflection
+BOUNCE_M = 0.2  # the point is raised so much for its lines of sight: the ground would block them
+DEEPEST_DB = -30.0  # deepest fringe that is ever measured
 
 
 class GroundReflection(GainEffect):
@@ -131,7 +131,7 @@ class GroundReflection(GainEffect):
 
 
 def _bounces(links: Links) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return whether (n,) links have both rays, and their ends (n, 3) above a plane z = 0 [m]."""
+    """Find which links (n,) have both rays, and their ends (n, 3) relative to a plane z = 0 [m]."""
     device_m = links.device_m[links.device]
     if links.city is not None and links.city.terrain is not None:
         return bounces_on_terrain(links.city, device_m, links.receiver_m, links.los)
@@ -140,20 +140,20 @@ def _bounces(links: Links) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def bounces_on_terrain(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
                        los: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find where rays between n pairs of ends bounce off a terrain.
+    """Find the ground reflection between n pairs of ends on terrain.
 
-    The plane that touches the terrain at a point reflects at another one; there the next plane
-    touches it, until both are one.
+    Fixed-point iteration: reflect at the tangent plane of a point, then take the tangent plane at
+    the point of reflection.
 
     Args:
         city: 3D map with a terrain.
         device_m: (n, 3) first ends [m].
         receiver_m: (n, 3) second ends [m].
-        los: (n,) bool, links with line of sight; others have no bounce.
+        los: (n,) bool, links with line of sight; others have no reflection.
 
     Returns:
-        (n,) bool, whether there is a bounce that nothing blocks; and both ends (n, 3) as the plane
-        of the bounce sees them: z above it, the first one at x = y = 0, the second one at y = 0.
+        (n,) bool, whether there is an unblocked reflection; and both ends (n, 3) in the frame of
+        its plane: z above it, the first end at x = y = 0, the second at y = 0 [m].
     """
     height_m = [np.maximum(end_m[:, 2] - city.ground_height_m(*end_m[:, :2].T), MIN_END_HEIGHT_M)
                 for end_m in (device_m, receiver_m)]
@@ -164,8 +164,8 @@ def bounces_on_terrain(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarr
         normal = _slope_normals(city, touch_m)
         above_m = [np.einsum("ij,ij->i", end_m - touch_m, normal)
                    for end_m in (device_m, receiver_m)]
-        whole_m = np.maximum(above_m[0] + above_m[1], MIN_END_HEIGHT_M)
-        share = np.clip(above_m[0] / whole_m, 0.0, 1.0)
+        sum_m = np.maximum(above_m[0] + above_m[1], MIN_END_HEIGHT_M)
+        share = np.clip(above_m[0] / sum_m, 0.0, 1.0)
         feet_m = [end_m - height[:, None] * normal
                   for end_m, height in zip((device_m, receiver_m), above_m)]
         at_m = feet_m[0] + share[:, None] * (feet_m[1] - feet_m[0])
@@ -180,7 +180,7 @@ def bounces_on_terrain(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarr
 
 
 def _slope_normals(city: CityMap, points_m: np.ndarray) -> np.ndarray:
-    """Return the upward unit normals (n, 3) of a terrain, over `SLOPE_M` to each side."""
+    """Compute the upward unit normals (n, 3) of a terrain, over `SLOPE_M` to each side."""
     rise = []
     for aside_m in SLOPE_M * np.eye(2):
         forth, back = points_m[:, :2] + aside_m, points_m[:, :2] - aside_m
@@ -191,7 +191,7 @@ def _slope_normals(city: CityMap, points_m: np.ndarray) -> np.ndarray:
 
 
 def _has_bounce(links: Links) -> np.ndarray:
-    """Return whether (n,) links have both the direct ray and the one off flat ground."""
+    """Check which links (n,) have both the direct ray and the one off flat ground."""
     clear = links.los.copy()
     if links.city is not None:
         a_m, b_m = links.device_m[links.device[clear]], links.receiver_m[clear]
@@ -205,13 +205,13 @@ def _has_bounce(links: Links) -> np.ndarray:
 
 def two_ray_db(device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float, strength: float,
                roughness_m: float, ground_m: float) -> np.ndarray:
-    """Return the level of both rays relative to the direct one [dB].
+    """Compute the level (n,) of direct and reflected ray relative to the direct one [dB].
 
     Args:
         device_m: (n, 3) positions of the devices [m].
         receiver_m: (n, 3) positions of the receivers [m].
-        frequency_hz: of the radio [Hz].
-        strength: of the reflection, relative to smooth medium dry ground.
+        frequency_hz: carrier frequency [Hz].
+        strength: reflection coefficient relative to smooth medium dry ground.
         roughness_m: standard deviation of the surface's height [m].
         ground_m: height of the plane [m].
     """

@@ -1,11 +1,9 @@
-"""An unknown emitter adds its power to all readings: the more, the closer the end that reads is.
+"""`interference`: an unknown emitter near the ground adds its power to the readings.
 
-That is the receiver, or the device where it is a gateway that listens (`reads_levels`): an emitter
-beside a node that sends raises nothing at a gateway far away.
-Powers of signal and interference add (ITU-R SM.1753). The emitter is assumed to be near the ground.
-Over a 3D map its power falls as that of a device at its place, by the channel, buildings in the way
-included; without one by the free-space law, 20 log10 d (ITU-R P.525), as a slope that was fitted to
-readings with interference in them is too small.
+Powers of signal and interference add (ITU-R SM.1753) at the end that reads: the receiver, or the
+device if it is a gateway that listens (`reads_levels`). With a 3D map the interference follows the
+channel, as from a device at the emitter's place, buildings included; without one free space, 20
+log10 d (ITU-R P.525), as an exponent fitted to readings with interference is too small.
 """
 
 from collections.abc import Sequence
@@ -29,20 +27,20 @@ from radiotwin.effects.places import Mark
 from radiotwin.links import Links
 from radiotwin.links.declared import NOTHING
 
-HEIGHT_M = 1.5  # of the emitter
-REFERENCE_M = 100.0  # distance of its level
-MIN_POSITIONS, SAME_POSITION_M = 20, 10.0  # of ends that read, and what counts as one
-AROUND_M = 100.0  # searched beyond these ends; farther away it would be a noise floor
-EDGE_M = 10.0  # of the searched area, where an estimate means "outside"
-MAX_CELLS, MIN_CELL_M = 300, 20.0  # of the search
-QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8)  # of the readings over the emitter's, tried as its level
-MAX_LINKS = 2000  # that the search looks at
-MAX_PROPOSALS, APART_M = 2, 60.0  # and their distance from each other
-MIN_NATS = 4.0  # that an emitter must gain to be proposed
+HEIGHT_M = 1.5  # height of the emitter above the ground
+REFERENCE_M = 100.0  # distance at which its level is given
+MIN_POSITIONS, SAME_POSITION_M = 20, 10.0  # positions of reading ends, and grid that counts them
+AROUND_M = 100.0  # margin of the search area; an emitter farther away acts as a noise floor
+EDGE_M = 10.0  # distance to the edge of the area below which an estimate means "outside"
+MAX_CELLS, MIN_CELL_M = 300, 20.0  # number and least side of the cells of the search
+QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8)  # of readings minus the emitter's path gain: trial levels
+MAX_LINKS = 2000  # drawn at random for the search
+MAX_PROPOSALS, APART_M = 2, 60.0  # number of proposals, and least distance between them
+MIN_NATS = 4.0  # log-likelihood gain above which an emitter is proposed
 
 
 class Interference(ReceiverEffect):
-    """One emitter that all receivers hear."""
+    """One emitter that all reading ends hear."""
 
     name = "interference"
     in_words = "an emitter beside the devices"
@@ -86,7 +84,7 @@ class Interference(ReceiverEffect):
             height_m = HEIGHT_M + links.city.ground_height_m(*positions_m.T)
             positions_m = positions_m[~links.city.inside(np.column_stack([positions_m, height_m]))]
         rows = subsample(np.arange(len(links)), MAX_LINKS)
-        nats, levels_db = _gains(view, rows, positions_m)
+        nats, levels_db = _gains_nats(view, rows, positions_m)
         nats = nats * len(links) / len(rows)
         found: list[Interference.Params] = []
         for number in np.argsort(-nats.max(axis=1)):
@@ -103,14 +101,15 @@ class Interference(ReceiverEffect):
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
-        """Return also what all links proposed: every link bears on it, in each part alike."""
+        """Propose anew, and also the parameters from all links, which one fold hardly changes."""
         return [*self.propose(view), self.params]
 
     @override
     def term(self, links: Links, level_at: LevelAt) -> Term:
         params = self.params
-        fall_db = _fall_db(links, params.place_m, level_at if params.through_channel else None)
-        return Term.of_inputs(np.exp((params.level_db + fall_db) * NEPERS))
+        path_db = _path_gain_db(links, params.place_m,
+                                level_at if params.through_channel else None)
+        return Term.of_inputs(np.exp((params.level_db + path_db) * NEPERS))
 
     @override
     def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -152,17 +151,17 @@ class Interference(ReceiverEffect):
 
 
 def _reading_m(links: Links) -> np.ndarray:
-    """Return the position (n, 3) of the end that reads each level [m]: it hears what is there."""
+    """Return the position (n, 3) of the end that reads each level [m]."""
     if links.reads is None:
         return links.receiver_m
     return np.where(links.reads[links.device, None], links.device_m[links.device], links.receiver_m)
 
 
-def _fall_db(links: Links, position_m: Sequence[float] | np.ndarray,
-             level_at: LevelAt | None) -> np.ndarray:
-    """Return the level (n,) of an emitter of 0 dB: by the channel, or else by free space.
+def _path_gain_db(links: Links, position_m: Sequence[float] | np.ndarray,
+                  level_at: LevelAt | None) -> np.ndarray:
+    """Compute the gain (n,) from an emitter to the reading ends, by the channel or free space [dB].
 
-    In free space it is 0 dB at `REFERENCE_M`.
+    In free space it is relative to that at `REFERENCE_M`.
     """
     ground_m = 0.0 if links.city is None else float(links.city.ground_height_m(*position_m))
     emitter_m = np.array([*position_m, ground_m + HEIGHT_M])
@@ -174,12 +173,15 @@ def _fall_db(links: Links, position_m: Sequence[float] | np.ndarray,
     return -20 * np.log10(np.maximum(distance_m, 1.0) / REFERENCE_M)
 
 
-def _gains(view: ResidualView, rows: np.ndarray,
-           positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return half of the drop of the weighted squares of rows (r,) by each of p emitters [nats].
+def _gains_nats(view: ResidualView, rows: np.ndarray,
+                positions_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the gain of p trial emitters with q levels each on the residuals of rows (r,).
 
-    With each of q levels, (p, q), and these (p, q) [dB]. A level and a slope for each class of line
-    of sight are fitted beside it: the channel's have taken up part of the interference.
+    Half of the reduction of the weighted squares. A level and a slope per class of sight are fitted
+    in addition, as those of the channel already absorbed part of the interference.
+
+    Returns:
+        (p, q) gains [nats], and (p, q) levels [dB].
     """
     part = view.links.select(rows)
     root = np.sqrt(view.weight[rows])
@@ -191,9 +193,9 @@ def _gains(view: ResidualView, rows: np.ndarray,
     target = target - basis @ (basis.T @ target)
     nats, levels_db = np.empty((2, len(positions_m), len(QUANTILES)))
     for number, position_m in enumerate(positions_m):
-        fall_db = _fall_db(part, position_m, None if part.city is None else view.level_at)
-        levels_db[number] = np.nanquantile(part.level_db - fall_db, QUANTILES)
-        power_db = fall_db + levels_db[number][:, None]
+        path_db = _path_gain_db(part, position_m, None if part.city is None else view.level_at)
+        levels_db[number] = np.nanquantile(part.level_db - path_db, QUANTILES)
+        power_db = path_db + levels_db[number][:, None]
         rise_db = root * 10 * np.log10(1 + 10 ** ((power_db - view.mean_db[rows]) / 10))
         rise_db = rise_db - (rise_db @ basis) @ basis.T
         nats[number] = rise_db @ target - 0.5 * (rise_db**2).sum(axis=1)

@@ -1,15 +1,15 @@
-"""A receiver that loses lock now and then: links are blank, or weaker, whatever their level.
+"""`lock_loss`: a receiver that loses lock at times, so that links are blank or weaker at random.
 
-A blank is either too weak or lost, P(blank) = p + (1 - p) F (the p-tobit of Deaton and Irish 1984,
+A blank is either too weak or lost, P(blank) = p + (1 - p) F (the p-Tobit of Deaton and Irish 1984,
 'Statistical models for zero expenditures in household budgets', Journal of Public Economics 23),
-with a p for each receiver. Of a receiver that goes on reading without lock the level is lower by
-some decibels with a probability p. Losses in sequences have the same p as losses at random; that
-neighbouring links are lost together widens the interval.
+with one p per receiver. A receiver that still reads without lock has, with probability p, a level
+that is lower by some decibels. Losses in sequences have the same p; their correlation widens the
+interval.
 
-All links of an instant share the receiver's state: lock kept or lost. So the likelihood of a drop
-is a mixture over instants, fitted by EM (Dempster, Laird and Rubin 1977, JRSS B 39) from several
-first drops, and held against one Student t whose tails are as heavy as the levels want them. A drop
-that comes once is an episode or a faulty flight, and one that comes at certain places is the map's.
+All links of an instant share the receiver's state: lock kept or lost. So drops are a mixture of two
+states of instants, fitted by EM (Dempster, Laird and Rubin 1977, JRSS B 39) from several start
+values, and compared with one Student t of fitted tails. A drop that happens once is an episode or a
+faulty flight; one at certain places is an error of the map.
 """
 
 from dataclasses import dataclass
@@ -35,36 +35,36 @@ from radiotwin.inference.gaussian import robust_sd
 from radiotwin.inference.student import DOF, Losses, log_density
 from radiotwin.links import Links
 
-TAILS = (1.2, 1.6, 2.2, 3.0, 4.0, 8.0)  # degrees of freedom of the single t, tried
-FIRST_DROPS_DB = (10.0, 15.0, 22.0, 32.0, 42.0)
-STEPS = 40  # of EM
-MIN_DROP_DB = 8.0  # a smaller one cannot be told from shadowing
-MAX_SHARE = 0.5  # of two states the rarer one is the fault
-MIN_RUNS = 4  # stretches of time in which levels are low
-MAX_RUN = 0.5  # share of the low instants in the longest of them
-MAX_OTHERS = 0.3  # share of low readings of other receivers, over this one's
-MIN_APART = 3.0  # error scales between the states
+TAILS = (1.2, 1.6, 2.2, 3.0, 4.0, 8.0)  # trial degrees of freedom of the single t
+FIRST_DROPS_DB = (10.0, 15.0, 22.0, 32.0, 42.0)  # start values of EM
+STEPS = 40  # iterations of EM
+MIN_DROP_DB = 8.0  # a smaller one cannot be distinguished from shadowing
+MAX_SHARE = 0.5  # largest share of the low state: the rarer state is the fault
+MIN_RUNS = 4  # least number of separate periods with low levels
+MAX_RUN = 0.5  # largest share of the low instants in the longest period
+MAX_OTHERS = 0.3  # largest share of low readings of other receivers, relative to this one's
+MIN_SEPARATION = 3.0  # least distance between the states [error scales]
 MIN_LINKS = 60  # of a receiver, with line of sight
-MIN_NATS = 5.0  # that losses must gain to be proposed for a receiver
-STRONGEST = 0.25  # share of the links, which must gain, too
-MIN_DEVICE_LINKS = 20  # of a device, to be asked whether it gains
-MIN_DEVICES = 0.6  # share of those devices that must gain
-PROBABILITIES = np.geomspace(0.002, 0.9, 60)  # tried
-MIN_PROBABILITY = 1e-9  # of a level below the limit; bounds the weight of one link
+MIN_NATS = 5.0  # log-likelihood gain above which losses of a receiver are proposed
+STRONGEST = 0.25  # share of the strongest links, whose gain must also be positive
+MIN_DEVICE_LINKS = 20  # of a device, to test whether its links gain
+MIN_DEVICES = 0.6  # share of those devices whose links must gain
+PROBABILITIES = np.geomspace(0.002, 0.9, 60)  # trial values
+MIN_PROBABILITY = 1e-9  # least probability of a level below the limit; bounds the weight of a link
 MAX_VARIED = 8  # receivers whose probabilities are refined; more take too long
-STEP, MAX_CHANGE = 0.3, 1.0  # of the log-odds
-STEP_DB, MAX_CHANGE_DB = 1.0, 6.0  # of a drop
-MAX_DROP_DB = 80.0  # the range of a good receiver
+STEP, MAX_CHANGE = 0.3, 1.0  # first step and bound of the search [log odds]
+STEP_DB, MAX_CHANGE_DB = 1.0, 6.0  # the same for a drop
+MAX_DROP_DB = 80.0  # dynamic range of a good receiver
 
 
 @dataclass(frozen=True, eq=False)
 class _Drops:
-    """Drops of a receiver's level.
+    """Random drops of one receiver's level.
 
     Attributes:
-        share: of its instants.
-        drop_db: how much lower they are.
-        nats: (n,) gain in log-likelihood of each of its readings.
+        share: share of instants with a drop.
+        drop_db: drop [dB].
+        nats: (n,) log-likelihood gain of each reading.
     """
 
     share: float
@@ -74,7 +74,16 @@ class _Drops:
 
 @dataclass(frozen=True, eq=False)
 class _States:
-    """Two states of instants: (i,) probability of the low one, and log-likelihood (i,) [nats]."""
+    """Mixture of two states over i instants.
+
+    Attributes:
+        share: share of the low state.
+        level_db: level of the high state [dB].
+        drop_db: its distance to the low state [dB].
+        scale_db: scale of the errors [dB].
+        low: (i,) posterior probability of the low state.
+        nats: (i,) log-likelihood.
+    """
 
     share: float
     level_db: float
@@ -85,28 +94,30 @@ class _States:
 
 
 def _find_drops(view: ResidualView, receiver: int, rows: np.ndarray) -> _Drops | None:
-    """Return how the readings (n,) of a receiver drop now and then; None where they do not."""
-    every_db, _ = compared_where_possible_db(view)
-    rest_db, instant = every_db[rows], _instants(view.links, rows)
+    """Find random drops in the readings (rows) of a receiver; None if there are none."""
+    compared_db, _ = compared_where_possible_db(view)
+    rest_db, instant = compared_db[rows], _instants(view.links, rows)
     states = max((_two_states(rest_db, instant, drop_db) for drop_db in FIRST_DROPS_DB),
-                 key=lambda each: each.nats.sum())
+                 key=lambda tried: tried.nats.sum())
     single = _single_state(rest_db)
     nats = (states.nats / np.bincount(instant))[instant] - single
     if (nats.sum() < MIN_NATS * view.design_effect or states.drop_db < MIN_DROP_DB
-            or states.drop_db < MIN_APART * states.scale_db or not 0 < states.share < MAX_SHARE):
+            or states.drop_db < MIN_SEPARATION * states.scale_db
+            or not 0 < states.share < MAX_SHARE):
         return None
     if not _comes_and_goes(view.links, rows, instant, states.low > 0.5):
         return None
     others = np.flatnonzero((view.links.receiver != receiver) & np.isfinite(view.links.level_db)
                             & (view.links.los == view.links.los[rows[0]]))
     low_db = states.level_db - 0.5 * states.drop_db
-    if len(others) and (every_db[others] < low_db).mean() > MAX_OTHERS * (rest_db < low_db).mean():
+    if len(others) and ((compared_db[others] < low_db).mean()
+                        > MAX_OTHERS * (rest_db < low_db).mean()):
         return None
     return _Drops(states.share, states.drop_db, nats)
 
 
 def _instants(links: Links, rows: np.ndarray) -> np.ndarray:
-    """Return the number (n,) of the instant of each link, in the order of time."""
+    """Assign each link (n,) to an instant by flight and time; one without a time is separate."""
     time_s = links.time_s[rows]
     key = np.where(np.isfinite(time_s), time_s, rows)
     _, instant = np.unique(np.column_stack([links.flight[rows], key]), axis=0, return_inverse=True)
@@ -114,19 +125,18 @@ def _instants(links: Links, rows: np.ndarray) -> np.ndarray:
 
 
 def _two_states(rest_db: np.ndarray, instant: np.ndarray, drop_db: float) -> _States:
-    """Return the likeliest two states of instants, from a first drop on."""
+    """Fit the mixture of two states by EM, starting from a drop [dB]."""
     share, level_db = 0.2, float(np.quantile(rest_db, 0.6))
     scale_db = max(robust_sd(rest_db), 0.5) / 2
     low, total = np.zeros(instant.max() + 1), np.zeros(instant.max() + 1)
     for _ in range(STEPS):
         z = (rest_db[None] - level_db + np.array([[0.0], [drop_db]])) / scale_db
-        of_links = log_density(z, DOF) - np.log(scale_db)
-        of_instants = np.array([np.bincount(instant, weights=each) for each in of_links])
-        of_instants += np.log([[1 - share], [share]])
-        total = np.logaddexp(*of_instants)
-        low = np.exp(of_instants[1] - total)
-        mine = np.array([1 - low, low])[:, instant]
-        weight = mine * (DOF + 1) / (DOF + z * z)
+        link_nats = log_density(z, DOF) - np.log(scale_db)
+        state_nats = np.array([np.bincount(instant, weights=nats) for nats in link_nats])
+        state_nats += np.log([[1 - share], [share]])
+        total = np.logaddexp(*state_nats)
+        low = np.exp(state_nats[1] - total)
+        weight = np.array([1 - low, low])[:, instant] * (DOF + 1) / (DOF + z * z)
         kept, dropped = weight.sum(axis=1)
         if min(kept, dropped) < 1.0:
             break
@@ -139,7 +149,7 @@ def _two_states(rest_db: np.ndarray, instant: np.ndarray, drop_db: float) -> _St
 
 
 def _single_state(rest_db: np.ndarray) -> np.ndarray:
-    """Return the log-likelihood of each residual (n,) by the likeliest single t [nats]."""
+    """Fit one Student t with trial degrees of freedom; return its log-likelihoods (n,) [nats]."""
     best = np.full(len(rest_db), -np.inf)
     for dof in TAILS:
         level_db = float(np.median(rest_db))
@@ -156,7 +166,7 @@ def _single_state(rest_db: np.ndarray) -> np.ndarray:
 
 def _comes_and_goes(links: Links, rows: np.ndarray, instant: np.ndarray,
                     low: np.ndarray) -> bool:
-    """Return whether the low instants (i,) are several stretches of time, none of them most."""
+    """Check whether the low instants (i,) form several separate periods, none of them dominant."""
     flight = np.zeros(len(low), dtype=int)
     flight[instant] = links.flight[rows]
     begins = low & ~np.r_[False, low[:-1] & (flight[1:] == flight[:-1])]
@@ -165,7 +175,7 @@ def _comes_and_goes(links: Links, rows: np.ndarray, instant: np.ndarray,
 
 
 class LockLoss(DetectionEffect):
-    """A probability of loss for each receiver whose links become likelier by it."""
+    """A probability of loss for each receiver whose links gain likelihood by it."""
 
     name = "lock_loss"
     in_words = "loss of lock"
@@ -187,7 +197,7 @@ class LockLoss(DetectionEffect):
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links, blank, shares, drops_db = view.links, {}, {}, {}
-        # Behind buildings, links are blank, or weak, for want of a path, too.
+        # Behind buildings links are also blank, or weak, because there is no path.
         clear = links.los if links.los.any() else np.ones(len(links), dtype=bool)
         for receiver in frequent_labels(links.receiver[clear], MIN_LINKS):
             rows = np.flatnonzero(clear & (links.receiver == receiver))
@@ -223,10 +233,10 @@ class LockLoss(DetectionEffect):
         most = np.r_[np.full(len(log_odds), np.inf), np.full(len(drops_db), MAX_DROP_DB)]
 
         def varied(numbers: np.ndarray) -> LockLoss:
-            shares, own_db = np.split(numbers, [len(log_odds)])
+            new_log_odds, new_drops_db = np.split(numbers, [len(log_odds)])
             return self.with_params(self.Params(
-                receivers=dict(zip(self.params.receivers, expit(shares).tolist())),
-                drops_db=dict(zip(self.params.drops_db, own_db.tolist()))))
+                receivers=dict(zip(self.params.receivers, expit(new_log_odds).tolist())),
+                drops_db=dict(zip(self.params.drops_db, new_drops_db.tolist()))))
 
         return Variation(
             start, np.r_[np.full(len(log_odds), STEP), np.full(len(drops_db), STEP_DB)],
@@ -235,12 +245,12 @@ class LockLoss(DetectionEffect):
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         sd = estimate.params_sd
-        if not len(sd):  # too many to be varied
+        if not len(sd):  # too many receivers to refine
             sd = np.full(len(self.params.receivers) + len(self.params.drops_db), np.nan)
         shares_sd, drops_sd_db = np.split(sd, [len(self.params.receivers)])
         result = {}
-        for (receiver, probability), own_sd in zip(self.params.receivers.items(), shares_sd):
-            low, high = expit(logit(probability) + QUANTILE_90 * own_sd * np.array([-1, 1]))
+        for (receiver, probability), log_odds_sd in zip(self.params.receivers.items(), shares_sd):
+            low, high = expit(logit(probability) + QUANTILE_90 * log_odds_sd * np.array([-1, 1]))
             result[f"lost_share[{links.receiver_names[receiver]}]"] = Parameter(
                 probability, float(low), float(high), "of its links")
         for (receiver, drop_db), sd_db in zip(self.params.drops_db.items(), drops_sd_db):
@@ -250,15 +260,15 @@ class LockLoss(DetectionEffect):
 
 
 def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
-    """Return the likeliest share of the links (n,) of a receiver that are lost; None: no gain."""
+    """Estimate the share of a receiver's links (rows) that are lost; None if the gain is low."""
     links = view.links
     blank = np.isnan(links.level_db[rows])
     if not blank.any() or not np.isfinite(links.limit_db[rows]).all():
         return None
     margin = (links.limit_db[rows] - view.mean_db[rows]) / view.scale_db[rows]
     probability, nats = _likeliest(stdtr(DOF, margin), blank)
-    # A receiver less sensitive than declared misses no strong links, and an obstacle affects some
-    # devices only.
+    # The strongest links must gain, else its limit of detection is higher; and most devices, else
+    # there is an obstacle.
     strong = margin <= np.quantile(margin, STRONGEST)
     gains = (nats.sum() > MIN_NATS * view.design_effect and nats[strong].sum() > 0
              and _most_devices_gain(links.device[rows], nats))
@@ -266,9 +276,11 @@ def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
 
 
 def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the likeliest dropout probability, and the gain of each link by it (n,) [nats].
+    """Estimate the probability of a random blank, and the gain (n,) of each link by it [nats].
 
-    Of links with a probability of a level below the limit, (n,), and whether they are blank.
+    Args:
+        below: (n,) probability that the level is below the limit.
+        blank: (n,) bool.
     """
     below = np.maximum(below, MIN_PROBABILITY)
 
@@ -282,6 +294,7 @@ def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]
 
 
 def _most_devices_gain(device: np.ndarray, nats: np.ndarray) -> bool:
+    """Check whether most devices with enough links have a positive sum of gains (n,) [nats]."""
     counts, sums = np.bincount(device), np.bincount(device, weights=nats)
     enough = counts >= MIN_DEVICE_LINKS
     return not enough.any() or float((sums[enough] > 0).mean()) > MIN_DEVICES

@@ -1,8 +1,8 @@
-"""Vegetation that the map shows: woods, parks and rows of trees, with a loss that is fitted.
+"""`mapped_vegetation`: loss through woods, parks or rows of trees that the map shows.
 
-Loss of d metres through it: A_m (1 − exp(−γ d / A_m)) (ITU-R P.833-10, Eq. 1), with the A_m of the
-frequency; γ, the specific attenuation, is fitted, one for each kind. The ray tracer and the paths
-over the map know nothing of vegetation.
+Loss over d metres inside: A_m (1 − exp(−γ d / A_m)) (ITU-R P.833-10, Eq. 1), with A_m of the
+frequency and one fitted specific attenuation γ per kind. The ray tracer and the paths over the map
+do not include vegetation.
 """
 
 from typing import Literal
@@ -18,13 +18,13 @@ from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter,
 from radiotwin.links import Links
 from radiotwin.scene.vegetation import KINDS
 
-MIN_THROUGH_M, MIN_LINKS = 3.0, 60  # way in vegetation that counts, and links that have one
-SPECIFIC_DB_M = (0.05, 0.15, 0.4, 1.0)  # that are tried first
-MIN_SPECIFIC_DB_M = 0.005  # less costs nothing: 0.5 dB over 100 m
+MIN_THROUGH_M, MIN_LINKS = 3.0, 60  # least length in vegetation, and number of such links
+SPECIFIC_DB_M = (0.05, 0.15, 0.4, 1.0)  # start values
+MIN_SPECIFIC_DB_M = 0.005  # 0.5 dB over 100 m; a lower value is no loss
 
 
 class MappedVegetation(GainEffect):
-    """Loss in the declared vegetation of one kind; one step finds one kind's."""
+    """Loss through the mapped vegetation of one kind; each step finds one kind."""
 
     name = "mapped_vegetation"
     in_words = "vegetation of the map"
@@ -82,10 +82,12 @@ class MappedVegetation(GainEffect):
             Allowed(low=0.0, high=5.0))}
 
     def _kinds(self, links: Links) -> list[str]:
+        """List the kinds of vegetation that enough links pass through."""
         return [kind for kind in KINDS
                 if (self._through_m(links, kind) >= MIN_THROUGH_M).sum() >= MIN_LINKS]
 
     def _through_m(self, links: Links, kind: str) -> np.ndarray:
+        """Measure the length (n,) of links inside vegetation of a kind [m]; cached."""
         def measure() -> np.ndarray:
             city = city_of(links, self.name)
             vegetation = city.vegetation.of_kind(kind)

@@ -1,11 +1,10 @@
-"""A building that the map does not show.
+"""`missing_obstacle`: a building that the map does not show, as a box.
 
 It is located by back-projecting the loss along the links; then a box is fitted. Behind the box
-these powers add: what passes over the two edges of its roof and around both sides (knife edges of
-ITU-R P.526), and what reaches any shadow by reflections: what is left on the other paths of the
-link or, where that explains more, the class's level without line of sight (a small box hides the
-straight line only, a large one most paths), plus a fitted offset. Exactly: the channel's level over
-the map with the box in it.
+these powers add: over the two edges of its roof and around both sides (knife edges of ITU-R P.526),
+and scattered power with a fitted offset: that of the link's other paths or, if that fits better,
+the channel's level without line of sight (a small box hides the straight line only, a large one
+most paths). Exact levels are the channel's over the map with the box in it.
 """
 
 from collections.abc import Iterable, Iterator
@@ -46,35 +45,35 @@ from radiotwin.effects.params import (
     Parameter,
     Variation,
 )
-from radiotwin.effects.patterns import WIDE_M, Pattern, crossed
+from radiotwin.effects.patterns import WIDE_M, Pattern, lengths_in_boxes
 from radiotwin.effects.places import Correction, Mark
 from radiotwin.links import Links
 from radiotwin.scene.citymap import CONCRETE, CityMap
 
-MIN_NATS = 6.0  # that a cell must gain to be proposed
+MIN_NATS = 6.0  # log-likelihood gain above which a cell is proposed
 MAX_PROPOSALS = 4
-SHIFTS_M = (-8.0, 0.0, 8.0)  # from a cell's centre, to the east and to the north
-SQUARES_M, RECTANGLES_M = (6.0, 12.0, 24.0), ((20.0, 8.0), (36.0, 12.0), (40.0, 24.0))  # tried
+SHIFTS_M = (-8.0, 0.0, 8.0)  # trial shifts from a cell's centre, to the east and to the north
+SQUARES_M, RECTANGLES_M = (6.0, 12.0, 24.0), ((20.0, 8.0), (36.0, 12.0), (40.0, 24.0))  # trial
 SHAPES = (*product(((side_m, side_m) for side_m in SQUARES_M), (0.0, 45.0)),
           *product(RECTANGLES_M, (-45.0, 0.0, 45.0, 90.0)))  # sides [m] and turn [deg]
-SCATTERED_DB = (0.0, -10.0)  # relative power in the shadow that shapes are tried with
-MAX_BUILT = 0.15  # of its ground and so far around it that is built in the map
-AROUND_M = 3.0  # outlines are off by metres: a box along a wall is a wall that is off
-GRID, MIN_BUILT_M = 9, 2.0  # points along each side that are looked at, and what is built there
-REACH_M, MAX_LINKS = 30.0, 3000  # links so near to a centre, and how many, that shapes are tried on
-NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
-MARGIN_M = 10.0  # and those within so much more are followed at once: boxes are tried side by side
-TURNS_DEG = (-20.0, 20.0)  # from where quick levels end: of a nearly square box they tell little
-LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # of an obstructed link, equally likely
-MAX_LOSS_DB = 50.0  # that a box causes
-TYPICAL_HEIGHT_M = 15.0
+SCATTERED_DB = (0.0, -10.0)  # trial values of the relative power in the shadow
+MAX_BUILT = 0.15  # largest share of its footprint and margin that is built on the map
+AROUND_M = 3.0  # that margin: a box along a wall is an error of the wall, as outlines are off
+GRID, MIN_BUILT_M = 9, 2.0  # points along each side of the footprint, and least height of a roof
+REACH_M, MAX_LINKS = 30.0, 3000  # shapes are tested on links so near to a cell, so many at most
+NEAR_M = 25.0  # links whose ground tracks are farther away keep their level, also the exact one
+MARGIN_M = 10.0  # paths of links within NEAR_M plus this are followed at once, for several boxes
+TURNS_DEG = (-20.0, 20.0)  # further start values: quick levels determine the turn poorly
+LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # loss of an obstructed link, equally probable
+MAX_LOSS_DB = 50.0  # largest loss behind a box
+TYPICAL_HEIGHT_M = 15.0  # of a building whose detectable loss is reported
 HEIGHT_SCALE_M = 20.0  # of Rayleigh distributed heights: dense urban, ITU-R P.1410-6, Table 1
 
 T = TypeVar("T")
 
 
 class MissingObstacle(GainEffect):
-    """A box that obstructs links; one step finds one."""
+    """A box that obstructs links; each step finds one."""
 
     name = "missing_obstacle"
     in_words = "a building that the map lacks"
@@ -86,7 +85,7 @@ class MissingObstacle(GainEffect):
     confused_with = ("foliage", "antenna_pattern", "device_position_error")
 
     class Params(EffectParams):
-        """A box, and what reaches its shadow."""
+        """A box, and the power in its shadow."""
 
         box: Box = Field(description="In place of the building.")
         scattered_db: Decibels = Field(
@@ -111,11 +110,11 @@ class MissingObstacle(GainEffect):
             return []
         nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows],
                                 LOSSES_DB) / view.design_effect
-        centres_m, total = back_project(*ends_above_ground(links, rows), nats)
+        cells = best_cells(*back_project(*ends_above_ground(links, rows), nats), MAX_PROPOSALS)
         found = [self._best_shape(view, rows, centre_m, height, by_class)
-                 for centre_m, height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
-                 if gain > MIN_NATS for by_class in _ways(links, (False, True))]
-        return [each for each in found if each is not None]
+                 for centre_m, height, cell_nats in cells if cell_nats > MIN_NATS
+                 for by_class in _shadow_options(links, (False, True))]
+        return [params for params in found if params is not None]
 
     @override
     def kind(self) -> bool:
@@ -123,30 +122,30 @@ class MissingObstacle(GainEffect):
 
     def _best_shape(self, view: ResidualView, los: np.ndarray, centre_m: np.ndarray,
                     height: int, by_class: bool) -> Params | None:
-        """Return the box near a cell's centre with which links (r,) with line of sight gain most.
+        """Find the box near a cell's centre with the highest gain of links with sight (rows `los`).
 
-        Of shapes, turns and places that the cell does not tell: a box that is too large hides links
-        that are not obstructed, and a search that starts there ends where it started. None where
-        all stand in buildings of the map.
+        Shapes, turns, places and heights are tried in turn: a local search from a box that is too
+        large would not leave it. None if all boxes stand in buildings of the map.
         """
         links, (x_m, y_m) = view.links, centre_m.tolist()
         found = view.found_params(self.name, "box")
         around = Box(x_m, y_m, 2 * REACH_M, 2 * REACH_M, max(HEIGHTS_M), 0.0)
         near = near_box(around, *ends_above_ground(links, los), 0.0)
         rows = subsample(los[near], MAX_LINKS)
-        mine = links.select(rows)
+        near_links = links.select(rows)
 
         gains: dict[tuple[Box, float], float] = {}
-        scattered_db = _ways(links, SCATTERED_DB)
+        scattered_db = _shadow_options(links, SCATTERED_DB)
 
         def params(box: Box, scattered_db: float) -> MissingObstacle.Params:
             return self.Params(box=box, scattered_db=scattered_db, by_class=by_class)
 
         def best(boxes: Iterable[Box]) -> Box:
             for box in boxes:
-                changes_db = self._offsets_db(mine, box, scattered_db, by_class, view.level_at)
-                for each_db, changed_db in zip(scattered_db, changes_db, strict=True):
-                    gains[box, each_db] = float(view.gain_nats(rows, changed_db).sum())
+                changes_db = self._offsets_db(near_links, box, scattered_db, by_class,
+                                              view.level_at)
+                for power_db, change_db in zip(scattered_db, changes_db, strict=True):
+                    gains[box, power_db] = float(view.gain_nats(rows, change_db).sum())
             return max(gains, key=gains.__getitem__)[0]
 
         tops_m = HEIGHTS_M[max(height - 1, 0):height + 2]
@@ -165,18 +164,18 @@ class MissingObstacle(GainEffect):
         if self.is_exact:
             city = city_of(links, self.name)
             rows = np.flatnonzero(self._near(links, self.params.box))
-            mine = links.select(rows)
-            with_box = mine.with_city(_with_box(city, self.params.box))
-            offset_db[rows] = level_at(with_box, True) - level_at(mine, True)
+            near_links = links.select(rows)
+            with_box = near_links.with_city(_with_box(city, self.params.box))
+            offset_db[rows] = level_at(with_box, True) - level_at(near_links, True)
             return Term.of_offset(offset_db)
         if self.levels == "known_paths":
-            return Term.of_offset(self._past_db(links, self.params.box, level_at))
+            return Term.of_offset(self._known_paths_db(links, self.params.box, level_at))
         return Term.of_offset(self._offsets_db(links, self.params.box, (self.params.scattered_db,),
                                                self.params.by_class, level_at)[0])
 
     def _offsets_db(self, links: Links, box: Box, scattered_db: tuple[float, ...],
                     by_class: bool, level_at: LevelAt) -> np.ndarray:
-        """Return what a box adds to links (n,), by each of k powers in its shadow (k, n) [dB]."""
+        """Compute the gain (k, n) of links by a box for k scattered powers, by knife edges [dB]."""
         offset_db, rows = np.zeros((len(scattered_db), len(links))), np.flatnonzero(links.los)
         crossing = cross(box, *ends_above(links, box[:2], rows))
         crosses = np.isfinite(crossing.left_m)
@@ -190,8 +189,8 @@ class MissingObstacle(GainEffect):
                                           scattered, speed_of_light / links.frequency_hz)
         return offset_db
 
-    def _past_db(self, links: Links, box: Box, level_at: LevelAt) -> np.ndarray:
-        """Return what a box adds to links (n,) past which their known paths go [dB]."""
+    def _known_paths_db(self, links: Links, box: Box, level_at: LevelAt) -> np.ndarray:
+        """Compute the gain (n,) of links by a box that obstructs some of their known paths [dB]."""
         from radiotwin.propagation.laws.followed_paths import KnownPaths, UprightBox
 
         city, rows = city_of(links, self.name), np.flatnonzero(self._near(links, box))
@@ -206,7 +205,7 @@ class MissingObstacle(GainEffect):
         power = known.past(UprightBox(box[:2], (box.length_m / 2, box.width_m / 2),
                                       float(np.radians(box.turn_deg)), top_m), rows)
         before = power.direct + power.others
-        # Diffuse power, and what a channel adds to that of paths, passes any box.
+        # Power that the channel adds to that of the paths, such as diffuse power, passes any box.
         rest = np.maximum(10 ** (level_db[rows] / 10) - before, 0.0)
         crossing = cross(box, *ends_above(links, box[:2], rows))
         crosses = np.isfinite(crossing.left_m)
@@ -219,7 +218,7 @@ class MissingObstacle(GainEffect):
         return offset_db
 
     def _near(self, links: Links, box: Box, within_m: float = NEAR_M) -> np.ndarray:
-        """Return whether (n,) links may have other levels along paths because of a box."""
+        """Check which links (n,) pass so near to a box that their paths may change."""
         return near_box(box, links.device_m[links.device], links.receiver_m, within_m)
 
     @override
@@ -227,7 +226,7 @@ class MissingObstacle(GainEffect):
         return None if self.levels == "quick" else self._near(links, self.params.box)
 
     def _shadow_db(self, links: Links, level_at: LevelAt, by_class: bool) -> np.ndarray:
-        """Return what links (n,) lose if something hides the other end [dB]; see `Params`."""
+        """Compute the gain (n,), below 0, of links in a full shadow, see `Params.by_class` [dB]."""
         def derive() -> np.ndarray:
             hidden = links.with_los(np.zeros(len(links), bool))
             return level_at(hidden, not by_class) - level_at(links, not by_class)
@@ -235,7 +234,7 @@ class MissingObstacle(GainEffect):
 
     @override
     def exactly(self) -> Effect:
-        # The search goes on from here: a turn must not begin at its bounds.
+        # The search continues from here: the turn must not start at its bounds.
         return self.with_params(self.changed(box=self.params.box.straightened(),
                                              by_class=False).params, "exact")
 
@@ -243,8 +242,8 @@ class MissingObstacle(GainEffect):
     def variation(self) -> Variation:
         params = self.params
         x_m, y_m = params.box[:2]
-        # To follow paths for each value takes minutes, and known ones tell nearly the same; what
-        # reaches the shadow is on them.
+        # Known paths are nearly as good as following them for each value, which takes minutes. They
+        # contain the scattered power, so that is not searched.
         along_paths = self.levels != "quick"
         varied = self.with_params(params, "known_paths" if along_paths else "quick")
         count = len(params.box) + (not along_paths)
@@ -264,7 +263,7 @@ class MissingObstacle(GainEffect):
 
     @override
     def neg_log_prior(self) -> float:
-        # Links that all pass below the roof only bound its height from below.
+        # If all links pass below the roof, they only bound its height from below.
         return 0.5 * (self.params.box.height_m / HEIGHT_SCALE_M) ** 2
 
     @override
@@ -292,7 +291,7 @@ class MissingObstacle(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
-        for inside_m in crossed(view.links, TYPICAL_HEIGHT_M):
+        for inside_m in lengths_in_boxes(view.links, TYPICAL_HEIGHT_M):
             yield Pattern("place", "dB", f"of a building {WIDE_M:.0f} m wide and "
                           f"{TYPICAL_HEIGHT_M:.0f} m high, behind it", -1.0 * (inside_m > 0),
                           high=MAX_LOSS_DB)
@@ -317,14 +316,23 @@ class MissingObstacle(GainEffect):
         return self.changed(box=self.params.box.like(other.params.box))
 
 
-def _ways(links: Links, ways: tuple[T, ...]) -> tuple[T, ...]:
-    """Return the ways in which power reaches a shadow; without a map there is one, past the box."""
-    return ways if links.city is not None else ways[:1]
+def _shadow_options(links: Links, options: tuple[T, ...]) -> tuple[T, ...]:
+    """Return all options of the power in a shadow; without a map, without scattering, one."""
+    return options if links.city is not None else options[:1]
 
 
 def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
              wavelength_m: float) -> np.ndarray:
-    """Return what a box adds to links that cross it, (n,) or (k, n) as `scattered` power is."""
+    """Compute the gain of links that cross a box [dB].
+
+    Args:
+        crossing: of n links.
+        scattered: power in the shadow, relative to the link without the box; scalar, (n,), (k, n).
+        wavelength_m: wavelength [m].
+
+    Returns:
+        (n,) or (k, n), at most 0 and at least -`MAX_LOSS_DB`.
+    """
     over_db = two_edges_db(crossing.enter_over_m, crossing.leave_over_m, crossing.before_m,
                            crossing.between_m, crossing.behind_m, wavelength_m)
     first_m = crossing.before_m + crossing.between_m / 2
@@ -332,17 +340,14 @@ def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
     power = scattered
     for side_m in (crossing.left_m, crossing.right_m):
         power = power + 10 ** (-knife_edge_db(side_m, first_m, second_m, wavelength_m) / 10)
-    # A link above the roof has its own level: what comes around the sides does not add to it.
+    # For a link above the roof, power around the sides and scattered power are not added.
     below_roof = np.maximum(crossing.enter_over_m, crossing.leave_over_m) > 0
     power = np.where(below_roof, power, 0.0) + 10 ** (-over_db / 10)
     return np.maximum(10 * np.log10(np.minimum(power, 1.0)), -MAX_LOSS_DB)
 
 
 def built_share(links: Links, box: Box, found: Iterable[Box] = ()) -> float:
-    """Return the share of the ground of a box, and just around it, that is built.
-
-    In the map of links, if they have one, or because boxes were found there.
-    """
+    """Compute the share of a box's footprint and margin that is built, on the map or by `found`."""
     x_m, y_m = grid_around(box, AROUND_M, GRID)
     built = np.zeros(x_m.shape, dtype=bool)
     if links.city is not None:
@@ -354,6 +359,7 @@ def built_share(links: Links, box: Box, found: Iterable[Box] = ()) -> float:
 
 @lru_cache(maxsize=32)
 def _with_box(city: CityMap, box: Box) -> CityMap:
+    """Add a box of concrete to a map."""
     import trimesh  # slow to load, and needed for exact levels only
 
     pose = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
@@ -363,8 +369,9 @@ def _with_box(city: CityMap, box: Box) -> CityMap:
     mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m + depth_m), pose)
     count = len(mesh.faces)
     material = np.concatenate([city.material, np.full(count, len(city.materials))])
-    terrain, height_sd_m = (None if each is None else np.concatenate([each, np.full(count, own)])
-                            for each, own in ((city.terrain, False), (city.height_sd_m, np.nan)))
+    terrain, height_sd_m = (
+        None if of_faces is None else np.concatenate([of_faces, np.full(count, new)])
+        for of_faces, new in ((city.terrain, False), (city.height_sd_m, np.nan)))
     return CityMap(np.vstack([city.vertices, mesh.vertices]),
                    np.vstack([city.faces, mesh.faces + len(city.vertices)]),
                    (*city.materials, CONCRETE), material, city.vegetation, terrain, height_sd_m)

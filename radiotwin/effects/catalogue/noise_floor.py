@@ -1,12 +1,12 @@
-"""Readings that contain the receiver's own noise: near the floor they stop falling with distance.
+"""`noise_floor_censoring`: readings that contain the receiver's noise and level off at its floor.
 
 Powers of signal and noise add: reading = 10 log10(10^(signal / 10) + 10^(floor / 10)). Readings
 such as RSSI contain both; those of a known reference signal do not (ITU-R SM.1753, 'Methods for
 measurements of radio noise').
 
-So nearly no reading is far below a floor, however weak the signal: of 30 receivers whose noise was
-measured alone (`powder_frs`) no reading is by 6 dB. Where many are, weak links fade less than the
-base says, for another reason: scattering, ways that it does not follow.
+Hardly any reading is then far below the floor, however weak the signal: none by 6 dB for 30
+receivers whose noise was measured separately (`powder_frs`). If many are, weak links are stronger
+than predicted for another reason, such as scattering or paths that are not followed.
 """
 
 import numpy as np
@@ -26,16 +26,16 @@ from radiotwin.effects.params import (
 from radiotwin.links import Links
 
 MIN_LINKS = 40  # of a receiver, to estimate its floor
-MIN_RECEIVERS = 3  # with a floor, so that their median is the usual one
-MIN_NATS = 2.0  # that a floor must gain to be proposed for a receiver alone
-QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)  # of a receiver's readings, tried as its floor
-COMMON_QUANTILES = (0.03, 0.15)  # the same for all receivers
-MAX_BELOW, BELOW_DB = 0.01, 6.0  # share of a receiver's readings that may be as far below its floor
-AT_BOUND_DB = 0.1
+MIN_RECEIVERS = 3  # with a floor, for their median to apply to other receivers
+MIN_NATS = 2.0  # log-likelihood gain above which a floor of single receivers is proposed
+QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)  # of a receiver's readings: trial floors
+COMMON_QUANTILES = (0.03, 0.15)  # trial floors of all receivers at once
+MAX_BELOW, BELOW_DB = 0.01, 6.0  # largest share of readings so far below the floor
+AT_BOUND_DB = 0.1  # distance to the highest allowed floor that counts as being at the bound
 
 
 class NoiseFloor(ReceiverEffect):
-    """A floor for each receiver."""
+    """A noise floor for each receiver."""
 
     name = "noise_floor_censoring"
     in_words = "a limit of detection"
@@ -59,7 +59,7 @@ class NoiseFloor(ReceiverEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        links, found, own, highest = view.links, {}, {}, {}
+        links, found, sure, highest = view.links, {}, {}, {}
         seen = np.isfinite(links.level_db)
         for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
             rows = seen & (links.receiver == receiver)
@@ -70,30 +70,30 @@ class NoiseFloor(ReceiverEffect):
             found[receiver] = max(
                 (-float(weight @ (residual_db + mean_db - floored(mean_db, floor_db)[0]) ** 2),
                  float(floor_db)) for floor_db in floors_db)[1]
-            every = np.flatnonzero(links.receiver == receiver)  # blanks, too
-            all_db = view.mean_db[every]
+            with_blanks = np.flatnonzero(links.receiver == receiver)
+            all_db = view.mean_db[with_blanks]
             nats, floor_db = max(
-                (float(view.gain_nats(every, floored(all_db, floor_db)[0] - all_db).sum()),
+                (float(view.gain_nats(with_blanks, floored(all_db, floor_db)[0] - all_db).sum()),
                  float(floor_db)) for floor_db in floors_db)
             if nats > MIN_NATS:
-                own[receiver] = floor_db
+                sure[receiver] = floor_db
         if not found:
             return []
-        # A law that was fitted without a floor is too flat and hides it, so usual ones are tried.
+        # A law fitted without a floor is too flat and hides it, so typical floors are tried, too.
         tried = [{receiver: min(highest[receiver], float(np.nanquantile(
             links.level_db[links.receiver == receiver], share))) for receiver in found}
             for share in COMMON_QUANTILES]
-        # Where links are blank below a limit, a floor above it is wrong for most receivers: then
-        # one may have a floor alone.
-        alone = own and own.keys() != found.keys()
-        return [*([self.Params(receivers=own, highest=highest, alone=True)] if alone else []),
+        # If links are blank below a limit, a floor above it is wrong for most receivers, but single
+        # ones may have one.
+        single = sure and sure.keys() != found.keys()
+        return [*([self.Params(receivers=sure, highest=highest, alone=True)] if single else []),
                 *(self.Params(receivers=floors_db, highest=highest)
                   for floors_db in (found, *tried))]
 
     @override
     def inputs(self, links: Links) -> np.ndarray:
         floors_db = list(self.params.receivers.values())
-        # A receiver without an estimate has the usual floor, unless some have one alone.
+        # A receiver without an estimate has the median floor, unless only single ones have a floor.
         usual = len(floors_db) >= MIN_RECEIVERS and not self.params.alone
         usual_db = np.median(floors_db) if usual else -np.inf
         by_receiver_db = np.full(len(links.receiver_names), usual_db)
@@ -132,5 +132,5 @@ class NoiseFloor(ReceiverEffect):
 
 
 def floored(level_db: np.ndarray, floor_db: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the reading (n,) of levels (n,) with a noise floor [dB], and its slope (n,)."""
+    """Compute the reading (n,) of levels (n,) with a noise floor [dB], and its derivative (n,)."""
     return add_power(level_db, np.exp(floor_db * NEPERS))

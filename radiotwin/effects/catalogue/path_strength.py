@@ -1,8 +1,8 @@
-"""Paths that a law of distance does not follow: reflected off walls, and diffracted at edges.
+"""`wall_reflection`, `diffraction`: power of reflected or diffracted paths added to a distance law.
 
-They are followed over the 3D map by the image method and the uniform theory of diffraction
-(`radiotwin.propagation.paths`). Their powers add to that of the channel, whose level is fitted
-again: without line of sight it then covers only what no path explains.
+The paths are followed over the 3D map by the image method and the uniform theory of diffraction
+(`radiotwin.propagation.paths`). The channel's level is fitted again: without line of sight it then
+covers only the power that no path explains.
 """
 
 from typing import ClassVar
@@ -18,14 +18,14 @@ from radiotwin.effects.params import Allowed, Decibels, EffectParams, Estimate, 
 from radiotwin.links import Links
 from radiotwin.propagation.laws.followed_paths import path_gains
 
-STRENGTHS_DB = (0.0, -4.0, -8.0)  # to begin with, relative to theory
+STRENGTHS_DB = (0.0, -4.0, -8.0)  # start values relative to theory
 MAX_LINKS = 60_000  # bounds the time of following paths
-BELOW_DB, ABOVE_DB = 30.0, 15.0  # theory, within which strengths are searched
-MIN_CLEAR = 20  # links with line of sight, for a median level
+BELOW_DB, ABOVE_DB = 30.0, 15.0  # range of strengths below and above theory
+MIN_CLEAR = 20  # links with line of sight, to calibrate the level
 
 
 class _Paths(PathEffect):
-    """Power of some kinds of paths, with one common strength."""
+    """Base of effects that add the power of some kinds of paths, with one fitted strength."""
 
     nlos_only = True  # with line of sight they add tenths of a decibel
     in_paths = True
@@ -55,7 +55,7 @@ class _Paths(PathEffect):
         wavelength_m = speed_of_light / links.frequency_hz
         direct_db = 20 * np.log10(wavelength_m / (4 * np.pi * links.distance_m))
         rows = links.los & np.isfinite(view.residual_db) & np.isfinite(links.level_db)
-        # Levels may be powers of unknown transmitters; links with line of sight calibrate them.
+        # Levels may be powers of unknown transmitters: calibrate them on links with line of sight.
         level_db = (float(np.median((links.level_db - direct_db)[rows]))
                     if rows.sum() > MIN_CLEAR else 0.0)
         return [self.Params(strength_db=level_db + strength_db, level_db=level_db)

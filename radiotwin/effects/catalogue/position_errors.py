@@ -1,6 +1,6 @@
-"""Ends of links that are not at their declared positions.
+"""`device_position_error`, `device_moved`, `receiver_position_error`: wrong positions of ends.
 
-No law of its own: the channel predicts again with the end elsewhere, lines of sight included.
+The channel predicts the links again from the other position, including the line of sight.
 """
 
 from collections.abc import Iterator
@@ -29,22 +29,22 @@ from radiotwin.effects.patterns import Pattern, members
 from radiotwin.effects.places import Correction, Mark
 from radiotwin.links import Links, site_of
 
-MIN_MOVE_M = 5.0  # less is within what surveys, receivers and the walls of maps are off by
-# Moves that are tried: of devices on circles, of receivers along axes.
+MIN_MOVE_M = 5.0  # smaller moves are within the accuracy of surveys and of the walls of maps
+# Trial moves: of devices on circles, of receivers along axes.
 RADII_M = (8.0, 15.0, 25.0, 40.0, 60.0, 85.0)
 DIRECTIONS = 12
 RECEIVER_MOVES_M = (5.0, 10.0, 20.0)
 RECEIVER_AXES = ((1, 0, 0), (0, 1, 0), (0.7, 0.7, 0), (0.7, -0.7, 0), (0, 0, 1))
-MAX_MOVE_M = 120.0  # east and north, of a device
-TYPICAL_M = 10.0  # move of a device, for the slope of levels in its position
+MAX_MOVE_M = 120.0  # largest move of a device, east and north
+TYPICAL_M = 10.0  # typical move of a device, for the change of levels per metre
 MAX_RECEIVER_MOVE_M = 60.0  # along each axis
 
 
 class _PositionError(MovedEnd):
-    """An end that is by a constant off its given position.
+    """Base of constant position errors.
 
     Attributes:
-        step_m, max_move_m: first step and bound of the search along each axis.
+        step_m, max_move_m: first step and bound of the search along each axis [m].
     """
 
     figure = "links"
@@ -71,7 +71,7 @@ class _PositionError(MovedEnd):
 
 
 class DevicePositionError(_PositionError):
-    """A wrong position of an anchor and of all on its mast; one step finds one, the worst."""
+    """Wrong position of an anchor and all devices on its mast; each step finds the worst."""
 
     name = "device_position_error"
     in_words = "a wrong position of the device"
@@ -134,14 +134,15 @@ class DevicePositionError(_PositionError):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
-        for mine in members(view.links.device):
-            device = int(view.links.device[mine][0])
+        for mask in members(view.links.device):
+            device = int(view.links.device[mask][0])
             if device in view.links.anchors:
                 move_db = partial(self._moved_north_db, view, device)
                 yield Pattern("position", "m", "of one device", move_db(TYPICAL_M) / TYPICAL_M,
                               move_db, MIN_MOVE_M, MAX_MOVE_M)
 
     def _moved_north_db(self, view: ResidualView, device: int, by_m: float) -> np.ndarray:
+        """Compute the change of all levels (n,) if a device moves north [dB]."""
         north = self.with_params(self.Params(device=device, move_m=(0.0, by_m)))
         return north.term(view.links, view.level_at).offset_db
 
@@ -156,7 +157,7 @@ class DevicePositionError(_PositionError):
 
 
 class DeviceMoved(_PositionError):
-    """An anchor that was elsewhere from one flight on, or up to one."""
+    """An anchor at another position from one flight on, or up to one flight."""
 
     name = "device_moved"
     in_words = "a device that was moved between flights"
@@ -187,23 +188,23 @@ class DeviceMoved(_PositionError):
         links = view.links
         if view.group is None:
             return []
-        found = [self._best_of(view, device) for device in view.in_group(links.device)
+        found = [self._best_move_in_time(view, device) for device in view.in_group(links.device)
                  if device in _movable_anchors(links)]
-        return [params for nats, params in sorted(found, key=lambda each: -each[0])
+        return [params for nats, params in sorted(found, key=lambda pair: -pair[0])
                 if nats > MIN_NATS][:1]
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
         return [self.params] if len(self.rows(view.links)) else []
 
-    def _best_of(self, view: ResidualView, device: int) -> tuple[float, Params]:
-        """Return the move of a device that gains most from one flight on, or up to one [nats]."""
+    def _best_move_in_time(self, view: ResidualView, device: int) -> tuple[float, Params]:
+        """Find the move of a device, from one flight on or up to one, with the best gain [nats]."""
         links = view.links
-        every = np.flatnonzero(links.device == device)
-        rows = subsample(every, MAX_PROPOSE_LINKS)
+        device_rows = np.flatnonzero(links.device == device)
+        rows = subsample(device_rows, MAX_PROPOSE_LINKS)
         device_links = links.select(rows)
-        flights = in_order_of_time(device_links)
-        place = np.array([flights.index(each) for each in device_links.flight.tolist()])
+        flights = flights_by_time(device_links)
+        place = np.array([flights.index(flight) for flight in device_links.flight.tolist()])
         before_db = view.level_at(device_links)
         best: tuple[float, int, bool, tuple[float, float]] = (-np.inf, 0, False, (0.0, 0.0))
         for move_m in _moves_around_m():
@@ -219,8 +220,8 @@ class DeviceMoved(_PositionError):
                     best = max(best, (float(total), first, is_before, move_m))
         total, first, is_before, move_m = best
         moved = flights[:first] if is_before else flights[first:]
-        names = [str(links.flight_names[each]) for each in moved]
-        return total * len(every) / len(rows), self.Params(
+        names = [str(links.flight_names[flight]) for flight in moved]
+        return total * len(device_rows) / len(rows), self.Params(
             device=device, flights=names or [str(links.flight_names[flights[0]])], move_m=move_m)
 
     @override
@@ -252,7 +253,7 @@ class DeviceMoved(_PositionError):
 
 
 class ReceiverPositionError(_PositionError):
-    """A constant error of all positions of a receiver; one step finds one receiver, the worst."""
+    """Constant error of all positions of one receiver; each step finds the worst receiver."""
 
     name = "receiver_position_error"
     in_words = "a wrong position of the receiver"
@@ -310,14 +311,14 @@ class ReceiverPositionError(_PositionError):
 
 
 def _moves_around_m() -> list[tuple[float, float]]:
-    """Return moves of a device that are tried, east and north [m]."""
+    """List the trial moves of a device, east and north [m]."""
     return [(float(radius_m * np.sin(angle)), float(radius_m * np.cos(angle)))
             for radius_m in RADII_M
             for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
 
 
-def in_order_of_time(links: Links) -> list[int]:
-    """Return the flights of links in the order in which they were, or else in which they are."""
+def flights_by_time(links: Links) -> list[int]:
+    """List the flights of links by their first time, or by their index if times are unknown."""
     flights = np.unique(links.flight)
     known = np.isfinite(links.time_s).all() and not links.time_restarts
     return sorted(flights.tolist(), key=lambda flight: float(
@@ -325,6 +326,6 @@ def in_order_of_time(links: Links) -> list[int]:
 
 
 def _movable_anchors(links: Links) -> list[int]:
-    """Return anchors with enough links; other devices were located where these links fit best."""
+    """List anchors with enough links; other devices were located by these links themselves."""
     return [device for device in frequent_labels(links.device, MIN_LINKS)
             if device in links.anchors]

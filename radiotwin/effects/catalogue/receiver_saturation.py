@@ -1,4 +1,4 @@
-"""A receiver that compresses strong signals.
+"""`receiver_saturation`: a receiver that compresses strong signals.
 
 Rapp's model of a solid-state amplifier (Rapp 1991, 'Effects of HPA-nonlinearity on a 4-DPSK/OFDM
 signal'): output = input / (1 + (input / saturation)^(2p))^(1 / 2p), in amplitudes; here in
@@ -25,13 +25,13 @@ from radiotwin.links import Links
 
 MIN_STRONG = 20  # links above the saturation level
 MIN_LINKS = 5 * MIN_STRONG  # of a receiver
-MIN_NATS = 3.0  # that compression must gain to be proposed for a receiver
-SMOOTHNESS = (1.0, 3.0)  # tried
-QUANTILES = (0.6, 0.7, 0.8, 0.88, 0.94, 0.98)  # of the predicted levels, tried as saturation level
+MIN_NATS = 3.0  # log-likelihood gain above which compression of a receiver is proposed
+SMOOTHNESS = (1.0, 3.0)  # trial values
+QUANTILES = (0.6, 0.7, 0.8, 0.88, 0.94, 0.98)  # of the predicted levels: trial saturation levels
 
 
 class Compression(NamedTuple):
-    """Rapp's model.
+    """Parameters of Rapp's model.
 
     Attributes:
         level_db: saturation level [dB].
@@ -43,7 +43,7 @@ class Compression(NamedTuple):
 
 
 class ReceiverSaturation(ReceiverEffect):
-    """Receivers that read less than they receive where it is strong."""
+    """Compression of strong signals by receivers."""
 
     name = "receiver_saturation"
     in_words = "saturation of the receiver"
@@ -92,8 +92,8 @@ class ReceiverSaturation(ReceiverEffect):
     @override
     def response(self, level_db: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         reading_db, slope = level_db.copy(), np.ones_like(level_db)
-        mine = np.isfinite(inputs[:, 0])
-        reading_db[mine], slope[mine] = _compress(level_db[mine], *inputs[mine].T)
+        rows = np.isfinite(inputs[:, 0])
+        reading_db[rows], slope[rows] = _compress(level_db[rows], *inputs[rows].T)
         return reading_db, slope
 
     @override
@@ -123,7 +123,8 @@ class ReceiverSaturation(ReceiverEffect):
 
 def _compress(level_db: np.ndarray, saturation_db: float | np.ndarray,
               smoothness: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compress levels (n,) by Rapp's model: readings (n,) [dB] and their derivative (n,)."""
     over = (level_db - saturation_db) * smoothness * np.log(10) / 10
     reading_db = level_db - np.logaddexp(0, over) / smoothness * 10 / np.log(10)
-    # A slope of e^-60 is none, but can be divided by.
+    # A slope of e^-60 is practically 0 and can still be a divisor.
     return reading_db, 1 / (1 + np.exp(np.minimum(over, 60)))

@@ -1,10 +1,8 @@
-"""A building of the map that does not exist any more.
+"""`removed_obstacle`: a building of the map that no longer exists.
 
-No law of its own: links near it have the channel's level over the map without it.
-
-The buildings that most links behind them have lost less to than the model says are tried. Maps give
-many a roof too high, and links that pass just below its edge gain from that building's removal as
-well: it has to explain them much better than a lower building does.
+Links near it have the channel's level over the map without it. Candidates are the buildings behind
+which links are stronger than predicted. As mapped roofs are often too high, which also makes links
+just below the edge stronger, removal must explain them much better than a lower building.
 """
 
 from collections.abc import Iterator
@@ -31,19 +29,19 @@ from radiotwin.errors import BadInput
 from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
 
-MAX_PROPOSALS = 4  # of buildings whose removal is tried exactly
-MIN_LINKS = 8  # that a building hides
-RISES_DB = (-4.0, -8.0, -12.0, -16.0, -20.0)  # losses that a link behind it would not have
-LOWER = (5 / 6, 5 / 3)  # standard deviations of its mapped height, by which a building may be lower
-FLAT_M = 0.5  # least height of a building that is lower
+MAX_PROPOSALS = 4  # buildings whose removal is computed exactly
+MIN_LINKS = 8  # links that a building must hide
+RISES_DB = (-4.0, -8.0, -12.0, -16.0, -20.0)  # losses that disappear with the building, negative
+LOWER = (5 / 6, 5 / 3)  # trial reductions of its height [standard deviations of mapped heights]
+FLAT_M = 0.5  # least height of a lowered building
 # Very strong evidence (Kass and Raftery 1995, 'Bayes factors', J. Am. Stat. Assoc. 90, Sec. 3.2).
 MIN_LEAD_NATS = 5.0
-SAME_M = 1.0  # a building whose centre is as near is the same one
-NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
+SAME_M = 1.0  # largest distance between centres of the same building
+NEAR_M = 25.0  # links whose ground tracks are farther away keep their level, also the exact one
 
 
 class RemovedObstacle(GainEffect):
-    """One building of the map; one step finds one."""
+    """One building removed from the map; each step finds one."""
 
     name = "removed_obstacle"
     in_words = "a building that is gone"
@@ -73,14 +71,13 @@ class RemovedObstacle(GainEffect):
         a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
         nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows], RISES_DB)
         label, centres_m = buildings(links.city)
-        total = np.full(len(centres_m), -np.inf)
+        total_nats = np.full(len(centres_m), -np.inf)
         for building in np.unique(label[~links.city.on_ground]).tolist():
             behind = ~links.city.without(label != building).line_of_sight(a_m, b_m)
             if behind.sum() >= MIN_LINKS:
-                total[building] = nats[behind].sum()
-        # A building behind which links are no stronger than they should be is there.
-        likely = [int(building) for building in np.argsort(-total)[:MAX_PROPOSALS]
-                  if total[building] > 0]
+                total_nats[building] = nats[behind].sum()
+        likely = [int(building) for building in np.argsort(-total_nats)[:MAX_PROPOSALS]
+                  if total_nats[building] > 0]
         gains = {building: _gain_nats(view, building, _without(links.city, building)[0])
                  for building in likely}
         for building in sorted(gains, key=gains.__getitem__, reverse=True):
@@ -97,8 +94,8 @@ class RemovedObstacle(GainEffect):
         offset_db, with_it = np.zeros(len(links)), city_of(links, self.name)
         city, box = _without(with_it, self.params.building)
         rows = _near(links, box)
-        mine = links.select(rows)
-        offset_db[rows] = level_at(mine.with_city(city), True) - level_at(mine, True)
+        near_links = links.select(rows)
+        offset_db[rows] = level_at(near_links.with_city(city), True) - level_at(near_links, True)
         return Term.of_offset(offset_db)
 
     @override
@@ -107,7 +104,7 @@ class RemovedObstacle(GainEffect):
 
     @override
     def corrected_map(self, city: CityMap) -> CityMap:
-        # By its place: other effects' buildings that are gone, or there, have changed the numbers.
+        # By its position: buildings removed or added by other effects have changed the indices.
         apart_m = np.linalg.norm(buildings(city)[1] - np.array(self.params.centre_m), axis=1)
         nearest = int(apart_m.argmin())
         return _without(city, nearest)[0] if apart_m[nearest] < SAME_M else city
@@ -123,12 +120,12 @@ class RemovedObstacle(GainEffect):
 
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
-        # Of one building that hides neither many links nor few: each map has paths of its own.
+        # One building that hides a median number of links, as following paths is expensive.
         links = view.links
         assert links.city is not None
         blocker, (_, centres_m) = only_blocker(links), buildings(links.city)
         hiding = sorted(frequent_labels(blocker[blocker >= 0], MIN_HIDDEN),
-                        key=lambda each: np.count_nonzero(blocker == each))
+                        key=lambda building: np.count_nonzero(blocker == building))
         if not hiding:
             return
         building = hiding[len(hiding) // 2]
@@ -152,57 +149,53 @@ class RemovedObstacle(GainEffect):
 
 
 def _gain_nats(view: ResidualView, building: int, other: CityMap) -> float:
-    """Return how much likelier links are over another map, which differs in one building."""
+    """Compute the log-likelihood gain by another map, which differs in one building [nats]."""
     assert view.links.city is not None
     rows = _near(view.links, _without(view.links.city, building)[1])
-    mine = view.links.select(rows)
-    change_db = view.level_at(mine.with_city(other), True) - view.level_at(mine, True)
+    near_links = view.links.select(rows)
+    change_db = view.level_at(near_links.with_city(other), True) - view.level_at(near_links, True)
     return float(view.gain_nats(rows, change_db).sum())
 
 
 def _near(links: Links, box: Box) -> np.ndarray:
-    """Return the rows of links that pass near a box."""
+    """List the rows of links that pass near a box."""
     return np.flatnonzero(near_box(box, links.device_m[links.device], links.receiver_m, NEAR_M))
 
 
 def only_blocker(links: Links) -> np.ndarray:
-    """Return (n,) the building that alone blocks each link; -1 where none or more than one does.
-
-    Terrain is no building.
-    """
+    """Find the building (n,) that alone blocks each link; -1 if none, several or terrain does."""
     assert links.city is not None
     label = buildings(links.city)[0]
-    alone = np.full(len(links), -1)
+    blocker = np.full(len(links), -1)
     rows = np.flatnonzero(~links.los)
     a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
     near, far = links.city.first_hits(a_m, b_m)[1], links.city.first_hits(b_m, a_m)[1]
     same = (near >= 0) & (far >= 0) & (label[near] == label[far])
     if links.city.terrain is not None:
         same &= ~links.city.terrain[near]
-    alone[rows[same]] = label[near[same]]
-    return alone
+    blocker[rows[same]] = label[near[same]]
+    return blocker
 
 
 @lru_cache(maxsize=32)
 def _lower(city: CityMap, building: int, by_m: float) -> CityMap:
-    """Return a map in which a building is lower, or nearly as flat as the ground."""
-    mine = np.unique(city.faces[buildings(city)[0] == building])
+    """Lower a building of a map, at most to `FLAT_M` above its base."""
+    corners = np.unique(city.faces[buildings(city)[0] == building])
     vertices = city.vertices.copy()
-    height_m = vertices[mine, 2]
-    vertices[mine, 2] = np.maximum(height_m - by_m, np.minimum(height_m, height_m.min() + FLAT_M))
+    z_m = vertices[corners, 2]
+    vertices[corners, 2] = np.maximum(z_m - by_m, np.minimum(z_m, z_m.min() + FLAT_M))
     return city.with_vertices(vertices)
 
 
 @lru_cache(maxsize=32)
 def _without(city: CityMap, building: int) -> tuple[CityMap, Box]:
-    """Return a map without a building, and the box around that building."""
+    """Remove a building from a map; also return the box around it."""
     label, centres_m = buildings(city)
     if building >= len(centres_m):
         raise BadInput(f"the effect removed_obstacle removes building {building}, but the map has "
                        f"{len(centres_m)}; give the scene that the twin was made with")
-    mine = label == building
-    corners_m = city.vertices[city.faces[mine]].reshape(-1, 3)
+    faces = label == building
+    corners_m = city.vertices[city.faces[faces]].reshape(-1, 3)
     low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
     (x_m, y_m, _), (length_m, width_m, _) = (low_m + high_m) / 2, high_m - low_m
-    return (city.without(mine),
-            Box(x_m, y_m, length_m, width_m, high_m[2], 0.0))
+    return city.without(faces), Box(x_m, y_m, length_m, width_m, high_m[2], 0.0)

@@ -1,15 +1,15 @@
-"""Roofs of a map that are higher or lower than it says, where links pass their edges.
+"""`roof_heights`: roofs higher or lower than mapped, estimated from links that pass their edges.
 
-Many heights are counted from storeys or guessed. A link that passes a roof's edge loses as behind
-two knife edges (ITU-R P.526), but no more than what is left on other paths: the law without line of
-sight. The height of each roof with such links is estimated beside all others, with a prior around
-the map's; a roof whose uncertainty its links do not halve stays where it is.
+Many mapped heights are counted from storeys or guessed. A link over a roof has the diffraction loss
+of two knife edges (ITU-R P.526), bounded by the power of other paths: the channel law without line
+of sight. The height of each roof with such links is estimated, the others fixed, with a prior about
+the mapped height; a roof whose uncertainty its links do not halve keeps its height.
 
-The height that predicts best is not yet the roof's: where more gets around buildings than over
-them, all roofs seem low, and each by another amount. In 14 campaigns that another hand made, with
-exact maps, knife edges and ways around corners, roofs came out 1.2 m too low in the mean and
-scattered by 1.1 m. So the offset that all have in common counts as the model's, and the scatter of
-the others is part of each roof's uncertainty.
+The height that predicts best is biased: if more power gets around buildings than over them, all
+roofs seem low, each by another amount. In 14 campaigns by another generator, with exact maps, knife
+edges and paths around corners, roofs came out 1.2 m too low on average, with a scatter of 1.1 m. So
+the offset common to all roofs counts as an error of the model, and the scatter of the others is
+part of each roof's uncertainty.
 """
 
 from __future__ import annotations
@@ -40,34 +40,34 @@ from radiotwin.links import Links
 from radiotwin.scene.citymap import DOWN, CityMap
 
 SAMPLES = 24  # points of a link over the box around a building
-END_M = 2.0  # a building closer to an end of a link than this belongs to that end
-BOTTOMLESS_M = 1e4  # height of the box in which links are looked for above a building
-WALL_SD_M = 1.0  # where an edge is not known better, neither is how high above it a link passes
-OFFSETS = np.arange(-16, 17) / 6  # that are tried, in standard deviations of the prior
-LEAST_SHARE = 0.2  # of a roof's height that is left
-TELLING_DB = 1.0  # least change of a link over the offsets, to be evidence
-MIN_LINKS = 8  # that are evidence of a roof
-MAX_SD_SHARE = 0.5  # of the prior's that may be left of a roof's uncertainty: one bit is learnt
-MIN_OFFSET_M = 0.25  # smaller ones are none
-SWEEPS = 3  # over all roofs, each beside the others as they are
-MAX_LINKS = 6000  # that are looked at
-LEAST_CONTRAST_DB = 3.0  # between links with line of sight and without; less: roofs hide nothing
-HIDDEN_DB = 200.0  # loss of a way that something other than a roof blocks
-# Standard deviations of what laws of edges are off by, in metres of height: of one roof (worth so
-# many roofs whose scatter is seen), and of all roofs together.
+END_M = 2.0  # a building closer to an end of a link belongs to that end
+BOTTOMLESS_M = 1e4  # height of the box in which links over a building are searched
+WALL_SD_M = 1.0  # position error of an edge; times the slope of the link an error of its height
+OFFSETS = np.arange(-16, 17) / 6  # trial offsets [standard deviations of the prior]
+LEAST_SHARE = 0.2  # least height of a roof over the mapped height
+INFORMATIVE_DB = 1.0  # least change of a link over the trial offsets
+MIN_LINKS = 8  # informative links of a roof
+MAX_SD_SHARE = 0.5  # largest posterior over prior sd of an estimated roof: one bit
+MIN_OFFSET_M = 0.25  # smaller offsets are dropped
+SWEEPS = 3  # passes over all roofs
+MAX_LINKS = 6000  # drawn at random for the estimate
+LEAST_CONTRAST_DB = 3.0  # median of level with minus without sight, below which nothing is hidden
+HIDDEN_DB = 200.0  # loss of the straight line if terrain or another obstacle blocks it
+# Prior sd of the model error in metres of height: of one roof (counting as `MODEL_ROOFS` observed
+# roofs), and of the offset common to all roofs.
 MODEL_SD_M, MODEL_ROOFS, COMMON_SD_M = 1.5, 8, 1.5
 
 
 class RoofCrossings(NamedTuple):
-    """How links cross roofs; m pairs of a link and a building, sorted by the link.
+    """Geometry of m crossings of a link over a building, sorted by link; (m,) each.
 
     Attributes:
-        link: (m,) row of the link.
-        building: (m,) as `buildings` numbers them.
-        enter_over_m, leave_over_m: (m,) height of the roof above the link, where it enters and
-            where it leaves; negative where it passes above.
-        before_m, between_m, behind_m: (m,) distance along the ground from the first end to where
-            the link enters, from there to where it leaves, and on to the second end.
+        link: row of the link.
+        building: index from `buildings`.
+        enter_over_m, leave_over_m: height of the roof above the link at entry and at exit;
+            negative if the link passes above.
+        before_m, between_m, behind_m: ground distances from the first end to the entry, from entry
+            to exit, and from the exit to the second end.
     """
 
     link: np.ndarray
@@ -80,12 +80,12 @@ class RoofCrossings(NamedTuple):
 
     def loss_db(self, raised_m: np.ndarray | float, wavelength_m: float,
                 rows: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """Return the loss over each roof alone, by two edges (ITU-R P.526) [dB].
+        """Compute the loss over each roof by two knife edges (ITU-R P.526) [dB].
 
         Args:
-            raised_m: (r,), or (…, 1), how much higher the roofs are than on the map [m].
-            wavelength_m: of the radio [m].
-            rows: r pairs.
+            raised_m: (r,), or (…, 1), true minus mapped height of the roofs [m].
+            wavelength_m: wavelength [m].
+            rows: r crossings.
         """
         return two_edges_db(self.enter_over_m[rows] + raised_m, self.leave_over_m[rows] + raised_m,
                             self.before_m[rows], self.between_m[rows], self.behind_m[rows],
@@ -94,13 +94,13 @@ class RoofCrossings(NamedTuple):
 
 def roof_crossings(city: CityMap, a_m: np.ndarray, b_m: np.ndarray,
                    which: np.ndarray | None = None) -> RoofCrossings:
-    """Return where links cross buildings that neither of their ends stands on.
+    """Find where links cross buildings, except those at their ends.
 
     Args:
         city: 3D map.
         a_m: (n, 3) first ends [m].
         b_m: (n, 3) second ends [m].
-        which: buildings; None: all of the map.
+        which: indices of buildings; None: all.
     """
     label, boxes = buildings(city)[0], _boxes(city)
     found = [np.zeros((7, 0))]
@@ -108,12 +108,13 @@ def roof_crossings(city: CityMap, a_m: np.ndarray, b_m: np.ndarray,
     for building in sorted(boxes) if which is None else which.tolist():
         if building not in boxes:
             continue
-        way = cross(boxes[building], a_m, b_m)
-        near = np.flatnonzero((way.before_m > END_M) & (way.behind_m > END_M))
+        crossing = cross(boxes[building], a_m, b_m)
+        near = np.flatnonzero((crossing.before_m > END_M) & (crossing.behind_m > END_M))
         if not len(near):
             continue
-        track_m = way.before_m[near] + way.between_m[near] + way.behind_m[near]
-        along_m = way.before_m[near, None] + share * way.between_m[near, None]
+        before_m, between_m = crossing.before_m[near], crossing.between_m[near]
+        track_m = before_m + between_m + crossing.behind_m[near]
+        along_m = before_m[:, None] + share * between_m[:, None]
         points_m = a_m[near, None] + (along_m / track_m[:, None])[..., None] * (
             b_m - a_m)[near, None]
         over_m = _roof_over_m(city, points_m.reshape(-1, 3), label == building)
@@ -130,30 +131,30 @@ def roof_crossings(city: CityMap, a_m: np.ndarray, b_m: np.ndarray,
     return RoofCrossings(pairs[0].astype(int), pairs[1].astype(int), *pairs[2:])
 
 
-def _roof_over_m(city: CityMap, points_m: np.ndarray, is_mine: np.ndarray) -> np.ndarray:
-    """Return how far some faces (f,) lie above points (n, 3), seen from above; NaN beside them."""
+def _roof_over_m(city: CityMap, points_m: np.ndarray, of_building: np.ndarray) -> np.ndarray:
+    """Compute the height (n,) of a building's roof (faces (f,)) above points; NaN beside it [m]."""
     top_m = float(city.vertices[:, 2].max()) + 1.0
     above_m = np.column_stack([points_m[:, :2], np.full(len(points_m), top_m)])
     distance_m, face, _ = city.first_hits_towards(above_m, DOWN)
-    return np.where((face >= 0) & is_mine[face], top_m - distance_m - points_m[:, 2], np.nan)
+    return np.where((face >= 0) & of_building[face], top_m - distance_m - points_m[:, 2], np.nan)
 
 
 @lru_cache(maxsize=4)
 def _boxes(city: CityMap) -> dict[int, Box]:
-    """Return a bottomless box around each building; the ground is none."""
+    """Return building -> box of height `BOTTOMLESS_M` around it; without the ground."""
     label = buildings(city)[0]
     low_m, high_m = building_extents_m(city, label)
     middle_m, size_m = 0.5 * (low_m + high_m), high_m - low_m
     found = {}
     for building in np.unique(label[~city.on_ground]).tolist():
-        (x_m, y_m, _), (length_m, width_m, _) = (each[building].tolist()
-                                                 for each in (middle_m, size_m))
+        (x_m, y_m, _), (length_m, width_m, _) = middle_m[building].tolist(), size_m[
+            building].tolist()
         found[building] = Box(x_m, y_m, length_m, width_m, BOTTOMLESS_M, 0.0)
     return found
 
 
 class RoofHeights(GainEffect):
-    """Roofs that are higher or lower than the map says."""
+    """Height offsets of mapped roofs."""
 
     name = "roof_heights"
     variant = "roofs that are off by metres"
@@ -197,16 +198,17 @@ class RoofHeights(GainEffect):
             raised_m[roof.building] = roof.offset_m
         which = np.flatnonzero(raised_m)
         ends_m = links.device_m[links.device], links.receiver_m
-        ways = roof_crossings(city, *ends_m, which)
-        rows, link = np.unique(ways.link, return_inverse=True)
+        crossings = roof_crossings(city, *ends_m, which)
+        rows, link = np.unique(crossings.link, return_inverse=True)
         if not len(rows):
             return Term.of_offset(offset_db)
         others = _without(city, tuple(which.tolist()))
         hidden = ~others.line_of_sight(ends_m[0][rows], ends_m[1][rows])
         wavelength_m = speed_of_light / links.frequency_hz
         before_db, after_db = (np.where(hidden, HIDDEN_DB, 0.0) for _ in range(2))
-        np.maximum.at(before_db, link, ways.loss_db(0.0, wavelength_m))
-        np.maximum.at(after_db, link, ways.loss_db(raised_m[ways.building], wavelength_m))
+        np.maximum.at(before_db, link, crossings.loss_db(0.0, wavelength_m))
+        np.maximum.at(after_db, link, crossings.loss_db(raised_m[crossings.building],
+                                                        wavelength_m))
         contrast_db = _contrast_db(links.select(rows), level_at)
         offset_db[rows] = _level_db(after_db, contrast_db) - _level_db(before_db, contrast_db)
         return Term.of_offset(offset_db)
@@ -223,23 +225,26 @@ class RoofHeights(GainEffect):
 
 
 def surely_off(roofs: Sequence[Roof]) -> list[Roof]:
-    """Return the roofs whose 90 % interval leaves out the map's height, the most wrong first."""
+    """List the roofs whose 90 % interval excludes the mapped height, largest offset first."""
     return sorted((roof for roof in roofs
                    if abs(roof.true_offset_m) > QUANTILE_90 * roof.offset_sd_m),
                   key=lambda roof: -abs(roof.true_offset_m))
 
 
-def beside_the_others(roofs: Sequence[Roof]) -> tuple[Roof, ...]:
-    """Return roofs with the offset of the others taken for the model's, and their scatter added.
+def with_model_error(roofs: Sequence[Roof]) -> tuple[Roof, ...]:
+    """Estimate the model error of each roof from all others, leave-one-out, and add it.
+
+    Sets `common_m` to the common offset of the others, and adds their scatter and the uncertainty
+    of that offset to `offset_sd_m`.
 
     Args:
-        roofs: n roofs; the standard deviation of each is of what its own links leave open.
+        roofs: n roofs with the standard deviations from their own links.
     """
-    off_m, own_sd_m = (np.array([getattr(roof, name) for roof in roofs])
-                       for name in ("offset_m", "offset_sd_m"))
+    offset_m, link_sd_m = (np.array([getattr(roof, name) for roof in roofs])
+                           for name in ("offset_m", "offset_sd_m"))
     found = []
     for number, roof in enumerate(roofs):
-        others_m, sd_m = (np.delete(values, number) for values in (off_m, own_sd_m))
+        others_m, sd_m = (np.delete(values, number) for values in (offset_m, link_sd_m))
         seen = max(len(others_m) - 1, 0)
         scatter = ((others_m - others_m.mean()) ** 2).sum() if seen else 0.0
         variance = (MODEL_ROOFS * MODEL_SD_M**2 + scatter) / (MODEL_ROOFS + seen)
@@ -252,12 +257,12 @@ def beside_the_others(roofs: Sequence[Roof]) -> tuple[Roof, ...]:
 
 
 class _Search:
-    """The likeliest height of each roof, all others as they are.
+    """Coordinate-wise estimate of the roof offsets.
 
     Args:
         view: residuals of n links.
-        rows: (r,) of which these are looked at.
-        contrast_db: (r,) what each would lose without any line of sight [dB].
+        rows: (r,) links that are used.
+        contrast_db: (r,) level with minus without line of sight by the channel law [dB].
     """
 
     def __init__(self, view: ResidualView, rows: np.ndarray, contrast_db: np.ndarray) -> None:
@@ -265,88 +270,92 @@ class _Search:
         assert links.city is not None
         self._view, self._rows, self._contrast_db = view, rows, contrast_db
         self._city, self._wavelength_m = links.city, speed_of_light / links.frequency_hz
-        self._ways = roof_crossings(links.city, links.device_m[links.device], links.receiver_m)
-        self._loss_db = self._ways.loss_db(0.0, self._wavelength_m)  # (m,) of each roof as it is
+        self._crossings = roof_crossings(links.city, links.device_m[links.device],
+                                         links.receiver_m)
+        self._loss_db = self._crossings.loss_db(0.0, self._wavelength_m)  # (m,), updated by sweeps
         by_roofs = np.zeros(len(rows), dtype=bool)
-        over_m = np.maximum(self._ways.enter_over_m, self._ways.leave_over_m)
-        by_roofs[self._ways.link[over_m > 0]] = True
+        over_m = np.maximum(self._crossings.enter_over_m, self._crossings.leave_over_m)
+        by_roofs[self._crossings.link[over_m > 0]] = True
         self._hidden_db = np.where(~links.los & ~by_roofs, HIDDEN_DB, 0.0)
         self._before_db = _level_db(self._most_db(self._loss_db), contrast_db)
         step_m = links.receiver_m - links.device_m[links.device]
         self._slope = np.abs(step_m[:, 2]) / np.maximum(np.hypot(*step_m[:, :2].T), 1.0)
 
     def _most_db(self, loss_db: np.ndarray) -> np.ndarray:
-        """Return the greatest of the losses (m,) over roofs of each link (r,) [dB]."""
+        """Compute the greatest loss (r,) of each link over its roofs, from losses (m,) [dB]."""
         most_db = self._hidden_db.copy()
         if len(loss_db):
-            link = self._ways.link
+            link = self._crossings.link
             first = np.flatnonzero(np.r_[True, np.diff(link) > 0])
             most_db[link[first]] = np.maximum(most_db[link[first]],
                                               np.maximum.reduceat(loss_db, first))
         return most_db
 
     def roofs(self) -> tuple[Roof, ...]:
+        """Estimate all roofs with enough links, in several sweeps, model error included."""
         label, centres_m = buildings(self._city)
         priors_m = building_height_sds_m(self._city)
         tall_m = centres_m[:, 2] - building_extents_m(self._city, label)[0][:, 2]
-        pairs = {int(building): np.flatnonzero(self._ways.building == building)
-                 for building in np.unique(self._ways.building)}
+        crossings_of = {int(building): np.flatnonzero(self._crossings.building == building)
+                        for building in np.unique(self._crossings.building)}
         found: dict[int, Roof] = {}
         for _ in range(SWEEPS):
-            for building, mine in pairs.items():
-                offset_m, sd_m = self._estimate(mine, float(tall_m[building]),
+            for building, crossings in crossings_of.items():
+                offset_m, sd_m = self._estimate(crossings, float(tall_m[building]),
                                                 float(priors_m[building]))
-                self._loss_db[mine] = self._ways.loss_db(offset_m, self._wavelength_m, mine)
+                self._loss_db[crossings] = self._crossings.loss_db(offset_m, self._wavelength_m,
+                                                                   crossings)
                 x_m, y_m, height_m = centres_m[building].tolist()
                 found[building] = Roof(building, x_m, y_m, height_m, offset_m, sd_m)
-        told = [roof for roof in found.values() if roof.offset_m]
-        return tuple(roof for roof in beside_the_others(told)
+        determined = [roof for roof in found.values() if roof.offset_m]
+        return tuple(roof for roof in with_model_error(determined)
                      if abs(roof.offset_m) >= MIN_OFFSET_M)
 
-    def _estimate(self, mine: np.ndarray, tall_m: float, prior_m: float) -> tuple[float, float]:
-        """Return mean and sd of a roof's offset from its pairs (q,) [m]; 0 if undetermined."""
-        offsets_m = prior_m * OFFSETS
+    def _estimate(self, crossings: np.ndarray, tall_m: float,
+                  prior_sd_m: float) -> tuple[float, float]:
+        """Estimate a roof's offset from its crossings (q,): mean and sd [m]; 0 if undetermined."""
+        offsets_m = prior_sd_m * OFFSETS
         offsets_m = offsets_m[offsets_m > (LEAST_SHARE - 1) * tall_m]
-        link = self._ways.link[mine]
+        link = self._crossings.link[crossings]
         without_db = self._loss_db.copy()
-        without_db[mine] = 0.0
+        without_db[crossings] = 0.0
         others_db = self._most_db(without_db)[link]
-        loss_db = self._ways.loss_db(offsets_m[:, None], self._wavelength_m, mine)
+        loss_db = self._crossings.loss_db(offsets_m[:, None], self._wavelength_m, crossings)
         after_db = _level_db(np.maximum(others_db, loss_db), self._contrast_db[link])
-        telling = np.ptp(after_db, axis=0) > TELLING_DB
-        if telling.sum() < MIN_LINKS:
-            return 0.0, prior_m
-        change_db = (after_db - self._before_db[link])[:, telling]
-        rows = self._rows[link[telling]]
-        log = np.array([self._view.gain_nats(rows, each_db).sum() for each_db in change_db])
-        log -= 0.5 * (offsets_m / prior_m) ** 2
-        if log.argmax() == 0:  # it may not be there at all, which is not for this to say
-            return 0.0, prior_m
+        informative = np.ptp(after_db, axis=0) > INFORMATIVE_DB
+        if informative.sum() < MIN_LINKS:
+            return 0.0, prior_sd_m
+        changes_db = (after_db - self._before_db[link])[:, informative]
+        rows = self._rows[link[informative]]
+        log = np.array([self._view.gain_nats(rows, change_db).sum() for change_db in changes_db])
+        log -= 0.5 * (offsets_m / prior_sd_m) ** 2
+        if log.argmax() == 0:  # lowest: it may not exist, which `removed_obstacle` decides
+            return 0.0, prior_sd_m
         share = np.exp(log - log.max())
         share /= share.sum()
         mean_m = float(share @ offsets_m)
         spread_m = np.sqrt(share @ (offsets_m - mean_m) ** 2 + np.diff(offsets_m)[0] ** 2 / 12)
-        if spread_m > MAX_SD_SHARE * prior_m:
-            return 0.0, prior_m
-        slope = float(np.median(self._slope[link[telling]]))
-        if log.argmax() == len(log) - 1:  # higher than any that was tried
-            spread_m = prior_m
+        if spread_m > MAX_SD_SHARE * prior_sd_m:
+            return 0.0, prior_sd_m
+        slope = float(np.median(self._slope[link[informative]]))
+        if log.argmax() == len(log) - 1:  # highest trial offset: the true one may be higher
+            spread_m = prior_sd_m
         return mean_m, float(np.hypot(spread_m, WALL_SD_M * slope))
 
 
 @lru_cache(maxsize=8)
 def _without(city: CityMap, which: tuple[int, ...]) -> CityMap:
-    """Return the map without some buildings; a map is predicted in many batches over the same."""
+    """Remove buildings from a map; cached, as a map is predicted in many batches."""
     return city.without(np.isin(buildings(city)[0], which))
 
 
 def _contrast_db(links: Links, level_at: LevelAt) -> np.ndarray:
-    """Return what each link (n,) has more with line of sight than without, by the law [dB]."""
-    with_it, without = (level_at(links.with_los(np.full(len(links), each)))
-                        for each in (True, False))
-    return np.maximum(with_it - without, 0.0)
+    """Compute the level (n,) with minus without line of sight by the law, at least 0 [dB]."""
+    with_los, without = (level_at(links.with_los(np.full(len(links), is_los)))
+                         for is_los in (True, False))
+    return np.maximum(with_los - without, 0.0)
 
 
 def _level_db(loss_db: np.ndarray, contrast_db: np.ndarray) -> np.ndarray:
-    """Return the level (n,) of a way over roofs beside the less that is on others [dB]."""
+    """Add the powers over the roofs and of other paths, `contrast_db` below line of sight [dB]."""
     return 10 * np.log10(10 ** (-loss_db / 10) + 10 ** (-contrast_db / 10))

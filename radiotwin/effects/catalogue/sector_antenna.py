@@ -1,4 +1,4 @@
-"""A device with a sector antenna that nobody declared; `radiotwin.effects.antennas` has its law."""
+"""`antenna_pattern` of a device: an undeclared sector antenna, see `radiotwin.effects.antennas`."""
 
 from collections.abc import Iterator
 from itertools import product
@@ -25,12 +25,12 @@ from radiotwin.effects.params import Estimate, Parameter, Variation, quantities
 from radiotwin.effects.patterns import Pattern, members
 from radiotwin.links import Links, site_of
 
-AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0).tolist()  # of patterns that are tried first
+AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0).tolist()  # of trial patterns
 TYPICAL_WIDTH_DEG = 65.0  # 3GPP TR 38.901, Table 7.3-1
 
 
 class SectorAntenna(SectorEffect):
-    """An undeclared sector antenna; one step finds one device's, or all those of a mast."""
+    """An undeclared sector antenna; each step finds that of one device, or all of a mast."""
 
     settled_by = "fly around the device at one distance and one height"
     variant = "sector antenna of a device"
@@ -43,15 +43,15 @@ class SectorAntenna(SectorEffect):
                  for device in devices}
         devices = sorted((set(eligible_devices(view.links)) - known)
                          & set(view.in_group(view.links.device)))
-        ways = {straight: _best_patterns(view, devices, straight)
-                for straight in ([False, True] if view.links.city is not None else [False])}
-        straight = max(ways, key=lambda way: max((nats for _, nats in ways[way].values()),
-                                                 default=0.0))  # of equal ones the first
-        found = ways[straight]
+        patterns = {straight: _best_patterns(view, devices, straight)
+                    for straight in ([False, True] if view.links.city is not None else [False])}
+        straight = max(patterns, key=lambda key: max((nats for _, nats in patterns[key].values()),
+                                                     default=0.0))  # the first of equal ones
+        found = patterns[straight]
         if not found:
             return []
         best = max(found, key=lambda device: found[device][1])
-        # Sectors of one mast are supported by the evidence of all of them.
+        # All sectors of the mast at once, as their evidence adds up, and the best one.
         mast = set(site_of(view.links, best)) & set(found)
         return [self.Params(devices={device: found[device][0] for device in sorted(chosen)},
                             straight=straight)
@@ -64,11 +64,11 @@ class SectorAntenna(SectorEffect):
     @override
     def typical_patterns(self, view: ResidualView) -> Iterator[Pattern]:
         links, size = view.links, quantities(SectorPattern)["front_to_back_db"]
-        for mine in members(links.device):
-            off = _signed_deg(links.azimuth_deg - median_azimuth_deg(links.azimuth_deg[mine]))
+        for mask in members(links.device):
+            off = _signed_deg(links.azimuth_deg - median_azimuth_deg(links.azimuth_deg[mask]))
             yield Pattern("direction", "dB",
                           f"front to back of one device, {TYPICAL_WIDTH_DEG:.0f}° wide",
-                          mine * -np.minimum(0.5 * (off / TYPICAL_WIDTH_DEG) ** 2, 1.0),
+                          mask * -np.minimum(0.5 * (off / TYPICAL_WIDTH_DEG) ** 2, 1.0),
                           low=size["low"], high=size["high"])
 
     @override
@@ -85,34 +85,35 @@ class SectorAntenna(SectorEffect):
 
 
 def median_azimuth_deg(azimuth_deg: np.ndarray) -> float:
-    """Return the median of directions (n,), taken around their mean: there is no step at north."""
+    """Compute the median of directions (n,) about their circular mean [deg]."""
     mean_deg = np.degrees(np.angle(np.exp(1j * np.radians(azimuth_deg)).sum()))
     return float((mean_deg + np.median(_signed_deg(azimuth_deg - mean_deg))) % 360)
 
 
 def _signed_deg(angle_deg: np.ndarray) -> np.ndarray:
-    """Return the same angles from -180 up to 180 [deg]."""
+    """Wrap angles to -180 to 180 [deg]."""
     return (angle_deg + 180) % 360 - 180
 
 
 def _best_patterns(view: ResidualView, devices: list[int],
                    straight: bool) -> dict[int, tuple[SectorPattern, float]]:
-    """Return device -> best pattern and its gain [nats], of those that gain enough."""
+    """Find device -> best pattern and its gain [nats], for devices above `MIN_NATS`."""
     found = {}
     for device in devices:
-        every = np.flatnonzero(view.links.device == device)
-        rows = subsample(every, MAX_PROPOSE_LINKS)
+        device_rows = np.flatnonzero(view.links.device == device)
+        rows = subsample(device_rows, MAX_PROPOSE_LINKS)
         if not len(rows):
             continue
         pattern, nats = _best_pattern(view, rows, straight)
-        if nats * len(every) / len(rows) > MIN_NATS:
-            found[device] = pattern, nats * len(every) / len(rows)
+        nats = nats * len(device_rows) / len(rows)
+        if nats > MIN_NATS:
+            found[device] = pattern, nats
     return found
 
 
 def _best_pattern(view: ResidualView, rows: np.ndarray,
                   straight: bool) -> tuple[SectorPattern, float]:
-    """Return the pattern of a grid that fits links best, and its gain over a level alone [nats]."""
+    """Find the pattern of a grid that fits links best, and its gain over a constant [nats]."""
     rays, residual_db = Departures.of(view.links, rows, straight), view.residual_db[rows]
     weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
 
@@ -126,7 +127,7 @@ def _best_pattern(view: ResidualView, rows: np.ndarray,
                                 tilt_deg=tilt, vertical_beamwidth_deg=height)
         return nats(rays.offset_db(pattern)), pattern
 
-    # Of equal ones the last in the order of the numbers.
+    # Of equal gains the pattern with the largest numbers is taken.
     flat = max((tried(*numbers)[0], numbers)
                for numbers in product(AZIMUTHS_DEG, BEAMWIDTHS_DEG, FRONT_TO_BACK_DB))[1]
     vertical = max((tried(*flat, *numbers)[0], numbers) for numbers in VERTICALS_DEG)[1]

@@ -1,10 +1,9 @@
-"""A receiver with an undeclared half-wave dipole, upright or tilted, fixed to its body.
+"""`antenna_pattern` of a receiver: an undeclared half-wave dipole, tilted, fixed to its body.
 
-Far field of a half-wave dipole, cos(π/2 cos θ) / sin θ along its own polar direction (Balanis,
-Antenna Theory, Sec. 4.6), directivity 1.64, times the share of it that has the polarisation of an
-upright transmitting antenna's wave. With a 3D map each path has the gain of the direction from
-which it comes. Power on paths that are not followed, which is fitted too, has the mean of the
-pattern.
+Far field of a half-wave dipole, cos(π/2 cos θ) / sin θ in its polar direction (Balanis, Antenna
+Theory, Sec. 4.6), directivity 1.64, times the projection on the polarisation of the wave of an
+upright transmitting antenna. With a 3D map each path has the gain of its direction of arrival; the
+power on paths that are not followed is fitted and has the mean gain of the pattern.
 """
 
 from functools import partial
@@ -14,24 +13,22 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antennas import BodyFrameEffect, report_patterns
+from radiotwin.effects.antennas import MIN_LINKS, MIN_NATS, BodyFrameEffect, report_patterns
 from radiotwin.effects.arrays import frequent_labels, squares_about_mean
 from radiotwin.effects.base import ResidualView
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, quantity
 from radiotwin.links import Links
 from radiotwin.propagation.laws.followed_paths import Rays
 
-MIN_LINKS = 100  # of a receiver with line of sight, to propose its dipole
-MIN_NATS = 4.0  # that a dipole must gain to be proposed
 DIRECTIVITY = 1.64  # of a half-wave dipole (Balanis, Sec. 4.6)
-MIN_GAIN = 10**-2.5  # below the maximum, linear: no real antenna has deeper nulls
+MIN_GAIN = 10**-2.5  # relative to the maximum, linear: no real antenna has deeper nulls
 MEAN_GAIN = 0.5  # over all directions and both polarisations
-TILTS_DEG = np.arange(0.0, 60.1, 5.0)  # that are tried
+TILTS_DEG = np.arange(0.0, 60.1, 5.0)  # trial values
 AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0)
 
 
 class DipoleParams(EffectParams):
-    """Attitude of one receiver's dipole in the body frame."""
+    """Tilt of one receiver's dipole in the body frame."""
 
     tilt_deg: float = quantity(0.0, unit="deg", low=0.0, high=85.0, step=4.0,
                                description="Angle between the dipole and the body's top.")
@@ -42,7 +39,7 @@ class DipoleParams(EffectParams):
 
 
 def dipole_gain(ray: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Return the gain of a half-wave dipole for vertically polarised waves, linear.
+    """Compute the gain of a half-wave dipole for vertically polarised waves, linear.
 
     Args:
         ray: (…, 3) unit vectors towards the source of the wave; up is z.
@@ -52,7 +49,7 @@ def dipole_gain(ray: np.ndarray, axis: np.ndarray) -> np.ndarray:
         (…,) relative to an isotropic antenna.
     """
     cosine = np.einsum("...i,...i->...", ray, axis)
-    # The wave's electric field lies in the vertical plane through the ray.
+    # The electric field of the wave is in the vertical plane through the ray.
     flat = np.sqrt(np.maximum(1 - ray[..., 2] ** 2, 1e-9))
     along = (axis[..., 2] - ray[..., 2] * cosine) / flat
     field = np.cos(np.pi / 2 * cosine) / np.maximum(1 - cosine**2, 1e-6) * along
@@ -60,7 +57,7 @@ def dipole_gain(ray: np.ndarray, axis: np.ndarray) -> np.ndarray:
 
 
 class TiltedDipole(BodyFrameEffect):
-    """A dipole for each receiver that fits better with one."""
+    """A tilted dipole for each receiver that fits better with one."""
 
     name = "antenna_pattern"
     acts_on = ("receiver", "direction")
@@ -105,7 +102,7 @@ class TiltedDipole(BodyFrameEffect):
 
 
 def _best_dipole(view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
-    """Return the dipole of a grid that fits best along straight lines; None if none gains much."""
+    """Find the dipole of a grid that fits best along straight lines; None if the gain is low."""
     links = view.links.select(rows)
     ray, residual_db, weight = -_unit(links.offset_m), view.residual_db[rows], view.weight[rows]
 
@@ -121,11 +118,11 @@ def _best_dipole(view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
 
 
 class _Arrivals(NamedTuple):
-    """Directions from which links arrive at their receiver.
+    """Directions of arrival of n links at their receivers.
 
     Attributes:
-        rays: at the receiver.
-        axes: (n, 3, 3) of the receiver, see `Links.receiver_axes`.
+        rays: p rays of the paths at the receiver.
+        axes: (n, 3, 3) body axes of the receiver, see `Links.receiver_axes`.
     """
 
     rays: Rays
@@ -133,12 +130,12 @@ class _Arrivals(NamedTuple):
 
     @classmethod
     def of(cls, links: Links, rows: np.ndarray) -> "_Arrivals":
-        """Return those of some links, which are followed over the map."""
+        """Find the arrivals of some links, with paths over the map."""
         links = links.select(rows)
         return cls(Rays.of(links, of_device=False), links.receiver_axes)
 
     def offset_db(self, dipole: DipoleParams) -> np.ndarray:
-        """Return (n,) what the dipole adds to each link [dB]."""
+        """Compute the gain (n,) of each link by the dipole [dB]."""
         axis = _axis(self.axes, dipole.tilt_deg, dipole.lean_azimuth_deg)
         gain = dipole_gain(self.rays.direction,
                            axis.astype(self.rays.direction.dtype)[self.rays.link])
@@ -146,11 +143,12 @@ class _Arrivals(NamedTuple):
 
 
 def _axis(axes: np.ndarray, tilt_deg: float, azimuth_deg: float) -> np.ndarray:
-    """Return (n, 3) the direction in the world of a dipole on receivers with axes (n, 3, 3)."""
+    """Compute the direction (n, 3) in the map frame of dipoles on bodies with axes (n, 3, 3)."""
     tilt, lean = np.radians(tilt_deg), np.radians(azimuth_deg)
     in_body = np.array([np.sin(tilt) * np.sin(lean), np.sin(tilt) * np.cos(lean), np.cos(tilt)])
     return np.einsum("i,nij->nj", in_body, axes)
 
 
 def _unit(offset_m: np.ndarray) -> np.ndarray:
+    """Normalise vectors (n, 3)."""
     return offset_m / np.maximum(np.linalg.norm(offset_m, axis=1, keepdims=True), 1e-9)

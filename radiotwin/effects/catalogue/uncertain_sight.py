@@ -1,9 +1,9 @@
-"""Walls and roofs of a map that are off by metres: near them, the line of sight is not certain.
+"""`uncertain_sight`: near walls and roofs with errors of metres, the line of sight is uncertain.
 
-In how many of some maps as this one might be (`perturbed_map`) a link has line of sight is its
-chance of it. Where that is neither 0 nor 1, the map's class says less than elsewhere: the level
-lies between those of both classes, and errors are larger. How much of either is fitted. Without
-this, a box or a grove that hides a few links beside a wall explains what the wall's error did.
+The probability of line of sight of a link is its frequency over randomly perturbed maps
+(`perturbed_map`). Where it is neither 0 nor 1, the level is between those with and without line of
+sight, and errors are larger; both are fitted. Otherwise a box or a grove that hides a few links
+near a wall would explain the effect of the wall's error.
 """
 
 from dataclasses import replace
@@ -20,14 +20,14 @@ from radiotwin.scene.citymap import perturbed_map
 # Between the accuracies of buildings as blocks with roofs (2 m) and of surveyed ones (0.5 m): LoD2
 # and LoD3 of CityGML 2.0 (OGC 12-019, Table 1); heights are often counted from storeys.
 WALL_SD_M, HEIGHT_SD_M = 1.0, 2.0
-MAPS = 8  # beside the one that is given
-PRIOR_SD_DB = 20.0  # of what a link near a wall loses or gains: the difference of the classes
-CONTRASTS_DB = (6.0, 12.0, 20.0)  # that are tried first
-MIN_LINKS = 60  # of which it is not certain
+MAPS = 8  # number of perturbed maps, in addition to the given one
+PRIOR_SD_DB = 20.0  # of the difference of level between both classes
+CONTRASTS_DB = (6.0, 12.0, 20.0)  # start values
+MIN_LINKS = 60  # with an uncertain line of sight
 
 
 class UncertainSight(GainEffect):
-    """Levels between those of both classes near walls and roofs, and larger errors."""
+    """Levels between those with and without line of sight near walls, and larger errors."""
 
     name = "uncertain_sight"
     parameter_labels = {"contrast_db": "difference of both classes, by their scatter",
@@ -81,7 +81,7 @@ class UncertainSight(GainEffect):
             zip(names, estimate.coefficients, estimate.coefficients_sd, strict=True)}
 
     def _chance(self, links: Links) -> np.ndarray:
-        """Return how probable the line of sight of each link (n,) is."""
+        """Compute the probability (n,) of line of sight of each link; cached."""
         def derive() -> np.ndarray:
             city = city_of(links, self.name)
             seen = links.los.astype(float)

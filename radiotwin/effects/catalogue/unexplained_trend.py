@@ -1,9 +1,8 @@
-"""`unexplained_trend`, a last resort: the residual as a smooth curve over one variable.
+"""`unexplained_trend`, the last resort: the residual as a piecewise linear curve over one variable.
 
-It describes on which variable the residual still depends, and how; it explains nothing. It is no
-candidate among the effects, because it would fit part of whatever they model. A twin and its maps
-have a curve that is the same for all receivers and over a variable of places; a map has no heading
-and no time.
+It describes on which variable the residual still depends, without a cause. It is no candidate among
+the effects, because it would fit part of any of them. Maps include a curve only if it is common to
+all receivers and over a variable of position; a map has no heading and no time.
 """
 
 from typing import Annotated
@@ -19,16 +18,17 @@ from radiotwin.links import Links, residual_variable
 
 KNOTS = 8
 PRIOR_SD_DB = 5.0  # of the value at a knot
-MAX_CURVES = 10  # receivers that may have a curve each
-MIN_KNOWN = 0.5  # share of the links with a value
+MAX_CURVES = 10  # largest number of receivers with separate curves
+MIN_KNOWN = 0.5  # least share of links with a known value of the variable
 CIRCULAR = ("azimuth_deg", "body_azimuth_deg", "heading_deg")
 ON_MAPS = ("distance_m", "elevation_deg", "azimuth_deg", "altitude_m", "predicted_level_db",
            "metres_inside_m", "diffraction_parameter")
 OVER = "over "
-MAX_KNOT = 1e15  # of times since 1970, too
+MAX_KNOT = 1e15  # bound of a knot; covers times since 1970
 
 
-def _ascending(values: list[float]) -> list[float]:
+def _check_ascending(values: list[float]) -> list[float]:
+    """Raise if the values do not ascend."""
     if any(after <= before for before, after in zip(values, values[1:], strict=False)):
         raise ValueError("knots must ascend")
     return values
@@ -47,7 +47,7 @@ class UnexplainedTrend(GainEffect):
         """Knots and receivers of the curves."""
 
         knots: Annotated[list[Annotated[float, Field(ge=-MAX_KNOT, le=MAX_KNOT)]],
-                         AfterValidator(_ascending)] = Field(
+                         AfterValidator(_check_ascending)] = Field(
             min_length=1, max_length=KNOTS, description="Values of the variable, ascending.")
         receivers: Unique[ReceiverIndex | None] = Field(
             description="Indices of the receivers with a curve each; [None] is one for all.")
@@ -109,5 +109,6 @@ class UnexplainedTrend(GainEffect):
         return result
 
     def _value(self, links: Links, level_at: LevelAt) -> np.ndarray:
+        """Return the variable (n,) of the links; cached."""
         return self.of_links.get(
             links, (level_at,), lambda: residual_variable(self.variable, links, level_at(links)))
