@@ -1,12 +1,11 @@
-"""Tracing in pieces: what one call of the solver gets, what solves it, and where it is kept.
+"""Tracing in batches of links: `LinkBatch`, the solvers of a batch, and the cache of their gains.
 
-Each finished piece of a map is kept on disk, so that an interrupted trace can be resumed.
+Each finished batch of a map is kept on disk, so that an interrupted trace can be resumed.
 
-Large cities are traced by tiles: batches of links that lie close together, and the geometry that
-they reach. A path of length L between two ends at the distance d leaves their straight line by no
-more than r = sqrt(L² - d²) / 2, as the shortest way by a point beside the line is that by a point
-beside its middle. So a culling radius about the line keeps all paths up to a length; longer ones
-are left out, with all buildings that none of the others meets.
+Large cities are traced by tiles: batches of links that lie close together, with only the geometry
+around them. A path of length L between ends at the distance d stays within r = sqrt(L² - d²) / 2 of
+their straight line (the foci of an ellipsoid). So geometry farther than a culling radius from the
+line only matters for paths longer than a limit.
 """
 
 import hashlib
@@ -36,25 +35,26 @@ from radiotwin.scene.materials import Material
 from radiotwin.trace.settings import FINER, SolverSettings
 from radiotwin.trace.solver import Antennas, CellGains, PathGains
 
-# Calls of the solver for the estimate of what an exchange of ends changes: a tenth of the map's
+# Calls of the solver that estimate the effect of exchanging the ends of links: a tenth of the
+# map's, within these bounds
 MIN_EXCHANGED, MAX_EXCHANGED = 8, 50
-GEOMETRY_COPIES = 3  # of a packed city in a worker: as received, unpacked, and a tile of it
+GEOMETRY_COPIES = 3  # of a packed city in a worker's memory: received, unpacked, and its tile
 MANY_SHAPES = 5_000
-"""Shapes from which on a city is traced by tiles unless the settings say otherwise."""
+"""A city with more shapes is traced by tiles, unless the settings have a radius."""
 RADIUS_M = 400.0
-"""Culling radius unless the settings say otherwise; its error is in docs/scale.md."""
+"""Default culling radius; its error is in docs/scale.md."""
 OMITTED_DB = 20.0
-"""How far below the limit of detection a path is that is left out for its length: 1 % of the power
-of the weakest link that is detected."""
+"""Paths may be left out for their length if they are this far below the limit of detection: they
+have 1 % of the power of the weakest detected link."""
 
 
 @dataclass(frozen=True)
 class Tile:
-    """Part of a city that the links of a batch reach.
+    """The part of a city that a batch of links is traced in.
 
     Attributes:
-        hull_m: Corners of the convex hull of the links' ends, from above [m].
-        radius_m: What is farther from it is left out [m].
+        hull_m: Corners (x, y) of the convex hull of the links' ends [m].
+        radius_m: Shapes farther from the hull are left out [m].
     """
 
     hull_m: tuple[tuple[float, float], ...]
@@ -63,14 +63,14 @@ class Tile:
 
 @dataclass(frozen=True, eq=False)
 class PackedCity:
-    """A city in a few arrays: 50,000 shapes take the memory of their triangles.
+    """A city in a few arrays, which take no more memory than its triangles.
 
     Attributes:
         vertices_m: (v, 3) positions [m].
         faces: (f, 3) indices of vertices, shape by shape.
         first_face: (n + 1,) first face of each of n shapes.
-        material: (n,) row of `materials`.
-        materials: Of all shapes.
+        material: (n,) index of each shape's material.
+        materials: All materials.
     """
 
     vertices_m: np.ndarray
@@ -81,7 +81,7 @@ class PackedCity:
 
     @classmethod
     def of(cls, shapes: Sequence[CityShape]) -> "PackedCity":
-        """Pack shapes."""
+        """Pack the shapes of a city."""
         starts = np.cumsum([0, *(len(shape.mesh.vertices) for shape in shapes)])
         row = {material: index for index, material in
                enumerate(dict.fromkeys(shape.material for shape in shapes))}
@@ -96,26 +96,26 @@ class PackedCity:
 
     @property
     def nbytes(self) -> int:
-        """Size in memory."""
+        """Memory of the arrays [bytes]."""
         return self.vertices_m.nbytes + self.faces.nbytes
 
     @cached_property
     def _boxes(self) -> Any:
-        """(n,) rectangles around the shapes, from above."""
+        """(n,) bounding rectangles of the shapes in the plane."""
         import shapely
 
         corner_m = self.vertices_m[self.faces][..., :2]
         filled = np.diff(self.first_face) > 0
-        bounds_m = np.full((len(self), 4), np.nan)  # of a shape without faces: near nothing
+        bounds_m = np.full((len(self), 4), np.nan)  # of a shape without faces: near no tile
         starts = self.first_face[:-1][filled]
         bounds_m[filled, :2] = np.minimum.reduceat(corner_m.min(axis=1), starts)
         bounds_m[filled, 2:] = np.maximum.reduceat(corner_m.max(axis=1), starts)
         return shapely.box(*bounds_m.T)
 
     def near(self, tile: Tile) -> np.ndarray:
-        """Return (n,) bool: shapes whose bounding rectangle lies within reach of a tile.
+        """Return (n,) bool: shapes whose bounding rectangle is within a tile's radius of its hull.
 
-        The ground reaches everywhere, so it stays whole.
+        The ground, which extends everywhere, is always among them.
         """
         import shapely
 
@@ -124,7 +124,7 @@ class PackedCity:
         return shapely.dwithin(self._boxes, hull, tile.radius_m)
 
     def part(self, kept: np.ndarray) -> list[CityShape]:
-        """Return some shapes, (n,) bool, those of one material as one."""
+        """Return the shapes `kept`, (n,) bool, joined to one shape per material."""
         import trimesh
 
         shape = np.repeat(np.arange(len(self)), np.diff(self.first_face))
@@ -140,7 +140,7 @@ class PackedCity:
 
 
 def with_radius(scene: Scene, settings: SolverSettings) -> SolverSettings:
-    """Return the settings with the culling radius that holds for a scene; a given one stays."""
+    """Set the default culling radius for a scene of many shapes, unless a radius is given."""
     if settings.solver != "paths" or settings.radius_m is not None:
         return settings
     folder = scene.folder / "meshes"
@@ -149,9 +149,10 @@ def with_radius(scene: Scene, settings: SolverSettings) -> SolverSettings:
 
 
 def longest_path_m(scene: Scene) -> float:
-    """Return the length of a path that free space leaves `OMITTED_DB` below the limit [m].
+    """Return the longest path that may matter [m]: longer ones can be left out.
 
-    Walls and edges only take power away, and antennas are counted with their peaks.
+    Its free-space gain, with the peaks of the antennas, is `OMITTED_DB` below the limit of
+    detection. Interactions only take power away.
     """
     peaks_dbi = [0.0 if antenna is None else antenna.pattern.peak_dbi
                  for antenna in scene.device_antennas]
@@ -163,10 +164,10 @@ def longest_path_m(scene: Scene) -> float:
 
 def tile_of(device_m: np.ndarray, points_m: np.ndarray, radius_m: float, longest_m: float
             ) -> Tile:
-    """Return the part of the city that links from a device (3,) to points (n, 3) reach [m].
+    """Return the tile for links from a device (3,) to points (n, 3) [m].
 
-    Paths longer than `longest_m` need not be found: if all shorter ones stay closer to the straight
-    line than `radius_m`, the tile is that much narrower.
+    Its radius is `radius_m`, or less if all paths up to `longest_m` stay closer to the straight
+    lines of the links.
     """
     import shapely
 
@@ -179,10 +180,10 @@ def tile_of(device_m: np.ndarray, points_m: np.ndarray, radius_m: float, longest
 
 
 def batches_by_place(points_m: np.ndarray, size: int) -> list[np.ndarray]:
-    """Split points (n, 3) into batches of points that lie close together: ascending indices.
+    """Split points (n, 3) into batches of neighbouring points, each of ascending indices.
 
-    The points are halved across their longer side, again and again, as a k-d tree is made. All
-    batches but one are full, as a batch costs the same however few points it has.
+    As for a k-d tree, the points are halved across their longer side, again and again. All batches
+    but one are full: a batch takes the same time for any number of points.
     """
     def split(index: np.ndarray) -> list[np.ndarray]:
         batches = math.ceil(len(index) / size)
@@ -197,15 +198,15 @@ def batches_by_place(points_m: np.ndarray, size: int) -> list[np.ndarray]:
 
 
 class BatchStore:
-    """Gains of finished pieces in a folder, as a job's cache; they belong to one key.
+    """Cache of the gains of finished batches of one trace, as files in the scene folder.
 
     Args:
-        scene_folder: Its folder `cache` holds them.
-        key: Everything that decides the arrays; different keys have different folders.
+        scene_folder: Scene folder; the files are in `cache/trace-<hash>`.
+        key: Everything that the gains depend on.
 
     Attributes:
         hash: SHA-256 of the key.
-        folder: The folder.
+        folder: Folder of the files.
     """
 
     def __init__(self, scene_folder: Path, key: dict[str, Any]) -> None:
@@ -219,7 +220,7 @@ class BatchStore:
                 temporary.write_text(text + "\n", encoding="utf-8")
 
     def get(self, piece: "LinkBatch") -> tuple[np.ndarray] | None:
-        """Return the gains of a piece in a tuple; None where they are absent or damaged."""
+        """Return the gains of a batch in a tuple; None if they are absent or damaged."""
         try:
             data = read_bytes(self.folder / f"{piece.name}.npy", "batch of a trace")
         except BadInput:
@@ -227,21 +228,21 @@ class BatchStore:
         if len(data) < 8 * len(piece):
             return None
         array = np.frombuffer(data[len(data) - 8 * len(piece):], dtype=float)
-        if data != _file_content(array):  # not as `put` writes it
+        if data != _file_content(array):  # another header than `put` writes
             return None
         note_finished()
         return (array,)
 
     def put(self, piece: "LinkBatch", result: np.ndarray, messages: list[str],
             seconds: float) -> None:
-        """Save the gains of a piece, completely or not at all."""
+        """Save the gains of a batch, completely or not at all."""
         with atomic_path(self.folder / f"{piece.name}.npy") as temporary:
             temporary.write_bytes(_file_content(result))
         note_finished()
 
 
 def _file_content(array: np.ndarray) -> bytes:
-    """Return the bytes of a `.npy` file of floats."""
+    """Return the content of a `.npy` file of an array of floats."""
     file = io.BytesIO()
     np.save(file, np.asarray(array, dtype=float), allow_pickle=False)
     return file.getvalue()
@@ -249,17 +250,17 @@ def _file_content(array: np.ndarray) -> bytes:
 
 @dataclass(frozen=True, eq=False)
 class LinkBatch:
-    """Links from one device that are solved together: one piece of a trace.
+    """Links from one device that are solved together.
 
-    What a piece holds does not depend on the number of workers, as a gain depends, in rare cases,
-    on the points that are solved with it.
+    Batches do not depend on the number of workers: in rare cases a gain depends on the points that
+    are solved with it.
 
     Attributes:
-        name: In the store.
+        name: Name in the cache.
         device_m: (3,) position of the device [m].
         points_m: (n, 3) positions of the receivers [m].
-        antennas: Of the device and of the receivers; None: isotropic.
-        batch_receivers: As in `SolverSettings`.
+        antennas: Antennas of the device and of the receivers; None: isotropic.
+        batch_receivers: Number of receivers in a call, see `SolverSettings`.
         tile: Part of the city that they are solved in; None: all of it.
     """
 
@@ -274,7 +275,7 @@ class LinkBatch:
         return len(self.points_m)
 
     def halves(self) -> "tuple[LinkBatch, LinkBatch] | None":
-        """Return two pieces that are solved in half the memory; None where it has one point."""
+        """Split the batch into two that need half the memory; None if it has one point."""
         if len(self) < 2 or self.batch_receivers < 2:
             return None
         middle, step = (len(self) + 1) // 2, (self.batch_receivers + 1) // 2
@@ -287,19 +288,20 @@ class LinkBatch:
 def link_pieces(scene: Scene, settings: SolverSettings,
                 devices: Sequence[tuple[str, np.ndarray, Antenna | None]], points_m: np.ndarray,
                 size: int | None = None) -> tuple[list[LinkBatch], np.ndarray]:
-    """Return the links of some devices to the same points (n, 3) [m] in pieces.
+    """Divide the links from several devices to the same points into batches.
 
-    Points are solved together in their order, or where there are tiles by place.
+    Points are batched in their order; with tiles, by position.
 
     Args:
         scene: City, UAVs' antenna and limit of detection.
-        settings: Of the solver.
-        devices: Name before those of its pieces, (3,) position [m] and antenna of each.
+        settings: Settings of the solver.
+        devices: Prefix of the batches' names, position (3,) [m] and antenna of each device.
         points_m: (n, 3) positions of the receivers [m].
-        size: Most points of a piece; None: those of a call of the solver `paths`.
+        size: Maximum number of points in a batch; None: `settings.batch_receivers`.
 
     Returns:
-        The pieces, device by device, and the (n,) index of the points in their order.
+        The batches, device by device, and the indices (n,) of the points in the order of a device's
+        batches.
     """
     size = size or settings.batch_receivers
     if settings.is_tiled:
@@ -320,15 +322,16 @@ def link_pieces(scene: Scene, settings: SolverSettings,
 
 
 class _Solve:
-    """Solves pieces; the solver, which takes seconds to make, is made with the first one.
+    """Base of the callables that solve a batch.
 
-    Sent to another process, it takes the geometry along, and reads no file there.
+    The solver takes seconds to construct: this is done for the first batch. Pickled, the object
+    holds the geometry, so that another process reads no file.
     """
 
-    geometry_bytes = 0  # memory that the geometry takes beside the solver's own
+    geometry_bytes = 0  # memory of the geometry in addition to the solver's
 
     def __init__(self, scene: Scene, settings: SolverSettings) -> None:
-        self._city: Any = scene.xml_path  # or what is made of it
+        self._city: Any = scene.xml_path  # or its shapes, when pickled; or a `PackedCity`
         self._frequency_hz, self._settings = scene.config.radio.frequency_hz, settings
         self._solver: Any = None
 
@@ -338,10 +341,10 @@ class _Solve:
 
 
 class SolveLinks(_Solve):
-    """Gains along paths, see `PathGains`."""
+    """Computes the gains of a batch along paths in the whole city, see `PathGains`."""
 
     def __call__(self, piece: LinkBatch) -> np.ndarray:
-        """Return (n,) gains [dB]."""
+        """Return the gains (n,) of a batch [dB]."""
         if self._solver is None or self._solver.settings.batch_receivers != piece.batch_receivers:
             settings = replace(self._settings, batch_receivers=piece.batch_receivers)
             self._solver = PathGains(self._city, self._frequency_hz, settings)
@@ -349,12 +352,12 @@ class SolveLinks(_Solve):
 
 
 class SolveTiles(_Solve):
-    """Gains along paths in the part of the city that a piece reaches.
+    """Computes the gains of a batch along paths in its tile of the city.
 
-    The solver of the last tile is kept, as neighbouring pieces may share it.
+    The solver of the last tile is kept: consecutive batches may share it.
 
     Attributes:
-        shapes: Number of shapes in that tile.
+        shapes: Number of shapes in the last tile.
     """
 
     def __init__(self, scene: Scene, settings: SolverSettings) -> None:
@@ -365,10 +368,10 @@ class SolveTiles(_Solve):
         self.shapes = 0
 
     def __call__(self, piece: LinkBatch) -> np.ndarray:
-        """Return (n,) gains [dB]."""
+        """Return the gains (n,) of a batch [dB]."""
         assert piece.tile is not None
         if self._solver is None or self._solved != (piece.tile, piece.batch_receivers):
-            self._solver = None  # frees the last one's memory first
+            self._solver = None  # frees the memory of the last tile first
             settings = replace(self._settings, batch_receivers=piece.batch_receivers)
             kept = self._city.near(piece.tile)
             self.shapes = int(kept.sum())
@@ -379,14 +382,14 @@ class SolveTiles(_Solve):
 
 
 class SolveCells(_Solve):
-    """Gains averaged over cells, see `CellGains`; a piece is one altitude of the lattice."""
+    """Computes gains averaged over cells, see `CellGains`; a batch is one altitude."""
 
     def __init__(self, scene: Scene, settings: SolverSettings) -> None:
         super().__init__(scene, settings)
         self._lattice: Lattice = scene.lattice
 
     def __call__(self, piece: LinkBatch) -> np.ndarray:
-        """Return (n,) gains [dB]."""
+        """Return the gains (n,) of a batch [dB]."""
         if self._solver is None:
             self._solver = CellGains(self._city, self._frequency_hz, self._settings, self._lattice)
         return self._solver.solve(piece.device_m, piece.points_m[0, 2])
@@ -394,10 +397,10 @@ class SolveCells(_Solve):
 
 def link_job(scene: Scene, settings: SolverSettings,
              description: str) -> Job[LinkBatch, np.ndarray]:
-    """Return the job that traces pieces; `description` is shown with its progress.
+    """Return the job that solves batches; `description` is shown with its progress.
 
     Raises:
-        BadInput: Antennas, which the solver `map` does not know.
+        BadInput: The scene has antennas, and the solver is `map`.
     """
     if settings.solver == "paths":
         solve = SolveTiles(scene, settings) if settings.is_tiled else SolveLinks(scene, settings)
@@ -410,22 +413,34 @@ def link_job(scene: Scene, settings: SolverSettings,
 
 
 def _resources(settings: SolverSettings, geometry_bytes: int = 0) -> Resources:
+    """Return the memory, and share of the GPU, that a worker needs."""
     memory_bytes = settings.memory_bytes() + geometry_bytes
     if settings.compute_device == "cpu":
         return Resources(memory_bytes)
-    # It is the GPU's memory; that of the processor has not been measured.
+    # The GPU's memory; the use of main memory has not been measured
     return Resources(memory_bytes, is_bound=False, gpu_share=share_of_gpu(memory_bytes))
 
 
 def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
                   executor: Executor, columns: np.ndarray | None = None, label: str = "",
                   description: str = "tracing") -> np.ndarray:
-    """Return the gains (devices, positions) of a lattice [dB]; NaN where there is no path.
+    """Trace the links from devices to lattice positions; batches in the cache are not solved again.
 
-    Only what the store lacks is solved. `columns` and `label` are those of `lattice_pieces`.
+    Args:
+        scene: City, devices and lattice.
+        settings: Settings of the solver.
+        store: Cache of the batches.
+        index: Indices of the devices.
+        executor: Where it runs.
+        columns: Indices of lattice positions; None: all.
+        label: Part of the batches' names; "": by the solver.
+        description: Shown with the progress.
+
+    Returns:
+        (devices, positions) gains [dB]; NaN where there is no path.
 
     Raises:
-        BadInput: The scene cannot be read, or the store not written.
+        BadInput: The scene cannot be read, or the cache cannot be written.
         RunFailed: No usable libLLVM.
     """
     pieces, order = lattice_pieces(scene, settings, index, columns, label)
@@ -438,14 +453,14 @@ def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, ind
 
 def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
                 executor: Executor) -> tuple[slice, np.ndarray, np.ndarray]:
-    """Solve a sample of links with ten times the rays, in the same memory; see `solve_lattice`.
+    """Trace a sample of a map's links with ten times the rays, in the same memory.
 
     The sample is 1 % of the positions (at least 8; drawn by the settings' seed) for all devices.
     With the solver `map`, which solves whole altitudes, it is the lowest altitude for the first
-    device.
+    device. Arguments are those of `solve_lattice`.
 
     Returns:
-        Rows and columns in the result of `solve_lattice`, and their gains (rows, columns) [dB].
+        Rows (devices) and columns (positions) of the map, and their gains (rows, columns) [dB].
     """
     total = len(scene.lattice.positions_m)
     if settings.solver == "paths":
@@ -459,40 +474,40 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
 
 
 def sampled(scene: Scene) -> int:
-    """Return how many positions `solve_finer` takes."""
+    """Return the number of positions that `solve_finer` samples."""
     total = len(scene.lattice.positions_m)
     return min(total, max(8, round(0.01 * total)))
 
 
 def exchanged_calls(scene: Scene, settings: SolverSettings, devices: int) -> int:
-    """Return the most calls of the solver that `solve_exchanged` makes, of one antenna."""
+    """Return the maximum number of solver calls in `solve_exchanged`, per antenna of devices."""
     batches = devices * -(-len(scene.lattice.positions_m) // settings.batch_receivers)
     return min(sampled(scene), max(MIN_EXCHANGED, min(MAX_EXCHANGED, batches // 10)))
 
 
 def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
                     executor: Executor, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Solve links with their ends exchanged: rays start at receivers; see `solve_lattice`.
+    """Trace links with their ends exchanged: rays start at the receivers.
 
     Args:
         scene: City, devices, antennas and lattice.
-        settings: With the solver `paths`.
-        store: Of the map.
-        index: Devices.
+        settings: Settings with the solver `paths`.
+        store: Cache of the map's batches.
+        index: Indices of the devices.
         executor: Where it runs.
-        columns: Positions of receivers to choose from, see `exchanged_calls`.
+        columns: Indices of lattice positions to choose from, see `exchanged_calls`.
 
     Returns:
-        Columns that were solved, and their gains (devices, columns) [dB].
+        Indices of the positions that were solved, and their gains (devices, positions) [dB].
     """
-    of_antenna: dict[int, list[int]] = {}  # a call has one antenna for all its points
+    by_antenna: dict[int, list[int]] = {}  # all points of a call have the same antenna
     for device in index:
-        of_antenna.setdefault(id(scene.device_antennas[device]), []).append(device)
+        by_antenna.setdefault(id(scene.device_antennas[device]), []).append(device)
     size = settings.batch_receivers
-    groups = [devices[start:start + size] for devices in of_antenna.values()
+    groups = [devices[start:start + size] for devices in by_antenna.values()
               for start in range(0, len(devices), size)]
-    most = exchanged_calls(scene, settings, len(index))
-    columns = columns[::max(1, -(-len(columns) * len(groups) // most))]
+    max_calls = exchanged_calls(scene, settings, len(index))
+    columns = columns[::max(1, -(-len(columns) * len(groups) // max_calls))]
     longest_m = longest_path_m(scene) if settings.is_tiled else 0.0
     pieces = []
     for column in columns:
@@ -513,17 +528,17 @@ def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, i
 
 
 def _plane(scene: Scene) -> int:
-    """Return the number of positions at one altitude."""
+    """Return the number of lattice positions at one altitude."""
     return len(scene.lattice.y_m) * len(scene.lattice.x_m)
 
 
 def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
                    columns: np.ndarray | None = None, label: str = ""
                    ) -> tuple[list[LinkBatch], np.ndarray]:
-    """Return the pieces that a map is traced in, and the order of the positions in them.
+    """Divide a map into batches; also return the order of the positions in them.
 
-    `columns` are the indices of the positions to trace (None: all); `label` is part of the names of
-    their pieces.
+    `columns` are the indices of the positions to trace (None: all). `label` is part of the batches'
+    names.
     """
     points_m = scene.lattice.positions_m if columns is None else scene.lattice.positions_m[columns]
     label = label or ("batch" if settings.solver == "paths" else "altitude")

@@ -1,21 +1,21 @@
-"""Sionna RT 2.2.0 with a diffraction that is the same in both directions: mended in memory.
+"""Patches of Sionna RT 2.2.0 that make its diffraction reciprocal, applied in memory.
 
-Three faults are mended, for the time of a call:
+Three faults are corrected during a call:
 
-1. The coefficient of its wedge changes when the two ends are exchanged: it multiplies all four
-   terms by the reflection of the incident ray. A device 0.5 m from a metal wall, with the receiver
-   in its shadow, gets 32 dB too much. It is replaced by that of Kouyoumjian and Pathak [1] with
-   Luebbers' reflections [2] in a reciprocal form, that of `radiotwin.propagation.paths`: each face
-   reflects at the smaller of the angles that the incident and the diffracted ray make with it. For
-   a conductor this is the exact coefficient of [1].
-2. Whether a receiver is seen from a diffraction point is tested from a point that is moved off the
-   face that the ray had hit, along that face's normal, to the receiver's side. Behind the face that
-   is into the wall, where the angle of the wedge's inside exceeds 90 degrees. Such a receiver
-   then never gets the ray.
+1. Its wedge coefficient changes when the two ends are exchanged: it multiplies all four terms by
+   the reflection of the incident ray. For a device 0.5 m from a metal wall and a receiver in its
+   shadow, the gain is 32 dB too high. It is replaced by the coefficient of Kouyoumjian and Pathak
+   [1] with Luebbers' reflections [2] in a reciprocal form, as in `radiotwin.propagation.paths`:
+   each face reflects at the smaller of the angles that the incident and the diffracted ray make
+   with it. For a conductor this is the exact coefficient of [1].
+2. The visibility of a receiver from a diffraction point is tested from a point that is moved along
+   the normal of the face that the ray hit, to the receiver's side. For a receiver behind that face,
+   the point lies inside the wall if the wedge's inner angle exceeds 90 degrees. Such a receiver
+   never gets the ray.
 3. The length from a diffraction point to the receiver is summed over the vertices of all depths up
-   to `max_depth`, also over those behind the last interaction, which still hold the image of the
-   diffraction point. So where reflections follow on the edge and the path has less than `max_depth`
-   interactions, the way from the edge to the last reflection counts three times.
+   to `max_depth`, including those after the last interaction, which still hold the image of the
+   diffraction point. If reflections follow on the edge and the path has less than `max_depth`
+   interactions, the segment from the edge to the last reflection counts three times.
 
 [1] Kouyoumjian and Pathak, "A uniform geometrical theory of diffraction for an edge in a perfectly
     conducting surface", Proc. IEEE 62(11), 1974: eq. 25-29.
@@ -33,7 +33,8 @@ from radiotwin.errors import MissingPackage
 
 KNOWN_VERSION = "2.2.0"
 
-_SERIES_FROM = 20.0  # argument of the transition function; above, Sionna RT's loses precision
+# From this argument on, a series replaces Sionna RT's transition function, which loses precision
+_SERIES_FROM = 20.0
 
 
 def installed_version() -> str:
@@ -50,7 +51,7 @@ def installed_version() -> str:
 
 
 def default_diffraction() -> Literal["reciprocal", "sionna"]:
-    """Return `reciprocal`, or with a warning `sionna` where another version is installed."""
+    """Return `reciprocal`; if another version of Sionna RT is installed, warn, return `sionna`."""
     if installed_version() == KNOWN_VERSION:
         return "reciprocal"
     warnings.warn(f"Sionna RT {installed_version()} is installed; its diffraction is used as it "
@@ -61,7 +62,7 @@ def default_diffraction() -> Literal["reciprocal", "sionna"]:
 
 @contextmanager
 def mended(diffraction: str) -> Iterator[None]:
-    """Mend Sionna RT, which is imported already, within this context where it is `reciprocal`."""
+    """Patch Sionna RT within this context, if the diffraction is `reciprocal`."""
     if diffraction != "reciprocal":
         yield
         return
@@ -74,12 +75,12 @@ def mended(diffraction: str) -> Iterator[None]:
     sample = Search._sample_radio_material
 
     def sample_outwards(self: Any, si: Any, *others: Any) -> Any:
-        """Go on from a diffraction point 1 mm off its edge, as Sionna RT's image method does."""
+        """Continue a diffracted ray 1 mm off the edge, as Sionna RT's image method does."""
         found, normal, wedges = sample(self, si, *others)
         diffracted = found.sampled_component == InteractionType.DIFFRACTION
         outward = drjit.normalize(wedges.n0 + wedges.nn)
         si.p = drjit.select(diffracted, si.p + 1e-3 * outward, si.p)
-        si.n = drjit.select(diffracted, 0.0, si.n)  # along which rays would start farther off
+        si.n = drjit.select(diffracted, 0.0, si.n)  # otherwise rays start farther off, along it
         return found, normal, wedges
 
     changed = ((Search, "_sample_radio_material", sample_outwards),
@@ -96,7 +97,7 @@ def mended(diffraction: str) -> Iterator[None]:
 
 
 def _lengths_m(self: Any, paths: Any, source: Any, target: Any) -> Any:
-    """Return the lengths after and before the diffraction, summed up to the last interaction."""
+    """Return the path lengths after and before the diffraction, up to the last interaction."""
     import drjit
     import mitsuba
     from sionna.rt.constants import InteractionType
@@ -119,7 +120,7 @@ def _lengths_m(self: Any, paths: Any, source: Any, target: Any) -> Any:
 
 def _wedge_matrix(self: Any, to_world: Any, direction_in: Any, direction: Any, si: Any,
                   permittivity: Any, wave_number: Any) -> Any:
-    """Return the Jones matrix (4 x 4, real) of a wedge, in the place of Sionna RT's own.
+    """Return the Jones matrix (4 x 4, real) of diffraction at a wedge; replaces Sionna RT's.
 
     Args:
         self: Material of both faces, a slab.
@@ -146,7 +147,7 @@ def _wedge_matrix(self: Any, to_world: Any, direction_in: Any, direction: Any, s
     n = exterior / drjit.pi
 
     def angle(to_end: Any) -> Any:
-        """Return an end's angle from face 0 [rad], in 0 to `exterior`."""
+        """Return the angle of a direction from face 0 [rad], from 0 to `exterior`."""
         found = drjit.atan2(drjit.dot(to_end, normal_0), drjit.dot(to_end, tangent))
         found = drjit.select(found < 0, found + drjit.two_pi, found)
         inside = drjit.select(found > 0.5 * (drjit.two_pi + exterior), 0.0, exterior)
@@ -160,6 +161,7 @@ def _wedge_matrix(self: Any, to_world: Any, direction_in: Any, direction: Any, s
     x = wave_number * after_m * before_m / (after_m + before_m) * drjit.square(sine)
 
     def reflected(angle_of_face: Any) -> tuple[Any, Any]:
+        """Return the reflection coefficients TE and TM of a face at a grazing angle [rad]."""
         te, tm, *_ = itu_coefficients_single_layer_slab(
             drjit.maximum(sine * drjit.sin(angle_of_face), 1e-5), permittivity, self._d,
             drjit.two_pi / wave_number)
@@ -187,9 +189,9 @@ def _wedge_matrix(self: Any, to_world: Any, direction_in: Any, direction: Any, s
 
 
 def _cotangent_term(beta: Any, x: Any, n: Any, sign: int) -> Any:
-    """Return cot((π + sign β) / 2n) F(x a(β)), finite at the boundaries of shadow [1, eq. 26-29].
+    """Return cot((π + sign β) / 2n) F(x a(β)), finite at shadow boundaries [1, eq. 26-29].
 
-    Both factors are functions of the angle from the boundary, so that single precision suffices.
+    Both factors are computed from the angle to the boundary, so that single precision suffices.
     """
     import drjit
 

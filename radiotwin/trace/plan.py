@@ -1,4 +1,4 @@
-"""Before a trace: its cost, from a few batches; and the rays a city needs, from a few links."""
+"""Before a trace: estimate its cost from a few batches, and choose the quality by a few links."""
 
 import math
 import time
@@ -27,12 +27,12 @@ from radiotwin.trace.run import device_indices, noise_figures, open_store
 from radiotwin.trace.settings import FINER, QUALITIES, SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, PathGains
 
-CALIBRATED = 6  # batches; the first one compiles kernels
-NOISE_SHARE = 0.1  # of the time: 1 % of the links again with ten times the rays
+CALIBRATED = 6  # batches that are timed; the first one also compiles kernels
+NOISE_SHARE = 0.1  # additional time for the noise: 1 % of the links with ten times the rays
 WORKERS = (1, 2, 4, 8, 16, 64, 256)
-TARGETS_DB = (0.05, 20.0)
-_CALLS, _POINTS = 4, 40  # links of the pilot: calls, each of one device and so many points
-_MIN_LINKS = 20  # detected ones, without which an RMS says nothing
+TARGETS_DB = (0.05, 20.0)  # allowed range of the error target
+_CALLS, _POINTS = 4, 40  # of the pilot: calls of one device each, and points per call
+_MIN_LINKS = 20  # detected links that an RMS needs
 
 
 @dataclass(frozen=True)
@@ -40,17 +40,17 @@ class TracePlan:
     """Cost of a trace.
 
     Attributes:
-        links: Links of the map.
-        batches: Batches of the map.
-        finished: Of these, how many are kept from an earlier run.
+        links: Number of links of the map.
+        batches: Number of batches of the map.
+        finished: Number of batches in the cache.
         start_s: Time until a worker begins [s]: libraries, geometry, compilation.
-        batch_s: Median processor time of a batch [s]: how long it takes on a core of its own.
-        batch_p90_s: Processor time that nine in ten do not exceed [s].
-        busy: How many times as long the batches took here, beside other work.
-        peak_bytes: Memory that a worker took.
-        memory_bytes: Most that a worker may take.
-        workers: As many as this machine has cores and memory for.
-        exchanged: Batches more, of links whose ends are exchanged.
+        batch_s: Median processor time of a batch [s].
+        batch_p90_s: 90th percentile of the processor time of a batch [s].
+        busy: Wall time over processor time of the timed batches: more than 1 on a busy machine.
+        peak_bytes: Memory that the worker used.
+        memory_bytes: Memory that a worker may use.
+        workers: Number of workers that this machine has cores and memory for.
+        exchanged: Number of additional batches, with exchanged ends.
     """
 
     links: int
@@ -66,7 +66,7 @@ class TracePlan:
     exchanged: int = 0
 
     def seconds(self, workers: int) -> float:
-        """Return the time that so many workers take, each on a core of this machine's kind [s]."""
+        """Estimate the duration with some workers, each on a core like this machine's [s]."""
         left = self.batches - self.finished
         if not left:
             return 0.0
@@ -74,14 +74,14 @@ class TracePlan:
         return self.start_s + rounds * self.batch_s
 
     def rows(self) -> list[tuple[int, float, float]]:
-        """Return (workers, seconds, memory of all [bytes]) for some numbers of workers."""
+        """Return (workers, duration [s], their memory [bytes]) for usual numbers of workers."""
         return [(count, self.seconds(count), count * float(self.memory_bytes))
                 for count in sorted({*WORKERS, self.workers})]
 
 
 @dataclass(frozen=True)
 class _Measured:
-    """Solves a piece; also returns wall and processor time [s] and the most memory taken."""
+    """Calls a function of a batch; also returns wall and processor time [s] and peak memory."""
 
     function: Any
 
@@ -94,10 +94,10 @@ class _Measured:
 
 def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None = None
                ) -> TracePlan:
-    """Estimate what a map costs; the batches that are solved for that are kept for it.
+    """Estimate the cost of a map by solving a few batches, which the trace will use.
 
     One worker on one core solves a few batches that are drawn by the settings' seed. Batches over
-    dense parts of a city take longer than others: the figures are as good as the sample.
+    dense parts of a city take longer than others: the estimate is as good as the sample.
 
     Args:
         scene: City, devices and lattice.
@@ -171,11 +171,10 @@ def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
                    ) -> list[Rung]:
     """Find the quality with the fewest rays whose numerical error is within a target.
 
-    160 links between the devices and the points outdoors are drawn by the settings' seed, so that
-    the same question has the same answer. They are solved with each quality, from the fewest rays
-    on, and again with ten times its rays, until the RMS difference of detected links is within the
-    target. It is the figure that `noise_floor_db` of a traced map estimates from 1 % of the map.
-    Within `keep_pieces` each quality's gains are kept.
+    160 links between the devices and the points outdoors are drawn by the settings' seed. They are
+    solved with each quality, from the fewest rays on, and again with ten times its rays, until the
+    RMS difference of detected links is within the target. `noise_floor_db` of a traced map is the
+    same figure for 1 % of the map. Within `keep_pieces`, each quality's gains are kept.
 
     Args:
         scene: City, devices and radio.
@@ -218,7 +217,7 @@ def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
 
 def _calls(points_m: np.ndarray, index: Sequence[int], seed: int
            ) -> list[tuple[int, np.ndarray]]:
-    """Draw (device, points) of the pilot's calls."""
+    """Draw the links of the pilot: (device, points) of each call of the solver."""
     rng = np.random.default_rng([seed, len(points_m), *index])
     devices = np.resize(rng.permutation(index), _CALLS)
     count = min(_POINTS, len(points_m))
@@ -228,6 +227,7 @@ def _calls(points_m: np.ndarray, index: Sequence[int], seed: int
 
 def _try(scene: Scene, quality: str, settings: SolverSettings,
          calls: list[tuple[int, np.ndarray]]) -> Rung:
+    """Solve the pilot's links with a quality, and with ten times its rays, and compare them."""
     solved = [kept("pilot", (scene.content_hash(), one.attributes(), *calls),
                    partial(_solve, scene, one, calls),
                    lambda found: ({"found": found}, None), lambda arrays, _: arrays["found"])
@@ -257,4 +257,4 @@ def _solve(scene: Scene, settings: SolverSettings, calls: list[tuple[int, np.nda
         seconds.append((time.perf_counter() - started) / solved)
     gain_db = np.concatenate(gains)
     gain_db[(gain_db < scene.config.gain_limit_db) | (gain_db == IMPOSSIBLE_DB)] = np.nan
-    return np.append(gain_db, np.median(seconds[1:]))  # the first one compiles the kernels
+    return np.append(gain_db, np.median(seconds[1:]))  # the first call compiles the kernels

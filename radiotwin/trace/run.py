@@ -1,7 +1,7 @@
-"""The truth map: every lattice position, every device, resumable and checked; and gains at points.
+"""`trace_map` (all lattice positions, resumable) and `trace_points`: traced, checked gains.
 
-A map is kept if its gains are possible by physics. Its numerical noise is the change of its gains
-when ten times the rays are sent, and when the ends of links are exchanged.
+A map is only written if its gains are possible by physics. Its numerical noise is estimated from
+the change of gains with ten times the rays, and with the ends of links exchanged.
 """
 
 import hashlib
@@ -43,35 +43,43 @@ from radiotwin.trace.link_job import (
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB, library_versions
 
-# Limits of physics for LoS links, relative to free space. The power of an LoS link is that of the
-# direct path plus that of each reflected or diffracted one. None of them is stronger than the
-# direct path, as each is longer and loses power at every interaction; over a city there are rarely
-# more than the ground and two walls that come close. So the median LoS link lies 0 to 3 dB above
-# free space. The fields of the same paths may also cancel (no lower bound). The 0.5 dB below allow
-# for numerical noise. How far one link may lie above free space depends on its paths:
+# Bounds by physics for LoS links, relative to free space. The power of an LoS link is that of the
+# direct path plus those of reflected and diffracted ones. Each of these is weaker than the direct
+# path, as it is longer and loses power at every interaction; over a city, rarely more than the
+# ground and two walls come close. So the median LoS link lies 0 to 3 dB above free space. The
+# 0.5 dB below allow for numerical noise. The bound of a single link depends on its paths:
 # `PathGains.solve` checks it.
 MEDIAN_EXCESS_DB = (-0.5, 3.0)  # lowest and highest
 MIN_EXCESS_DB = -0.5  # of a link that the tracer sees in LoS
-# Where a ray grazes an edge, the tracer and the map's own ray test may differ in LoS: such a share
-# of LoS links may lie below, and as many however small the map.
+# Where a ray grazes an edge, the tracer and the 3D map may differ in LoS: this share of LoS links,
+# and this number in a small map, may lie below.
 MAX_DARK_SHARE, MAX_DARK_LINKS = 0.005, 3
-DOUBT_DB = 6.0  # a link whose two ends differ by more is doubtful
+DOUBT_DB = 6.0  # a link is doubtful if exchanging its ends changes its gain by more
 MAX_STEM = 100  # characters of a file's name
 
 
 def free_space_gain_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
-    """Return Friis' gain between isotropic antennas (ITU-R P.525-4, eq. 4) [dB]."""
+    """Return the free-space gain between isotropic antennas (ITU-R P.525-4, eq. 4) [dB]."""
     return 20 * np.log10(speed_of_light / (4 * np.pi * frequency_hz * np.asarray(distance_m)))
 
 
 def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, frequency_hz: float,
                 solver: str, combining: str, direct_dbi: np.ndarray | float = 0.0,
                 peak_dbi: np.ndarray | float = 0.0) -> dict[str, float]:
-    """Check raw gains (n,) of links [dB], NaN without a path, against the limits of physics.
+    """Check traced gains against bounds by physics.
 
-    With antennas, a link is no weaker than its direct path, and no stronger than if all its paths
-    left and arrived in the directions of the antennas' peaks: `direct_dbi` is the gain of both
-    along the straight line, `peak_dbi` their highest, (n,) each.
+    With antennas, an LoS link is at least as strong as its direct path, and at most as if all paths
+    left and arrived at the antennas' peaks.
+
+    Args:
+        gain_db: (n,) gains [dB]; NaN: no path.
+        los: (n,) bool, line of sight by the 3D map.
+        distance_m: (n,) distance of the ends [m].
+        frequency_hz: Frequency [Hz].
+        solver: `paths` or `map`.
+        combining: `power` or `coherent`.
+        direct_dbi: (n,) gain of both antennas along the straight line [dBi].
+        peak_dbi: (n,) sum of both antennas' peaks [dBi].
 
     Returns:
         Figures for the map's attributes.
@@ -114,11 +122,11 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
 
 
 def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float | str]:
-    """Compare two solutions of the same links, (n,) gains [dB] with NaN where not detected.
+    """Compare gains with those from ten times the rays, both (n,) [dB] with NaN where not detected.
 
     Returns:
-        Attributes: RMS, median and 90th percentile of the difference over links detected in both,
-        and the share of links detected in one only. NaN where no link is detected in both.
+        Attributes of the map: RMS, median and 90th percentile of the difference over links detected
+        in both (NaN if there are none), and the share of links detected in only one.
     """
     both = np.isfinite(gain_db) & np.isfinite(finer_db)
     difference_db = np.abs(gain_db - finer_db)[both] if both.any() else np.array([np.nan])
@@ -136,32 +144,32 @@ def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float 
 
 def exchange_figures(gain_db: np.ndarray, exchanged_db: np.ndarray, los: np.ndarray
                      ) -> dict[str, float]:
-    """Compare links with the same from their other ends, (n,) gains [dB], NaN where not detected.
+    """Compare gains with those of exchanged ends, both (n,) [dB] with NaN where not detected.
 
-    Gains do not depend on which end sends (reciprocity). What differs is the truth's own error:
-    paths that the rays of one end miss, and a wedge that is not reciprocal.
+    By reciprocity they are equal. A difference is an error of the traced map: paths that the rays
+    of one end miss, and diffraction that is not reciprocal.
 
     Returns:
-        Attributes: RMS of the difference over links detected in both, of links in line of sight
-        (`los`, (n,) bool) and without; of the latter also the mean of the exchanged minus the
-        map's gain, and the share that differs by more than `DOUBT_DB`. NaN of a class without
-        links.
+        Attributes of the map, over links detected in both: RMS of the difference for LoS (`los`,
+        (n,) bool) and for NLoS links; for the latter also the mean of exchanged minus original
+        gain, and the share that differs by more than `DOUBT_DB`. NaN for a class without links.
     """
     both = np.isfinite(gain_db) & np.isfinite(exchanged_db)
-    of_class = [(exchanged_db - gain_db)[both & each] for each in (los, ~los)]
-    with_sight_db, without_db = (each if len(each) else np.array([np.nan]) for each in of_class)
+    difference_db = exchanged_db - gain_db
+    los_db, nlos_db = (difference_db[both & is_class] if (both & is_class).any()
+                       else np.array([np.nan]) for is_class in (los, ~los))
     return {
         "exchanged_links": int(both.sum()),
-        "exchanged_los_db": float(np.sqrt(np.mean(with_sight_db**2))),
-        "exchanged_nlos_db": float(np.sqrt(np.mean(without_db**2))),
-        "exchanged_nlos_bias_db": float(np.mean(without_db)),
-        "exchanged_nlos_doubtful_share": float(np.mean(np.abs(without_db) > DOUBT_DB))}
+        "exchanged_los_db": float(np.sqrt(np.mean(los_db**2))),
+        "exchanged_nlos_db": float(np.sqrt(np.mean(nlos_db**2))),
+        "exchanged_nlos_bias_db": float(np.mean(nlos_db)),
+        "exchanged_nlos_doubtful_share": float(np.mean(np.abs(nlos_db) > DOUBT_DB))}
 
 
 def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
-    """Return the file that a scene's traced map is written to unless another is named."""
+    """Return the default file of a scene's traced map."""
     name = "-".join(["truth", *(devices or [])])
-    if len(name) > MAX_STEM:  # what is cut off counts, too
+    if len(name) > MAX_STEM:  # the digest tells apart names that are cut at the same place
         digest = hashlib.sha256(name.encode()).hexdigest()[:12]
         name = f"{name[:MAX_STEM]}-{digest}"
     return scene.folder / f"{name}.nc"
@@ -172,9 +180,9 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
               executor: Executor | None = None) -> RadioMap:
     """Trace the radio map of a scene's lattice and write it.
 
-    Each finished batch is kept in the scene's `cache/trace-<hash>`, named by the hash of all that
-    decides a gain. Run again after a kill, the trace resumes after the last finished batch and
-    gives the same map to the bit; run again when it is finished, it solves nothing.
+    Finished batches are kept in the scene's `cache/trace-<hash>`; the hash is of everything that a
+    gain depends on. After an interruption, the trace resumes after the last finished batch and
+    gives the same map to the bit; a finished trace is not repeated.
 
     Args:
         scene: City, devices and lattice.
@@ -186,7 +194,7 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
     Returns:
         The map: gain [dB], NaN where there is no path, the gain is below the receiver's
         sensitivity, the position is inside a building, or the tracer found more power than the
-        link's paths can carry; the counts of each are attributes. The last comes with a warning.
+        link's paths can carry (with a warning). Attributes count each.
 
     Raises:
         BadInput: No device, an unknown one, a scene that cannot be read, or an output that cannot
@@ -221,7 +229,7 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
     raw_db = solve_lattice(scene, settings, store, index, executor)
 
     positions_m, device_m = scene.lattice.positions_m, scene.device_m[index]
-    los = np.stack([scene.city.line_of_sight(one_m[None], positions_m) for one_m in device_m])
+    los = np.stack([scene.city.line_of_sight(point_m[None], positions_m) for point_m in device_m])
     inside = scene.blocked.ravel()
     distance_m = np.linalg.norm(device_m[:, None, :] - positions_m[None], axis=2)
     frequency_hz = scene.config.radio.frequency_hz
@@ -266,11 +274,14 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
 
 def warn_of_terrain(city: CityMap, device_m: np.ndarray, positions_m: np.ndarray,
                     no_path: np.ndarray) -> None:
-    """Warn of links (devices, positions) that terrain hides, or the Earth, and Sionna RT cannot."""
+    """Warn of links that Sionna RT cannot trace: behind terrain, or beyond the horizon.
+
+    `no_path`, (devices, positions) bool, are the links without a path.
+    """
     hidden = far = 0
-    for one_m, missed in zip(device_m, no_path, strict=True):
-        far += int((np.hypot(*(positions_m - one_m)[:, :2].T) > FAR_M).sum())
-        hidden += int(city.hidden_by_ground(one_m[None], positions_m[missed]).sum())
+    for point_m, missed in zip(device_m, no_path, strict=True):
+        far += int((np.hypot(*(positions_m - point_m)[:, :2].T) > FAR_M).sum())
+        hidden += int(city.hidden_by_ground(point_m[None], positions_m[missed]).sum())
     if hidden:
         warnings.warn(f"behind terrain lie {percent(hidden / no_path.size)} of the links, and no "
                       "path was found to them: Sionna RT diffracts once, so that what rounded "
@@ -284,25 +295,25 @@ def warn_of_terrain(city: CityMap, device_m: np.ndarray, positions_m: np.ndarray
 
 
 def _antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return both antennas' gain along each straight line, and its maximum.
+    """Return the gain of both antennas along the straight lines of links, and their peaks.
 
     Returns:
-        (devices, positions) and (devices, 1) [dBi].
+        (devices, positions) gains of both ends together, and (devices, 1) peaks [dBi].
     """
-    way_m = scene.lattice.positions_m[None] - scene.device_m[index][:, None]
-    direct_dbi, peak_dbi = np.zeros(way_m.shape[:2]), np.zeros((len(index), 1))
+    link_m = scene.lattice.positions_m[None] - scene.device_m[index][:, None]
+    direct_dbi, peak_dbi = np.zeros(link_m.shape[:2]), np.zeros((len(index), 1))
     for row, antenna in enumerate(scene.device_antennas[device] for device in index):
         if antenna is not None:
-            direct_dbi[row] += antenna.gain_dbi(way_m[row])
+            direct_dbi[row] += antenna.gain_dbi(link_m[row])
             peak_dbi[row] += antenna.pattern.peak_dbi
     if scene.uav_antenna is not None:
-        direct_dbi += scene.uav_antenna.gain_dbi(-way_m)
+        direct_dbi += scene.uav_antenna.gain_dbi(-link_m)
         peak_dbi += scene.uav_antenna.pattern.peak_dbi
     return direct_dbi, peak_dbi
 
 
 def _finished(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | None:
-    """Return the map at `path` if it is the requested one."""
+    """Load the map at `path` if it is finished, of this trace and these devices; else None."""
     if not path.exists():
         return None
     try:
@@ -315,10 +326,10 @@ def _finished(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | Non
 
 
 def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
-    """Return the indices into `scene.config.devices` of the named devices, or of all.
+    """Return the indices of named devices in `scene.config.devices`; None: of all.
 
     Raises:
-        BadInput: The scene has no devices, or not that one.
+        BadInput: The scene has no devices, or none of that name.
     """
     names = {device.device: index for index, device in enumerate(scene.config.devices)}
     if not names:
@@ -332,7 +343,7 @@ def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
 
 
 def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
-    """Return the store of the batches of a scene's map with these settings, in its folder.
+    """Open the cache of a scene's map with these settings, in the scene folder.
 
     Raises:
         BadInput: The folder lies outside the scene's, or cannot be written.
@@ -346,7 +357,7 @@ def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
 
 def _censor(raw_db: np.ndarray, inside: np.ndarray, impossible: np.ndarray, limit_db: float
             ) -> tuple[np.ndarray, dict[str, int]]:
-    """Replace undetected gains by NaN, and count the links by reason."""
+    """Set gains that are not detected to NaN, and count the links by reason."""
     within = np.broadcast_to(inside, raw_db.shape)
     no_path = np.isnan(raw_db) & ~within & ~impossible
     below = ~within & (raw_db < limit_db)
@@ -363,9 +374,9 @@ def _censor(raw_db: np.ndarray, inside: np.ndarray, impossible: np.ndarray, limi
 def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
                 antennas: list[Antenna | None] | None = None,
                 executor: Executor | None = None) -> np.ndarray:
-    """Trace the gains between positions; receivers have the antenna of the scene's UAVs.
+    """Trace the gains between any positions; receivers have the antenna of the scene's UAVs.
 
-    Within `keep_pieces` each finished batch is kept.
+    Within `keep_pieces`, each finished batch is kept.
 
     Args:
         scene: City and frequency.
@@ -387,14 +398,14 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
         raise BadInput(f"the solver {settings.solver!r} averages over lattice cells; points need "
                        "the solver 'paths'")
     settings = with_radius(scene, settings)
-    pieces, order = link_pieces(scene, settings, [("", *each) for each in zip(
+    pieces, order = link_pieces(scene, settings, [("", *device) for device in zip(
         device_m, antennas or [None] * len(device_m))], points_m)
-    decided_by = scene.content_hash()
+    scene_hash = scene.content_hash()
 
     def inputs(piece: LinkBatch) -> tuple:
-        own = replace(settings, batch_receivers=piece.batch_receivers)
-        return (decided_by, own.attributes(), piece.device_m, piece.points_m, piece.antennas,
-                *([] if piece.tile is None else [piece.tile]))
+        piece_settings = replace(settings, batch_receivers=piece.batch_receivers)
+        return (scene_hash, piece_settings.attributes(), piece.device_m, piece.points_m,
+                piece.antennas, *([] if piece.tile is None else [piece.tile]))
 
     gains = (executor or Executor()).run(
         link_job(scene, settings, "tracing"), pieces,

@@ -29,39 +29,39 @@ QUALITIES: dict[str, dict[str, int]] = {
 }
 
 FINER = 10  # factor of rays, for the estimate of the numerical noise
-MEMORY_MARGIN = 1.5  # of the memory that a call takes, for what is left of the calls before
-# Entries of the table in which Sionna RT looks up whether a candidate path is new. Two candidates
-# with one entry are taken for one, and a path is dropped: at Sionna's 10^6 about 8 % of the
-# candidates of 60 receivers, and which ones depends on the other receivers in the call. A prime, as
+MEMORY_MARGIN = 1.5  # factor for memory that earlier calls have not freed
+# Entries of the hash table by which Sionna RT finds out whether a candidate path is new. Candidates
+# that share an entry are taken for one, and a path is dropped: with Sionna's 10^6 entries, about
+# 8 % of the candidates of 60 receivers, depending on the other receivers of the call. A prime, as
 # the hash is weak in its lower bits.
 TABLE_SIZE = 4_000_037
 # Share of the rays that are diffracted at an edge of the face they hit. With 0.5 instead of
-# Sionna's 0.2, nine links in ten of a dense city lie within 0.5 dB of a reference with ten times
+# Sionna's 0.2, nine in ten links of a dense city are within 0.5 dB of a reference with ten times
 # the samples, instead of 1.1 dB: shadowed points are mostly reached over one edge.
 DIFFRACTION_PROBABILITY = 0.5
 
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """Settings that decide the gains of a trace; all are in the map's attributes and cache key.
+    """Settings that the gains of a trace depend on; they are in the map's attributes and cache key.
 
     Attributes:
         solver: `paths` finds the paths to each position, `map` averages over lattice cells.
         max_depth: Maximum number of interactions of a path.
-        samples_per_src: Rays launched from each device. A path that none of them finds is missing.
-        batch_receivers: Positions solved in one call (`paths` only). The call takes about 0.5 GiB
+        samples_per_src: Rays launched from each device. A path that no ray finds is missing.
+        batch_receivers: Positions solved in one call (`paths` only). The call needs about 0.5 GiB
             and 36 bytes * `max_depth * samples_per_src * batch_receivers`.
         max_num_paths_per_src: Candidate paths that one call can hold (`paths` only).
         diffraction: First-order diffraction at the edges of buildings: `reciprocal`, the same in
-            both directions and exact for conductors (`radiotwin.trace.mended`, the default where
-            the installed Sionna RT is the one that it mends); `sionna`, as released; `off`.
+            both directions and exact for conductors (`radiotwin.trace.mended`, the default if the
+            installed version of Sionna RT can be patched); `sionna`, as released; `off`.
         refraction: Paths through walls. Off, as buildings are hollow shells in the usual city
             model: a ray that enters one meets no inner walls, floors or furniture.
         combining: `power` adds the powers of paths (the mean over fading), `coherent` their fields.
-        seed: Seed of the interactions that rays take.
-        radius_m: Culling radius [m]: what lies farther from the lines of a batch's links is left
-            out (`paths` only, see `radiotwin.trace.link_job`); infinite: nothing is. None: nothing
-            of a city of up to 5,000 shapes, else 400 m.
+        seed: Seed of the random interactions of rays.
+        radius_m: Culling radius [m]: geometry farther from the lines of a batch's links is left out
+            (`paths` only, see `radiotwin.trace.link_job`); infinite: none is. None: 400 m in a city
+            of more than 5,000 shapes, else infinite.
         compute_device: `cpu`, or `cuda`: a GPU, whose gains differ from the processor's.
     """
 
@@ -107,7 +107,7 @@ class SolverSettings:
 
     @property
     def is_tiled(self) -> bool:
-        """Whether a batch is solved in the part of the city that its links reach."""
+        """Whether batches are solved in tiles, i.e. with a finite culling radius."""
         return self.radius_m is not None and math.isfinite(self.radius_m)
 
     @classmethod
@@ -134,25 +134,27 @@ class SolverSettings:
                        batch_receivers=max(1, self.batch_receivers // factor))
 
     def memory_bytes(self) -> int:
-        """Return the most that a process which solves batches may take; 0: not known (`map`)."""
+        """Return the maximum memory of a process that solves batches; 0: not known (`map`)."""
         if self.solver == "map":
             return 0
         rays = self.max_depth * self.samples_per_src * self.batch_receivers
         return int(MEMORY_MARGIN * (2**29 + 36 * rays))
 
     def attributes(self) -> dict[str, Any]:
-        """Return all that decides a gain, as attributes of a NetCDF file (without booleans).
+        """Return everything that a gain depends on, as attributes of a NetCDF file.
 
-        The processor is not among them: maps of it are the same on every machine. `wedge` is there
-        for `reciprocal` only: a map with `diffraction` 1 and no `wedge` has Sionna RT's own.
+        `compute_device` is left out for processors: their maps are the same on every machine.
+        `wedge` is only there for `reciprocal`: a map with `diffraction` 1 and no `wedge` has Sionna
+        RT's own. NetCDF has no booleans: they are 0 and 1.
         """
-        own = {name: int(value) if isinstance(value, bool) else value
-               for name, value in asdict(self).items()
-               if name != "radius_m" or self.is_tiled}
-        own["diffraction"] = int(self.diffraction != "off")
+        found = {name: int(value) if isinstance(value, bool) else value
+                 for name, value in asdict(self).items()
+                 if name != "radius_m" or self.is_tiled}
+        found["diffraction"] = int(self.diffraction != "off")
         if self.diffraction == "reciprocal":
-            own["wedge"] = self.diffraction
+            found["wedge"] = self.diffraction
         if self.compute_device == "cpu":
-            del own["compute_device"]
-        return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY,
-                      "paths_counted": "once", "ground": "half space"}
+            del found["compute_device"]
+        return found | {
+            "table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY,
+            "paths_counted": "once", "ground": "half space"}

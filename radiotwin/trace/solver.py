@@ -1,12 +1,11 @@
 """Gains of links by Sionna RT: along the paths that it finds, or averaged over lattice cells.
 
-Sionna RT 2.2.0 returns some paths more than once, in two ways. Its repeatable search sends the rays
-twice, to count candidate paths and to store them. Some rays take another way the second time (in
-RBM, in one call of two in fifteen, single ones of 100,000, from their third interaction on), so
-that their candidates are counted but never written. Such a blank candidate is a direct path to the
-first receiver of the call. It appeared up to 400 times, 26 dB too much, and has no direction of
-departure. And where the meshes of two buildings share an edge, each of them diffracts the same ray
-at the same point.
+Sionna RT 2.2.0 returns some paths more than once, for two reasons. Its deterministic search sends
+the rays twice, to count candidate paths and to store them. Some rays take another path the second
+time (in RBM, single ones of 100,000, from their third interaction on, in 2 of 15 calls): their
+candidates are counted but never written. Such a blank candidate appears as a direct path to the
+first receiver of the call, without a direction of departure, up to 400 times (26 dB too much). And
+if the meshes of two buildings share an edge, both diffract the same ray at the same point.
 """
 
 import logging
@@ -39,41 +38,41 @@ from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE, Solver
 log = logging.getLogger(__name__)
 City = Path | str | Sequence[CityShape] | None
 """`city.xml` of a scene folder, or what `read_city` returns; None for free space."""
-GROUND_DEPTH_M = 1000.0  # of the ground: a half space, as its materials are lossy
+GROUND_DEPTH_M = 1000.0  # thickness of the ground: as a half space, since its materials are lossy
 _VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 # Delays are single precision, with a unit roundoff of 6e-8, and sums of up to five segments.
 _LENGTH_TOLERANCE = 1e-6  # relative
-_SAME_POINT_M = 0.01  # as close as two surfaces must be to count as one
-# Dr.Jit keeps freed memory for the next call, which needs the same sizes again but for the paths.
-# Freed after every call, 40 % of the time goes into allocating it again; never, it may pile up.
+_SAME_POINT_M = 0.01  # closer points are one; as for surfaces of the 3D map
+# Dr.Jit keeps freed memory for the next call. Releasing it after every call takes 40 % of the time
+# for allocations; never releasing it may use ever more memory.
 _CALLS_BETWEEN_FLUSHES = 10
-# A path is no stronger than free space over its own length; this much is left to rounding.
+# A path is no stronger than free space over its own length, but for this rounding
 _BOUND_TOLERANCE_DB = 0.1
 IMPOSSIBLE_DB = np.inf
-"""Gain of a link that stays above what its own paths can carry."""
+"""Gain of a link that exceeds the bound of its paths."""
 Antennas = tuple[Antenna | None, Antenna | None]
 
 
 def library_versions() -> dict[str, str]:
-    """Return the versions of the libraries that compute a gain."""
+    """Return the versions of the libraries that gains depend on."""
     return {f"{name.replace('-', '_')}_version": version(name)
             for name in ("sionna-rt", "mitsuba", "drjit")}
 
 
 def import_sionna(device: Device = "cpu") -> Any:
-    """Return the module `sionna.rt`, on a libLLVM that works (`cpu`), or on a GPU (`cuda`).
+    """Import `sionna.rt` for the processor (`cpu`, with a working libLLVM) or a GPU (`cuda`).
 
-    A process traces on one of them: Sionna RT cannot change from one to the other.
+    A process cannot change from one to the other.
 
-    Mitsuba looks for its plugins in the working directory first, which may be the folder of a
-    stranger's scene: from now on it looks for them where it is installed, and nowhere else.
+    Mitsuba looks for plugins in the working directory first, which may be the folder of a
+    stranger's scene: it is restricted to the folder where it is installed.
 
     Raises:
         RunFailed: No usable libLLVM or GPU, or this process traces on another device already.
     """
     if device == "cpu":
         llvm.prepare()
-    with deferred():  # their compiled parts abort where Python raises while they are loaded
+    with deferred():  # Ctrl-C while compiled modules are loaded would abort the process
         import drjit
         import mitsuba
 
@@ -81,14 +80,15 @@ def import_sionna(device: Device = "cpu") -> Any:
         import sionna.rt
 
     drjit.set_thread_count(allowed_cores())
-    own = mitsuba.FileResolver()
-    own.clear()
-    own.append(os.path.dirname(os.path.realpath(mitsuba.__file__)))
-    mitsuba.set_file_resolver(own)  # type: ignore[operator]  # as its stub says
+    resolver = mitsuba.FileResolver()
+    resolver.clear()
+    resolver.append(os.path.dirname(os.path.realpath(mitsuba.__file__)))
+    mitsuba.set_file_resolver(resolver)  # type: ignore[operator]  # as its stub says
     return sionna.rt
 
 
 def _set_variant(mitsuba: Any, device: Device) -> None:
+    """Set Mitsuba's variant for a device; RunFailed if that is impossible in this process."""
     wanted, used = _VARIANTS[device], mitsuba.variant()
     if used is None:
         try:
@@ -102,11 +102,11 @@ def _set_variant(mitsuba: Any, device: Device) -> None:
 
 
 def load_city(city: City, frequency_hz: float, device: Device = "cpu") -> Any:
-    """Load a city at a frequency, with one vertically polarised isotropic antenna at every end.
+    """Load a city into Sionna RT, with vertically polarised isotropic antennas at both ends.
 
-    Mitsuba's parser, which can load other files and plugins, gets a copy that is written from what
-    `read_city` read, not the scene's own file. ITU materials outside their frequency range are
-    held at its nearest end, with a warning.
+    Mitsuba's parser, which can load other files and plugins, gets a copy written from the parsed
+    shapes, not the scene's own file. ITU materials outside their frequency range keep the constants
+    at its nearest end, with a warning.
 
     Raises:
         BadInput: The file cannot be read.
@@ -124,6 +124,7 @@ def load_city(city: City, frequency_hz: float, device: Device = "cpu") -> Any:
 
 
 def _load_copy(rt: Any, city: Path | str | Sequence[CityShape]) -> Any:
+    """Write a copy of a city, with flat ground as a half space, and load it into Sionna RT."""
     shapes = read_city(city) if isinstance(city, Path | str) else city
     with scratch_folder() as folder:
         write_city(folder, [_deep(shape) if _is_flat_ground(shape) else shape for shape in shapes])
@@ -138,17 +139,19 @@ def _load_copy(rt: Any, city: Path | str | Sequence[CityShape]) -> Any:
 
 
 def _is_flat_ground(shape: CityShape) -> bool:
+    """Return whether all vertices of a shape are at z = 0."""
     return bool((np.abs(shape.mesh.vertices[:, 2]) < GROUND_M).all())
 
 
 def _deep(ground: CityShape) -> CityShape:
-    """Return a ground from whose far side nothing comes back: a half space, and not a slab."""
+    """Make the ground so thick that nothing is reflected from its far side: a half space."""
     material = replace(ground.material, name=f"{ground.material.name}-ground",
                        thickness_m=GROUND_DEPTH_M)
     return replace(ground, material=material)
 
 
 def _hold_in_range(material: Any, frequency_hz: float) -> None:
+    """Fix the constants of an ITU material outside its frequency range, with a warning."""
     epsilon, conductivity, in_range = permittivity(material.itu_type, frequency_hz)
     if in_range:
         return
@@ -161,9 +164,10 @@ def _hold_in_range(material: Any, frequency_hz: float) -> None:
 
 @contextmanager
 def candidate_search(table_size: int, diffraction_probability: float) -> Iterator[None]:
-    """Set two constants of Sionna RT's search for candidate paths that it has no arguments for.
+    """Set two constants of Sionna RT's path search within this context.
 
-    See `TABLE_SIZE` and `DIFFRACTION_PROBABILITY` of `radiotwin.trace.settings`.
+    They are `TABLE_SIZE` and `DIFFRACTION_PROBABILITY` of `radiotwin.trace.settings`; Sionna RT has
+    no arguments for them.
     """
     from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator as Search
 
@@ -178,11 +182,11 @@ def candidate_search(table_size: int, diffraction_probability: float) -> Iterato
 
 def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: np.ndarray,
                    strength: np.ndarray, cos_turn: np.ndarray) -> np.ndarray:
-    """Mark each path of each link once.
+    """Return a mask of the paths of links without duplicates.
 
-    Two paths are one if they have the same interactions in the same order at the same points, and
-    the same length; of these the strongest is kept. Paths of one length over different points stay,
-    as from two walls at equal distances. A link has one direct path.
+    Paths are duplicates if they have the same interactions in the same order at the same points,
+    and the same length; the strongest is kept. Paths of equal length over different points (two
+    walls at equal distances) are kept. A link has one direct path.
 
     Args:
         interactions: (depth, n, k) types of interactions of k paths of n links, 0: none.
@@ -228,11 +232,11 @@ def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: n
 
 
 class PathGains:
-    """Gains from one device to many points, found by shooting rays and the image method.
+    """Gains from a device to points along the paths that Sionna RT finds (shooting and images).
 
-    Each call of Sionna RT has one device and a fixed number of points. So a gain does not depend on
-    the other devices, nor, but for rare collisions in a hash table, on the other points; kernels
-    are compiled once; and memory is bounded. The settings have the solver `paths`.
+    Each call has one device and a fixed number of points. So a gain does not depend on other
+    devices, nor, but for rare collisions in a hash table, on other points; kernels are compiled
+    once; and memory is bounded. The settings must have the solver `paths`.
 
     Raises:
         BadInput: The file cannot be read.
@@ -252,21 +256,20 @@ class PathGains:
             self._city.add(radio_device)
 
     def batches(self, n: int) -> list[slice]:
-        """Return the slices that `n` points are solved in."""
+        """Return the slices of `n` points that are solved in one call each."""
         step = self.settings.batch_receivers
         return [slice(start, min(start + step, n)) for start in range(0, n, step)]
 
     def solve(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None)
               ) -> np.ndarray:
-        """Solve one batch.
+        """Return the gains of one batch.
 
-        Rays are launched all around whatever the antennas. Each path then gets their gains in the
-        directions in which it leaves and arrives, and stays vertically polarised, as a pattern of
-        levels says nothing else.
+        Rays are launched in all directions, and vertically polarised. Each path is then weighted
+        with the antennas' gains in its directions of departure and arrival.
 
-        A path counts once (`radiotwin.trace.solver`), and carries no more than free space does
-        over its own length between the peaks of the antennas. A link whose gain exceeds what all
-        its paths can carry is solved again alone, with the next seed.
+        Duplicate paths count once. A path carries at most the power of free space over its own
+        length between the antennas' peaks: a link whose gain exceeds the sum of these bounds is
+        solved again alone, with the next seed.
 
         Args:
             device_m: (3,) position [m].
@@ -280,17 +283,17 @@ class PathGains:
         seed = self.settings.seed
         gain_db = self._solve(device_m, points_m, antennas, seed)
         for row in np.flatnonzero(gain_db == IMPOSSIBLE_DB):
-            alone_m, other_seed = points_m[row:row + 1], (seed + 1) % 2**31
-            gain_db[row] = self._solve(device_m, alone_m, antennas, other_seed)[0]
+            point_m, next_seed = points_m[row:row + 1], (seed + 1) % 2**31
+            gain_db[row] = self._solve(device_m, point_m, antennas, next_seed)[0]
         return gain_db
 
     def _solve(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas, seed: int
                ) -> np.ndarray:
-        """Solve once; `IMPOSSIBLE_DB` where a gain exceeds its bound."""
+        """Return the gains of one call; `IMPOSSIBLE_DB` where a gain exceeds its bound."""
         import drjit
 
         settings = self.settings
-        # A short batch is filled up with its last point: the same shapes run the same kernels
+        # A short batch is filled up with its last point: arrays of the same size need no new kernel
         padded_m = points_m[np.minimum(np.arange(settings.batch_receivers), len(points_m) - 1)]
         self._transmitter.position = [float(value) for value in device_m]
         for receiver, point_m in zip(self._receivers, padded_m):
@@ -311,14 +314,14 @@ class PathGains:
 
     def gains(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None)
               ) -> np.ndarray:
-        """Solve any number of points (n, 3), batch by batch; as `solve`."""
+        """Return the gains of any number of points (n, 3), batch by batch; see `solve`."""
         gain_db = np.full(len(points_m), np.nan)
         for part in self.batches(len(points_m)):
             gain_db[part] = self.solve(device_m, points_m[part], antennas)
         return gain_db
 
     def _combine(self, paths: Any, antennas: Antennas) -> tuple[np.ndarray, np.ndarray]:
-        """Return the (batch_receivers,) received over transmitted power, and its highest value."""
+        """Return received over transmitted power (batch_receivers,), and its upper bound."""
         n = self.settings.batch_receivers
 
         def by_link(values: Any) -> np.ndarray:
@@ -344,7 +347,7 @@ class PathGains:
                 _exact_sums(limit) ** 2)
 
     def _counted(self, paths: Any, strength: np.ndarray, cos_turn: np.ndarray) -> np.ndarray:
-        """Return (n, k) whether a path counts; arguments as of `distinct_paths`."""
+        """Return `distinct_paths` of Sionna RT's paths, (n, k) bool."""
         interactions = np.array(paths.interactions)
         interactions = interactions.reshape(len(interactions), *strength.shape)
         vertices_m = np.array(paths.vertices).reshape(*interactions.shape, 3)
@@ -353,11 +356,11 @@ class PathGains:
 
 
 class CellGains:
-    """Gains from one device to the cells around lattice positions, one altitude at a time.
+    """Gains from a device averaged over cells around lattice positions, one altitude at a time.
 
-    A cell is a horizontal square of side `lattice.step_m`, centred on its position. Its gain is the
-    power that all rays carry through it: an average over 400 m² where the step is 20 m, not the
-    gain at a point. So the border of a shadow is blurred, and a link in it has no sharp LoS.
+    A cell is a horizontal square of side `lattice.step_m`, centred on its position. Its gain is an
+    average over the cell (400 m² with a step of 20 m): shadow borders are blurred, and links there
+    have no sharp LoS.
 
     Raises:
         BadInput: The file cannot be read.
@@ -375,7 +378,7 @@ class CellGains:
         self._city.add(self._transmitter)
 
     def solve(self, device_m: np.ndarray, z_m: float) -> np.ndarray:
-        """Solve one altitude: (ny * nx,) gain [dB]; NaN where no ray came through."""
+        """Return the gains (ny * nx,) at one altitude [dB]; NaN where no ray passed."""
         import drjit
 
         settings, lattice = self.settings, self.lattice
@@ -403,11 +406,11 @@ def power_to_db(power: np.ndarray) -> np.ndarray:
 
 
 def _directions(zenith_rad: np.ndarray, azimuth_rad: np.ndarray) -> np.ndarray:
-    """Return (..., 3) unit vectors of Sionna's angles; the azimuth counts from x to y."""
+    """Return the unit vectors (..., 3) of zenith and azimuth; the azimuth counts from x to y."""
     return np.stack([np.sin(zenith_rad) * np.cos(azimuth_rad),
                      np.sin(zenith_rad) * np.sin(azimuth_rad), np.cos(zenith_rad)], axis=-1)
 
 
 def _exact_sums(values: np.ndarray) -> np.ndarray:
-    """Sum each row exactly: the order in which Sionna RT returns paths depends on threads."""
+    """Sum each row exactly, as the order of Sionna RT's paths depends on threads."""
     return np.array([math.fsum(row[row != 0]) for row in values])
