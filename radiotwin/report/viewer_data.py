@@ -138,9 +138,10 @@ def link_layer(run: Run) -> dict | None:
         since_s = links["time_s"] - links.groupby("flight")["time_s"].transform("min")
         layer["time"] = pack_m(since_s.fillna(0.0))
     if "measured_db" in links:
-        layer["unit"] = "dBm" if _is_power(run) else "dB"
+        unit = "dBm" if _is_power(run) else "dB"
+        layer["unit"] = unit
         fields.append(_field("held-out links: measured level", "measured level",
-                             links["measured_db"].to_numpy(dtype=float), "gain", layer["unit"]))
+                             links["measured_db"].to_numpy(dtype=float), "gain", unit))
     return layer
 
 
