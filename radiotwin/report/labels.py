@@ -15,6 +15,7 @@ from radiotwin.geo import to_geographic
 from radiotwin.io.files import atomic_file
 from radiotwin.io.forms import Origin
 from radiotwin.io.texts import moment
+from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.streets import CREDIT
 from radiotwin.twin.model.correlated_shadowing import NAME as SHADOWING
@@ -67,6 +68,12 @@ DATES_S = 1e9, 4e9  # times from 2001 to 2096; no other number of seconds is as 
 def name_label(name: str) -> str:
     """Return the printed name of an effect or a base: `receiver_drift` -> `receiver drift`."""
     return NAMES.get(name, name.replace("_", " "))
+
+
+def source_label(radio_map: RadioMap) -> str:
+    """Return what made a radio map: `twin:segmented_nn` -> `segmented NN`."""
+    source = str(radio_map.dataset.attrs.get("source", "no source given"))
+    return name_label(source.removeprefix("twin:"))
 
 
 def interpolations() -> frozenset[str]:

@@ -34,6 +34,7 @@ from radiotwin.report.labels import (
     new_figure,
     save,
     shorten,
+    source_label,
 )
 from radiotwin.scene import Scene
 from radiotwin.scene.plot import draw_streets, draw_vegetation, height_grid
@@ -117,10 +118,9 @@ def _radio_map_figure(radio_map: RadioMap, scene: Scene, devices: Sequence[TwinD
             ax.set(xlabel="", xticklabels=[])
     what, unit = ("channel gain", "dB") if powers_dbm is None else ("received power", "dBm")
     figure.colorbar(image, ax=axes, label=f"{what} [{unit}]", shrink=0.7)
-    source = plain(str(radio_map.dataset.attrs.get("source", "")))
     left_out = len(radio_map.devices) - len(names)
     more = f" ({left_out} more devices not shown)" if left_out else ""
-    title = f"{what.capitalize()} at {_lowest(radio_map)}, {source}{more}"
+    title = f"{what.capitalize()} at {_lowest(radio_map)}, {plain(source_label(radio_map))}{more}"
     letters = int(TITLE_LETTERS_IN * figure.get_figwidth())
     figure.suptitle(fill(title, letters, break_on_hyphens=False))
     handles = {label: handle for ax in axes.flat[:len(names)]

@@ -45,7 +45,7 @@ LOS_COLOURS = [[209, 73, 91], [42, 127, 158]]  # RGB of no and of line of sight
 
 
 def pack(values: np.ndarray) -> dict:
-    """Return an array as JSON can hold it.
+    """Encode an array as type, shape and base64 of its little-endian bytes, for JSON.
 
     Args:
         values: array of type float32, int32, int16 or uint8, of any shape.
@@ -63,14 +63,15 @@ def pack_db(level_db: np.ndarray) -> dict:
 
 
 def pack_m(values: ArrayLike) -> dict:
-    """Pack coordinates or times in single precision."""
+    """Pack coordinates [m] or times [s] in single precision."""
     return pack(np.asarray(values).astype(np.float32))
 
 
 def map_layers(run: Run) -> list[dict]:
-    """Return gain, standard deviation, line of sight and error of each map of a run.
+    """Pack level, standard deviation, line of sight and error of each radio map of a run.
 
-    Large maps are thinned to every n-th position; a note is added to the run.
+    Levels are received powers where the twin's measurements were. Of large maps every n-th position
+    is taken, and `run.notes` says so.
     """
     step = _thinning(run)
     truth = run.maps.get(TRUTH)
@@ -104,12 +105,11 @@ def map_layers(run: Run) -> list[dict]:
 
 
 def link_layer(run: Run) -> dict | None:
-    """Return held-out links of a close-loop at the moving end; None without residuals.
+    """Pack the held-out links of a close-loop; None if the run has no residuals.
 
-    They have the measured level, where the file has it, and the residuals before and after. An
-    interval of 90 % is that of the residuals of all links of the same sight.
-
-    A note is added to the run where links are left out.
+    A link has the position of its moving end, its residuals before and after, its measured level
+    and, for some, its paths. `interval_db` holds 90 % of the residuals of links without and with
+    line of sight. `run.notes` says where links are left out.
     """
     links = run.residuals
     if links is None or links.empty:
@@ -146,11 +146,17 @@ def link_layer(run: Run) -> dict | None:
 
 
 def path_layer(scene: Scene, links: pd.DataFrame) -> dict:
-    """Return the strongest paths of the links with the largest residuals, over the map as given.
+    """Follow the strongest reflected and diffracted paths of the links with the largest residuals.
+
+    Found buildings are not in the map that they are followed over.
+
+    Args:
+        scene: 3D map and carrier frequency.
+        links: held-out links, see `radiotwin.closeloop.output.residuals`.
 
     Returns:
-        `link` (p,) row of the link of each path, `end` (p,) of its points, and all points one after
-        another (m, 3), from the device to the receiver [m].
+        `points` (m, 3) of all paths, one path after another, from the device to the receiver [m];
+        `end` (p,) row behind the last point of each path; `link` (p,) row of its link.
     """
     def position_m(rows: pd.DataFrame, end: str) -> np.ndarray:
         return rows[[f"{end}_{axis}_m" for axis in "xyz"]].to_numpy(dtype=float)
@@ -182,13 +188,13 @@ def _is_power(run: Run) -> bool:
 
 
 def _interval_db(residual_db: np.ndarray) -> list[float]:
-    """Return the ends between which 90 % of residuals are [dB]."""
+    """Return the 5 % and 95 % quantiles of residuals (n,) [dB]; zeros if none is known."""
     known_db = residual_db[np.isfinite(residual_db)]
     return np.quantile(known_db, [0.05, 0.95]).tolist() if len(known_db) else [0.0, 0.0]
 
 
 def device_layer(run: Run) -> list[dict]:
-    """Return name, role, true position if known, and the twin's estimate of each device."""
+    """Return each device's name, role, true position (None: not known), and the twin's estimate."""
     devices: dict[str, dict] = {}
     for known in run.scene.config.devices if run.scene else []:
         devices[known.device] = {"name": known.device, "role": known.role, "estimate": None,
@@ -211,7 +217,10 @@ def device_layer(run: Run) -> list[dict]:
 
 
 def found_layer(run: Run) -> list[dict]:
-    """Return name, place, outline and height [m] of what a close-loop found beside the devices."""
+    """Return name, place, outline and height [m] of each object that a close-loop found.
+
+    Causes that belong to a device, such as its antenna, are no objects.
+    """
     found = []
     for effect in causes(run.closeloop or {"effects": []}):
         height_m = (effect["parameters"].get("height_m") or {}).get("value") or 0.0
@@ -224,9 +233,9 @@ def found_layer(run: Run) -> list[dict]:
 
 
 def flight_layer(run: Run) -> list[dict]:
-    """Return the start of each flight, and the position of each UAV from then on.
+    """Pack start and end of each flight [s], and each UAV's positions over the time since then.
 
-    A note is added to the run where positions are left out.
+    `run.notes` says where positions are left out.
     """
     tracks = run.tracks
     if tracks is None or tracks.empty:
@@ -253,7 +262,7 @@ def flight_layer(run: Run) -> list[dict]:
 
 
 def bounds_m(run: Run) -> list[float]:
-    """Return x_min, x_max, y_min, y_max of what is drawn [m]."""
+    """Return x_min, x_max, y_min, y_max of the scene, without one of all devices and links [m]."""
     if run.scene is not None:
         return list(run.scene.config.extent.bounds)
     devices = [device["estimate"] or device["true"] for device in device_layer(run)]
@@ -272,7 +281,7 @@ def bounds_m(run: Run) -> list[float]:
 
 
 def _field(label: str, quantity: str, level_db: np.ndarray, kind: str, unit: str = "dB") -> dict:
-    """Return levels with the ends of their colour scale."""
+    """Pack levels with their unit and the ends of their colour scale."""
     if kind == "error":
         high = residual_range_db(level_db)
         low = -high
@@ -283,7 +292,10 @@ def _field(label: str, quantity: str, level_db: np.ndarray, kind: str, unit: str
 
 
 def _error_db(radio_map: RadioMap, truth: RadioMap, step: int) -> np.ndarray:
-    """Return (device, z, y, x) map minus truth at every n-th position; NaN where there is none."""
+    """Subtract the truth from a map (device, z, y, x), at every n-th position (`step`).
+
+    NaN for devices that the truth lacks.
+    """
     error_db = np.full(radio_map.gain_db.shape, np.nan)
     model_db, true_db = comparable_db(radio_map, truth), truth.gain_db[..., ::step, ::step]
     row_of = {device: row for row, device in enumerate(truth.devices)}
@@ -294,7 +306,7 @@ def _error_db(radio_map: RadioMap, truth: RadioMap, step: int) -> np.ndarray:
 
 
 def _map_devices(run: Run, name: str) -> int:
-    """Return the number of devices of a map that are shown; adds a note where some are not."""
+    """Return how many devices of a map the page holds; `run.notes` says if some are left out."""
     devices, altitudes = run.maps[name].gain_db.shape[:2]
     shown = min(devices, MAX_MAP_DEVICES, max(MAX_VALUES // (3 * altitudes), 1))
     if shown < devices:
@@ -303,12 +315,13 @@ def _map_devices(run: Run, name: str) -> int:
 
 
 def _same_lattice(one: RadioMap, other: RadioMap) -> bool:
+    """Return whether two maps are over the same positions."""
     return one.gain_db.shape[1:] == other.gain_db.shape[1:] and np.allclose(
         one.lattice.positions_m, other.lattice.positions_m)
 
 
 def _thinning(run: Run) -> int:
-    """Return n where every n-th position of the lattice is shown; adds a note to the run."""
+    """Return n so that every n-th position of all maps fits into `MAX_VALUES`; adds a note."""
     values = sum(3 * radio_map.gain_db.size for radio_map in run.maps.values())
     step = max(int(np.ceil(np.sqrt(values / MAX_VALUES))), 1)
     if step * run.map_step > 1:
@@ -318,10 +331,10 @@ def _thinning(run: Run) -> int:
 
 
 def city_mesh(scene: Scene) -> tuple[dict, str]:
-    """Return the buildings of a scene for the viewer, and a note on what was simplified.
+    """Pack the triangles of a scene's buildings, and return a note if they were simplified.
 
-    Flat ground is left out. A city of more than `MAX_FACES` triangles is drawn as blocks, each as
-    high as the highest surface in its cell.
+    Flat ground is left out. A city of more than `MAX_FACES` triangles becomes blocks, each as high
+    as the highest surface in its cell.
     """
     city = scene.city
     keep = city.vertices[city.faces][:, :, 2].max(axis=1) > FLAT_M
@@ -335,7 +348,7 @@ def city_mesh(scene: Scene) -> tuple[dict, str]:
 
 
 def street_layer(scene: Scene | None) -> dict | None:
-    """Return the streets of a scene as (n, 2, 3) ends of straight lines [m], on the ground."""
+    """Pack the streets of a scene as the ends (n, 2, 3) of straight lines on the ground [m]."""
     if scene is None or not scene.streets_m:
         return None
     ends_m = np.concatenate([np.stack([line_m[:-1], line_m[1:]], axis=1)
@@ -380,12 +393,13 @@ def _quads(*coordinates: np.ndarray) -> np.ndarray:
 
 
 def _packed(vertices_m: np.ndarray, faces: np.ndarray) -> dict:
+    """Pack vertices (v, 3) [m] as x, y, z, and triangles (f, 3) of their indices as i, j, k."""
     return {axis: pack_m(vertices_m[:, i]) for i, axis in enumerate("xyz")} | \
         {corner: pack(faces[:, i].astype(np.int32)) for i, corner in enumerate("ijk")}
 
 
 def viewer_data(run: Run) -> dict[str, Any]:
-    """Return the data that `viewer.js` reads; adds to `run.notes`."""
+    """Collect all that `viewer.js` reads; adds to `run.notes`."""
     city, note = city_mesh(run.scene) if run.scene else (None, "")
     if note:
         run.notes.append(note)

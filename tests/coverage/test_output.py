@@ -27,7 +27,7 @@ from radiotwin.coverage.output import (
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_geographic
 from radiotwin.report import write_coverage_pictures
-from radiotwin.report.coverage_figures import _attribution
+from radiotwin.report.labels import attribution
 from radiotwin.scene import Scene
 
 
@@ -169,6 +169,6 @@ def test_a_missing_package_is_told(scene, monkeypatch):
 
 
 def test_maps_of_openstreetmap_are_credited(scene):
-    assert _attribution(scene) == ""
+    assert attribution(scene) == ""
     of_osm = scene.config.model_copy(update={"provenance": {"source": "data/town.osm.pbf"}})
-    assert _attribution(Scene(scene.folder, of_osm)) == "© OpenStreetMap contributors (ODbL)"
+    assert attribution(Scene(scene.folder, of_osm)) == "© OpenStreetMap contributors (ODbL)"
