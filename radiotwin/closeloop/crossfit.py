@@ -22,7 +22,7 @@ from typing_extensions import override
 from radiotwin.effects.arrays import subsample
 from radiotwin.errors import BadInput
 from radiotwin.inference.held_out import deal_groups
-from radiotwin.inference.student import mean_if_detected
+from radiotwin.inference.student import ReadingLaw
 from radiotwin.links import Links, with_evidence
 from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.evidence import evidence_width_m
@@ -331,8 +331,8 @@ class CrossFit:
         """(n,) held-out mean level, given that the link is detected [dB]; NaN without one."""
         reading = self.held_out_reading
         return self.held_out(lambda fold: np.where(
-            fold.usable, mean_if_detected(*reading, fold.model.limit_db, fold.model.dof,
-                                          fold.model.losses), np.nan))
+            fold.usable, ReadingLaw(*reading, fold.model.limit_db, fold.model.dof,
+                                    fold.model.losses).reading_db, np.nan))
 
     @property
     def reads_quality(self) -> bool:

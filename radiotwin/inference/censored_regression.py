@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
-from radiotwin.inference import student
-from radiotwin.inference.student import NO_LOSSES, Losses
+from radiotwin.inference.student import MIN_PROBABILITY, NO_LOSSES, Losses, ReadingLaw
 
 MIN_SCALE_DB = 0.05
 FIRST_SCALE_DB = 5.0  # initial error scale
@@ -128,8 +127,11 @@ class CensoredRegression:
 
     def nll_at(self, mean_db: np.ndarray, scale_db: np.ndarray) -> np.ndarray:
         """Compute the negative log-likelihood (n,) of the levels for mean and scale (n,) [nats]."""
-        return student.censored_nll(self.level_db, self.limit_db, mean_db, scale_db, self.dof,
-                                    self.losses)
+        return self.reading_law(mean_db, scale_db).nll(self.level_db)
+
+    def reading_law(self, mean_db: np.ndarray, scale_db: np.ndarray) -> ReadingLaw:
+        """Return the distribution of the readings for mean and scale (n,) [dB]."""
+        return ReadingLaw(mean_db, scale_db, self.limit_db, self.dof, self.losses)
 
     def residual_db(self, result: "FitResult") -> np.ndarray:
         """Compute measured minus predicted levels (n,) [dB], also for blanks.
@@ -141,11 +143,10 @@ class CensoredRegression:
         mean, blank = predicted.mean_db, np.isnan(self.level_db)
         limit = np.where(np.isfinite(self.limit_db), self.limit_db, mean)
         excess_db = np.minimum(limit - mean, 0.0)
-        below = (1 - self.losses.blank) * student.below_probability(
-            -excess_db, predicted.scale_db, np.zeros(len(mean)), self.dof, self.losses)
-        missed = np.maximum(self.losses.blank + below, student.MIN_PROBABILITY)
-        dropped_db = student.expected_drop_db(self.level_db, mean, predicted.scale_db, self.dof,
-                                              self.losses)
+        excess_law = self.reading_law(-excess_db, predicted.scale_db)
+        below = (1 - self.losses.blank) * excess_law.below(np.zeros(len(mean)))
+        missed = np.maximum(self.losses.blank + below, MIN_PROBABILITY)
+        dropped_db = self.reading_law(mean, predicted.scale_db).expected_drop_db(self.level_db)
         return np.where(blank, excess_db * below / missed, self.level_db - mean + dropped_db)
 
 
@@ -259,9 +260,8 @@ def _slope_and_hessian(problem: CensoredRegression, predicted: Linearisation,
         log-posterior, (groups,) step of the log scales, in which a row counts by the share of its
         error that passes the receiver, and the approximate gain of that step [nats].
     """
-    slope, curvature, scale_slope = student.derivatives(
-        problem.level_db, problem.limit_db, predicted.mean_db, predicted.scale_db, problem.dof,
-        problem.losses)
+    slope, curvature, scale_slope = problem.reading_law(
+        predicted.mean_db, predicted.scale_db).derivatives(problem.level_db)
     # Fisher information of one row about log(scale) (Lange et al. 1989).
     growth, information = predicted.growth, 2 * problem.dof / (problem.dof + 3)
     toward, hessian = _moments(problem, predicted, slope * predicted.slope + scale_slope * growth,

@@ -15,12 +15,7 @@ from radiotwin.inference.censored_regression import (
     _slope_and_hessian,
     fit,
 )
-from radiotwin.inference.student import (
-    Losses,
-    derivatives,
-    detection_probability,
-    mean_if_detected,
-)
+from radiotwin.inference.student import Losses, ReadingLaw
 
 
 def problem(level_db, columns, limit_db=-np.inf, dof=5.0, split=1, paths=None, receiver=None, prior_sd_db=np.inf):
@@ -120,8 +115,7 @@ def test_derivatives_are_those_of_the_likelihood_also_where_links_are_lost(share
     level_db[::2] = np.nan
     given = replace(problem(level_db, np.ones((300, 1)), -95.0), losses=Losses(np.full(300, share), np.full(300, drop), np.full(300, 12.0)))
     mean, scale, step = rng.uniform(-110, -70, 300), 3.0, 1e-3
-    slope, curvature, scale_slope = derivatives(level_db, given.limit_db, mean, np.full(300, scale), given.dof,
-                                                given.losses)
+    slope, curvature, scale_slope = given.reading_law(mean, np.full(300, scale)).derivatives(level_db)
     around = [given.nll_at(mean + way * step, np.full(300, scale)) for way in (-1, 0, 1)]
     np.testing.assert_allclose(slope, (around[0] - around[2]) / (2 * step), atol=1e-5)
     blank = np.isnan(level_db)
@@ -163,9 +157,9 @@ def test_mean_and_probability_of_detection_count_both_states(limit_db):
     rng = np.random.default_rng(1)
     level_db = -85 + 4 * rng.standard_t(5, 10**6) - 20 * (rng.random(10**6) < 0.3)
     seen = (level_db > limit_db) & (rng.random(10**6) > 0.2)
-    args = np.array([-85.0]), np.array([4.0]), np.array([limit_db]), 5, Losses(0.2, 0.3, 20.0)
-    assert detection_probability(*args)[0] == pytest.approx(seen.mean(), abs=0.002)
-    assert mean_if_detected(*args)[0] == pytest.approx(level_db[seen].mean(), abs=0.03)
+    law = ReadingLaw(np.array([-85.0]), np.array([4.0]), np.array([limit_db]), 5, Losses(0.2, 0.3, 20.0))
+    assert law.detection_probability[0] == pytest.approx(seen.mean(), abs=0.002)
+    assert law.reading_db[0] == pytest.approx(level_db[seen].mean(), abs=0.03)
 
 
 def test_what_paths_add_and_receivers_compress_is_undone():

@@ -13,9 +13,8 @@ import numpy as np
 from scipy.optimize import minimize
 from typing_extensions import override
 
-from radiotwin.inference import student
 from radiotwin.inference.gaussian import Limit, limits_of
-from radiotwin.inference.student import DOF
+from radiotwin.inference.student import DOF, ReadingLaw
 from radiotwin.links import LinkGeometry, Links
 from radiotwin.links import design_effect as design_effect_of
 from radiotwin.propagation.laws.base import (
@@ -79,8 +78,8 @@ def fit_class(level_db: np.ndarray, limits_db: np.ndarray, paths: np.ndarray,
 
     def nll(numbers: np.ndarray) -> float:
         class_scale_db = float(np.exp(np.clip(numbers[1], -3, 4)))
-        return float(student.censored_nll(level_db, limits_db, paths + numbers[0],
-                                          scale_db(class_scale_db, square_db), DOF).sum())
+        law = ReadingLaw(paths + numbers[0], scale_db(class_scale_db, square_db), limits_db, DOF)
+        return float(law.nll(level_db).sum())
 
     found = minimize(nll, start, method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02})
     return np.array([found.x[0], np.clip(found.x[1], -3, 4)])
@@ -126,7 +125,7 @@ class LinkFit:
                 self._start.get(is_los))
             mean_db = paths_db[of_class] + offset_db
             errors_db = scale_db(float(np.exp(log_scale)), square_db[of_class])
-            nll[of_class] = student.censored_nll(level_db, limits_db, mean_db, errors_db, DOF)
+            nll[of_class] = ReadingLaw(mean_db, errors_db, limits_db, DOF).nll(level_db)
             z[of_class] = np.nan_to_num((level_db - mean_db) / errors_db)
         return nll, z
 

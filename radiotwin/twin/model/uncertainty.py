@@ -16,7 +16,6 @@ from scipy.sparse import csr_array, hstack, issparse, vstack
 
 from radiotwin.effects.base import DetectionEffect, LimitEffect
 from radiotwin.effects.params import NEAR_SHARE, Estimate, Variation
-from radiotwin.inference import student
 from radiotwin.inference.censored_regression import CensoredRegression, Linearisation
 from radiotwin.inference.sandwich import Scores
 from radiotwin.links import evidence_blocks, places
@@ -201,9 +200,8 @@ def _curvatures(problem: CensoredRegression, predicted: Linearisation,
 
     The information of the scale of Student's t is that of Lange et al. (1989), App. B.
     """
-    slope, curvature, scale_slope = student.derivatives(
-        problem.level_db, problem.limit_db, predicted.mean_db, predicted.scale_db, problem.dof,
-        problem.losses)
+    slope, curvature, scale_slope = problem.reading_law(
+        predicted.mean_db, predicted.scale_db).derivatives(problem.level_db)
     seen = np.isfinite(problem.level_db)
     expected = (problem.dof + 1) / (problem.dof + 3) / predicted.scale_db**2
     return (slope, scale_slope, np.where(seen, expected, curvature),
