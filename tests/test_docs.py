@@ -91,7 +91,8 @@ def test_a_figure_that_differs_from_its_table_is_noticed():
 
 @pytest.mark.parametrize("page, of_the_question", [  # settings, thresholds, licences: no results
     ("README.md", set()), ("docs/results.md", {"90 %", "1.5 m", "0.5", "0.7", "0.9", "0.45"}),
-    ("docs/real-data.md", {"90 %", "2.0", "3.56", "3.69", "462.7"})])
+    ("docs/real-data.md", {"90 %", "2.0", "3.56", "3.69", "462.7"}), ("docs/scale.md", set()),
+    ("docs/limitations.md", {"2.2", "36.777", "0.5 m", "0.7", "5.8", "90 %"}), ("docs/install.md", {"3.11", "3.12", "3.13"})])
 def test_results_are_said_with_figures_of_tables_alone(page, of_the_question):
     text = (ROOT / page).read_text(encoding="utf-8")
     if page == "README.md":
