@@ -1,4 +1,4 @@
-"""Import of measurements from logs and tables of any layout, with a report of what was kept."""
+"""Import measurements from logs and tables of any layout, with a report."""
 
 from radiotwin.importing.run import import_files, import_measurements
 from radiotwin.importing.settings import Settings, parse_columns, read_settings

@@ -1,8 +1,7 @@
-"""Known formats of logs, recognised by their columns: which column holds what, in which unit.
+"""Known formats of logs: how they are recognised, and the mapping of their columns.
 
-Most are tables. The sweeps of rtl_power have a line for each tuning (`date, time, Hz low, Hz high,
-Hz step, samples, dB, dB, …`), all of one time, with the last bin twice: the power of their bins in
-a band is summed.
+Most are tables. A sweep of rtl_power has a line for each tuning (`date, time, Hz low, Hz high, Hz
+step, samples, dB, dB, …`), with the last bin twice; the power of its bins in a band is summed.
 """
 
 import io
@@ -24,7 +23,7 @@ from radiotwin.io.budgets import CELLS, COLUMNS, ROWS
 _FIRST = 6  # fields before the bins
 _NO_LEVEL = re.compile(r"-?(1\.#|nan|inf)", re.IGNORECASE)
 """Of a bin without power; `-1.#J` and `-1.#IND` are those of Windows."""
-_EDGE = 1e-6  # of a step: an edge of the band on that of a bin
+_EDGE = 1e-6  # tolerance of band edges, in bin widths
 SEMTECH = "Semtech, SX1276/77/78/79 data sheet, rev. 4, 5.5.5"
 _LEVEL = "power of the packet, dBm: RSSI, plus SNR where that is below 0"
 _CAUTION = ("the RSSI of a packet below the noise is mostly noise, so level = RSSI + SNR where SNR "
@@ -43,14 +42,14 @@ _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ
 
 
 def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np.ndarray]:
-    """Return the power of each sweep in the band of the settings, or of all bins.
+    """Sum the power of each sweep of rtl_power in the band of the settings, or over all bins.
 
-    A bin counts where its centre lies in the band; of bins that are wider than the band the one
-    with its middle, whose edges then are the name of the band.
+    Bins with their centre in the band count. If bins are wider than the band, it is the bin that
+    contains the middle of the band, and the band is named after its edges.
 
     Returns:
-        texts `date, time, band, power_db, bins`, `power_db` empty where a sweep does not cover the
-        band; and the first line of each sweep.
+        texts `date, time, band, power_db, bins`, with `power_db` empty if a sweep does not cover
+        the band; and the first line of each sweep.
     """
     band_hz = settings.band_hz
     sweeps: list[list[str]] = []
@@ -112,7 +111,7 @@ def _read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np
 
 
 def _bins(file: LogFile, number: int, fields: list[str]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the centres [Hz] and levels [dB] of the bins of a line, and their width [Hz]."""
+    """Parse a line of rtl_power: centres [Hz] and levels [dB] of its bins, and their width [Hz]."""
     try:
         low_hz, high_hz, step_hz = map(float, fields[2:5])
         levels = fields[_FIRST:] if fields[-1] else fields[_FIRST:-1]
@@ -128,20 +127,20 @@ def _bins(file: LogFile, number: int, fields: list[str]) -> tuple[np.ndarray, np
 
 @dataclass(frozen=True)
 class Format:
-    """The mapping of a known format.
+    """A known format of logs.
 
     Attributes:
-        name: as of `--format`.
-        title: of the program that writes it.
-        columns: quantity of `Columns` -> entry of a mapping, or several, of which the first counts
-            whose columns the file has; names in any case, `*` for any text.
+        name: for the option `--format`.
+        title: program that writes the format.
+        columns: quantity of `Columns` -> column or template; of several, the first one whose
+            columns the file has. Upper and lower case are equal, `*` matches any text.
         signature: columns by which a file is recognised.
-        needs: quantities of which it has a column, besides.
-        level: what the level is, with its unit.
-        source: of the description.
-        settings: others than `columns`.
-        caution: of the units, which is printed at every import.
-        zone_caution: of the time zone, which is printed where none is declared.
+        needs: quantities that a file must have besides.
+        level: meaning of the level, with its unit.
+        source: of this description.
+        settings: further settings of the import.
+        caution: printed at every import.
+        zone_caution: printed if no time zone is declared.
         without_header: how a file without a header is recognised and read, or None.
     """
 
@@ -158,13 +157,13 @@ class Format:
     needs: tuple[str, ...] = ()
 
     def fits(self, header: Iterable[str]) -> bool:
-        """Return whether a header has the signature."""
+        """Return whether a header has the signature and the needed quantities."""
         names = list(header)
         return set(map(_plain, self.signature)) <= set(map(_plain, names)) and (
             not self.needs or set(self.needs) <= set(self.mapping(names)))
 
     def mapping(self, header: Iterable[str]) -> dict[str, str]:
-        """Return the entries of `columns` for a header, without what it does not have."""
+        """Return the entries of `columns` that a header has, with its spelling of the names."""
         actual = {_plain(name): name for name in reversed(list(header))}  # the first one counts
         result = {}
         for quantity, entries in self.columns.items():
@@ -179,7 +178,7 @@ class Format:
 
 
 def _plain(name: str) -> str:
-    """Return a name in lower case without what programs put after it: an index, `(Text)`."""
+    """Return a column name in lower case without a suffix such as `[1]` or `(Text)`."""
     return re.sub(r"(\s*(\(text\)|\[\d+\]))+$", "", name.strip().lower())
 
 
@@ -192,7 +191,7 @@ def _found(name: str, actual: Mapping[str, str]) -> str:
 
 
 def _place_in(payload: str) -> dict[str, str | tuple[str, ...]]:
-    """Return the entries of the position that a node sends, as its decoder may name it."""
+    """Return the mapping of a node's position, for the usual names in decoded payloads."""
     return {quantity: tuple(f"{payload}{each}" for short in (long, *others)
                             for each in ((f"*{short}",) if short == long else
                                          (short, f"*.{short}")))
@@ -234,20 +233,20 @@ DRIVE_TEST = (
 def _lora(name: str, title: str, source: str, payload: str, place: str,
           settings: Mapping[str, Any] = _UNITS, **columns: str | tuple[str, ...]
           ) -> tuple[Format, Format]:
-    """Return the formats of uplinks of a network, for nodes with and without a position.
+    """Return the formats of a LoRa network's uplinks, for nodes with and without a position.
 
     Args:
-        name: of the format for nodes without one.
+        name: of the format for nodes without a position.
         title: of the network.
         source: of the description.
-        payload: before the names of what a node sends.
-        place: before the names of a gateway's position.
-        settings: others than `columns`.
-        columns: entries of `level`, `snr`, `time`, `node` and `gateway`.
+        payload: prefix of the decoded payload's columns.
+        place: prefix of the columns of a gateway's position.
+        settings: further settings of the import.
+        columns: columns of `level`, `snr`, `time`, `node` and `gateway`.
     """
     node, gateway = str(columns.pop("node")), str(columns.pop("gateway"))
     places = {each: f"{place}{each}" for each in ("latitude", "longitude", "altitude")}
-    if not place.endswith("."):  # as Helium has it
+    if not place.endswith("."):  # Helium
         places = {"latitude": f"{place}.lat", "longitude": f"{place}.long"}
     signature = (str(columns["level"]), gateway, node)
     return (
@@ -262,7 +261,7 @@ def _lora(name: str, title: str, source: str, payload: str, place: str,
 
 
 def _things_stack(prefix: str) -> tuple[Format, Format]:
-    """Return the formats of uplink messages, whose fields may have a prefix."""
+    """Return the formats of The Things Stack's uplink messages, with a prefix of their fields."""
     message, gateway = f"{prefix}uplink_message.", f"{prefix}uplink_message.rx_metadata."
     return _lora(
         "things-stack" + "-storage" * bool(prefix),
@@ -407,7 +406,7 @@ FORMATS: tuple[Format, ...] = (*PHONE, *DRIVE_TEST, *LORA, *SCANNER)
 
 
 def expected(formats: Iterable[Format], columns: Collection[str] = ()) -> Expected:
-    """Return what a file of some formats, or of a declared mapping (lower case), may have."""
+    """Return the columns that a file of some formats, or with declared columns, may have."""
     formats = list(formats)
     signatures = [frozenset(name.lower() for name in each.signature) for each in formats]
     return Expected((frozenset(columns), *signatures),

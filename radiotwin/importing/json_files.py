@@ -1,8 +1,8 @@
-"""Tables in JSON: a row for each record, or for each object of a list of receptions in it.
+"""Read tables from JSON: a row for each record, or for each object of its list of receptions.
 
-A record is an object: one a line, one after the other on any number of lines, in an array, or a
-feature of GeoJSON (RFC 7946; RFC 8142 has one a line). Nested values become columns with dots in
-their names. Tables of pandas, a list or an object for each column, are read, too.
+Records are objects: one per line, one after the other over several lines, in an array, or features
+of GeoJSON (RFC 7946; RFC 8142 has one per line). Nested values become columns with dots in their
+names. Tables of pandas, with a list or an object for each column, are read as well.
 """
 
 import io
@@ -20,25 +20,25 @@ from radiotwin.geo import ALLOWED, reference_system
 from radiotwin.importing.log_files import Lines, LogFile
 from radiotwin.importing.source import BadRows, Source
 from radiotwin.io.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, NESTING, ROWS
-from radiotwin.io.cells import listed, shown
+from radiotwin.io.cells import cell_text, listed
 from radiotwin.io.inputs import parse_json
 
-_MAX_NUMBERED = 16  # values of a list that are columns, such as coordinates
+_MAX_NUMBERED = 16  # longest list whose values become columns, such as coordinates
 _PLACE = ("longitude", "latitude", "altitude")
 BEFORE = "before"
 """Column of the text before the object of a line, such as a topic of MQTT."""
-_HEAD_BYTES = 2**16  # in which lines are looked for
+_HEAD_BYTES = 2**16  # in which the kind of JSON is recognised
 _SEPARATOR = "\x1e"  # before each record of RFC 8142
 
 
 class _Table:
-    """Rows of records as they come.
+    """Collects the rows of records.
 
     Args:
         file: for messages.
-        used: names of columns that are needed, in lower case; without any all lists are rows.
+        used: needed columns, in lower case; if there are none, the objects of all lists are rows.
         chosen: the only list whose objects are rows, or None.
-        crs: of the coordinates of features, where the file has none.
+        crs: of the coordinates of features, if the file declares none.
     """
 
     def __init__(self, file: LogFile, used: Collection[str], chosen: str | None,
@@ -64,7 +64,7 @@ class _Table:
             self.numbers.append(number)
             self._columns |= dict.fromkeys(row)
             self._cells += len(row)
-            # After each: one record may stand for many rows.
+            # After each row: one record may have many.
             COLUMNS.check(len(self._columns), self._file)
             ROWS.check(len(self.rows), self._file)
             CELLS.check(len(self.rows) * len(self._columns), self._file)
@@ -72,7 +72,7 @@ class _Table:
 
     def source(self, where: Callable[[int], str],
                bad: list[tuple[str, int, str]]) -> Source:
-        """Return all rows; records without receptions are none where others have some."""
+        """Return all rows; records without receptions are left out if others have receptions."""
         lists = tuple(f"{name}." for name, is_rows in self._is_rows.items() if is_rows)
         others = {row for row in self._without if lists
                   and not any(name.startswith(lists) for name in self.rows[row])}
@@ -95,7 +95,7 @@ class _Table:
                       left_out=tuple(left_out))
 
     def _rows(self, value: dict[str, Any], prefix: str) -> Iterator[tuple[dict[str, str], bool]]:
-        """Yield the rows of an object, and whether they are objects of a list."""
+        """Yield the rows of an object, each with whether it is an object of a list."""
         flat: dict[str, str] = {}
         receptions: list[tuple[str, list[Any]]] = []
         self._flatten(value, prefix, flat, receptions)
@@ -108,6 +108,7 @@ class _Table:
 
     def _flatten(self, value: dict[str, Any], prefix: str, flat: dict[str, str],
                  receptions: list[tuple[str, list[Any]]]) -> None:
+        """Add the nested values of an object to `flat`, and its lists of rows to `receptions`."""
         for key, item in value.items():
             name = f"{prefix}{key}"
             if isinstance(item, dict):
@@ -119,6 +120,7 @@ class _Table:
 
     def _add_list(self, name: str, items: list[Any], flat: dict[str, str],
                   receptions: list[tuple[str, list[Any]]]) -> None:
+        """Add a list as rows, as numbered columns, or as unread, see `_flatten`."""
         if items and all(isinstance(each, dict) for each in items):
             if name not in self._is_rows:
                 begin = f"{name.lower()}."
@@ -136,7 +138,7 @@ class _Table:
 
 
 def starts_json(line: str) -> bool:
-    """Return whether a first line is JSON, or a word or two and an object, as of an MQTT client."""
+    """Return whether a first line is JSON, or an object after a word or two (MQTT clients)."""
     if re.match("\x1e?{|\\[ *({|$)", line):
         return True
     before, brace, _ = line.partition("{")
@@ -154,16 +156,17 @@ def read_json_log(file: LogFile, declared: Collection[str], may_be: Collection[s
 
     Args:
         file: `.json`, `.jsonl`, `.geojson` or a text.
-        declared: columns that are needed, in lower case.
-        may_be: columns of known formats. A list of objects to which one of them or of the declared
-            ones belongs makes a row of each object; where one is missing, or there are none, every
-            list does, so that a message has its columns.
-        chosen: name of the only list that does, in full or its end; None to find them.
-        crs: reference system of the coordinates of features, where the file names none.
-        bad_rows: where lines that are no JSON are noted, or None.
+        declared: needed columns, in lower case.
+        may_be: columns of known formats. The objects of a list become rows if one of these or of
+            the declared columns is in it. If columns are missing, or none are given, the objects of
+            all lists become rows, so that a message can name their columns.
+        chosen: name, or end of the name, of the only list whose objects become rows; None: see
+            above.
+        crs: reference system of the coordinates of features, if the file declares none.
+        bad_rows: where lines that are no JSON are noted; None: they raise BadInput.
 
     Returns:
-        the cells as texts: `""` where a value is null, missing, or a list that is not read.
+        the cells as texts, `""` for null, a missing value, and a list that is not read.
 
     Raises:
         BadInput: no JSON, no records, or features that are no points.
@@ -178,7 +181,7 @@ def read_json_log(file: LogFile, declared: Collection[str], may_be: Collection[s
 
 def _read(file: LogFile, used: Collection[str], chosen: str | None, crs: str | None,
           bad_rows: BadRows | None) -> Source:
-    """Read the records of a file whose lists are rows where a column that is used is in them."""
+    """Read the records of a file; the objects of lists with a used column become rows."""
     table = _Table(file, used, chosen, crs)
     try:
         if _has_lines(file):
@@ -192,7 +195,7 @@ def _read(file: LogFile, used: Collection[str], chosen: str | None, crs: str | N
 
 
 def _has_lines(file: LogFile) -> bool:
-    """Return whether the first of several lines is an object."""
+    """Return whether a file has JSON lines: its first line is a complete object."""
     with file.open() as content:
         head = content.read(_HEAD_BYTES).decode("utf-8-sig", "replace")
     lines = [line for line in (each.strip().lstrip(_SEPARATOR).rstrip(",")
@@ -205,7 +208,7 @@ def _has_lines(file: LogFile) -> bool:
 
 def _add_lines(file: LogFile, table: _Table,
                bad_rows: BadRows | None) -> list[tuple[str, int, str]]:
-    """Add the records of JSON lines; return why, how many and which others are left out."""
+    """Add the records of JSON lines; return the bad ones: reason, number, and the first one."""
     bad: list[int] = []
     cut: list[tuple[str, int, str]] = []
     with file.open() as content, io.TextIOWrapper(content, "utf-8", newline="") as text:
@@ -241,10 +244,10 @@ def _add_lines(file: LogFile, table: _Table,
 
 def _add_document(file: LogFile, table: _Table,
                   bad_rows: BadRows | None) -> tuple[bool, list[tuple[str, int, str]]]:
-    """Add the records of a document, or of several in a row.
+    """Add the records of all documents in a file to a table.
 
     Returns:
-        whether they are features; and why, how many and which others are left out.
+        whether they are GeoJSON features; and bad records: reason, number, and the first one.
     """
     is_map = False
     bad: list[tuple[str, int, str]] = []
@@ -273,8 +276,8 @@ def _add_document(file: LogFile, table: _Table,
             where = f"{file}: {noun} {number}"
             try:
                 if not isinstance(record, dict):
-                    raise BadInput(f"{where} is {shown(record)}; allowed are objects")
-                own = _point(record, where) if is_map else record
+                    raise BadInput(f"{where} is {cell_text(record)}; allowed are objects")
+                row = _point(record, where) if is_map else record
             except BadInput as error:
                 if bad_rows is None:
                     raise
@@ -283,12 +286,12 @@ def _add_document(file: LogFile, table: _Table,
                     raise BadInput(f"{error}{bad_rows.hint(1)}") from None
                 bad.append(("bad row", 1, f"{noun} {number}"))
                 continue
-            table.add(own, number, where)
+            table.add(row, number, where)
     return is_map, bad
 
 
 def _documents(file: LogFile) -> Iterator[Any]:
-    """Yield the documents that a text holds one after the other, as loggers append them."""
+    """Yield the JSON documents of a text, which loggers append one after the other."""
     text = file.read_text(DOCUMENT_BYTES)
     decoder = json.JSONDecoder()
     at = 0
@@ -307,7 +310,7 @@ def _documents(file: LogFile) -> Iterator[Any]:
 
 
 def _of_columns(value: dict[str, Any]) -> list[dict[str, Any]] | None:
-    """Return the records of an object that has a list, or an object, for each column, or None.
+    """Convert an object with a list or an object for each column to records; None if it is none.
 
     pandas writes `{"a": {"0": 1, "1": 2}}`, `{"a": [1, 2]}` and `{"columns": …, "data": …}`.
     """
@@ -341,7 +344,7 @@ def _point(feature: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _to_degrees(file: LogFile, table: pd.DataFrame, crs: str) -> dict[str, pd.Series]:
-    """Return longitude and latitude as texts, of coordinates in another system."""
+    """Convert coordinates in another reference system to longitude and latitude, as texts."""
     from pyproj import Transformer
     from pyproj.exceptions import CRSError, ProjError
 
@@ -350,7 +353,7 @@ def _to_degrees(file: LogFile, table: pd.DataFrame, crs: str) -> dict[str, pd.Se
         transformer = Transformer.from_crs(reference_system(crs), "EPSG:4326", always_xy=True)
         degrees = transformer.transform(x, y)
     except (CRSError, ProjError) as error:
-        raise BadInput(f"{file}: its crs {shown(crs)} cannot be read ({error!s:.200}); declare "
+        raise BadInput(f"{file}: its crs {cell_text(crs)} cannot be read ({error!s:.200}); declare "
                        f"{ALLOWED} by --crs, without that member of the file") from None
     return {name: pd.Series([repr(float(each)) if np.isfinite(each) else "" for each in values],
                             index=table.index, dtype=str)

@@ -1,4 +1,4 @@
-"""The files of an import: named ones, those of a folder, and those in a zip file."""
+"""List and open the files of an import: single files, folders, and zip files."""
 
 import io
 import os
@@ -21,17 +21,17 @@ TEXTS = (".csv", ".tsv", ".txt", ".log", *JSON)
 BINARIES = (".parquet", ".xlsx")
 _WHAT = f"log ({', '.join((*TEXTS, *BINARIES))}), folder or .zip"
 _BLOCK_BYTES = 2**20
-_DIRECTORY_BYTES = 4 * 2**20  # of a zip's list of files, which is some tenfold in memory
+_DIRECTORY_BYTES = 4 * 2**20  # of a zip's list of files, which takes ten times that in memory
 _END, _END_64 = b"PK\x05\x06", b"PK\x06\x07"  # APPNOTE.TXT 6.3.10, 4.3.16 and 4.3.15
 
 
 @dataclass(frozen=True)
 class LogFile:
-    """A file, or a file in a zip file, which is read from there and never extracted.
+    """A file, or a member of a zip file, which is read without being extracted.
 
     Attributes:
         path: of the file, or of the zip file.
-        name: of the file below the folder or in the zip file that was given.
+        name: of the file relative to the given folder, or in the zip file.
         member: name in the zip file, or None.
     """
 
@@ -44,16 +44,12 @@ class LogFile:
 
     @property
     def suffix(self) -> str:
-        """Ending of the name in lower case, without that of its compression."""
+        """Suffix of the name in lower case, without `.gz`."""
         return PurePath(self.name.lower().removesuffix(".gz")).suffix
 
     @contextmanager
     def open(self) -> Iterator[IO[bytes]]:
-        """Open it for reading, decompressed, up to the budget of a file.
-
-        Raises:
-            BadInput: it cannot be read.
-        """
+        """Open the file for reading, decompressed and bounded; BadInput if it cannot be read."""
         if self.member is None:
             with open_gzip(self.path, _WHAT) as file:
                 yield file
@@ -63,14 +59,10 @@ class LogFile:
                 yield content
 
     def read_text(self, budget: Budget) -> str:
-        """Read a text in UTF-8.
-
-        Raises:
-            BadInput: it cannot be read, is too large, or no UTF-8.
-        """
+        """Read a text in UTF-8; BadInput if it is none, or too large."""
         with self.open() as file:
             data = bytearray()
-            while block := file.read(_BLOCK_BYTES):  # asked for the limit, it would take all of it
+            while block := file.read(_BLOCK_BYTES):  # a single read would allocate the limit
                 data += block
                 budget.check(len(data), self)
         return decode_text(bytes(data), self)
@@ -78,7 +70,7 @@ class LogFile:
 
 @dataclass(frozen=True)
 class Sheet(LogFile):
-    """The text of a sheet, comma-separated; each row is a line.
+    """A sheet of a workbook as comma-separated text.
 
     Attributes:
         text: in UTF-8.
@@ -88,7 +80,7 @@ class Sheet(LogFile):
 
     @contextmanager
     def open(self) -> Iterator[IO[bytes]]:
-        """Open it for reading."""
+        """Open the text for reading."""
         yield io.BytesIO(self.text)
 
 
@@ -97,11 +89,11 @@ def list_files(paths: Iterable[Path | str],
     """List the files to import: in the order of `paths`, and by name in each.
 
     Args:
-        paths: files, folders (with all in them), and zip files.
-        without: files and folders that are no logs, such as tables of positions, or the output.
+        paths: files, folders (searched recursively), and zip files.
+        without: files and folders to skip, such as tables of positions and the output.
 
     Returns:
-        the files, and how many of folders and zip files have another format and are left out.
+        the files, and the number of files of other formats in folders and zip files.
 
     Raises:
         BadInput: a path cannot be read, or there are none or too many files.
@@ -126,7 +118,7 @@ def list_files(paths: Iterable[Path | str],
 
 
 def flight_names(files: list[LogFile]) -> list[str]:
-    """Return a name of each file: its stem, or as much more as makes it unique."""
+    """Return a unique name of each file: its stem, else its name, else its path."""
     stems = [PurePosixPath(re.sub(r"\.gz$", "", file.name, flags=re.IGNORECASE)).stem
              for file in files]
     if len(set(stems)) == len(stems):
@@ -137,7 +129,7 @@ def flight_names(files: list[LogFile]) -> list[str]:
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
-    """Open a zip file whose list of files is small, and whose files are so in all.
+    """Open a zip file after a check of its size when unpacked.
 
     Raises:
         BadInput: no zip file, encrypted, of an unusual compression, or too large.
@@ -164,11 +156,7 @@ def open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
 
 @contextmanager
 def open_member(archive: zipfile.ZipFile, name: str, source: object) -> Iterator[IO[bytes]]:
-    """Open a file in a zip file, of at most as many bytes as the list of files declares.
-
-    Raises:
-        BadInput: it is damaged.
-    """
+    """Open a member of a zip file; BadInput if it is damaged."""
     try:
         with archive.open(name) as content:
             yield content
@@ -179,7 +167,7 @@ def open_member(archive: zipfile.ZipFile, name: str, source: object) -> Iterator
 
 
 def _check_directory(file: IO[bytes], path: Path) -> None:
-    """Refuse a long list of files before `ZipFile` reads it."""
+    """Raise BadInput if the list of files is too long, before `ZipFile` reads it."""
     size = file.seek(0, os.SEEK_END)
     file.seek(max(size - 2**16 - 22, 0))  # the list's end: 22 bytes and a comment
     tail = file.read()
@@ -194,19 +182,20 @@ def _check_directory(file: IO[bytes], path: Path) -> None:
 
 
 def _in_archive(path: Path) -> tuple[list[LogFile], int]:
+    """Return the texts in a zip file, and the number of its other files."""
     with open_archive(path) as archive:
         names = [entry.filename for entry in archive.infolist() if not entry.is_dir()]
     names = sorted(name for name in names if not _is_hidden(PurePosixPath(name)))
     if len(set(names)) != len(names):
         raise BadInput(f"{path} holds two files of one name; make the zip file again")
     files = [LogFile(path, name, name) for name in names]
-    # What is compressed itself needs to be read from its end, or holds other files.
+    # Parquet and workbooks are read from their end, which a zip member does not allow.
     kept = [file for file in files if file.suffix in TEXTS]
     return kept, len(files) - len(kept)
 
 
 def _in_folder(folder: Path, excluded: set[Path]) -> tuple[list[LogFile], int]:
-    """Return all files with a known suffix in a folder and below; links to outside are refused."""
+    """Return the files of known formats in a folder, recursively, and the number of others."""
     files, others = [], 0
     for root, folders, names in os.walk(folder):
         folders[:] = (name for name in folders if not name.startswith(".")
@@ -234,19 +223,19 @@ def _is_hidden(name: PurePosixPath) -> bool:
 def _resolved(path: Path) -> Path:
     try:
         return path.resolve()
-    except (OSError, RuntimeError, ValueError):  # no file can have this name: reading it says so
+    except (OSError, RuntimeError, ValueError):  # an impossible name: opening it raises BadInput
         return path
 
 
 class Lines:
-    """Iterates over the lines of a text.
+    """Iterate over the lines of a text, with a bound of their length.
 
     Args:
         text: opened with `newline=""`.
-        source: of it, for messages.
+        source: of the text, for messages.
 
     Attributes:
-        number: of the line that was read last, from 1.
+        number: of the last line, from 1.
     """
 
     def __init__(self, text: io.TextIOWrapper, source: object) -> None:

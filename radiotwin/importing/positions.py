@@ -1,8 +1,8 @@
-"""Positions of receivers and devices in one local frame: x east, y north, z up [m].
+"""Find the positions of receivers and devices in one local frame: x east, y north, z up [m].
 
-They are from the columns of the log, else from tables of positions, whose WGS84 or projected
-coordinates are converted. A device of `devices.csv` has one position: one that was at several
-places over time becomes the devices `NAME@1`, `NAME@2`, ….
+They come from columns of the log, else from tables of positions; WGS84 or projected coordinates
+are converted. A device of `devices.csv` has one position, so a device that was at several places
+over time becomes the devices `NAME@1`, `NAME@2`, ….
 """
 
 from collections.abc import Collection
@@ -18,7 +18,7 @@ from radiotwin.importing.read_source import Expected, read_source
 from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings
 from radiotwin.importing.source import Source, Tally, are_few
 from radiotwin.importing.units import ISO, seconds
-from radiotwin.io.cells import shown
+from radiotwin.io.cells import cell_text
 from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.measurements import DEVICE_OPTIONAL
 from radiotwin.links.plausible import FAR_M, READS, distances_m, far_notes, unmatched_notes
@@ -27,22 +27,22 @@ from radiotwin.links.site_table import SiteTable, is_site_table, local_positions
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
 NAMED = ("receiver", "device")
 SINCE, UNTIL = "since_s", "until_s"
-"""Columns of a table of devices: from when until when a device was there [s]; NaN = always."""
-_MAX_PLACES = 1000  # of one device; one that moves all the time has no places
-SAME_BAND = 1.05  # ratio of carriers between which a device hops: 0.4 dB by 20 lg f
-MIN_SPREAD_DEG = 0.5  # of positions of which some are 100 km from others
-MIN_PLACES, MIN_REPEATS = 4, 3  # of a receiver that moves, and of readings at a place of none
-APART_M = 100_000.0  # from all other readings: more than the campaigns of one log lie apart
-FAST_M_S, NEAR_M = 340.0, 1000.0  # sound in air; jumps below it are errors of a fix, not glitches
-MIN_READINGS = 10  # of which one may be told from the others
-MOVING_M = 1.0  # a device whose positions differ by more than this is not at rest
+"""Columns of a table of devices: start and end of the time at a position [s]; NaN = always."""
+_MAX_PLACES = 1000  # of one device; with more it is taken to move all the time
+SAME_BAND = 1.05  # ratio of carriers of one band, within which 20 lg f changes by 0.4 dB
+MIN_SPREAD_DEG = 0.5  # of positions, to search for placeholders 100 km away
+MIN_PLACES, MIN_REPEATS = 4, 3  # of a moving receiver; readings at a placeholder position
+APART_M = 100_000.0  # distance from all other readings of a glitch
+FAST_M_S, NEAR_M = 340.0, 1000.0  # speed and jump of a glitch; smaller ones are errors of a fix
+MIN_READINGS = 10  # of a receiver, to find glitches
+MOVING_M = 1.0  # spread of a device's positions above which it moves
 
 
 def find_origin(declared: Origin | None, receivers: pd.DataFrame,
                 devices: pd.DataFrame) -> Origin | None:
-    """Return the declared origin, or the median of the receivers; None where all are local.
+    """Return the declared origin, else the median of the receivers, else of the devices.
 
-    Where no receiver has a latitude, that of the devices.
+    It is None if all positions are local.
 
     Raises:
         BadInput: some positions are local and some geographic, and no origin relates them.
@@ -63,9 +63,9 @@ def find_origin(declared: Origin | None, receivers: pd.DataFrame,
 
 
 def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
-    """Convert projected x, y, in the unit of a reference system, to latitude and longitude.
+    """Convert columns x, y of a projected reference system to latitude and longitude.
 
-    Other columns stay; without a system x and y do, too.
+    Other columns stay; without a system all columns stay.
 
     Raises:
         BadInput: unknown or not projected system, or x, y far outside its area of use.
@@ -78,18 +78,18 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
     try:
         system = reference_system(crs)
     except CRSError as error:
-        raise BadInput(f"crs {shown(crs)} is unknown ({error!s:.200}); give {ALLOWED}, such as "
+        raise BadInput(f"crs {cell_text(crs)} is unknown ({error!s:.200}); give {ALLOWED}, such as "
                        "EPSG:32633 (UTM 33 N)") from None
     if not system.is_projected:
-        raise BadInput(f"crs {shown(crs)} is {system.type_name}, not a projected one with x and y; "
-                       "degrees go into latitude and longitude")
+        raise BadInput(f"crs {cell_text(crs)} is {system.type_name}, not a projected one with x "
+                       "and y; degrees go into latitude and longitude")
     known = positions["x"].notna() & positions["y"].notna()
     x, y = positions["x"][known].to_numpy(), positions["y"][known].to_numpy()
     try:
         transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
         longitude, latitude = transformer.transform(x, y)
     except ProjError as error:
-        raise BadInput(f"crs {shown(crs)} cannot be converted to latitude and longitude "
+        raise BadInput(f"crs {cell_text(crs)} cannot be converted to latitude and longitude "
                        f"({error!s:.200}); give another one, such as EPSG:32633 (UTM 33 N)"
                        ) from None
     area = system.area_of_use
@@ -102,11 +102,11 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
         if not inside.all():
             i = int(np.argmin(inside))
             raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is latitude {latitude[i]:.3f}, longitude "
-                           f"{longitude[i]:.3f}, far outside of the area of {shown(crs)}; is it "
-                           "another system, or are x and y swapped?")
+                           f"{longitude[i]:.3f}, far outside of the area of {cell_text(crs)}; is "
+                           "it another system, or are x and y swapped?")
     if not (np.isfinite(longitude) & np.isfinite(latitude)).all():
         i = int(np.argmin(np.isfinite(longitude) & np.isfinite(latitude)))
-        raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is no place of {shown(crs)}; is it another "
+        raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is no place of {cell_text(crs)}; is it another "
                        "system, or another unit?")
     degrees = np.full((len(positions), 2), np.nan)
     degrees[known] = np.column_stack([longitude, latitude])
@@ -115,7 +115,7 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
 
 
 def _numbered(names: pd.Series, since_s: np.ndarray) -> pd.Series:
-    """Return names (n,) of devices, as `NAME@1`, … in the order of time where one occurs twice."""
+    """Rename repeated names (n,) to `NAME@1`, … in the order of time."""
     order = np.lexsort((np.arange(len(names)), np.nan_to_num(since_s, nan=-np.inf)))
     number = names.iloc[order].groupby(names.iloc[order]).cumcount() + 1
     several = names.duplicated(keep=False)
@@ -123,42 +123,49 @@ def _numbered(names: pd.Series, since_s: np.ndarray) -> pd.Series:
 
 
 def _at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -> pd.DataFrame:
-    """Name the device of each link after the place where it was at the time.
+    """Rename the device of each link to `NAME@…`, by its position in the table at that time.
 
-    A device that was nowhere at a time keeps its name, and has no position then.
+    A device without a position at a time keeps its name.
     """
     if table is None or SINCE not in table:
         return links
     place_of = pd.Series(table.index, index=table.index)
     owner = place_of.str.replace(r"@\d+$", "", regex=True)
-    # Of `_numbered` there are several and none without a number; others are called so.
-    numbered_ones = owner.duplicated(keep=False) & ~owner.isin(place_of)
-    owner = owner.where(numbered_ones, place_of).to_numpy()
+    # `_numbered` makes several names with a number; a single such name is the device's own.
+    is_numbered = owner.duplicated(keep=False) & ~owner.isin(place_of)
+    owner = owner.where(is_numbered, place_of).to_numpy()
     names = links["device"].to_numpy(dtype=object, copy=True)
     for device in dict.fromkeys(owner[place_of.to_numpy() != owner]):
-        own = np.flatnonzero(links["device"].to_numpy() == device)
-        if not len(own):
+        device_links = np.flatnonzero(links["device"].to_numpy() == device)
+        if not len(device_links):
             continue
-        if "time_s" not in links or links["time_s"].iloc[own].isna().any():
+        if "time_s" not in links or links["time_s"].iloc[device_links].isna().any():
             raise BadInput(f"{source.path}: device {device!r} is at several places over time, and "
                            "some of its readings have no time; give the column of the time")
         rows = np.flatnonzero(owner == device)
         since_s = np.nan_to_num(table[SINCE].to_numpy()[rows], nan=-np.inf)
         rows, since_s = rows[np.argsort(since_s)], np.sort(since_s)
-        time_s = links["time_s"].to_numpy()[own]
+        time_s = links["time_s"].to_numpy()[device_links]
         place = np.searchsorted(since_s, time_s, side="right") - 1
-        there = place >= 0
+        placed = place >= 0
         until_s = table[UNTIL].to_numpy()[rows][place.clip(0)]
-        there &= ~(time_s >= until_s)  # NaN: until the next one
-        names[own[there]] = table.index.to_numpy()[rows[place[there]]]
+        placed &= ~(time_s >= until_s)  # NaN: until the next row
+        names[device_links[placed]] = table.index.to_numpy()[rows[place[placed]]]
     return links.assign(device=names)
 
 
 def _place_names(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                 place_m: float) -> np.ndarray:
-    """Return the name (n,) of each link's device: `NAME@1`, … of one at several places in the log.
+    """Rename devices that have several positions in the log to `NAME@1`, `NAME@2`, ….
 
-    Places are numbered as they occur; a position (n, 3) [m] within `place_m` of one belongs to it.
+    Args:
+        source: for messages.
+        links: n links.
+        device_m: (n, 3) position of each link's device [m].
+        place_m: positions within this distance of the first one are one place [m].
+
+    Returns:
+        (n,) names; places are numbered as they occur.
     """
     names = links["device"].to_numpy(dtype=object, copy=True)
     filled_m = np.nan_to_num(device_m)
@@ -186,20 +193,19 @@ def _place_names(source: Source, links: pd.DataFrame, device_m: np.ndarray,
 
 
 def _read_sites(path: str, key: str, settings: Settings, names: Collection[str]) -> SiteTable:
-    """Read a table of positions; `key` is the column of the names, `device` or `receiver`.
+    """Read a table of positions of devices or receivers.
 
-    Several rows of one device are its places over time: column `since`, and `until` where it was
-    nowhere in between, in ISO 8601. They become devices `NAME@1`, `NAME@2`, ….
+    Several rows of one device are its positions over time, with columns `since` and optionally
+    `until` in ISO 8601. They become devices `NAME@1`, `NAME@2`, ….
 
     Args:
-        path: in any format of a log.
-        key: as above.
-        settings: unit of lengths whose columns do not say theirs, and reference system of x and y.
+        path: of the table, in any format of a log.
+        key: `device` or `receiver`.
+        settings: give the unit of lengths without one, and the reference system of x and y.
         names: in the log.
 
     Returns:
-        its values are latitude and longitude where x and y are projected; their index holds the
-        names.
+        the table, indexed by name, with projected x and y as latitude and longitude.
     """
     source = read_source(path, expected=Expected(is_wanted=is_site_table))
     uses = [*DEVICE_OPTIONAL, "antenna", "since", "until"] if key == "device" else []
@@ -220,7 +226,7 @@ def _read_sites(path: str, key: str, settings: Settings, names: Collection[str])
 
 
 def _period(source: Source, sites: SiteTable, settings: Settings) -> dict[str, np.ndarray]:
-    """Return since when, and until when, a device was at a place [s]; NaN where not given."""
+    """Read the start and end of the time at each position [s]; NaN: not given."""
     since_s = seconds(source, sites.columns["since"], ISO, settings.time_zone)
     until_s = np.full(len(source), np.nan)
     if "until" in sites.columns:
@@ -232,15 +238,15 @@ def _period(source: Source, sites: SiteTable, settings: Settings) -> dict[str, n
 
 @dataclass(frozen=True)
 class PositionedLinks:
-    """Links whose receivers have positions.
+    """Links with the positions of their receivers and devices.
 
     Attributes:
-        links: with `receiver_x_m, receiver_y_m, receiver_z_m`, and `receiver_above_ground_m` where
-            heights are above the ground.
-        devices: as in `devices.csv`: those of the links, in the order of their first ones.
-        device_m: position of each link's device [m], (n, 3); NaN where unknown.
-        origin: of the local frame; None where all positions were local already.
-        notes: on what was told apart.
+        links: with `receiver_x_m, receiver_y_m, receiver_z_m`, and `receiver_above_ground_m` for
+            heights above the ground.
+        devices: of the links, in the order of their first link, as in `devices.csv`.
+        device_m: (n, 3) position of each link's device [m]; NaN: unknown.
+        origin: of the local frame; None: all positions were local already.
+        notes: on devices that were split, and on implausible positions.
     """
 
     links: pd.DataFrame
@@ -250,7 +256,7 @@ class PositionedLinks:
     notes: list[str] = field(default_factory=list)
 
     def select(self, keep: np.ndarray) -> "PositionedLinks":
-        """Return the links of a mask (n,) with their devices."""
+        """Select links by a mask (n,), and their devices."""
         links = self.links[keep]
         devices = self.devices[self.devices["device"].isin(links["device"])]
         return PositionedLinks(links, devices.reset_index(drop=True), self.device_m[keep],
@@ -261,7 +267,7 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
                   tally: Tally) -> PositionedLinks:
     """Find the positions of receivers and devices in one local frame.
 
-    Links whose receiver has none are counted and left out.
+    Links without a receiver position are counted in the tally and left out.
 
     Raises:
         BadInput: a table that cannot be used, a position far from the origin, or a moving device.
@@ -311,14 +317,16 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
 
 
 def _without_fix(receivers: pd.DataFrame, names: pd.Series) -> dict[str, np.ndarray]:
-    """Return places that stand for readings without a position, and the rows of their readings.
+    """Find placeholder positions that a program wrote in place of a missing fix.
 
-    Programs write one place for all of them, such as that of their maker: it repeats to the last
-    digit, far from all others of a receiver that moves.
+    Such a position repeats to the last digit, far from all others of a moving receiver.
 
     Args:
-        receivers: (n,) positions, as of `local_positions`.
-        names: (n,) of the receivers.
+        receivers: n positions, see `local_positions`.
+        names: (n,) receivers.
+
+    Returns:
+        position as text -> rows of the readings there.
     """
     if "latitude" not in receivers:
         return {}
@@ -334,18 +342,18 @@ def _without_fix(receivers: pd.DataFrame, names: pd.Series) -> dict[str, np.ndar
                                              return_counts=True)
         if len(different) < MIN_PLACES:
             continue
-        middle = np.median(different, axis=0)  # however many readings have no place
+        middle = np.median(different, axis=0)  # independent of the number of missing fixes
         apart_m = distances_m(different, middle)
         for i in np.flatnonzero((apart_m > FAR_M) & (times >= MIN_REPEATS)):
             text = f"{different[i, 0]:.10g}, {different[i, 1]:.10g}"
-            own = rows[number.ravel() == i]
-            found[text] = np.concatenate([found[text], own]) if text in found else own
+            repeats = rows[number.ravel() == i]
+            found[text] = np.concatenate([found[text], repeats]) if text in found else repeats
     return found
 
 
 def _far_notes(source: Source, links: pd.DataFrame, receivers: pd.DataFrame,
                devices: pd.DataFrame, sites: dict[str, SiteTable]) -> list[str]:
-    """Return a note on devices that are odd distances from the receivers."""
+    """Note devices that are far from the receivers, see `far_notes`."""
     for axes in (("latitude", "longitude"), ("x", "y")):
         if all(axis in ends for axis in axes for ends in (receivers, devices)):
             break
@@ -360,10 +368,12 @@ def _far_notes(source: Source, links: pd.DataFrame, receivers: pd.DataFrame,
 
 
 def _by_carrier(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list[str]]:
-    """Return links whose devices have one carrier each, the names before, and a note.
+    """Split devices that are read on carriers of several bands into one device for each band.
 
-    A name that is read on carriers of different bands is of several transmitters: their levels and
-    antennas differ. Channels of one band, between which a device hops, are one.
+    Their levels and antennas differ. Channels of one band, between which a device hops, stay one.
+
+    Returns:
+        the links; new name -> old name; and a note.
     """
     if "frequency_hz" not in links:
         return links, {}, []
@@ -377,8 +387,8 @@ def _by_carrier(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list
         known_hz = np.unique(hz[rows])
         band = np.cumsum(np.r_[0, known_hz[1:] > SAME_BAND * known_hz[:-1]])
         usual_hz = np.array([np.median(known_hz[band == each]) for each in range(band[-1] + 1)])
-        own_hz = usual_hz[band[np.searchsorted(known_hz, hz[rows])]]
-        names[rows] = [f"{device} {each / 1e6:g} MHz" for each in own_hz]
+        band_hz = usual_hz[band[np.searchsorted(known_hz, hz[rows])]]
+        names[rows] = [f"{device} {each / 1e6:g} MHz" for each in band_hz]
         before |= dict.fromkeys(names[rows], device)
     if not before:
         return links, {}, []
@@ -389,10 +399,10 @@ def _by_carrier(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list
 
 
 def _are_glitches(links: pd.DataFrame, receiver_m: np.ndarray) -> np.ndarray:
-    """Return which links (n,) have a position of the receiver that it cannot have been at.
+    """Find links (n,) with an impossible receiver position, as a mask.
 
-    They are the few that lie far from all others of the receiver, or to which and from which it
-    would have had to fly faster than sound. Many are no glitches, but something else is wrong.
+    Such a position is far from all others of the receiver, or would need supersonic flight to and
+    from it. If there are many, they are no glitches, and none is marked.
     """
     known = np.flatnonzero(np.isfinite(receiver_m[:, :2]).all(axis=1))
     glitch = np.zeros(len(links), dtype=bool)
@@ -415,7 +425,7 @@ def _are_glitches(links: pd.DataFrame, receiver_m: np.ndarray) -> np.ndarray:
         known, time_s, receiver = known[order], time_s[order], receiver[order]
 
         def is_fast(rows: int) -> np.ndarray:
-            """Return whether each place is too far from that so many rows before."""
+            """Return whether each position is too far from the one `rows` before."""
             step_m = np.linalg.norm(receiver_m[known[rows:], :2] - receiver_m[known[:-rows], :2],
                                     axis=1)
             same = receiver[rows:] == receiver[:-rows]
@@ -428,6 +438,7 @@ def _are_glitches(links: pd.DataFrame, receiver_m: np.ndarray) -> np.ndarray:
 
 
 def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end: str) -> None:
+    """Raise BadInput about a position that is too far from the origin."""
     far = (np.abs(position_m) > MAX_POSITION_M).any(axis=1)
     if far.any():
         row = int(np.argmax(far))
@@ -438,9 +449,9 @@ def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end
 
 def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
                crs: str | None) -> pd.DataFrame:
-    """Return columns of `POSITION`: place and height each from the file, else from the table."""
-    own = {name: links[prefix + name] for name in POSITION if prefix + name in links}
-    positions = to_geographic(pd.DataFrame(own, index=links.index), crs)
+    """Return columns of `POSITION`: position and height each from the log, else from the table."""
+    columns = {name: links[prefix + name] for name in POSITION if prefix + name in links}
+    positions = to_geographic(pd.DataFrame(columns, index=links.index), crs)
     if table is None:
         return positions
     no_place = positions.reindex(columns=["latitude", "x"]).isna().all(axis=1)
@@ -460,25 +471,25 @@ def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, nam
 
 def _above_ground_m(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
                     z_m: np.ndarray) -> np.ndarray:
-    """Return heights above the ground (n,) of links (n,) [m]: of the file, else of the table.
+    """Return heights above the ground (n,) [m] from the log, else from the table.
 
-    NaN where there is none, or where the height above the datum is known.
+    NaN if there is none, or if the height above the datum, `z_m` (n,), is known.
     """
     above_m = np.full(len(names), np.nan)
     if table is not None and "above_ground_m" in table:
         above_m = names.map(table["above_ground_m"]).to_numpy(dtype=float)
     if prefix + ABOVE_GROUND in links:
-        own_m = links[prefix + ABOVE_GROUND].to_numpy(dtype=float)
-        above_m = np.where(np.isnan(own_m), above_m, own_m)
+        logged_m = links[prefix + ABOVE_GROUND].to_numpy(dtype=float)
+        above_m = np.where(np.isnan(logged_m), above_m, logged_m)
     return np.where(np.isnan(z_m), above_m, np.nan)
 
 
 def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                   table: pd.DataFrame | None, declared_as: dict[str, str],
                   moving_m: float) -> pd.DataFrame:
-    """Return the devices of the links as in `devices.csv`.
+    """Make the table `devices.csv` of the links' devices; BadInput if a device moves.
 
-    Some have another name in the table of devices, see `_by_carrier`.
+    `declared_as` is the name in the table of devices for those that `_by_carrier` renamed.
     """
     by_device = pd.DataFrame(device_m, columns=["x_m", "y_m", "z_m"], index=links.index).groupby(
         links["device"].to_numpy(), sort=False)
@@ -505,7 +516,7 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     if READS in links:
         devices[READS] = links.groupby("device", sort=False)[READS].max()
     if "frequency_hz" in links:
-        own_hz = links.groupby("device", sort=False)["frequency_hz"].median()
-        devices["frequency_hz"] = own_hz.fillna(devices["frequency_hz"]) \
-            if "frequency_hz" in devices else own_hz
+        logged_hz = links.groupby("device", sort=False)["frequency_hz"].median()
+        devices["frequency_hz"] = logged_hz.fillna(devices["frequency_hz"]) \
+            if "frequency_hz" in devices else logged_hz
     return devices.rename_axis("device").reset_index()

@@ -1,6 +1,6 @@
-"""Opening of a file of measurements: its format is known by its name and its first line.
+"""Open a file of measurements, whose format is recognised by its name and its first line.
 
-Each sheet of a workbook (.xlsx) becomes the text of a table.
+Each sheet of a workbook (.xlsx) is read as comma-separated text.
 """
 
 import csv
@@ -38,17 +38,17 @@ _BLOCK_BYTES = 2**20
 _PICTURES = ("xl/media/", "xl/embeddings/")
 _DOCTYPES = tuple("<!DOCTYPE".encode(name) for name in ("utf-8", "utf-16-le", "utf-16-be",
                                                         "utf-32-le", "utf-32-be"))
-_HEAD_BYTES = 2**16  # in which the first line is looked for
+_HEAD_BYTES = 2**16  # that contain the first line
 
 
 @dataclass(frozen=True)
 class WithoutHeader:
-    """A text whose file has no header.
+    """A format of texts without a header.
 
     Attributes:
-        first_line: regular expression of its whole first line.
-        names: of its columns.
-        read: returns cells and the line of each row, where it is no table with these columns.
+        first_line: regular expression of the whole first line.
+        names: of the columns.
+        read: reader that returns cells and the line of each row; None: a table with these columns.
     """
 
     first_line: str
@@ -61,9 +61,9 @@ class Expected:
     """Columns that a file may have.
 
     Attributes:
-        columns: sets of columns, of which a header is likely to have one, in lower case.
+        columns: sets of column names in lower case, one of which the header probably contains.
         without_header: formats of texts without a header.
-        is_wanted: whether a sheet with these columns is the one to read; None: by `columns`.
+        is_wanted: whether to read the sheet with a given header; None: it is chosen by `columns`.
     """
 
     columns: tuple[frozenset[str], ...] = ()
@@ -72,10 +72,7 @@ class Expected:
 
 
 def _read_sheets(file: LogFile, declared: str | None) -> Iterator[tuple[str, Sheet]]:
-    """Yield the declared sheet, or all that are no charts, by openpyxl.
-
-    Formulas have the values saved with them.
-    """
+    """Yield the declared sheet, or all sheets but charts; formulas have their saved values."""
     _check(file)
     openpyxl = optional_package(
         "openpyxl", f"{file}: workbooks need the package openpyxl; `pip install radiotwin[xlsx]`, "
@@ -103,7 +100,7 @@ def _read_sheets(file: LogFile, declared: str | None) -> Iterator[tuple[str, She
 
 def _read_workbook(file: LogFile, settings: Settings, expected: Expected,
                    bad_rows: BadRows | None) -> Source:
-    """Read the sheets with the declared columns, or with those of the first that has rows."""
+    """Read the sheets with the declared columns, else those with the columns of the first one."""
     settings = settings.model_copy(update={"delimiter": ","})
     sources: dict[str, Source] = {}
     failed: dict[str, BadInput] = {}
@@ -141,7 +138,7 @@ def _read_workbook(file: LogFile, settings: Settings, expected: Expected,
 
 
 def _joined(file: LogFile, sources: dict[str, Source], notes: tuple[str, ...]) -> Source:
-    """Return the rows of several sheets, one after the other."""
+    """Join the rows of several sheets."""
     starts = np.cumsum([0, *map(len, sources.values())])
     parts = list(sources.items())
 
@@ -162,9 +159,9 @@ def _joined(file: LogFile, sources: dict[str, Source], notes: tuple[str, ...]) -
 
 
 def _check(file: LogFile) -> None:
-    """Refuse a workbook that is large when unpacked, or that declares XML entities."""
+    """Raise BadInput if a workbook is too large when unpacked, or declares XML entities."""
     with open_archive(file.path) as archive:
-        # A part may have any name: what it is, others say of it.
+        # A part may have any name, so all are checked.
         entries = archive.infolist()
         DOCUMENT_BYTES.check(sum(entry.file_size for entry in entries
                                  if not entry.filename.startswith(_PICTURES)), file)
@@ -181,7 +178,8 @@ def _check(file: LogFile) -> None:
 
 
 def _text(file: LogFile, sheet: Any) -> bytes:
-    sheet.reset_dimensions()  # which a file may declare as it likes
+    """Convert a sheet to comma-separated text."""
+    sheet.reset_dimensions()  # those in the file may be wrong
     text = io.BytesIO()
     wrapper = io.TextIOWrapper(text, "utf-8", newline="", write_through=True)
     writer = csv.writer(wrapper)
@@ -199,7 +197,7 @@ def _text(file: LogFile, sheet: Any) -> bytes:
 
 
 def _shown(value: object) -> str:
-    """Return a cell as text; dates without a time, and whole numbers without a point."""
+    """Return a cell as text, without a time of midnight and without a point of whole numbers."""
     if value is None:
         return ""
     if isinstance(value, datetime):
@@ -213,13 +211,16 @@ def _shown(value: object) -> str:
 
 def read_source(file: LogFile | Path | str, settings: Settings | None = None,
                 expected: Expected = Expected(), bad_rows: BadRows | None = None) -> Source:
-    """Open a file of measurements of one of the formats of `log_files`.
+    """Read the table of a file of measurements.
 
-    What the settings do not declare of a text, and what is expected to be in it, is found. Bad rows
-    are noted where a user may allow them, see `Source`.
+    Args:
+        file: in a format of `log_files`.
+        settings: declared properties of the text; others are detected.
+        expected: columns that help to find the header.
+        bad_rows: where bad rows are noted, see `Source`; None: they are refused.
 
     Raises:
-        BadInput: another format, unreadable, or without rows.
+        BadInput: unknown format, unreadable, or without rows.
     """
     if not isinstance(file, LogFile):
         file = LogFile(Path(file), Path(file).name)
@@ -239,7 +240,7 @@ def read_source(file: LogFile | Path | str, settings: Settings | None = None,
 
 def _read_text(file: LogFile, settings: Settings, expected: Expected,
                bad_rows: BadRows | None) -> Source:
-    """Read a text: by the faster parser where it is plain CSV."""
+    """Read a text file: JSON, a format without a header, or a table; plain CSV by pandas."""
     first = _first_line(file)
     kind = next((each for each in expected.without_header
                  if re.fullmatch(each.first_line, first)), None)
@@ -268,7 +269,7 @@ def _read_text(file: LogFile, settings: Settings, expected: Expected,
 
 
 def _first_line(file: LogFile) -> str:
-    """Return the first line that is not blank, or as much of it as is enough to recognise it."""
+    """Return the first line that is not blank, at most its first `_HEAD_BYTES`."""
     with file.open() as content:
         head = content.read(_HEAD_BYTES).decode("latin-1").removeprefix("\u00ef\u00bb\u00bf")
     return next((line for line in map(str.strip, head.splitlines()) if line), "")

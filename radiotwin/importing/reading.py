@@ -1,4 +1,4 @@
-"""The files of an import as links, each by its own format: a row per receiver, device, reading."""
+"""Read the files of an import as links: one row for each reading of a device by a receiver."""
 
 import re
 from bisect import bisect_right
@@ -43,7 +43,7 @@ from radiotwin.importing.units import (
     seconds,
 )
 from radiotwin.io.budgets import ROWS
-from radiotwin.io.cells import as_numbers, as_text, listed, shown
+from radiotwin.io.cells import as_numbers, as_text, cell_text, listed
 from radiotwin.io.forms import name_fault
 from radiotwin.links.plausible import MAX_DEGREES, READS, height_placeholders, refuse_implausible
 from radiotwin.links.site_table import HEIGHTS, METRES
@@ -59,7 +59,7 @@ _DOTTED_DATE = r"(?<!\d)(0[1-9]|[12]\d|3[01])\.(0[1-9]|1[0-2])\.((?:19|20)\d\d)(
 
 @dataclass(frozen=True)
 class LevelColumn:
-    """One column of levels; what belongs to it only, by quantity; and what is added to it."""
+    """A column of levels, with the quantities of that column alone, and an offset [dB]."""
 
     spec: str
     own: dict[str, str]
@@ -68,13 +68,20 @@ class LevelColumn:
 
 def build_links(source: Source, settings: Settings, tally: Tally, problems: Problems,
                 file_name: str) -> tuple[pd.DataFrame, int]:
-    """Convert the rows of a file to links, and note all that is wrong: then they are incomplete.
+    """Convert the rows of a file to links.
+
+    Args:
+        source: the file.
+        settings: for this file.
+        tally: counts readings that are left out.
+        problems: collects all errors; if there are any, the result is incomplete.
+        file_name: for quantities that are taken from the file's name.
 
     Returns:
-        links in the order of the file, and the number of readings per row of the file. The index is
-        that of the source. Columns: `device, receiver, flight, level_db`; those of `QUANTITIES` and
-        of `device_` + `QUANTITIES` that are given [degrees, m]; and `time_s, heading_deg,
-        pitch_deg, roll_deg, quality, frequency_hz` where given.
+        links in the order of the file, with the index of the source, and the number of readings per
+        row. Columns: `device, receiver, flight, level_db`; if given, `QUANTITIES` and `device_` +
+        `QUANTITIES` [deg, m], and `time_s, heading_deg, pitch_deg, roll_deg, quality,
+        frequency_hz`.
     """
     columns = settings.columns.model_dump(exclude_none=True)
     columns = {name: _from_file_name(source, name, spec, file_name)
@@ -102,7 +109,7 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
     parts = []
     for level in levels:
         if any(name not in source.table for name in columns_of(level.spec, source.table)):
-            continue  # which is reported already
+            continue  # reported already
         with problems.noted():
             parts.append(_rows_as_links(source, level, shared, settings, tally))
     if problems:
@@ -112,10 +119,10 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
 
 
 def _from_file_name(source: Source, name: str, spec: str, file_name: str) -> str:
-    """Return the entry of a mapping with what the name of the file says: a name, a number, a date.
+    """Replace `by file` and `{file date}` in a mapping by a name, number or date in the file name.
 
     Raises:
-        BadInput: the file's name does not say it, or in two ways.
+        BadInput: the file name contains none, or two.
     """
     if spec == BY_FILE and name in NAMES:
         return f"{ALWAYS}{file_name}"
@@ -144,7 +151,7 @@ def _from_file_name(source: Source, name: str, spec: str, file_name: str) -> str
 
 def _shared(source: Source, columns: dict[str, str], settings: Settings,
             problems: Problems) -> pd.DataFrame:
-    """Return the columns that all levels of a row share: times, positions, names."""
+    """Read the columns that belong to all levels of a row: times, positions, names."""
     shared = pd.DataFrame(index=source.table.index)
     present = {name for name, spec in columns.items()
                if spec in (BY_DAY, BY_POSITION)
@@ -177,8 +184,8 @@ def _shared(source: Source, columns: dict[str, str], settings: Settings,
 
 def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, settings: Settings,
               tally: Tally) -> pd.DataFrame:
-    """Return the usable links of one column of levels."""
-    links = shared.copy(deep=False)  # columns are added and replaced, none is changed
+    """Make the links of one column of levels; unusable ones are counted and dropped."""
+    links = shared.copy(deep=False)  # columns are added and replaced, never changed in place
     for name, spec in level.own.items():
         if name not in NAMES:
             prefix = "device_" if "device" in level.own else ""
@@ -190,7 +197,7 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
             source = source.select(~nobody)
         else:
             if spec and (fault := name_fault(spec)):
-                raise BadInput(f"{source.path}: {name} {shown(spec)} of column {level.spec} "
+                raise BadInput(f"{source.path}: {name} {cell_text(spec)} of column {level.spec} "
                                f"{fault}")
             links[name] = spec
     offset_db: float | np.ndarray = settings.level_offset_db + level.offset_db
@@ -227,17 +234,18 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
 
 
 def _names_a_column(source: Source, level: LevelColumn, spec: str) -> bool:
-    """Return whether a name of a column of levels is in another column, as `PCI 1` is."""
+    """Return whether the name that belongs to a column of levels is itself in a column."""
     return spec in source.table and spec != level.spec
 
 
 def _is_length(name: str, settings: Settings) -> bool:
+    """Return whether a quantity is a length, which needs a unit."""
     base = name.removeprefix("device_")
     return base in QUANTITIES and base not in MAX_DEGREES and not (settings.crs and base in "xy")
 
 
 def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.ndarray:
-    """Return the numbers of a column in the project's units, (n,)."""
+    """Read a quantity in the project's units, (n,)."""
     if _is_length(name, settings) and (fixed := _FIXED_LENGTH.fullmatch(spec)):
         return np.full(len(source), float(fixed[1]) * METRES[fixed[2]])
     numbers = source.numbers(spec, name)
@@ -251,7 +259,7 @@ def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.nd
 
 def _names(source: Source, name: str, spec: str, shared: pd.DataFrame,
            settings: Settings) -> np.ndarray:
-    """Return the names of devices, receivers or flights, (n,); `""` where there is none."""
+    """Read the names of devices, receivers or flights, (n,); `""`: none."""
     if name == "flight" and spec == BY_DAY:
         return calendar_days(shared["time_s"].to_numpy(), settings.time_zone)
     if name == "device" and spec == BY_POSITION:
@@ -445,7 +453,7 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
 
 
 def _unused(source: Source, settings: Settings) -> list[str]:
-    """Return the columns of a file that nothing is read from."""
+    """Return the columns of a file that are not used."""
     header = list(map(str, source.table))
     used = {name for spec in settings.columns.model_dump(exclude_none=True).values()
             for name in columns_of(spec, header)} | set(settings.only)
@@ -456,7 +464,7 @@ def _unused(source: Source, settings: Settings) -> list[str]:
 
 
 def _declared_columns(settings: Settings) -> set[str]:
-    """Return the columns that the mapping names, in lower case."""
+    """Return the columns that the user's mapping names, in lower case."""
     specs = settings.columns.model_dump(exclude_none=True).values()
     names = {name.lower() for spec in specs for name in columns_of(spec, ())}
     for block in settings.wide:
@@ -468,7 +476,7 @@ def _declared_columns(settings: Settings) -> set[str]:
 
 def _settings_of(source: Source, settings: Settings,
                  flight: str) -> tuple[Settings, str | None, str]:
-    """Return the settings for a file, with those of its format, its name and its caution."""
+    """Complete the settings by those of the file's format; return also its name and caution."""
     header = list(map(str, source.table))
     found = None
     if settings.format:
@@ -492,20 +500,20 @@ def _settings_of(source: Source, settings: Settings,
 
 
 def _numbered_from(source: Source, first: int, prefix: str) -> Source:
-    """Return the same file with rows numbered from `first`, and a prefix of every place."""
-    own = source.where
+    """Renumber the rows of a file from `first`, and put a prefix before their places."""
+    where = source.where
     table = source.table.set_axis(pd.RangeIndex(first, first + len(source)))
-    return replace(source, table=table, where=lambda index: f"{prefix}{own(index - first)}",
+    return replace(source, table=table, where=lambda index: f"{prefix}{where(index - first)}",
                    fields={first + row: count for row, count in source.fields.items()},
                    left_out=tuple((reason, number, f"{prefix}{place}")
                                   for reason, number, place in source.left_out))
 
 
 def _without_cut_rows(source: Source, settings: Settings) -> Source:
-    """Return the rows that are whole as far as their columns are used; many others are refused.
+    """Drop rows that lack used columns; BadInput if there are many.
 
-    Programs leave out last cells that are empty. A row that ends where no other does, with a column
-    that is used, may have been cut off within it.
+    Programs omit empty last cells. A row of a length of its own that ends with a used column may
+    have been truncated within that cell.
     """
     header = list(map(str, source.table))
     specs = settings.columns.model_dump(exclude_none=True).values()
@@ -540,7 +548,7 @@ def _without_cut_rows(source: Source, settings: Settings) -> Source:
 
 def _links_of(source: Source, settings: Settings, tally: Tally, problems: Problems,
               name: str) -> tuple[pd.DataFrame, int]:
-    """Return the links of a file and its readings per row; count what is left out."""
+    """Return the links of a file and its readings per row; count repeated and unselected rows."""
     whole, repeated = without_repetition(source)
     chosen, others = _only(whole, settings)
     links, per_row = build_links(chosen, settings, tally, problems, name)
@@ -551,7 +559,7 @@ def _links_of(source: Source, settings: Settings, tally: Tally, problems: Proble
 
 
 def _only(source: Source, settings: Settings) -> tuple[Source, list[tuple[list[int], str, str]]]:
-    """Return the chosen rows, and the indices, the reason and the column of the others."""
+    """Select rows by the setting `only`; return also indices, reason and column of the others."""
     left_out = []
     for spec, values in settings.only.items():
         texts = [value for value in values if isinstance(value, str)]
@@ -571,7 +579,7 @@ def _only(source: Source, settings: Settings) -> tuple[Source, list[tuple[list[i
 
 def _without_copies(source: Source, links: pd.DataFrame, starts: list[int],
                     tally: Tally) -> pd.DataFrame:
-    """Remove readings that an earlier file has; without times, equal readings are no copies."""
+    """Drop readings with a time that an earlier file also has."""
     if "time_s" not in links:
         return links
     file = np.searchsorted(starts, links.index.to_numpy(), side="right")

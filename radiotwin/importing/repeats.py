@@ -1,10 +1,9 @@
-"""Readings at one place: repeated rows, stays of a receiver, and local means over fast fading.
+"""Reduce readings at one place: repeated rows, stays of a receiver, local means over fast fading.
 
-A receiver that hovers reads one and the same error many times: of a stay one reading counts. The
-phases of the paths, and with them the level, change within half a wavelength; shadowing changes
-over tens of metres. A mean over 20 to 40 wavelengths removes the first and keeps the second, and 36
-to 50 readings bring it within 1 dB (W. C. Y. Lee, "Estimate of local average power of a mobile
-radio signal", IEEE Trans. Veh. Technol. 34(1), 1985).
+A hovering receiver repeats one error, so one reading of each stay is kept. Fast fading changes the
+level within half a wavelength, shadowing over tens of metres. A mean over 20 to 40 wavelengths
+removes fading and keeps shadowing, and 36 to 50 readings bring it within 1 dB (W. C. Y. Lee,
+"Estimate of local average power of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1), 1985).
 """
 
 from typing import Literal
@@ -21,15 +20,14 @@ WAVELENGTHS = (20, 40)  # Lee 1985
 
 def average(links: pd.DataFrame, length_m: float,
             method: Literal["power", "median"]) -> pd.DataFrame:
-    """Average links over bins along the track of each (receiver, device, flight).
+    """Average levels in bins along the track of each receiver, device and flight.
 
-    A track is followed in the order of time, or of the file where it has no times. A reading that
-    was not detected counts as zero power in the mean and as the smallest value in the median; a bin
-    of which more than half were not detected is not detected. With at most half of them below the
-    limit of detection, the mean is off by at most 3 dB.
+    A track is ordered by time, or as in the file without times. A reading that was not detected
+    counts as zero power in the mean, and as the smallest value in the median; a bin with more than
+    half of them is not detected. With at most half of them the mean is off by at most 3 dB.
 
     Args:
-        links: as of `build_links`, with receiver positions.
+        links: from `build_links`, with receiver positions.
         length_m: length of the bins [m].
         method: `power`, the mean of the linear power, or `median`.
 
@@ -63,7 +61,7 @@ def in_wavelengths(length_m: float, frequency_hz: float) -> float:
 
 
 def _in_track_order(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
-    """Sort links by track (n,), and within a track by time where all of its times are known."""
+    """Sort links by track (n,), and within a track by time if all its times are known."""
     time_s = np.zeros(len(links))
     if "time_s" in links:
         time_s = links["time_s"].to_numpy(dtype=float)
@@ -74,7 +72,7 @@ def _in_track_order(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFram
 
 
 def positions_m(links: pd.DataFrame) -> np.ndarray:
-    """Return where receivers are, (n, 3) [m]: above the datum, else above the ground, else at 0."""
+    """Return receiver positions (n, 3) [m]; z is above the datum, else above the ground, else 0."""
     position_m = links[["receiver_x_m", "receiver_y_m", "receiver_z_m"]].to_numpy(copy=True)
     if "receiver_above_ground_m" in links:
         low = np.isnan(position_m[:, 2])
@@ -84,7 +82,7 @@ def positions_m(links: pd.DataFrame) -> np.ndarray:
 
 def _bins(links: pd.DataFrame, track: np.ndarray,
           length_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bin of each row, (n,) ascending, and the first row of each bin."""
+    """Return the bin of each row, (n,) ascending, and the first row of each bin of a length [m]."""
     position_m = positions_m(links)
     step_m = np.linalg.norm(np.diff(position_m, axis=0, prepend=position_m[:1]), axis=1)
     starts = np.diff(track, prepend=-1) != 0
@@ -97,7 +95,7 @@ def _bins(links: pd.DataFrame, track: np.ndarray,
 
 
 def _mean(values: np.ndarray, bin_index: np.ndarray, bins: int) -> np.ndarray:
-    """Return the means of the known values, (bins,); NaN where none is known."""
+    """Return the mean of the known values in each bin, (bins,); NaN if there are none."""
     known = ~np.isnan(values)
     if not known.any():
         return np.full(bins, np.nan)
@@ -123,10 +121,10 @@ def _level(level_db: np.ndarray, bin_index: np.ndarray, count: np.ndarray,
 
 
 def stay_representatives(links: pd.DataFrame, distance_m: float) -> np.ndarray:
-    """Return which readings (n,) represent a stay: of each the one with the (lower) median level.
+    """Select the reading with the (lower) median level of each stay of a receiver, as a mask (n,).
 
-    A stay is a run of readings of one receiver, device and flight, in the order of time, that are
-    within a distance of the first of them. A reading that was not detected is below all others.
+    A stay is a run of readings of one receiver, device and flight, in the order of time, within
+    `distance_m` of its first one. Readings that were not detected are the lowest levels.
     """
     track = links.groupby(["receiver", "device", "flight"], sort=False).ngroup().to_numpy()
     rows = pd.DataFrame({"row": np.arange(len(links)), "level_db": links["level_db"].to_numpy()})
@@ -144,19 +142,19 @@ def stay_representatives(links: pd.DataFrame, distance_m: float) -> np.ndarray:
 
 
 def _stays(position_m: np.ndarray, track: np.ndarray, distance_m: float) -> np.ndarray:
-    """Return the number of the stay of each reading, (n,) ascending."""
+    """Return the index of the stay of each reading, (n,) ascending."""
     stay = np.empty(len(track), dtype=np.int64)
-    number, current, limit = -1, None, distance_m**2
+    number, current, limit_m2 = -1, None, distance_m**2
     x0 = y0 = z0 = 0.0
-    for i, (own, (x, y, z)) in enumerate(zip(track.tolist(), position_m.tolist())):
-        if own != current or (x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2 > limit:
-            number, current, x0, y0, z0 = number + 1, own, x, y, z
+    for i, (label, (x, y, z)) in enumerate(zip(track.tolist(), position_m.tolist())):
+        if label != current or (x - x0) ** 2 + (y - y0) ** 2 + (z - z0) ** 2 > limit_m2:
+            number, current, x0, y0, z0 = number + 1, label, x, y, z
         stay[i] = number
     return stay
 
 
 def without_repetition(source: Source) -> tuple[Source, list[int]]:
-    """Remove the rows that equal an earlier one in every column; return their indices, too."""
+    """Drop rows that equal an earlier one in every column; return also their indices."""
     table = source.table
     objects = [name for name in table if table[name].dtype == object]  # lists have no hash
     comparable = table.astype(dict.fromkeys(objects, str)) if objects else table

@@ -1,4 +1,4 @@
-"""The whole import, from files to a folder, and its report: counts, ranges, implausible data."""
+"""Import files into a folder, with a report: counts, ranges, and warnings of implausible data."""
 
 import json
 import re
@@ -32,28 +32,28 @@ from radiotwin.links.plausible import FAR_M
 SCHEMA = "radiotwin.import/2"
 UNITS = {"_m": "m", "_deg": "°", "_s": "s", "_dbm": "dBm", "_db": "dB"}
 """End of a column's name -> unit."""
-# Limits beyond which a value is legal but worth a warning; chosen by the project.
-HIGH_M = 500.0  # of the lowest receiver: probably above the sea, not above ground
+# Thresholds of warnings, chosen by the project.
+HIGH_M = 500.0  # height of the lowest receiver, if it is probably above the sea
 MAX_MISSED = 0.5  # share of levels that were not detected
-MAX_IMPOSSIBLE = 0.01  # share of levels that no receiver can have meant
-MAX_SMALLEST = 0.1  # share of levels that equal the smallest: probably a placeholder
-MIN_SAMPLE = 20  # values from which a share or a range says something
-ISOLATED_DB = 30.0  # between the smallest or largest level and all others: rather a code
+MAX_IMPOSSIBLE = 0.01  # share of levels that no receiver can read
+MAX_SMALLEST = 0.1  # share of levels that equal the smallest, if it is probably a placeholder
+MIN_SAMPLE = 20  # values for a share or a range
+ISOLATED_DB = 30.0  # gap between the smallest or largest level and all others, if it is a code
 _IMPOSSIBLE = ("Is level_unit right? Path losses, positive, need --path-loss; uncalibrated levels "
                "above 0 dBm --level-offset-db; codes --not-measured")
 YEARS = (1990, 2100)
-ANTENNAS = "antennas"  # folder of the patterns that the table of devices names
+ANTENNAS = "antennas"  # folder of the devices' antenna patterns
 FILES = {"measurements.csv", "measurements.csv.gz", "devices.csv", FRAME_FILE, "import.toml",
          "import.json", ANTENNAS}
 _CUT_NUMBER = re.compile(r"(?:.* )?\d(?:[.,]\d+)?[eE]\+\d+")
 DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}
-"""End of a column's name -> decimals that are written; all finer than any measurement."""
+"""End of a column's name -> decimals that are written, finer than any measurement."""
 
 
 def _make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Tally,
                 positioned: PositionedLinks, measurements: Measurements,
                 settings: Settings) -> dict[str, Any]:
-    """Return the content of `import.json`; the readings kept and left out add up to those read."""
+    """Return the content of `import.json`; readings = kept + left out."""
     table, devices = measurements.table, measurements.devices
     origin = positioned.origin
     time_s = table["time_s"].dropna() if "time_s" in table else pd.Series(dtype=float)
@@ -203,7 +203,7 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
         the report, as in `import.json`.
 
     Raises:
-        BadInput: all that is wrong, with file, row and column; nothing is written.
+        BadInput: all errors, with file, row and column; nothing is written.
     """
     out = Path(out)
     require_folder(out, FILES, mark="import.json")
@@ -282,7 +282,7 @@ def import_measurements(paths: Path | str | Sequence[Path | str], out: Path | st
 
 def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
               tally: Tally) -> PositionedLinks:
-    """Apply the limits of distance and level; a link whose value is unknown passes."""
+    """Drop links outside the ranges of distance and level in the settings; unknown values pass."""
     links = positioned.links
     distance_m: Any = None
     level_db = links["level_db"].to_numpy()
@@ -309,7 +309,7 @@ def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
 
 def _measurements(table: pd.DataFrame, devices: pd.DataFrame, level: str,
                   origin: Origin | None) -> Measurements:
-    """Return the two tables with the columns in order and rounded."""
+    """Make the measurements, with columns in order and values rounded."""
     table = table.rename(columns={"level_db": level})
     order = ["time_s", *REQUIRED, level, *(name for name in OPTIONAL if name != "time_s")]
     table = table[[name for name in order if name in table]].reset_index(drop=True)
@@ -317,7 +317,7 @@ def _measurements(table: pd.DataFrame, devices: pd.DataFrame, level: str,
 
 
 def _with_antennas(measurements: Measurements, path: Path) -> Measurements:
-    """Return the measurements with the files that the table of devices at a path names."""
+    """Add the antenna files that the table of devices at a path names."""
     names = measurements.devices.get("antenna", pd.Series(dtype=str)).fillna("")
     if not names.any():
         return measurements
@@ -332,5 +332,6 @@ def _with_antennas(measurements: Measurements, path: Path) -> Measurements:
 
 
 def _rounded(table: pd.DataFrame) -> pd.DataFrame:
+    """Round the columns of a table to `DECIMALS`."""
     return table.round({name: decimals for name in table for ending, decimals in DECIMALS.items()
                         if name.endswith(ending)})

@@ -1,4 +1,4 @@
-"""Settings of an import: the same in its TOML file and in the options of the command line."""
+"""Settings of an import, in a TOML file and in the options of the command line."""
 
 import codecs
 import os
@@ -37,11 +37,7 @@ QUANTITIES = (*POSITION, ABOVE_GROUND)
 
 
 def check_position(given: set[str], prefix: str) -> None:
-    """Check that some of `QUANTITIES` are a position; the prefix is that of names in the message.
-
-    Raises:
-        ValueError: not latitude, longitude or x, y with at most one of `HEIGHTS`.
-    """
+    """Raise ValueError unless given quantities are latitude, longitude or x, y, and one height."""
     for pair in (("latitude", "longitude"), ("x", "y")):
         if len(given & set(pair)) == 1:
             raise ValueError(f"{prefix}{pair[0]} and {prefix}{pair[1]} are given together or not "
@@ -105,10 +101,10 @@ class Columns(Position):
 
 
 class Wide(Position):
-    """Columns of levels of several receivers or devices in one row.
+    """Columns with the levels of several receivers or devices in one row.
 
-    Every column that matches `level` is one of them. `*` in `level` matches any text; in the other
-    values it is replaced by that text, or by the name of the column where `level` has no `*`.
+    Every column that matches `level` has levels. `*` in `level` matches any text; in the other
+    values it is replaced by that text, or by the column's name if `level` has no `*`.
     """
 
     level: Spec | list[Spec]
@@ -243,11 +239,7 @@ class Settings(Table):
         return name
 
     def require_columns(self, source: str, header: Iterable[str]) -> None:
-        """Check that there are columns of levels and of devices.
-
-        Raises:
-            BadInput: names all that is missing, and the columns that the file has.
-        """
+        """Raise BadInput unless columns of levels and of devices are declared."""
         missing = []
         if not self.wide and not self.columns.level:
             missing += ["columns.level is missing: which column holds the level? For example "
@@ -261,11 +253,7 @@ class Settings(Table):
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Parse pairs of the command line, such as `latitude=lat,longitude=lon`.
-
-    Raises:
-        BadInput: not pairs, or a name that is repeated.
-    """
+    """Parse pairs such as `latitude=lat,longitude=lon`; BadInput if they are none, or repeated."""
     pairs: dict[str, str] = {}
     for part in text.split(","):
         name, equals, value = (piece.strip() for piece in part.partition("="))
@@ -278,13 +266,13 @@ def parse_columns(text: str) -> dict[str, str]:
 
 def read_settings(path: Path | str | None, given: Mapping[str, Any],
                   data_folder: Path | None = None) -> Settings:
-    """Read settings.
+    """Read the settings of an import.
 
     Args:
-        path: TOML file, in which the paths of tables are relative to it; None for no file.
+        path: TOML file; paths in it are relative to it. None: no file.
         given: fields of `Settings`, which replace those of the file.
-        data_folder: of the file to import; tables that the settings name may be in it, in the
-            settings' folder, and in the current one.
+        data_folder: of the file to import. Tables that the settings name must be there, in the
+            settings' folder, or in the current folder.
 
     Raises:
         BadInput: not readable, not TOML, values that are not allowed, or a table elsewhere.
@@ -310,22 +298,20 @@ def read_settings(path: Path | str | None, given: Mapping[str, Any],
 
 
 def merged(settings: Settings, defaults: Mapping[str, Any]) -> Settings:
-    """Return settings with defaults for what they do not declare.
-
-    Of the defaults a position counts only where none is declared.
+    """Fill in defaults for settings that are not declared; a default position counts as a whole.
 
     Raises:
-        BadInput: both together are not allowed.
+        BadInput: the combination is not allowed.
     """
-    own = settings.model_dump(exclude_unset=True, exclude_none=True)
+    given = settings.model_dump(exclude_unset=True, exclude_none=True)
     columns = dict(defaults.get("columns", {}))
-    declared = set(own.get("columns", {}))
+    declared = set(given.get("columns", {}))
     for prefix in ("", "device_"):
         for group in (("latitude", "longitude", "x", "y"), HEIGHTS):
             names = {prefix + name for name in group}
             if declared & names:
                 columns = {name: spec for name, spec in columns.items() if name not in names}
-    data = {**defaults, **own, "columns": columns | own.get("columns", {})}
+    data = {**defaults, **given, "columns": columns | given.get("columns", {})}
     try:
         return Settings.model_validate(data)
     except ValidationError as error:
@@ -333,7 +319,7 @@ def merged(settings: Settings, defaults: Mapping[str, Any]) -> Settings:
 
 
 def _table_of(settings: Path, name: str, data_folder: Path | None) -> Path:
-    """Return the path of a table that a settings file names, which may be a stranger's."""
+    """Return the path of a table that a settings file names; BadInput if it leads elsewhere."""
     path = settings.parent / name
     if not is_within(path, settings.parent, Path.cwd(), data_folder or Path.cwd()):
         raise BadInput(f"{settings}: {path} is neither in its folder nor in the current one, nor "
@@ -342,7 +328,7 @@ def _table_of(settings: Path, name: str, data_folder: Path | None) -> Path:
 
 
 def _key(problem: Mapping[str, Any]) -> str:
-    """Return the key of a problem, such as `wide.0.level`, without the types that were tried."""
+    """Return the key of a pydantic error, such as `wide.0.level`, without the types in it."""
     names = {*Settings.model_fields, *Columns.model_fields, *Wide.model_fields,
              *Origin.model_fields, *TrackFile.model_fields}
     extra = problem["type"] == "extra_forbidden"
@@ -351,7 +337,7 @@ def _key(problem: Mapping[str, Any]) -> str:
 
 
 def _source_of(problem: Mapping[str, Any], path: Path | None, given: Mapping[str, Any]) -> str:
-    """Return where a problem is from: an option overrules the file."""
+    """Return where a bad setting was given: an option, or the file."""
     key = problem["loc"][0] if problem["loc"] else None
     if key in given:
         return f"--{str(key).replace('_', '-')}"
@@ -361,6 +347,7 @@ def _source_of(problem: Mapping[str, Any], path: Path | None, given: Mapping[str
 
 
 def _message(problem: Mapping[str, Any], source: str | None) -> str:
+    """Return the message about a pydantic error."""
     key = _key(problem)
     reason = problem["msg"].removeprefix("Value error, ")
     table = problem["loc"][0] if problem["loc"] else ""
@@ -378,9 +365,9 @@ def _message(problem: Mapping[str, Any], source: str | None) -> str:
 
 
 def write_settings(settings: Settings, path: Path, folder: Path) -> None:
-    """Write settings that differ from the defaults as TOML.
+    """Write the settings that differ from the defaults as TOML.
 
-    Paths of tables become relative to the folder where the file will be in the end.
+    Paths of tables become relative to `folder`, in which the file will be.
     """
     data = settings.model_dump(exclude_none=True, exclude_defaults=True)
     for table in ("devices", "receivers"):

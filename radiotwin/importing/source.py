@@ -1,6 +1,6 @@
-"""A file of measurements as a table whose cells can be named in a message, and what is wrong in it.
+"""`Source`: a table whose rows can be named in messages; and the errors and counts of an import.
 
-All problems of an import become one message. Readings that are left out are counted by reason, so
+All errors of an import become one message. Readings that are left out are counted by reason, so
 that read = kept + left out.
 """
 
@@ -16,33 +16,33 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from radiotwin.errors import BadInput
-from radiotwin.io.cells import as_numbers, as_text, listed, refuse, shown
+from radiotwin.io.cells import as_numbers, as_text, cell_text, listed, refuse
 from radiotwin.io.forms import name_fault
 from radiotwin.links.plausible import MAX_DEGREES
 from radiotwin.links.site_table import dms_degrees
 
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
-_ROWS_AT_ONCE = 1_000_000  # of which stripped texts are made
+_ROWS_AT_ONCE = 1_000_000  # that are converted at once
 _TEMPLATE = re.compile(r"\{([^{}]+)\}")
-_SHOWN = 20  # of the problems in a message
-_FEW, _FEW_SHARE = 20, 0.1  # damaged rows that are no sign of a file that is read wrongly
+_SHOWN = 20  # errors in a message
+_FEW, _FEW_SHARE = 20, 0.1  # number and share of damaged rows in a file that is otherwise right
 
 
 def are_few(number: int, total: int) -> bool:
-    """Return whether so many damaged rows of a file are left out without being asked for."""
+    """Return whether the damaged rows are so few that they may be dropped without asking."""
     return number <= min(_FEW, _FEW_SHARE * total)
 
 
 @dataclass
 class BadRows:
-    """Rows that cannot be read, and are left out where the user allows so many.
+    """Unreadable rows that are left out, as far as the user allows.
 
     Attributes:
-        limit: of the rows of all files, `skip_bad_rows`.
-        prefix: of places in the file that is read, as its name where there are several.
-        rows: where, column, cell and reason of each that is left out.
-        fresh: index -> column of those that `take` noted last.
+        limit: allowed number in all files, `skip_bad_rows`.
+        prefix: of places in the present file: its name if there are several.
+        rows: place, column, cell and reason of each row that is left out.
+        fresh: index -> column of the rows that `take` noted since the last `without`.
     """
 
     limit: int = 0
@@ -51,16 +51,16 @@ class BadRows:
     fresh: dict[int, str] = field(default_factory=dict)
 
     def add(self, where: str, column: str, cell: object, reason: str) -> bool:
-        """Note a row; False if that would be more than allowed."""
+        """Note a bad row; return False if that exceeds the limit."""
         if where not in self.rows and len(self.rows) >= self.limit:
             return False
-        self.rows.setdefault(where, {"row": where, "column": column, "cell": shown(cell),
+        self.rows.setdefault(where, {"row": where, "column": column, "cell": cell_text(cell),
                                      "reason": reason.partition(";")[0]})
         return True
 
     def take(self, source: "Source", spec: str, cells: pd.Series, rows: np.ndarray,
              reason: str) -> bool:
-        """Note rows (n,) of cells; False, and none is noted, if they are more than allowed."""
+        """Note several bad rows of a column; return False, and note none, if they exceed it."""
         index = [int(cells.index[row]) for row in rows] if len(rows) <= self.limit else []
         places = [source.where(each) for each in index]
         if not places or len(self.rows.keys() | set(places)) > self.limit:
@@ -71,32 +71,32 @@ class BadRows:
         return True
 
     def hint(self, number: int) -> str:
-        """Return how so many more rows can be left out, for the end of a message."""
+        """Return the end of a message: the option that leaves out `number` more rows."""
         return f"; --skip-bad-rows {len(self.rows) + number} leaves such rows out"
 
     def without(self, links: pd.DataFrame, tally: "Tally", readings: int,
                 where: Callable[[int], str]) -> pd.DataFrame:
-        """Return links without the rows noted last; each counts as so many readings."""
+        """Drop the rows that were noted since the last call; each counts as `readings` readings."""
         fresh, self.fresh = self.fresh, {}
         for spec in dict.fromkeys(fresh.values()):
-            own = links.index[links.index.isin([row for row in fresh if fresh[row] == spec])]
-            if len(own):
-                tally.count("bad row", spec, len(own) * readings, where(own[0]))
+            bad = links.index[links.index.isin([row for row in fresh if fresh[row] == spec])]
+            if len(bad):
+                tally.count("bad row", spec, len(bad) * readings, where(bad[0]))
         return links[~links.index.isin(list(fresh))] if fresh else links
 
 
 @dataclass(frozen=True)
 class Source:
-    """A table whose index is the position of each row in the file.
+    """A table of a file; its index is the position of each row in the file.
 
     Attributes:
-        path: of the file, or a name of several, for messages.
+        path: of the file, or a label of several files, for messages.
         table: cells as in the file.
-        where: index -> `row 7`, as the file's user counts.
+        where: index -> `row 7`, as in the file.
         notes: on how the file was read.
-        fields: index -> number of fields, of the rows that had fewer than the header.
-        left_out: rows that are not in the table: reason, number, and the first of them.
-        bad_rows: where cells that cannot be read are noted; None where all must be readable.
+        fields: index -> number of fields, for rows with fewer fields than the header.
+        left_out: rows that are not in the table: reason, number, and the first one.
+        bad_rows: where unreadable cells are noted; None: they raise BadInput.
     """
 
     path: Path | str
@@ -111,16 +111,16 @@ class Source:
         return len(self.table)
 
     def select(self, keep: np.ndarray) -> Self:
-        """Return the rows (n,) that are kept."""
+        """Select rows by a mask (n,)."""
         return replace(self, table=self.table[keep])
 
     def cells(self, spec: str, purpose: str) -> pd.Series:
         """Return the cells of a column, a constant, or texts made of several columns.
 
         Args:
-            spec: name of a column, `always VALUE`, or a text with names in braces, such as
-                `{Date} {Time}`, which is empty where one of these cells is.
-            purpose: what they are needed for, for the message; as in the other methods.
+            spec: name of a column, `always VALUE`, or a template such as `{Date} {Time}`, which is
+                empty if one of its cells is.
+            purpose: quantity that the cells hold, for messages.
 
         Raises:
             BadInput: no such column.
@@ -140,11 +140,7 @@ class Source:
         return text
 
     def require(self, specs: Mapping[str, str]) -> None:
-        """Check that the file has all columns of a mapping: purpose -> as in `cells`.
-
-        Raises:
-            BadInput: names all that are missing.
-        """
+        """Raise BadInput unless the file has all columns of a mapping: quantity -> spec."""
         missing = [f"{name!r} ({purpose})" for purpose, spec in specs.items()
                    for name in columns_of(spec, self.table) if name not in self.table]
         if missing:
@@ -154,7 +150,7 @@ class Source:
                            f"{listed(self.table.columns)}. Correct the mapping")
 
     def names(self, spec: str, purpose: str) -> np.ndarray:
-        """Return the cells as names, (n,) texts, `""` where empty; equal ones are one object.
+        """Return the cells as names, (n,) texts, `""`: empty; see `cells`.
 
         Raises:
             BadInput: no such column, or a text that cannot be a name.
@@ -170,7 +166,7 @@ class Source:
         return names.to_numpy(dtype=object)[number]
 
     def numbers(self, spec: str, purpose: str) -> np.ndarray:
-        """Return the cells as numbers, (n,); NaN where empty.
+        """Return the cells as numbers, (n,), NaN: empty; see `cells`.
 
         Raises:
             BadInput: no such column, a text, or a number that is not finite.
@@ -196,17 +192,16 @@ class Source:
         return numbers
 
     def refuse(self, spec: str, cells: pd.Series, bad: ArrayLike, reason: str) -> None:
-        """Raise BadInput about the first bad cell (n,) of a column, if there is one.
+        """Raise BadInput about the first bad cell of a column, or note all as allowed bad rows.
 
-        The message names file, row and column, and ends with the reason. Nothing is raised where
-        the user allows so many bad rows; they are noted.
+        The message names file, row and column, and ends with the reason.
         """
         rows = np.flatnonzero(np.asarray(bad, dtype=bool))
         if not len(rows):
             return
         if spec in self.table:  # as in the file, where `N/A` is an empty cell
-            own = self.table[spec].reindex(cells.index)
-            cells = own.where(own.map(lambda cell: isinstance(cell, str)), cells)
+            texts = self.table[spec].reindex(cells.index)
+            cells = texts.where(texts.map(lambda cell: isinstance(cell, str)), cells)
         if self.bad_rows is not None:
             if self.bad_rows.take(self, spec, cells, rows, reason):
                 return
@@ -216,9 +211,9 @@ class Source:
 
 
 def columns_of(spec: str, header: Iterable[object]) -> list[str]:
-    """Return the names of columns in an entry of a mapping, as of `Source.cells`.
+    """Return the columns that an entry of a mapping names, see `Source.cells`.
 
-    A name of the header may have braces itself.
+    A name in the header may contain braces itself.
     """
     if spec.startswith(ALWAYS) and spec not in header:
         return []
@@ -241,7 +236,7 @@ class Problems:
 
     @contextmanager
     def noted(self) -> Iterator[None]:
-        """Keep the message of a `BadInput` raised within, and go on after it."""
+        """Catch a `BadInput` of the block and keep its message."""
         try:
             yield
         except BadInput as error:
@@ -262,12 +257,12 @@ class Problems:
 
 @dataclass
 class Tally:
-    """Readings that were left out.
+    """Counts of readings that were left out.
 
     Attributes:
-        left_out: (reason, column) -> number of readings, in the order of the reasons' first use.
-        first: (reason, column) -> the first of them, such as `row 7`.
-        notes: on what was found in the values.
+        left_out: (reason, column) -> number of readings, in the order of first use.
+        first: (reason, column) -> place of the first one, such as `row 7`.
+        notes: on odd values.
     """
 
     notes: list[str] = field(default_factory=list)
@@ -275,21 +270,14 @@ class Tally:
     first: dict[tuple[str, str], str] = field(default_factory=dict)
 
     def count(self, reason: str, column: str, number: int, where: str) -> None:
-        """Add readings left out for a reason; of none there is no entry.
-
-        Args:
-            reason: why they are left out.
-            column: of the file, or `""`.
-            number: of readings.
-            where: the first of them, such as `row 7`.
-        """
+        """Add a number of readings left out for a reason and column; `where` is the first one."""
         if number:
             self.left_out[reason, column] = self.left_out.get((reason, column), 0) + int(number)
             self.first.setdefault((reason, column), where)
 
     def drop(self, links: pd.DataFrame, bad: ArrayLike, reason: str, column: str,
              where: Callable[[int], str]) -> pd.DataFrame:
-        """Return links without the bad ones (n,), which are counted; `where` as of `Source`."""
+        """Drop and count bad links, a mask (n,); `where` is that of their `Source`."""
         bad = np.asarray(bad, dtype=bool)
         if not bad.any():
             return links

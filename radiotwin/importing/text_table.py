@@ -1,4 +1,4 @@
-"""Tables in texts of any dialect: encoding, separator, decimal mark, and lines around the table."""
+"""Read tables from texts of any dialect: encoding, separator, decimal mark, surrounding lines."""
 
 import codecs
 import csv
@@ -18,12 +18,12 @@ from radiotwin.importing.log_files import Lines, LogFile, Sheet
 from radiotwin.importing.settings import BLANKS, DELIMITERS, Settings
 from radiotwin.importing.source import BadRows
 from radiotwin.io.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS
-from radiotwin.io.cells import EMPTY, shown
-from radiotwin.io.texts import unquoted, without_quotes
+from radiotwin.io.cells import EMPTY, cell_text
+from radiotwin.io.texts import unescape_formula, unescape_formulas
 
 _BLOCK_BYTES, _TAIL_BYTES = 2**18, 2**16
-_LINES, _HEADER_LINES = 400, 200  # of the beginning that are looked at, and where the header is
-_MAX_TRAILER = 20  # lines after the table; more are a damaged table
+_LINES, _HEADER_LINES = 400, 200  # first lines that are examined; among which the header is
+_MAX_TRAILER = 20  # lines after the table; more mean a damaged table
 _BOMS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
          (codecs.BOM_UTF16_BE, "utf-16"))
 _UNDEFINED = b"\x81\x8d\x8f\x90\x9d"  # in Windows-1252
@@ -34,26 +34,26 @@ _NAMES = {"\t": "tabs", ";": "semicolons", ",": "commas", "|": "vertical bars", 
           "  ": "two and more blanks"}
 _RUNS = {" ": re.compile(r'"[^"]*"|[ \t]+'), "  ": re.compile(r'"[^"]*"| *\t *| {2,}')}
 _COMMENT = re.compile(r"\s*(#|%|//)")
-_CHUNK_CELLS = 2_000_000  # of which a table is made at a time
+_CHUNK_CELLS = 2_000_000  # that are converted at once
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a text holds a table.
+    """Dialect of a table in a text.
 
     Attributes:
-        encoding: as Python names it.
+        encoding: Python's name.
         delimiter: one of `DELIMITERS`.
         decimal: `.` or `,`.
-        before: lines before the header.
-        after: lines after the last row, blank ones not counted.
-        trailer: the first of them, where it was found and not declared.
-        repeated: a name of a column that occurs more than once, or `""`.
-        names: of the columns where there is no header.
-        units: line below the header that has no digit, as one of units, or `""`.
+        before: number of lines before the header.
+        after: number of lines after the last row, without blank ones.
+        trailer: the first line after the last row, if that was detected and not declared.
+        repeated: a column name that occurs more than once, or `""`.
+        names: of the columns, if there is no header.
+        units: line of units below the header (without a digit), or `""`.
         has_comments: whether some of the first lines, or the header, begin with `#`.
-        is_mark: whether the first field of the header is such a mark alone.
-        quotes: whether quotation marks hold a field together.
+        is_mark: whether the first field of the header is a comment mark only.
+        quotes: whether quotation marks enclose fields.
     """
 
     encoding: str = "utf-8"
@@ -70,37 +70,38 @@ class Dialect:
     quotes: bool = True
 
     def described(self) -> str:
-        """Return what differs from comma-separated UTF-8, or `""`."""
+        """Describe the differences from comma-separated UTF-8; `""` if there are none."""
         parts = [f"separated by {_NAMES[self.delimiter]}" * (self.delimiter != ","),
                  "decimal commas" * (self.decimal == ","),
                  f"encoding {self.encoding}" * (not self.encoding.startswith("utf-8")),
                  "no header" * bool(self.names), _lines(self.before, "before the header"),
                  _lines(self.after, "after the table")
-                 + f" ({shown(self.trailer)})" * bool(self.trailer),
+                 + f" ({cell_text(self.trailer)})" * bool(self.trailer),
                  f"a row of units ({self.units})" * bool(self.units)]
         if self.repeated:
-            parts.append(f"column {shown(self.repeated)} occurs more than once: the others are "
+            parts.append(f"column {cell_text(self.repeated)} occurs more than once: the others are "
                          f"{self.repeated}.2, …")
         return ", ".join(filter(None, parts))
 
 
 def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collection[str]],
                  names: Sequence[str]) -> Dialect:
-    """Find how a text holds a table; what is declared is not looked for.
+    """Detect the dialect of a text, as far as it is not declared.
 
     Args:
         file: of text.
-        settings: with what is declared.
-        expected: sets of columns, of which the header is likely to have one, in lower case.
+        settings: give the declared properties.
+        expected: sets of column names in lower case, one of which the header probably contains.
         names: of the columns, if the text has no header.
 
     Raises:
-        BadInput: it is no text, not in the declared encoding, or its decimal mark is ambiguous.
+        BadInput: the file is no text, not in the declared encoding, or its decimal mark is
+            ambiguous.
     """
     with file.open() as content:
         head, tail, whole, encoding = _scan(content, file, settings.encoding)
-    every = _split(head.decode(encoding, "replace").removeprefix("\ufeff"))
-    lines = (every if whole else every[:-1])[:_LINES]
+    head_lines = _split(head.decode(encoding, "replace").removeprefix("\ufeff"))
+    lines = (head_lines if whole else head_lines[:-1])[:_LINES]
     if names:
         before = settings.lines_before_header or 0
         delimiter = settings.delimiter or _delimiter(lines[before:], len(names))
@@ -113,9 +114,8 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
     decimal = settings.decimal or _decimal(file, delimiter, rows, isinstance(file, Sheet))
     after, trailer = settings.lines_after_table, ""
     if after is None:
-        last = _split(tail.decode(encoding, "replace"))
         lengths = Counter(map(len, rows))
-        last = every[first:] if whole else last[1:]
+        last = head_lines[first:] if whole else _split(tail.decode(encoding, "replace"))[1:]
         after = _trailer(last, delimiter, header,
                          {each for each, number in lengths.items() if each > 1 and number > 1})
         if after:
@@ -135,12 +135,12 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
 
 
 def fits(row: Sequence[str], columns: int) -> bool:
-    """Return whether a row has as many fields as the header; some programs end it with more."""
+    """Return whether a row has as many fields as the header, apart from empty last ones."""
     return len(row) >= columns and not any(field.strip() for field in row[columns:])
 
 
 def is_comment(row: Sequence[str], columns: int, first: Sequence[Sequence[str]]) -> bool:
-    """Return whether a row is a comment: it has a mark that the first row [of a table] has not."""
+    """Return whether a row is a comment: it begins with a mark, unlike the first row."""
     mark = _COMMENT.match(row[0]) if row else None
     if mark is None:
         return False
@@ -154,7 +154,7 @@ def has_other_lines(cells: pd.DataFrame) -> bool:
 
 
 def _is_of_units(rows: Sequence[Sequence[str]], columns: int) -> bool:
-    """Return whether the first of two rows has no digit where the second has them twice or more."""
+    """Return whether the first of two rows is one of units: no digits, above several numbers."""
     if len(rows) < 2 or not fits(rows[0], columns) or _COMMENT.match(rows[0][0]):
         return False
     digits = [any(character.isdigit() for character in above) for above in rows[0]]
@@ -165,8 +165,8 @@ def _is_of_units(rows: Sequence[Sequence[str]], columns: int) -> bool:
 
 
 def header_names(fields: Sequence[str]) -> list[str]:
-    """Return names of columns: without a last empty one, empty and repeated ones numbered."""
-    names = [re.sub("[\u200b\ufeff]", "", name).strip() for name in fields]  # of no width
+    """Return unique column names: empty and repeated ones get a number, a last empty one goes."""
+    names = [re.sub("[\u200b\ufeff]", "", name).strip() for name in fields]  # zero-width
     if names and (mark := _COMMENT.match(names[0])):  # as NumPy writes a header
         names[0] = names[0][mark.end():].strip() or names[0]
     if len(names) > 1 and not names[-1]:
@@ -189,7 +189,7 @@ def _lines(number: int, where: str) -> str:
 
 def _scan(content: IO[bytes], file: LogFile,
           declared: str | None) -> tuple[bytes, bytes, bool, str]:
-    """Return the beginning, the end, whether the beginning is all, and the encoding."""
+    """Read a text once; return its first and last block, whether that is all, and its encoding."""
     head = tail = content.read(_BLOCK_BYTES)
     encoding = codecs.lookup(declared).name if declared else next(
         (name for bom, name in _BOMS if head.startswith(bom)), "utf-8")
@@ -224,12 +224,13 @@ def _scan(content: IO[bytes], file: LogFile,
 
 
 def _split(text: str) -> list[str]:
-    """Return the lines of a text as its reader counts them, which `str.splitlines` does not."""
+    """Split a text into lines as `Lines` counts them, unlike `str.splitlines`."""
     lines = re.split(r"\r\n|\r|\n", text)
     return lines if lines[-1] else lines[:-1]
 
 
 def _fields(line: str, delimiter: str) -> list[str]:
+    """Split a line into fields; empty if a quotation mark is not closed."""
     line, delimiter = _with_tabs(line, delimiter), "\t" if delimiter in BLANKS else delimiter
     try:
         return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
@@ -238,7 +239,7 @@ def _fields(line: str, delimiter: str) -> list[str]:
 
 
 def _with_tabs(line: str, delimiter: str) -> str:
-    """Return a line with a tab for each run of blanks outside quotation marks that separates."""
+    """Replace the separating runs of blanks of a line by tabs, outside quotation marks."""
     if delimiter not in BLANKS:
         return line
     return _RUNS[delimiter].sub(lambda run: run[0] if run[0].startswith('"') else "\t",
@@ -246,17 +247,17 @@ def _with_tabs(line: str, delimiter: str) -> str:
 
 
 def _delimiter(lines: list[str], columns: int) -> str:
-    """Return the delimiter with which most lines have so many fields."""
+    """Return the delimiter that splits most lines into a number of fields."""
     return max((*DELIMITERS, *BLANKS), key=lambda each: sum(fits(_fields(line, each), columns)
                                                             for line in lines))
 
 
 def _header(lines: list[str], settings: Settings,
             expected: Sequence[Collection[str]]) -> tuple[int, str]:
-    """Return the index of the header and the delimiter that give the largest table.
+    """Find the index of the header line and the delimiter.
 
-    A line with more of the expected names comes first. Blanks are in texts, too: they separate
-    where they alone find all names, or nothing else does.
+    The header with most expected names wins, then the largest table. Blanks also occur within
+    texts, so they are delimiters only if they alone find all names, or no other delimiter fits.
     """
     delimiters = [settings.delimiter] if settings.delimiter else [*DELIMITERS, *BLANKS]
     places = range(min(len(lines), _HEADER_LINES))
@@ -293,26 +294,26 @@ def _is_number(text: str) -> bool:
 
 
 def _decimal(file: LogFile, delimiter: str, rows: list[list[str]], is_typed: bool) -> str:
-    """Return the decimal mark; a comma that may separate thousands is ambiguous.
+    """Return the decimal mark; BadInput if a comma may also separate thousands.
 
-    Where numbers are typed, as in a sheet, those that are texts have a mark of their own.
+    In a sheet (`is_typed`) only numbers that were entered as texts can have commas.
     """
     cells = [cell.strip() for row in rows for cell in row]
     commas = [cell for cell in cells if COMMA.fullmatch(cell)]
     if not commas:
         return "."
     if all(_THOUSANDS.fullmatch(cell) for cell in commas):
-        raise BadInput(f"{file}: {shown(commas[0])} may be a number with a decimal comma, or one "
-                       "with separated thousands; give --decimal , for the first, or --decimal . "
-                       "and write the number without its comma")
+        raise BadInput(f"{file}: {cell_text(commas[0])} may be a number with a decimal comma, or "
+                       "one with separated thousands; give --decimal , for the first, or "
+                       "--decimal . and write the number without its comma")
     has_points = delimiter == "," and not is_typed and any(map(_POINT.fullmatch, cells))
     return "." if has_points else ","
 
 
 def _trailer(lines: list[str], delimiter: str, header: list[str], lengths: set[int]) -> int:
-    """Return the number of lines at the end that are no rows of the table, such as a summary.
+    """Count the last lines that are no rows of the table, such as a summary.
 
-    Rows have as many fields as the header, or one of the numbers that others have.
+    A row has as many fields as the header, or one of the `lengths` of other rows.
     """
     columns, count = len(header_names(header)), 0
     for line in reversed(lines):
@@ -322,19 +323,19 @@ def _trailer(lines: list[str], delimiter: str, header: list[str], lengths: set[i
         if fits(fields, columns) or len(fields) in lengths or line.count('"') % 2:
             return count if count <= _MAX_TRAILER else 0
         count += 1
-    return 0  # no row is left: reading says what is wrong
+    return 0  # no row is left: reading raises BadInput
 
 
 @dataclass(frozen=True)
 class TextTable:
-    """Cells of a text as texts, `""` where empty, decimal commas as points.
+    """Cells of a table as texts, `""`: empty, with decimal points.
 
     Attributes:
-        cells: a row for each of the text.
-        lines: of the rows, (n,) from 1.
-        fields: row -> number of fields, of those that had fewer than the header.
-        notes: on lines that are no rows.
-        bad: lines of the rows with too many fields, which were left out.
+        cells: n rows.
+        lines: (n,) line of each row, from 1.
+        fields: row -> number of fields, for rows with fewer fields than the header.
+        notes: on skipped lines.
+        bad: lines of rows with too many fields, which were left out.
     """
 
     cells: pd.DataFrame
@@ -350,8 +351,8 @@ def read_text_table(file: LogFile, dialect: Dialect, bad_rows: BadRows | None) -
     Args:
         file: of text.
         dialect: of the text.
-        bad_rows: where rows with too many fields are noted, and those with too few are filled up;
-            None where there may be none.
+        bad_rows: notes rows with too many fields, and rows with too few are filled up; None: both
+            raise BadInput.
 
     Raises:
         BadInput: no header, a repeated name, or a row with too few or too many fields.
@@ -375,9 +376,9 @@ def read_text_table(file: LogFile, dialect: Dialect, bad_rows: BadRows | None) -
 
 
 class _QuotedLines(Lines):
-    """Lines of rows, which quotation marks may carry over any number of lines."""
+    """Lines with a bound of the length of a row, which may have line feeds in quotation marks."""
 
-    row_characters = 0  # of the row that is being read
+    row_characters = 0  # of the present row
 
     def __next__(self) -> str:
         line = super().__next__()
@@ -389,7 +390,7 @@ class _QuotedLines(Lines):
 
 
 def _rows(reader: Iterator[list[str]], lines: _QuotedLines) -> Iterator[list[str]]:
-    """Yield all rows; each is counted by itself."""
+    """Yield all rows, and restart the count of characters after each."""
     for row in reader:
         lines.row_characters = 0
         yield row
@@ -397,11 +398,12 @@ def _rows(reader: Iterator[list[str]], lines: _QuotedLines) -> Iterator[list[str
 
 def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
           lines: Lines, bad_rows: BadRows | None) -> TextTable:
+    """Read the header and the rows from a CSV reader, without comments and repeated headers."""
     names = list(dialect.names)
     if not names:
         fields = next(filter(None, reader), [])
         COLUMNS.check(len(fields), f"{file}: header")
-        names = header_names([unquoted(name) for name in fields[dialect.is_mark:]])
+        names = header_names([unescape_formula(name) for name in fields[dialect.is_mark:]])
     if not names:
         raise BadInput(f"{file} is empty; it needs a row with the names of the columns")
     chunk_rows = max(_CHUNK_CELLS // len(names), 1)
@@ -415,7 +417,7 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
         if is_comment(row, width, first):
             comments.append(number)
             continue
-        if header_names([unquoted(name) for name in row]) == names:  # files were joined
+        if header_names([unescape_formula(name) for name in row]) == names:  # files were joined
             headers.append(number)
             continue
         first = first or [row]
@@ -423,7 +425,7 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
             has_units = False
             continue
         if len(row) != width and not fits(row, width):
-            # Where blanks separate, any cell may be the one that is missing.
+            # With blanks as delimiters it is unknown which cell is missing.
             if bad_rows is None or len(row) > width or dialect.delimiter in BLANKS:
                 if bad_rows is not None and bad_rows.add(
                         f"{bad_rows.prefix}line {number}", "", f"{len(row)} fields",
@@ -457,7 +459,7 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
 
 def _without_last(reader: Iterator[list[str]], lines: Lines,
                   after: int) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows that are not blank, with their lines, without the last ones."""
+    """Yield the rows that are not blank with their line numbers, without the last `after` rows."""
     waiting: deque[tuple[int, list[str]]] = deque()
     for row in reader:
         if any(field.strip() for field in row):
@@ -467,7 +469,8 @@ def _without_last(reader: Iterator[list[str]], lines: Lines,
 
 
 def _cells(rows: list[list[str]], names: list[str], decimal: str) -> pd.DataFrame:
-    table = without_quotes(pd.DataFrame(rows, columns=names, dtype=str))
+    """Make a table of texts, with decimal points."""
+    table = unescape_formulas(pd.DataFrame(rows, columns=names, dtype=str))
     if decimal == ",":
         for name in names:
             cells = table[name]

@@ -1,7 +1,7 @@
-"""Cells of a log in the units of the project: times [s], levels [dB, dBm] and lengths [m].
+"""Convert cells of a log to the project's units: times [s], levels [dB, dBm] and lengths [m].
 
-Times count from 1970-01-01 UTC. Clocks that begin anew, or overlap, are noted: a receiver would be
-at two places at once.
+Times count from 1970-01-01 UTC. Clocks that restart, or overlap, are noted, since a receiver would
+be at two places at once.
 """
 
 import re
@@ -15,14 +15,14 @@ import pandas as pd
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.source import Source, constants_of
-from radiotwin.io.cells import EMPTY, as_numbers, as_text, shown
+from radiotwin.io.cells import EMPTY, as_numbers, as_text, cell_text
 from radiotwin.links.site_table import METRES
 
 _UNIT_IN_NAME = re.compile(r"(?:[_ (\[]|(?<=[a-z])(?=[MF]))((?i:m|met(?:er|re)s?|ft|feet))[)\]]?$")
 EPOCH_S = {"epoch s": 1.0, "epoch ms": 1e-3, "epoch us": 1e-6, "epoch ns": 1e-9}
 ISO = "ISO 8601"
 SERIAL = "serial date"
-"""Days since 1899-12-30, as spreadsheets have times (ECMA-376-1, 18.17.4.1)."""
+"""Times of spreadsheets: days since 1899-12-30 (ECMA-376-1, 18.17.4.1)."""
 ALLOWED = (f"allowed are {', '.join(EPOCH_S)}, {ISO}, {SERIAL} (days, of a spreadsheet), or a "
            "strftime format, such as '%d.%m.%Y %H:%M:%S'")
 _NO_DATE = "it has no date: put the date before it ({file date}: that of the file's name), in " \
@@ -30,52 +30,52 @@ _NO_DATE = "it has no date: put the date before it ({file date}: that of the fil
            "'%Y-%m-%d %H:%M:%S'"
 _DATES = re.compile("%[YymbBdjDFcxsGUVWuw]")
 BACK_S, HALF_DAY_S, DAY_S = 3600.0, 43_200.0, 86_400.0
-MAX_STEPS_BACK = 5  # more are no midnights, but rows in another order
-YEARS = (1900, 2200)  # of plausible times; milliseconds that are read as seconds lie outside
-_ROWS_AT_ONCE = 1_000_000  # of which texts are made
+MAX_STEPS_BACK = 5  # more are no midnights, but unsorted rows
+YEARS = (1900, 2200)  # of plausible times; milliseconds that are read as seconds are later
+_ROWS_AT_ONCE = 1_000_000  # that are converted at once
 _MAX_DAYS = 100_000  # since 1899; the year 2173
 SECONDS_PER_YEAR = 31_556_952  # Gregorian mean
 UTC_OFFSET = r"[Tt ]\d\d(?::?\d\d){0,2}(?:\.\d+)? ?(?:[Zz]|[+-]\d\d(?::?\d\d)?)$"
-"""At the end of an ISO 8601 text, extended or basic; from the hour on, as a date ends in -31."""
-NEAR_S = 1.0  # between two readings of which both places are known
-ELSEWHERE_M = 20.0  # within that time, for which a receiver would have to fly
-FAST_M_S = 100.0  # beyond this it does not fly
-MIN_PAIRS = 3  # of readings at two places, that are no single bad fix
-MIN_SHARE = 0.02  # of the pairs of readings that follow each other so fast
+"""End of an ISO 8601 time with an offset, extended or basic, from the hour on."""
+NEAR_S = 1.0  # between two successive readings whose positions are compared
+ELSEWHERE_M = 20.0  # positions farther apart than this and `FAST_M_S` are two places at once
+FAST_M_S = 100.0  # fastest receiver
+MIN_PAIRS = 3  # of readings at two places; fewer may be a bad fix
+MIN_SHARE = 0.02  # of such pairs among successive readings
 LEVEL_COLUMN = {"dBm": "rssi_dbm", "mW": "rssi_dbm", "W": "rssi_dbm", "dB": "gain_db"}
 """Unit in the file -> column of `measurements.csv`."""
 NOT_A_NUMBER = "nan"
 MAX_OVER, MIN_OVER, MAX_GAP_DB = 0.01, 5, 10.0
-"""Share, and different values, of levels that are too strong, and how far they are from others."""
+"""Share and number of values of impossibly strong levels, and their gap to others, of an
+uncalibrated column."""
 MILLIWATTS = {"mW": 1.0, "W": 1e3}
 POSSIBLE_DB = {"rssi_dbm": (-174.0, 0.0), "gain_db": (-250.0, 0.0)}
-"""Column of levels -> open interval [dBm or dB]: thermal noise at 290 K is -174 dBm in 1 Hz (k T of
-Johnson and Nyquist) and more in any wider channel, no receiver gets a milliwatt (0 dBm), and no
-channel amplifies."""
+"""Column of levels -> possible range [dBm or dB]: thermal noise at 290 K is -174 dBm in 1 Hz (k T
+of Johnson and Nyquist), no receiver gets a milliwatt (0 dBm), and no channel amplifies."""
 
 
 def seconds(source: Source, spec: str, time_format: str | None, zone: str | None) -> np.ndarray:
-    """Read the times of a column as seconds since the epoch, UTC, (n,); NaN where a cell is empty.
+    """Read the times of a column [s since 1970 UTC], (n,); NaN: empty.
 
     Args:
         source: the file.
         spec: the column.
-        time_format: one of `EPOCH_S`, `ISO`, or a strftime format; not needed where the file has
-            typed times.
+        time_format: one of `EPOCH_S`, `ISO`, `SERIAL`, or a strftime format; None for typed times.
         zone: IANA time zone of times without an offset from UTC.
 
     Raises:
-        BadInput: format or zone not declared, a cell that cannot be read, or a local time that the
-            zone's clocks skipped or showed twice.
+        BadInput: format or zone is not declared, a cell cannot be read, or a local time was skipped
+            or occurred twice when the clocks changed.
     """
     if zone is not None:
         _check_zone(zone)
     cells = source.cells(spec, "time")
     typed = cells.dtype.kind == "M"  # Parquet has typed times
     if time_format is None and not typed:
-        raise BadInput(f"{source.path}: column {spec}: time_format is not given; {ALLOWED}. The "
-                       f"values look like {shown(cells.iloc[0])} to {shown(cells.iloc[-1])}. "
-                       "If they carry no offset from UTC, give time_zone, too")
+        raise BadInput(
+            f"{source.path}: column {spec}: time_format is not given; {ALLOWED}. The values look "
+            f"like {cell_text(cells.iloc[0])} to {cell_text(cells.iloc[-1])}. If they carry no "
+            "offset from UTC, give time_zone, too")
     if time_format in EPOCH_S and not typed:
         time_s = source.numbers(spec, "time") * EPOCH_S[time_format]
         return _plausible(source, spec, cells, time_s)
@@ -92,7 +92,7 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
     if parsed.dt.tz is None:
         if zone is None:
             raise BadInput(f"{source.path}: column {spec}: the times, such as "
-                           f"{shown(text.iloc[0])}, carry no offset from UTC, and time_zone is "
+                           f"{cell_text(text.iloc[0])}, carry no offset from UTC, and time_zone is "
                            "not given; give UTC or a zone such as Europe/Berlin")
         parsed = _localize(source, spec, text, parsed, zone)
     utc = parsed.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy(dtype="datetime64[us]")
@@ -102,16 +102,16 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
 
 def past_midnights(source: Source, spec: str, time_s: np.ndarray,
                    ends: Callable[[], np.ndarray]) -> tuple[np.ndarray, str]:
-    """Find where a clock goes back by about a day, which it does at midnight under a fixed date.
+    """Add a day after each midnight, if the date of the times is a constant; note clocks set back.
 
     Args:
         source: the file.
-        spec: of the times; a date that it has as a constant does not change with the rows.
+        spec: of the times, possibly with a constant date.
         time_s: (n,) [s].
-        ends: returns (n,) numbers of the ends of each row; a file may hold one after the other.
+        ends: returns a label (n,) of each row's device and receiver, within which times ascend.
 
     Returns:
-        the times (n,), a day later after each midnight under a fixed date; and a note, or `""`.
+        the times (n,) [s], and a note, or `""`.
     """
     known = np.flatnonzero(np.isfinite(time_s))
     step_s = np.diff(time_s[known])
@@ -141,10 +141,7 @@ def _clock(duration_s: float) -> str:
 
 
 def calendar_days(time_s: np.ndarray, zone: str | None) -> np.ndarray:
-    """Convert times (n,) [s] to dates in a time zone, such as `2022-04-25`; `""` where unknown.
-
-    The zone is one of the IANA; None for UTC.
-    """
+    """Convert times (n,) [s] to dates such as `2022-04-25` in an IANA time zone (None: UTC)."""
     days = np.empty(len(time_s), dtype=object)
     for start in range(0, len(time_s), _ROWS_AT_ONCE):
         rows = slice(start, start + _ROWS_AT_ONCE)
@@ -168,7 +165,7 @@ def _check_zone(zone: str) -> None:
 
 
 def _parse(source: Source, spec: str, text: pd.Series, time_format: str) -> pd.Series:
-    """Return time stamps, with a zone where the texts carry offsets."""
+    """Parse texts as time stamps, with a zone if the texts have offsets from UTC."""
     iso = time_format == ISO
     if not iso and "%" not in time_format:
         raise BadInput(f"time_format {time_format!r} is unknown; {ALLOWED}")
@@ -201,7 +198,7 @@ def _parse(source: Source, spec: str, text: pd.Series, time_format: str) -> pd.S
 
 
 def _plausible(source: Source, spec: str, text: pd.Series, time_s: np.ndarray) -> np.ndarray:
-    """Return `time_s` if all of it lies within `YEARS`."""
+    """Return times (n,) [s]; BadInput if one is outside `YEARS`."""
     year = 1970 + time_s / SECONDS_PER_YEAR
     source.refuse(spec, text, (year < YEARS[0]) | (year > YEARS[1]),
                   f"lies outside of the years {YEARS[0]} to {YEARS[1]}; is time_format right "
@@ -211,7 +208,7 @@ def _plausible(source: Source, spec: str, text: pd.Series, time_s: np.ndarray) -
 
 def _localize(source: Source, spec: str, text: pd.Series, parsed: pd.Series,
               zone: str) -> pd.Series:
-    """Add the zone to local times; refuse times that the clocks skipped or showed twice."""
+    """Add a zone to local times; BadInput on a time that was skipped or occurred twice."""
     known = parsed.notna()
     local = parsed.dt.tz_localize(zone, ambiguous="NaT", nonexistent="shift_forward")
     source.refuse(spec, text, known & local.isna(),
@@ -223,22 +220,22 @@ def _localize(source: Source, spec: str, text: pd.Series, parsed: pd.Series,
 
 
 def clock_notes(links: pd.DataFrame) -> list[str]:
-    """Return notes on receivers whose times put them at two places at once."""
+    """Note receivers that would be at two places at once by their times."""
     if "time_s" not in links:
         return []
     notes = []
     columns = ["time_s", "flight", "receiver_x_m", "receiver_y_m"]
-    for receiver, own in links.groupby("receiver", sort=False)[columns]:
-        own = own.dropna().drop_duplicates(columns[0:1] + columns[2:]).sort_values("time_s",
-                                                                                 kind="stable")
-        step_s = np.diff(own["time_s"].to_numpy())
-        between_s = step_s + _resolution_s(own["time_s"].to_numpy())
-        step_m = np.linalg.norm(np.diff(own[columns[2:]].to_numpy(), axis=0), axis=1)
+    for receiver, track in links.groupby("receiver", sort=False)[columns]:
+        track = track.dropna().drop_duplicates(columns[0:1] + columns[2:])
+        track = track.sort_values("time_s", kind="stable")
+        step_s = np.diff(track["time_s"].to_numpy())
+        between_s = step_s + _resolution_s(track["time_s"].to_numpy())
+        step_m = np.linalg.norm(np.diff(track[columns[2:]].to_numpy(), axis=0), axis=1)
         near = step_s <= NEAR_S
         apart = near & (step_m > ELSEWHERE_M + FAST_M_S * between_s)
         if apart.sum() < max(MIN_PAIRS, MIN_SHARE * near.sum()):
             continue
-        flight = own["flight"].to_numpy()
+        flight = track["flight"].to_numpy()
         at = np.flatnonzero(apart)
         others = at[flight[at] != flight[at + 1]]
         if len(others) > len(at) / 2:
@@ -256,17 +253,20 @@ def clock_notes(links: pd.DataFrame) -> list[str]:
 
 
 def _resolution_s(time_s: np.ndarray) -> float:
-    """Return the unit that times (n,) are cut to [s]: 1 or 60, else 0."""
+    """Return the resolution [s] of rounded times (n,): 60 or 1, else 0."""
     return next((unit_s for unit_s in (60.0, 1.0) if not np.any(time_s % unit_s)), 0.0)
 
 
 def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
-    """Convert lengths (n,) in a unit of `METRES` to metres; `column` is for the message.
+    """Convert lengths (n,) to metres.
 
-    Where none is declared, the name of the column may end in it: `alt_m`, `Height (ft)`.
+    Args:
+        numbers: (n,) lengths.
+        unit: in `METRES`; None: from the end of the column's name: `alt_m`, `Height (ft)`.
+        column: for the message.
 
     Raises:
-        BadInput: the unit is not declared.
+        BadInput: the unit is unknown.
     """
     if unit is None and (named := _UNIT_IN_NAME.search(column)):
         unit = "ft" if named[1].lower().startswith("f") else "m"
@@ -280,9 +280,12 @@ def in_metres(numbers: np.ndarray, unit: str | None, column: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Levels:
-    """Levels (n,) of one column, and which of them were not measured, or are outside `POSSIBLE_DB`.
+    """Levels of one column.
 
-    A level [dBm, or dB for gains] that is NaN was not detected, or cannot be used.
+    Attributes:
+        db: (n,) level [dBm, or dB for gains]; NaN: not detected, not measured, or impossible.
+        not_measured: (n,) bool.
+        impossible: (n,) bool, outside `POSSIBLE_DB`.
     """
 
     db: np.ndarray
@@ -292,16 +295,16 @@ class Levels:
 
 def read_levels(source: Source, spec: str, settings: Settings,
                 offset_db: float | np.ndarray = 0.0) -> Levels:
-    """Read the levels of one column; the offset is added to each, or (n,) to each its own.
+    """Read the levels of one column, and add an offset [dB], one for all or (n,).
 
     Raises:
-        BadInput: the unit is not declared, a cell is not a number, or empty cells have no declared
-            meaning.
+        BadInput: the unit is not declared, a cell is not a number, or the meaning of empty cells is
+            not declared.
     """
     cells = source.cells(spec, "level")
     text = as_text(cells)
     is_text = cells.dtype.kind not in "fiu"
-    if is_text:  # the word, unlike an empty cell, is what a program wrote
+    if is_text:  # the word NaN has a meaning of its own, unlike an empty cell
         named = cells.notna() & (cells.astype(str).str.strip().str.lower() == NOT_A_NUMBER)
         text = text.mask(named, NOT_A_NUMBER)
     numbers = as_numbers(text)
@@ -335,15 +338,9 @@ def read_levels(source: Source, spec: str, settings: Settings,
 
 
 def _refuse_uncalibrated(source: Source, spec: str, db: np.ndarray, high_db: float) -> None:
-    """Refuse a column whose strongest levels would all be left out, as no receiver reads them.
+    """Raise BadInput if many levels (n,) [dB] are impossibly strong, from `high_db` on.
 
-    A code for "no reading" is one value or two, and stands apart.
-
-    Args:
-        source: the file.
-        spec: the column.
-        db: (n,) levels.
-        high_db: from which on they are impossible.
+    A code for "no reading" would be one or two values with a gap to the others.
     """
     over = np.unique(db[db >= high_db])
     share = float(np.mean(db >= high_db)) if len(db) else 0.0
@@ -361,9 +358,9 @@ def _refuse_uncalibrated(source: Source, spec: str, db: np.ndarray, high_db: flo
 
 def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str],
                is_text: bool) -> np.ndarray:
-    """Return where a cell equals one of the values, (n,) bool; texts in any case.
+    """Return which cells (n,) equal one of the values; upper and lower case are equal.
 
-    Only in a column of texts is the word NaN another value than an empty cell.
+    In a column of texts the word NaN is not an empty cell.
     """
     labels = {value.strip().lower() for value in values if isinstance(value, str)}
     labels = {label if label == NOT_A_NUMBER and is_text else
@@ -375,6 +372,7 @@ def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str],
 
 
 def _check_unit(source: Source, spec: str, numbers: np.ndarray, unit: str | None) -> None:
+    """Raise BadInput if the unit of levels is not declared."""
     if unit is None:
         values = "are all not detected"
         if len(numbers):

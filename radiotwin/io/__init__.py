@@ -1,1 +1,1 @@
-"""The way in and the way out of files: bounded sizes, checked forms, atomic writes, hashes."""
+"""Read and write files: bounded sizes, checked forms, atomic writes, content hashes."""

@@ -1,4 +1,4 @@
-"""Arrays and one text in the format of safetensors: data only, so that reading runs no code."""
+"""Arrays and one text in a safetensors file, which runs no code when it is read."""
 
 import json
 
@@ -10,16 +10,16 @@ from radiotwin.errors import BadInput
 
 
 def pack_arrays(arrays: dict[str, np.ndarray], key: str, text: str) -> bytes:
-    """Return the content of a file with arrays of numbers or booleans, and a text under a key."""
-    # One key, because safetensors writes several in an order that changes from run to run.
+    """Encode arrays of numbers or booleans, and a text under a metadata key, as safetensors."""
+    # One key only: safetensors writes several in a random order.
     return save({name: np.asarray(array, order="C") for name, array in arrays.items()}, {key: text})
 
 
 def parse_arrays(data: bytes, key: str, source: object) -> tuple[dict[str, np.ndarray], str]:
-    """Return the arrays of a file, and the text that it has under a key.
+    """Decode the arrays, and the text under a metadata key, from safetensors data.
 
     Raises:
-        BadInput: it is not whole, or not such a file; the message begins with `source`.
+        BadInput: the data is damaged, or in another format; the message begins with `source`.
     """
     try:
         arrays = load(data)

@@ -1,9 +1,9 @@
-"""Check that an HDF5 file or a Zarr folder holds plain arrays of bounded size, in itself.
+"""Check that an HDF5 file or a Zarr folder only holds plain arrays of bounded size.
 
-HDF5 files can name other files (external links, raw data, virtual datasets), call for filters that
-are loaded as plug-ins, and stand for far more values than they have bytes. So can Zarr folders, by
-links and codecs. All of that is refused by its description, before any value is read. The format of
-Zarr is version 3, https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html.
+HDF5 files can refer to other files (external links, raw data, virtual datasets), require filters
+that are loaded as plug-ins, and expand to far more values than they have bytes. Zarr folders can do
+the same by links and codecs. All of this is refused from the metadata, before any value is read.
+The Zarr format is version 3, https://zarr-specs.readthedocs.io/en/latest/v3/core/index.html.
 """
 
 import math
@@ -34,15 +34,15 @@ from radiotwin.io.inputs import parse_json, read_text
 _FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 _LAYOUTS = {h5py.h5d.COMPACT, h5py.h5d.CONTIGUOUS, h5py.h5d.CHUNKED}
 _TYPES = {h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.ENUM, h5py.h5t.STRING}
-_REFERRING = {"DIMENSION_LIST", "REFERENCE_LIST"}  # of which axis a dimension is
-_MAX_OBJECTS = 1_000  # of a file; a radio map has eight
-_MAX_CHUNK_VALUES = 2**24  # of a chunk that is larger than its array
-_MAX_INFLATED = 2**28  # bytes that one chunk may become without being tried
-_DEFLATE_RATIO = 1032  # the most that a byte can stand for
+_REFERRING = {"DIMENSION_LIST", "REFERENCE_LIST"}  # attributes that link dimensions and axes
+_MAX_OBJECTS = 1_000  # in a file; a radio map has eight
+_MAX_CHUNK_VALUES = 2**24  # in a chunk that is larger than its array
+_MAX_INFLATED = 2**28  # excess bytes of a chunk that are accepted without decompressing it
+_DEFLATE_RATIO = 1032  # highest compression ratio of deflate
 _HEAP, _HEAP_HEADER = b"GCOL", 16
 _BLOCK_BYTES = 2**22
 METADATA = "zarr.json"
-_PIECES = "c"  # folder of an array's pieces, by the default chunk key encoding
+_PIECES = "c"  # folder of an array's chunks, by the default chunk key encoding
 _FORMAT_2 = (".zgroup", ".zarray", ".zattrs", ".zmetadata")
 _ITEM_BYTES = {"bool": 1, "int8": 1, "int16": 2, "int32": 4, "int64": 8, "uint8": 1, "uint16": 2,
                "uint32": 4, "uint64": 8, "float16": 2, "float32": 4, "float64": 8}
@@ -50,8 +50,8 @@ _TEXT = "fixed_length_utf32"
 _COMPRESSORS = ("zstd", "gzip")
 _CRC_BYTES = 4
 _MAX_DIMS = 4
-_MAX_DIGITS = 9  # of the number of a piece
-_HEAD_BYTES = 18  # the longest head of a Zstandard frame
+_MAX_DIGITS = 9  # in the number of a chunk
+_HEAD_BYTES = 18  # longest header of a Zstandard frame
 _ADVICE = "a radio map is one file with plain arrays: make it again"
 _ZARR_ADVICE = ("write it again with radiotwin, or with xarray's to_zarr(…, zarr_format=3) and its "
                 "standard codecs")
@@ -62,12 +62,12 @@ def check_hdf5(file: IO[bytes], path: Path) -> None:
 
     Args:
         file: open for reading; its position changes.
-        path: of it, for messages.
+        path: of the file, for messages.
 
     Raises:
-        BadInput: it refers to another file, has groups, links, filters or types that radio maps do
-            not have, or is too large.
-        Exception: h5py's, of many classes: it is damaged, or not HDF5.
+        BadInput: the file refers to another one, has groups, links, filters or types that radio
+            maps do not have, or is too large.
+        Exception: from h5py, of many classes: the file is damaged, or not HDF5.
     """
     heap_bytes = _largest_heap(file)
     with h5py.File(file, "r") as opened:
@@ -87,7 +87,7 @@ def check_hdf5(file: IO[bytes], path: Path) -> None:
 
 
 def _check_array(array: h5py.h5d.DatasetID, path: Path, name: str, heap_bytes: int) -> None:
-    """Check where the values of an array are, in which form, and how many."""
+    """Check storage, filters, type and number of values of an HDF5 array."""
     plan, what = array.get_create_plist(), f"{path}: {name!r}"
     if plan.get_layout() not in _LAYOUTS or plan.get_external_count():
         raise BadInput(f"{what} takes its values from other files or arrays; {_ADVICE}")
@@ -115,7 +115,7 @@ def _check_array(array: h5py.h5d.DatasetID, path: Path, name: str, heap_bytes: i
 
 
 def _check_inflation(array: h5py.h5d.DatasetID, chunk_bytes: int, what: str) -> None:
-    """Check that no chunk becomes far larger than it should: HDF5 inflates it to its end."""
+    """Check that no chunk decompresses to far more than its size: HDF5 would inflate it all."""
     stored: list[tuple[tuple[int, ...], int]] = []
     array.chunk_iter(lambda info: stored.append((info.chunk_offset, info.size)))
     for offset, size in stored:
@@ -134,7 +134,7 @@ def _check_inflation(array: h5py.h5d.DatasetID, chunk_bytes: int, what: str) -> 
 
 
 def _check_attributes(owner: h5py.h5g.GroupID | h5py.h5d.DatasetID, path: Path, what: str) -> int:
-    """Check attributes by their descriptions; return how many texts of unknown length they have."""
+    """Check attributes by type and size; return the number of texts of unknown length in them."""
     count = h5py.h5a.get_num_attrs(owner)
     MAP_ATTRIBUTES.check(count, f"{path}: {what}")
     texts = size = 0
@@ -152,16 +152,16 @@ def _check_attributes(owner: h5py.h5g.GroupID | h5py.h5d.DatasetID, path: Path, 
 
 
 def _is_text(kind: h5py.h5t.TypeID) -> bool:
-    """Return whether values lie in a heap, each as long as it likes."""
+    """Return whether values are texts of variable length, which HDF5 keeps in a heap."""
     return isinstance(kind, h5py.h5t.TypeStringID) and bool(kind.is_variable_str())
 
 
 def _largest_heap(file: IO[bytes]) -> int:
-    """Return the bytes of the largest heap of a file: no text in it is longer.
+    """Return the size [bytes] of the largest heap of an HDF5 file, which bounds its texts.
 
-    HDF5 has the length of a text only after reading it. A heap begins with `GCOL`, a version, three
-    zeros and its size (HDF5 File Format Specification 3.0, III.E); chance makes the same eight
-    bytes once in 10^19.
+    HDF5 knows the length of a text only after reading it. A heap begins with `GCOL`, a version,
+    three zeros and its size (HDF5 File Format Specification 3.0, III.E); the same eight bytes occur
+    by chance once in 10^19.
     """
     file.seek(0)
     largest, tail = 0, b""
@@ -178,13 +178,13 @@ def _largest_heap(file: IO[bytes]) -> int:
 
 @dataclass(frozen=True)
 class _Array:
-    """Pieces of an array, by its description."""
+    """Chunks of a Zarr array, from its metadata."""
 
-    grid: tuple[int, ...]
-    piece_bytes: int
+    grid: tuple[int, ...]  # number of chunks along each axis
+    piece_bytes: int  # of one chunk, decompressed
     compressor: str | None
     has_crc: bool
-    missing_is_nothing: bool  # whether a piece that is not there stands for "not detected"
+    missing_is_nothing: bool  # whether a missing chunk means "not detected"
 
 
 def check_zarr(folder: Path, known: Collection[str], streamed: Budget) -> dict[str, int]:
@@ -192,15 +192,15 @@ def check_zarr(folder: Path, known: Collection[str], streamed: Budget) -> dict[s
 
     Args:
         folder: to check.
-        known: names of the arrays that may be in it.
-        streamed: limit of the values of an array of four dims, which is read in parts.
+        known: names of the arrays that are allowed.
+        streamed: budget of an array of four dimensions, which is read in parts.
 
     Returns:
-        Number of pieces that are not there, by array: they stand for the fill value.
+        array -> number of missing chunks, which have the fill value.
 
     Raises:
-        BadInput: it is no Zarr folder of format 3; it has links, arrays, codecs or types that radio
-            maps do not have; or it is too large.
+        BadInput: the folder is no Zarr of format 3; it has links, arrays, codecs or types that
+            radio maps do not have; or it is too large.
     """
     entries = _listed(folder, [METADATA, *known])
     if METADATA not in entries:
@@ -208,14 +208,12 @@ def check_zarr(folder: Path, known: Collection[str], streamed: Budget) -> dict[s
                        "… --out NAME.zarr` makes one")
     group = _metadata(folder, "group")
     MAP_ATTRIBUTES.check(len(group.get("attributes", {})), f"{folder}: its attributes")
-    missing = {}
-    for name in sorted(entries - {METADATA}):
-        missing[name] = _check_zarr_array(folder / name, streamed)
-    return missing
+    return {name: _check_zarr_array(folder / name, streamed)
+            for name in sorted(entries - {METADATA})}
 
 
 def _listed(folder: Path, allowed: Collection[str]) -> set[str]:
-    """Return the names in a folder, which must be among the allowed ones, and no links."""
+    """Return the names in a folder; BadInput if one is not allowed, or a link."""
     names = set()
     for entry in os.scandir(folder):
         if entry.name in _FORMAT_2:
@@ -235,7 +233,7 @@ def _refuse_kind(path: Path | str) -> None:
 
 
 def _metadata(folder: Path, kind: str) -> dict[str, Any]:
-    """Return the description of a group or an array."""
+    """Read and check `zarr.json` of a group or an array."""
     path = folder / METADATA
     found = parse_json(read_text(path, "description of a Zarr map", SETTINGS_BYTES), path,
                        allow_nan=True)
@@ -247,7 +245,7 @@ def _metadata(folder: Path, kind: str) -> dict[str, Any]:
 
 
 def _check_zarr_array(folder: Path, streamed: Budget) -> int:
-    """Check an array; return how many of its pieces are missing."""
+    """Check a Zarr array; return the number of its missing chunks."""
     names = _listed(folder, (METADATA, _PIECES))
     described = _metadata(folder, "array")
     try:
@@ -264,6 +262,7 @@ def _check_zarr_array(folder: Path, streamed: Budget) -> int:
 
 
 def _described(folder: Path, described: dict[str, Any], streamed: Budget) -> _Array:
+    """Check the metadata of a Zarr array, and return its chunks."""
     MAP_ATTRIBUTES.check(len(described.get("attributes", {})), f"{folder}: its attributes")
     shape = _sizes(described["shape"], 0)
     if described["chunk_grid"]["name"] != "regular" or described.get("storage_transformers"):
@@ -290,13 +289,14 @@ def _described(folder: Path, described: dict[str, Any], streamed: Budget) -> _Ar
 
 
 def _sizes(values: Any, least: int) -> tuple[int, ...]:
+    """Return sizes as a tuple; ValueError unless all are integers of at least `least`."""
     if not all(type(value) is int and value >= least for value in list(values)):
         raise ValueError(f"sizes {str(values)[:60]} are not whole numbers from {least} on")
     return tuple(values)
 
 
 def _kind(folder: Path, data_type: Any) -> tuple[str, int]:
-    """Return the type of the values, and the bytes of each."""
+    """Return the name of a Zarr data type, and the bytes of one value."""
     if isinstance(data_type, str) and data_type in _ITEM_BYTES:
         return data_type, _ITEM_BYTES[data_type]
     if isinstance(data_type, dict) and data_type.get("name") == _TEXT:
@@ -307,7 +307,7 @@ def _kind(folder: Path, data_type: Any) -> tuple[str, int]:
 
 
 def _codecs(folder: Path, codecs: Any) -> tuple[str | None, bool]:
-    """Return the compressor, if any, and whether a checksum follows."""
+    """Return the compressor of a list of Zarr codecs, if any, and whether a checksum follows."""
     names = [codec["name"] for codec in codecs]
     rest = names[1:]
     compressor = rest.pop(0) if rest and rest[0] in _COMPRESSORS else None
@@ -318,7 +318,7 @@ def _codecs(folder: Path, codecs: Any) -> tuple[str | None, bool]:
 
 
 def _check_pieces(path: Path, grid: tuple[int, ...], array: _Array) -> int:
-    """Check the pieces below a path; return their number."""
+    """Check names and sizes of the chunks below a path; return their number."""
     if not grid:
         _check_piece(path, array)
         return 1
@@ -336,7 +336,7 @@ def _check_pieces(path: Path, grid: tuple[int, ...], array: _Array) -> int:
 
 
 def _check_piece(path: Path, array: _Array) -> None:
-    """Check that a piece becomes exactly as large as it must be."""
+    """Check that a chunk decompresses to exactly the size of the array's chunks."""
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with open(handle, "rb") as file:
         status = os.fstat(handle)
@@ -358,9 +358,9 @@ def _check_piece(path: Path, array: _Array) -> None:
 
 
 def _zstd_bytes(head: bytes) -> int | None:
-    """Return the size that a Zstandard frame declares, RFC 8878, section 3.1.1.1; None: none.
+    """Return the decompressed size in the header of a Zstandard frame (RFC 8878, 3.1.1.1).
 
-    The decompressor takes memory for that, and writes no more.
+    The decompressor writes no more than that. None: the header is damaged, or declares none.
     """
     if len(head) < 6 or head[:4] != b"\x28\xb5\x2f\xfd":
         return None
@@ -374,7 +374,7 @@ def _zstd_bytes(head: bytes) -> int | None:
 
 
 def _gzip_bytes(data: bytes, expected: int) -> int | None:
-    """Return the decompressed size of gzip data; None where it is damaged, or above `expected`."""
+    """Return the decompressed size of gzip data; None if it is damaged, or above `expected`."""
     inflater = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         size = len(inflater.decompress(data, expected + 1))

@@ -1,7 +1,7 @@
-"""Size limits of inputs, checked before memory is taken.
+"""Size limits of inputs, checked before memory is allocated.
 
-Files come from strangers: a few bytes can stand for gigabytes. The limits are far above what the
-tool is made for; an environment variable raises one for those who know their file.
+A few bytes of a stranger's file can expand to gigabytes. The limits are far above ordinary use; an
+environment variable raises one.
 """
 
 import os
@@ -17,9 +17,9 @@ class Budget:
 
     Attributes:
         name: of the environment variable that changes it, without `RADIOTWIN_MAX_`.
-        default: limit where that variable is not set.
+        default: limit if the variable is not set.
         unit: plural noun, for the message.
-        of: has so many of it, for the table in SECURITY.md.
+        of: the input that is limited, for the table in SECURITY.md.
     """
 
     name: str
@@ -34,11 +34,7 @@ class Budget:
 
     @property
     def limit(self) -> int:
-        """Limit now.
-
-        Raises:
-            BadInput: the variable is set, and not to a positive whole number.
-        """
+        """Present limit; BadInput if the variable is set to anything but a positive integer."""
         text = os.environ.get(self.variable)
         if text is None:
             return self.default
@@ -49,16 +45,12 @@ class Budget:
         return int(digits)
 
     def check(self, amount: float, subject: object) -> None:
-        """Check an amount, as large as it is, or would get.
-
-        Raises:
-            BadInput: it is above the limit; the message begins with the subject, such as a path.
-        """
+        """Raise BadInput if an amount is above the limit; the message begins with the subject."""
         if amount > self.limit:
             self.refuse(subject, f"{amount:,.0f} {self.unit}")
 
     def refuse(self, subject: object, amount: str) -> NoReturn:
-        """Raise the message, BadInput, of a subject's amount, such as `more than 3 rows`."""
+        """Raise BadInput about a subject, such as a path, and an amount, such as `3 rows`."""
         raise BadInput(f"{subject}: {amount}; at most {self.limit:,} are read; if it is meant to "
                        f"be so large, set {self.variable} to a larger number")
 

@@ -1,7 +1,7 @@
-"""Tables in files: the cells of .csv, .csv.gz and .parquet, and the tables of a run's folder.
+"""Read and write tables: .csv, .csv.gz and .parquet, and the tables in a run's folder.
 
-Cells are text from CSV, whose rows are first checked to have as many fields as the header, and
-typed columns from Parquet.
+CSV gives cells as texts, after a check that every row has as many fields as the header; Parquet
+gives typed columns.
 """
 
 import csv
@@ -21,15 +21,15 @@ from radiotwin.errors import BadInput, optional_package
 from radiotwin.io.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS, TABLE_BYTES
 from radiotwin.io.forms import MAX_NUMBER, MAX_POSITION_M
 from radiotwin.io.inputs import open_gzip, open_input
-from radiotwin.io.texts import unquoted, with_quotes, without_quotes
+from radiotwin.io.texts import escape_formulas, unescape_formula, unescape_formulas
 
-_BLOCK_BYTES = 2**20  # that are checked at a time
+_BLOCK_BYTES = 2**20  # that are checked at once
 _WHAT = "table (.csv, .csv.gz, .parquet)"
-_CHUNK_CELLS = 2_000_000  # that are parsed at a time
-_NUMBERS_AT_ONCE = 1_000_000  # pandas makes an object of each
-_MAX_DIGITS = 1000  # of a number
-_CELL_BYTES = 8  # of a number, of the place of a text
-_PARQUET_ROWS, _NESTED_ROWS = 2**17, 2**10  # that are decoded at a time
+_CHUNK_CELLS = 2_000_000  # that are parsed at once
+_NUMBERS_AT_ONCE = 1_000_000  # converted at once: pandas makes an object of each
+_MAX_DIGITS = 1000  # in a number
+_CELL_BYTES = 8  # of a number, or of a reference to a text
+_PARQUET_ROWS, _NESTED_ROWS = 2**17, 2**10  # that are decoded at once
 _SHOWN_CHARACTERS, _SHOWN_COLUMNS = 80, 50  # of a cell, and of a table, in a message
 _SIGNS = re.compile("(?:^|(?<=[eE]))[\u2212\u2010-\u2014\ufe63\uff0d]")
 POSITION = ("x_m", "y_m", "z_m")
@@ -42,24 +42,22 @@ RESIDUALS = {
     "before_db": "number or nothing", "after_db": "number or nothing"}
 PLANNING = {"method": "text", "trained_in": "text", "real_episodes": "number",
             "truth_ratio": "number"}
-"""Column -> kind of its cells; the columns that a table must have."""
-
-
+"""Required columns of the tables in a run's folder -> kind of their cells."""
 EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
 """Texts, in lower case, of cells without a value."""
 
 
 class RaggedRows(BadInput):
-    """A row with another number of fields than the header."""
+    """Raised for a row with another number of fields than the header."""
 
 
 class CsvLayout:
-    """Checks that every row of a CSV file has as many fields as its header.
+    """Check that every row of a CSV file has as many fields as its header.
 
     Attributes:
         header: names of the columns.
-        rows: with the header, without blank lines.
-        has_apostrophes: whether there is any.
+        rows: number of rows with the header, without blank lines.
+        has_apostrophes: whether the file has any apostrophe.
     """
 
     def __init__(self, path: Path) -> None:
@@ -69,10 +67,9 @@ class CsvLayout:
         self.has_apostrophes = False
 
     def check(self, file: IO[bytes]) -> None:
-        """Check all rows of a file; count separators as long as there are no quotation marks.
+        """Check all rows of a file; BadInput names the first bad one.
 
-        Raises:
-            BadInput: names the row.
+        Separators are counted, which is fast, up to the first quotation mark.
         """
         blocks = self._blocks(file)
         for block in blocks:
@@ -85,7 +82,7 @@ class CsvLayout:
                            "columns")
 
     def _blocks(self, file: IO[bytes]) -> Iterator[bytes]:
-        """Yield whole lines, checked to be text."""
+        """Yield blocks of complete lines of UTF-8 text."""
         rest = file.read(3).removeprefix(b"\xef\xbb\xbf")
         while data := file.read(_BLOCK_BYTES):
             whole, newline, rest_of_data = data.rpartition(b"\n")
@@ -101,6 +98,7 @@ class CsvLayout:
             yield self._checked(rest)
 
     def _checked(self, block: bytes) -> bytes:
+        """Return a block if it is UTF-8 text without null characters; note apostrophes."""
         block.decode()
         if b"\0" in block:
             raise BadInput(f"{self._path} is not text in UTF-8 (it has null characters); allowed "
@@ -109,6 +107,7 @@ class CsvLayout:
         return block
 
     def _count_separators(self, block: bytes) -> None:
+        """Check rows without quotation marks by the number of their commas."""
         if not self.header:
             line, _, block = block.lstrip(b"\r\n").partition(b"\n")
             COLUMNS.check(line.count(b",") + 1, f"{self._path}: row 1")
@@ -132,7 +131,7 @@ class CsvLayout:
         self._add(len(fields))
 
     def _check_fields(self, blocks: Iterable[bytes]) -> None:
-        """Check rows that may have fields in quotation marks, or lines that end in any way."""
+        """Check rows with quotation marks, or with line ends of any kind."""
         lines = (line for block in blocks
                  for line in re.findall(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+$", block.decode()))
         try:
@@ -149,7 +148,7 @@ class CsvLayout:
                            "closed?") from None
 
     def _begin(self, header: list[str]) -> None:
-        self.header, self.rows = [unquoted(name.strip()) for name in header], 1
+        self.header, self.rows = [unescape_formula(name.strip()) for name in header], 1
         if len(header) == 1 and not self.header[0].isidentifier():
             raise BadInput(f"{self._path}: its header {self.header[0][:60]!r} is one single "
                            "column; allowed is comma-separated, UTF-8")
@@ -167,17 +166,17 @@ class CsvLayout:
 def read_cells(path: Path, required: Collection[str] = (),
                optional: Collection[str] | None = None,
                binary: Collection[str] = ()) -> pd.DataFrame:
-    """Read the cells of a table as they are.
+    """Read the cells of a table without converting them.
 
     Args:
-        path: `.csv`, `.csv.gz` or `.parquet`, in any case.
-        required: columns that it must have.
-        optional: other columns that are read; None for all.
-        binary: columns of Parquet whose bytes are no text; those of others have to be UTF-8.
+        path: `.csv`, `.csv.gz` or `.parquet`, in upper or lower case.
+        required: columns that the table must have.
+        optional: further columns to read; None: all.
+        binary: columns of Parquet with binary data; bytes in other columns must be UTF-8.
 
     Returns:
-        columns of texts (`""` where empty) from CSV, typed columns from Parquet; rows are numbered
-        from 0 in the order of the file.
+        columns of texts (`""`: empty) from CSV, typed columns from Parquet; rows are numbered from
+        0 in the order of the file.
 
     Raises:
         BadInput: no such file, unreadable, too large, no header, a missing or repeated column, or a
@@ -198,7 +197,7 @@ def read_cells(path: Path, required: Collection[str] = (),
 
 
 def column_names(path: Path) -> list[str]:
-    """Return the names of all columns of a table that `read_cells` reads."""
+    """Read the names of all columns of a table, see `read_cells`."""
     if path.suffix.lower() == ".parquet":
         from pyarrow.parquet import ParquetFile
 
@@ -207,23 +206,23 @@ def column_names(path: Path) -> list[str]:
     with open_gzip(path, _WHAT) as file, \
             io.TextIOWrapper(file, "utf-8-sig", newline="") as text:
         first = next(filter(None, csv.reader(text, skipinitialspace=True)))
-    return [unquoted(name.strip()) for name in first]
+    return [unescape_formula(name.strip()) for name in first]
 
 
 def write_csv(table: pd.DataFrame, target: Path | IO[bytes], float_format: str | None = None,
               header: bool = True) -> None:
     """Write a table, without its index, as CSV in which a spreadsheet finds no formula.
 
-    A text that begins as a formula does, and is not a number, gets an apostrophe in front, which
-    `read_cells` takes off again, as it does where a text has apostrophes and then such a beginning.
+    A text that begins like a formula, and is not a number, gets a leading apostrophe, which
+    `read_cells` removes again.
 
     Args:
         table: any columns.
         target: temporary path from `radiotwin.io.files`, compressed if it ends in `.gz`; or a file.
-        float_format: such as `%.4f`; all digits by default.
+        float_format: such as `%.4f`; by default all digits.
         header: whether to write the names of the columns.
     """
-    table = with_quotes(table)
+    table = escape_formulas(table)
     if not isinstance(target, Path) or target.suffix.lower() != ".gz":
         table.to_csv(target, index=False, float_format=float_format, header=header)
         return
@@ -233,7 +232,7 @@ def write_csv(table: pd.DataFrame, target: Path | IO[bytes], float_format: str |
 
 
 def check_suffix(path: Path) -> None:
-    """Raise BadInput unless a table has a suffix of a format that is read and written."""
+    """Raise BadInput unless a path ends in .csv, .csv.gz or .parquet, in upper or lower case."""
     name = PurePath(path.name.lower())  # some loggers write A.CSV
     if name.suffix not in (".csv", ".parquet") and name.suffixes[-2:] != [".csv", ".gz"]:
         raise BadInput(f"{path}: unknown format; allowed are .csv, .csv.gz and .parquet")
@@ -247,30 +246,27 @@ def require_pyarrow(path: Path) -> None:
 
 def refuse(path: Path | str, name: str, column: pd.Series, bad: ArrayLike, reason: str,
            where: Callable[[int], str] = lambda index: f"row {index + 2}") -> None:
-    """Raise BadInput about the first bad cell of a column, if there is one.
+    """Raise BadInput about the first bad cell of a column, if any; it names file, row and column.
 
     Args:
         path: of the table.
         name: of the column.
-        column: its cells, (n,).
+        column: (n,) cells.
         bad: (n,) bool.
         reason: end of the message, after the cell's text.
         where: number of a row -> its place in the file; by default row 1 is the header.
-
-    Raises:
-        BadInput: names file, row and column.
     """
     rows = np.flatnonzero(np.asarray(bad, dtype=bool))
     if len(rows):
         more = f" ({len(rows)} such rows)" if len(rows) > 1 else ""
         raise BadInput(f"{path}: {where(int(rows[0]))}, column {name}: "
-                       f"{shown(column.iloc[rows[0]])} {reason}{more}")
+                       f"{cell_text(column.iloc[rows[0]])} {reason}{more}")
 
 
 def as_numbers(text: pd.Series) -> np.ndarray:
-    """Convert texts (n,) without spaces around to numbers; NaN where one is none, or empty.
+    """Convert stripped texts (n,) to numbers; NaN if a text is empty or no number.
 
-    A number may have one of the minus signs and dashes of Unicode, as word processors set them.
+    Unicode minus signs and dashes, as set by word processors, count as `-`.
     """
     numbers = np.empty(len(text))
     for start in range(0, len(text), _NUMBERS_AT_ONCE):
@@ -289,10 +285,7 @@ def as_numbers(text: pd.Series) -> np.ndarray:
 
 
 def as_text(cells: pd.Series) -> pd.Series:
-    """Convert cells (n,) of any type to stripped texts.
-
-    `""` stands for every spelling of an empty cell; whole numbers have no point.
-    """
+    """Convert cells (n,) of any type to stripped texts; whole numbers get no point, NaN is `""`."""
     if cells.dtype.kind == "f":
         whole = (cells == cells.round()) & (cells.abs() < 2.0**53)  # exact in double precision
         if (cells.isna() | whole).all():  # an integer column with gaps
@@ -301,14 +294,14 @@ def as_text(cells: pd.Series) -> pd.Series:
     return text.mask(cells.isna() | text.str.lower().isin(EMPTY), "")
 
 
-def shown(cell: object) -> str:
-    """Return the text of a cell in quotation marks for a message, cut where it is long."""
+def cell_text(cell: object) -> str:
+    """Return a cell in quotation marks for a message; a long text is cut."""
     text = str(cell)
     return repr(text) if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]!r}…"
 
 
 def listed(names: Iterable[object]) -> str:
-    """Return the names of columns for a message, the first ones where there are many."""
+    """Join names of columns for a message; only the first ones of many."""
     texts = [str(name)[:_SHOWN_CHARACTERS] for name in names]
     more = f", … ({len(texts):,} columns)" if len(texts) > _SHOWN_COLUMNS else ""
     return ", ".join(texts[:_SHOWN_COLUMNS]) + more
@@ -316,11 +309,11 @@ def listed(names: Iterable[object]) -> str:
 
 def _selected(path: Path, names: list[str], required: Collection[str],
               optional: Collection[str] | None) -> list[str]:
-    """Check the names of all columns; return those that are to be read, in their order."""
+    """Check the names of all columns, and return those to read, in their order."""
     repeated = pd.Index(names, dtype=object).duplicated()
     if repeated.any():
         name = names[int(np.argmax(repeated))]
-        raise BadInput(f"{path}: row 1: column {shown(name)} occurs twice; every name must be "
+        raise BadInput(f"{path}: row 1: column {cell_text(name)} occurs twice; every name must be "
                        "unique")
     missing = [name for name in required if name not in names]
     if missing:
@@ -331,11 +324,10 @@ def _selected(path: Path, names: list[str], required: Collection[str],
 
 def _read_parquet(path: Path, required: Collection[str], optional: Collection[str] | None,
                   binary: Collection[str]) -> pd.DataFrame:
-    """Read Parquet without the index that pandas may have saved.
+    """Read Parquet as a table with rows numbered from 0.
 
-    A table that was filtered or sorted before it was saved would keep its old row labels; messages
-    count rows. It is decoded in batches, whose texts count before they are written out: a
-    dictionary can stand for far more than it takes in the file.
+    An index that pandas saved is ignored, since messages count rows. Texts are measured in batches
+    before they are decoded: a dictionary can expand to far more than its size in the file.
     """
     require_pyarrow(path)
     import pyarrow
@@ -374,12 +366,9 @@ def _read_parquet(path: Path, required: Collection[str], optional: Collection[st
 
 
 def _text_of(path: Path, name: str, column: Any) -> Any:
-    """Return a column of texts, or of bytes, as texts, which a file may call what is none.
+    """Convert an Arrow column of texts or bytes to texts; BadInput names a row that is not UTF-8.
 
-    Where none of the bytes is a text, as of UUIDs and geometries, it is their hexadecimal digits.
-
-    Raises:
-        BadInput: a text is not UTF-8; names the row.
+    A column of bytes without any text, such as UUIDs, becomes hexadecimal digits.
     """
     import pyarrow
     from pyarrow import types
@@ -405,7 +394,7 @@ def _text_of(path: Path, name: str, column: Any) -> Any:
 
 
 def _is_text(kind: Any) -> bool:
-    """Return whether cells of an Arrow type are texts, or bytes that may be one."""
+    """Return whether an Arrow type is one of texts, or of bytes that may be texts."""
     from pyarrow import types
 
     return any(is_kind(kind) for is_kind in (
@@ -431,9 +420,9 @@ def _decoded_bytes(column: Any) -> int:
 
 def _read_csv(path: Path, required: Collection[str],
               optional: Collection[str] | None) -> pd.DataFrame:
-    """Read cells of a CSV file as text.
+    """Read the cells of a CSV file as texts.
 
-    The fields are counted first: pandas fills short rows with blanks, and a blank level means "not
+    Fields are counted first: pandas would fill short rows with blanks, and a blank level means "not
     detected".
     """
     with open_gzip(path, _WHAT) as file:
@@ -444,21 +433,21 @@ def _read_csv(path: Path, required: Collection[str],
             pd.read_csv(file, dtype=str, keep_default_na=False, skipinitialspace=True, header=0,
                         names=layout.header, usecols=names, index_col=False, encoding="utf-8",
                         chunksize=max(_CHUNK_CELLS // len(layout.header), 1)) as reader:
-        chunks = [without_quotes(chunk) if layout.has_apostrophes else chunk for chunk in reader]
+        chunks = [unescape_formulas(chunk) if layout.has_apostrophes else chunk for chunk in reader]
     return pd.concat(chunks, ignore_index=True)
 
 
 def read_table(path: Path, kinds: dict[str, str], optional: dict[str, str] | None = None,
                ) -> pd.DataFrame:
-    """Read columns of a table that a run holds.
+    """Read columns of a table in a run's folder.
 
     Args:
         path: `.csv` or `.csv.gz`.
         kinds: column -> `text`, `number`, `number or nothing` (NaN), or `0 or 1`.
-        optional: the same, of columns that may be missing.
+        optional: the same for columns that may be missing.
 
     Raises:
-        BadInput: it cannot be read, a column is missing, or a cell is of another kind.
+        BadInput: the file cannot be read, a column is missing, or a cell is of another kind.
     """
     cells = read_cells(path)
     missing = [name for name in kinds if name not in cells]
@@ -471,11 +460,12 @@ def read_table(path: Path, kinds: dict[str, str], optional: dict[str, str] | Non
 
 
 def _numbers(path: Path, name: str, column: pd.Series, kind: str) -> pd.Series:
+    """Convert texts of a kind, see `read_table`, to numbers; BadInput on any other text."""
     numbers = pd.to_numeric(column, errors="coerce").astype(float)
     nothing = column.str.strip().isin(["", "nan"]) & (kind == "number or nothing")
-    most = MAX_POSITION_M if name.endswith("_m") else MAX_NUMBER
-    refuse(path, name, column, ~nothing & ~(np.abs(numbers) <= most),
-           f"is not a number within ±{most:g}; make the run again")
+    largest = MAX_POSITION_M if name.endswith("_m") else MAX_NUMBER
+    refuse(path, name, column, ~nothing & ~(np.abs(numbers) <= largest),
+           f"is not a number within ±{largest:g}; make the run again")
     if kind == "0 or 1":
         refuse(path, name, column, ~numbers.isin([0.0, 1.0]), "is neither 0 nor 1; make the run "
                                                               "again")

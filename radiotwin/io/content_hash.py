@@ -1,4 +1,4 @@
-"""Hash of values by their content, the same in every process and on every machine."""
+"""Hash values by their content, equally in every process and on every machine."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ HASH_BYTES = 20
 
 
 class Unhashable(TypeError):
-    """A value whose content cannot be told, such as an object of another package."""
+    """Raised for a value without a known content, such as an object of another package."""
 
 
 _hashed: WeakKeyDictionary[Any, bytes] = WeakKeyDictionary()
 
 
 def content_hash(value: Any) -> str:
-    """Return a hash of a value.
+    """Return the BLAKE2b hash of a value's content, in hexadecimal digits.
 
-    It may consist of numbers, texts, bytes, None, arrays, tuples, lists, sets, dictionaries, and
-    objects of classes of this package: pydantic models, dataclasses by their fields, others by
-    their `state()`, or else by their attributes. The hash of an object that cannot change (a frozen
-    dataclass, or a class with `never_changes`) is remembered.
+    A value is a number, text, bytes, None, array, tuple, list, set, dictionary, or an object of
+    this package: pydantic models and dataclasses count by their fields, others by `state()` or
+    their attributes. The hash of an immutable object (a frozen dataclass, or a class with
+    `never_changes`) is cached.
 
     Raises:
-        Unhashable: something else.
+        Unhashable: a part of the value is anything else.
     """
     digest = hashlib.blake2b(digest_size=HASH_BYTES)
     _add(digest, value)
@@ -38,7 +38,7 @@ def content_hash(value: Any) -> str:
 
 
 def _add(digest: Any, value: Any) -> None:
-    """Add a value: a letter for its kind, its length, its content."""
+    """Add a value to a hash: a letter for its kind, its length, its content."""
     if value is None or isinstance(value, bool | np.bool_):
         digest.update(f"b{value}".encode())
     elif isinstance(value, np.ndarray):
@@ -70,7 +70,7 @@ def _add(digest: Any, value: Any) -> None:
     elif isinstance(value, type):
         _add_class(digest, value)
     else:
-        digest.update(_of_object(value))
+        digest.update(_object_hash(value))
 
 
 def _add_bytes(digest: Any, kind: bytes, data: bytes) -> None:
@@ -78,19 +78,19 @@ def _add_bytes(digest: Any, kind: bytes, data: bytes) -> None:
 
 
 def _add_class(digest: Any, kind: type) -> None:
-    # The sources of other packages are not known, so neither is what their classes do.
+    # A class of another package may change with its version.
     if kind.__module__.partition(".")[0] != "radiotwin":
         raise Unhashable(f"{kind.__module__}.{kind.__qualname__}")
     _add_bytes(digest, b"c", f"{kind.__module__}.{kind.__qualname__}".encode())
 
 
-def _of_object(value: Any) -> bytes:
-    """Return the hash of an object; that of one that cannot change is remembered."""
+def _object_hash(value: Any) -> bytes:
+    """Return the hash of an object of this package; cached if it is immutable."""
     kind = type(value)
     parameters = getattr(kind, "__dataclass_params__", None)
-    remembered = kind.__hash__ is object.__hash__ and (
+    is_immutable = kind.__hash__ is object.__hash__ and (
         getattr(kind, "never_changes", False) or (parameters is not None and parameters.frozen))
-    if remembered and value in _hashed:
+    if is_immutable and value in _hashed:
         return _hashed[value]
     digest = hashlib.blake2b(digest_size=HASH_BYTES)
     _add_class(digest, kind)
@@ -103,6 +103,6 @@ def _of_object(value: Any) -> bytes:
         _add(digest, value.state())
     else:
         _add(digest, vars(value))
-    if remembered:
+    if is_immutable:
         _hashed[value] = digest.digest()
     return digest.digest()

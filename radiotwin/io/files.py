@@ -1,8 +1,7 @@
-"""Atomic output: files and folders are written under a temporary name, flushed, then renamed.
+"""Atomic output: files and folders are written to a temporary folder, flushed, then renamed.
 
-A temporary name is a folder `.radiotwin-????????` beside the output. A killed run leaves it; the
-next one that writes there removes it. It is locked while its process lives, so that none in use is
-taken away. (Files are not locked: HDF5 locks those that it writes itself.)
+The temporary folder `.radiotwin-????????` is beside the output, and locked while its process lives.
+A killed run leaves it behind; the next run that writes there removes it.
 """
 
 import errno
@@ -34,7 +33,7 @@ _TEMPORARY = re.compile(r"\.radiotwin-[a-z0-9_]{8}(?P<aside>-aside)?")
 
 
 def is_temporary(path: Path) -> bool:
-    """Return whether a path has the name of a temporary, which a killed process may have left."""
+    """Return whether a path has the name of a temporary folder."""
     return _TEMPORARY.fullmatch(path.name) is not None
 
 
@@ -64,15 +63,15 @@ def require_suffix(path: Path | str, *allowed: str) -> None:
 
 @contextmanager
 def atomic_path(path: Path | str, flush: bool = True) -> Iterator[Path]:
-    """Write a file atomically, by code that raises OSError where a write or a close fails.
+    """Write a file atomically with code that takes a path and raises OSError if a write fails.
 
     Args:
         path: of the file; missing folders are made.
-        flush: wait for the disk; without, a power failure may leave a damaged file.
+        flush: wait for the disk; without this, a power failure may leave a damaged file.
 
     Yields:
-        a temporary path with the same name in a folder beside `path`; it is flushed to the disk
-        and renamed to `path` on success and removed on failure.
+        a temporary path with the same file name. It is flushed and renamed to `path` on success,
+        and removed on failure.
 
     Raises:
         BadInput: the folder cannot be made or written, or `path` is not an ordinary file.
@@ -93,19 +92,18 @@ def atomic_path(path: Path | str, flush: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[bytes]]:
-    """Write a file atomically, by code that takes an open file.
+    """Write a file atomically with code that takes an open file.
 
     Args:
         path: of the file; missing folders are made.
-        hide_errors: keep the first error of a write until the end, for libraries that crash or
-            swallow it (HDF5); all that is written after it is kept in memory, and lost.
+        hide_errors: raise the first error of a write at the end only, for libraries that crash on
+            it or swallow it (HDF5); until then, further writes go to memory.
 
     Yields:
         binary file, open for reading and writing.
 
     Raises:
-        BadInput: as `atomic_path`.
-        RunFailed: as `atomic_path`.
+        BadInput, RunFailed: see `atomic_path`.
     """
     with atomic_path(path) as temporary:
         if not hide_errors:
@@ -116,23 +114,23 @@ def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[byte
         try:
             with kept:
                 yield kept  # type: ignore[misc]  # a raw file
-        finally:  # what the library made of the lost bytes matters less than why they were lost
+        finally:  # the first error is the cause, whatever the library raised after it
             if kept.error is not None:
                 raise kept.error
 
 
 @contextmanager
 def atomic_folder(path: Path | str, names: Collection[str] | None = None) -> Iterator[Path]:
-    """Write a folder atomically: all that it gets is written elsewhere, flushed, and moved in.
+    """Write a folder atomically.
 
     Args:
         path: of the folder; missing parents are made.
-        names: of the files and folders that it gets, as patterns such as `effect_*.png`: what an
-            older folder holds under other names stays in it. None: the older folder is replaced.
+        names: patterns, such as `effect_*.png`, of the files and folders that are replaced; others
+            in an older folder stay. None: the older folder is replaced as a whole.
 
     Yields:
-        an empty temporary folder, whose content replaces that of `path` on success; it is removed
-        on failure.
+        an empty temporary folder. Its content is moved to `path` on success, and removed on
+        failure.
 
     Raises:
         BadInput: the folder cannot be written, or `path` is a file.
@@ -153,18 +151,16 @@ def atomic_folder(path: Path | str, names: Collection[str] | None = None) -> Ite
 
 def require_folder(path: Path | str, names: Collection[str], mark: str | None = None,
                    keep_others: bool = False) -> None:
-    """Check that a folder can be written without loss of what others put in it.
-
-    Call it before long work.
+    """Check that a folder can be written without loss of foreign files; call it before long work.
 
     Args:
         path: of the folder.
-        names: of all that an earlier run may have written, as patterns such as `effect_*.png`.
-        mark: name of a file that every earlier run wrote; without it, the files are others'.
-        keep_others: files of other names stay in the folder (`names` of `atomic_folder`).
+        names: patterns, such as `effect_*.png`, of everything that an earlier run may have written.
+        mark: name of a file that every earlier run wrote; if it is missing, all files are foreign.
+        keep_others: whether files of other names stay in the folder, see `atomic_folder`.
 
     Raises:
-        BadInput: the folder cannot be written, or something in it would be lost.
+        BadInput: the folder cannot be written, or a foreign file in it would be lost.
         RunFailed: the disk is full.
     """
     path = Path(path)
@@ -193,18 +189,18 @@ def require_folder(path: Path | str, names: Collection[str], mark: str | None = 
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Make a folder for files that are needed for a while; the next run removes a killed one's."""
+    """Make a temporary folder that is removed at the end, or by the next run after a kill."""
     with _temporary_folder(Path(tempfile.gettempdir()) / "scratch") as folder:
         yield folder
 
 
 class _ErrorsKept(io.RawIOBase):
-    """A file whose writes always succeed: from the first that did not they are kept in memory.
+    """A file whose writes never fail: after the first error they go to memory.
 
-    A library reads again what it wrote, and crashes where that is lost.
+    HDF5 reads back what it wrote, and crashes if that is lost.
 
     Attributes:
-        error: of the first write that did not succeed.
+        error: of the first write that failed.
     """
 
     def __init__(self, file: io.FileIO) -> None:
@@ -303,7 +299,7 @@ def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
 
 
 def _lock(name: str) -> int | None:
-    """Open and lock a folder; None if it is there no more."""
+    """Open and lock a folder; None if it does not exist any more."""
     try:
         handle = os.open(name, os.O_RDONLY)
     except FileNotFoundError:
@@ -319,7 +315,7 @@ def _lock(name: str) -> int | None:
 
 @cache  # once a folder and process: a store of batches writes thousands of files to one
 def _sweep(folder: Path) -> None:
-    """Remove the temporaries of processes that were killed."""
+    """Remove the temporary folders of killed processes from a folder."""
     if fcntl is None:
         return
     with suppress(OSError):
@@ -331,6 +327,7 @@ def _sweep(folder: Path) -> None:
 
 
 def _remove_stale(path: Path, aside: bool) -> None:
+    """Remove a temporary folder unless its process lives; `aside`: first put back what it held."""
     handle = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if its process lives
@@ -343,12 +340,9 @@ def _remove_stale(path: Path, aside: bool) -> None:
 
 
 def _remove(folder: str | Path) -> None:
-    """Remove a folder, also with folders in it that nothing may be removed from.
-
-    One that stayed would be put back where an earlier run's was, see `_remove_stale`.
-    """
+    """Remove a folder, also with write-protected folders in it."""
     shutil.rmtree(folder, ignore_errors=True)
-    for at, names, _ in os.walk(folder):  # gone, as a rule
+    for at, names, _ in os.walk(folder):  # usually it is gone
         for path in (os.path.join(at, name) for name in names):
             with suppress(OSError):
                 if not os.path.islink(path):
@@ -361,10 +355,10 @@ def _is_one_of(name: str, patterns: Collection[str]) -> bool:
 
 
 def _beside(path: Path) -> Path:
-    """Return a path whose folder is for temporaries of the folder `path`: its parent, or itself.
+    """Return a path in the folder for temporaries of the folder `path`: its parent, or itself.
 
-    The working folder, a link and a mount point (a volume of a container) cannot be renamed, nor
-    what lies in a folder without rights.
+    A working folder, a link, a mount point (a container's volume), and a folder in a
+    write-protected one cannot be renamed; then temporaries go inside.
     """
     with _reported(path):
         try:
@@ -380,7 +374,7 @@ def _beside(path: Path) -> Path:
 
 
 def _swap(new: Path, path: Path, names: Collection[str] | None) -> None:
-    """Replace the folder `path`, or the `names` in it, by what is in `new`; all or nothing."""
+    """Replace the folder `path`, or the `names` in it, by the content of `new`; all or nothing."""
     inside = _beside(path) != path
     with deferred(), _locked(path if inside else path.parent):  # another process may, too
         if not inside:
@@ -412,7 +406,7 @@ def _swap(new: Path, path: Path, names: Collection[str] | None) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Wait until no other process replaces what is in a folder; a temporary is locked already."""
+    """Lock a folder against other processes that replace its content."""
     handle = None if fcntl is None or is_temporary(folder) else _lock(str(folder))
     try:
         yield
@@ -423,7 +417,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _parent_of(path: Path, only_tried: bool = False) -> Iterator[None]:
-    """Make the folders above `path`; remove the new ones where nothing was written."""
+    """Make the folders above `path`; remove the new ones again if nothing was written."""
     written = False
     with _reported(path):
         new = [folder for folder in path.parents if not folder.exists()]
@@ -433,7 +427,7 @@ def _parent_of(path: Path, only_tried: bool = False) -> Iterator[None]:
         yield
         written = not only_tried
     finally:
-        # Not where it was written: another process may need the folder, empty or not.
+        # After a write the folders stay: another process may use them.
         for folder in () if written else new:
             with suppress(OSError):  # not empty, or never made
                 folder.rmdir()
@@ -455,7 +449,7 @@ def _reported(path: Path, only_disk: bool = False) -> Iterator[None]:
 
 
 def _flush(path: Path) -> None:
-    """Have the system write a file to the disk, which may fail only now."""
+    """Flush a file to the disk."""
     handle = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
     try:
         os.fsync(handle)
@@ -464,13 +458,14 @@ def _flush(path: Path) -> None:
 
 
 def _flush_all(paths: list[Path]) -> None:
-    """Flush files side by side: thousands one after the other wait for the disk each."""
+    """Flush files in parallel, since each waits for the disk."""
     with ThreadPoolExecutor(min(_FLUSHED_AT_ONCE, max(len(paths), 1))) as pool:
         for _ in pool.map(_flush, paths):
             pass
 
 
 def _refuse_folder(path: Path) -> None:
+    """Raise BadInput if `path` is a folder or a special file."""
     with _reported(path):
         try:
             mode = path.stat().st_mode  # once: another process may write or remove it meanwhile

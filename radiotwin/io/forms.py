@@ -1,4 +1,4 @@
-"""Forms of TOML and JSON files: each field has its type before anything uses it."""
+"""Check the fields of TOML and JSON files against schemas before anything uses them."""
 
 import re
 from collections.abc import Sequence
@@ -58,12 +58,12 @@ class Origin(Table):
 
 
 def as_origin(value: Origin | Sequence[float] | None) -> Origin | None:
-    """Return the origin of a frame from (latitude, longitude) [degrees] and maybe its altitude [m].
+    """Convert (latitude, longitude) [deg], or these and an altitude [m], to an origin.
 
-    An origin, and None, are returned as they are.
+    An origin, and None, are returned unchanged.
 
     Raises:
-        BadInput: not two or three numbers, or a place that is not on the earth.
+        BadInput: not two or three numbers, or no place on the earth.
     """
     if value is None or isinstance(value, Origin):
         return value
@@ -78,7 +78,7 @@ def as_origin(value: Origin | Sequence[float] | None) -> Origin | None:
 
 
 class Record(BaseModel):
-    """Part of a record; fields that it does not name are dropped, so that all are checked."""
+    """Base of schemas for JSON records; unknown fields are dropped, so that all are checked."""
 
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 
@@ -103,11 +103,7 @@ Whole = Annotated[int, PlainValidator(_whole)]
 
 
 def read_record(path: Path | str, what: str) -> dict[str, Any]:
-    """Read a JSON object within the limits of size, entries and nesting.
-
-    Raises:
-        BadInput: it cannot be read, it is not JSON or no object, or it is too large.
-    """
+    """Read a JSON object; BadInput if it is no JSON object, or too large or too deeply nested."""
     record = parse_json(read_text(path, what, RECORD_BYTES), path)
     if not isinstance(record, dict):
         raise BadInput(f"{path} is no JSON object; make the run again")
@@ -116,11 +112,7 @@ def read_record(path: Path | str, what: str) -> dict[str, Any]:
 
 
 def check_size(record: object, source: object) -> None:
-    """Check the number of entries of each list and object of JSON, and how deep they are nested.
-
-    Raises:
-        BadInput: too many, or too deep; the message begins with `source`.
-    """
+    """Raise BadInput if a list or object of a JSON record is too long, or nested too deeply."""
     depth, level = 0, [record]
     while level:
         depth += 1
@@ -135,11 +127,11 @@ def check_size(record: object, source: object) -> None:
 
 def validated(schema: type[BaseModel], record: object, source: object,
               remedy: str) -> dict[str, Any]:
-    """Return the fields of a record that a schema names, and that were given.
+    """Check a record against a schema, and return its known fields that were given.
 
     Raises:
-        BadInput: a field is missing or has another type; the message names `source` and the first
-            one, and ends with the remedy, such as "run `radiotwin close-loop` again".
+        BadInput: a field is missing or has another type; the message begins with `source` and ends
+            with the remedy, such as "run `radiotwin close-loop` again".
     """
     try:
         return schema.model_validate(record).model_dump(by_alias=True, exclude_unset=True)

@@ -1,10 +1,10 @@
-"""The one way in: every file that is read is opened here, or checked here before a library does.
+"""Open input files of strangers, or check them before a library opens them.
 
-A file may come from a stranger. It is a regular file (a pipe or a device would wait for ever), it
-lies in the folder that names it, and it has a size budget that is checked before memory is taken.
+An input must be a regular file (a pipe or a device may block for ever), be within the folder that
+names it, and fit a size budget that is checked before memory is allocated.
 
-XML is parsed without the entities that a file may declare: a few lines of them can expand to
-gigabytes of text ("billion laughs"), or include another file of this machine.
+XML is parsed without declared entities: a few lines can expand to gigabytes of text ("billion
+laughs"), or include another file of this machine.
 """
 
 import gzip
@@ -41,7 +41,7 @@ _HEADER_BYTES = 2**16
 
 
 def is_within(path: Path, *folders: Path) -> bool:
-    """Return whether a path lies in one of the folders once links are followed."""
+    """Return whether a path is within one of the folders, with links resolved."""
     try:
         return any(path.resolve().is_relative_to(folder.resolve()) for folder in folders)
     except (OSError, RuntimeError, ValueError):  # circular links, a name that no file can have
@@ -49,11 +49,11 @@ def is_within(path: Path, *folders: Path) -> bool:
 
 
 def require_within(folder: Path, path: Path, source: str) -> Path:
-    """Return a path if it lies in a folder once links are followed.
+    """Return a path if it is within a folder, with links resolved.
 
     Args:
-        folder: that the reader may read.
-        path: file that something in the folder names.
+        folder: the only folder that may be read.
+        path: of a file that another file names.
         source: file, and line if known, that names it, for the message.
 
     Raises:
@@ -66,11 +66,7 @@ def require_within(folder: Path, path: Path, source: str) -> Path:
 
 
 def keep_inputs(out: Path, *read: Path | None) -> None:
-    """Check that an output replaces nothing that the command reads; call it before long work.
-
-    Raises:
-        BadInput: one of the files and folders `read` is `out`, or lies in it.
-    """
+    """Raise BadInput if an output would replace a file or folder that the command reads."""
     for path in read:
         if path is not None and is_within(path, out):
             raise BadInput(f"cannot write {out}: the command reads {path}, which would be lost; "
@@ -78,16 +74,13 @@ def keep_inputs(out: Path, *read: Path | None) -> None:
 
 
 def keep_others(out: Path, force: bool, *marks: str) -> None:
-    """Check that a file that is replaced was written by this program; call it before long work.
+    """Raise BadInput if an output would replace a file that this program did not write.
 
     Args:
         out: output of a command.
-        force: replace whatever is there.
-        marks: what is in the first line of a table that this command writes, by which it is
-            recognised; other files have the name of this program in them.
-
-    Raises:
-        BadInput: another file is there.
+        force: replace any file.
+        marks: columns by which a table of this command is recognised; other files are recognised
+            by the name of this program in them.
     """
     path, suffix = out / "zarr.json" if out.is_dir() else out, out.suffix.lower()
     if force or not path.is_file() or not path.stat().st_size:
@@ -107,11 +100,7 @@ def keep_others(out: Path, force: bool, *marks: str) -> None:
 
 
 def require_plain(folder: Path) -> None:
-    """Check that a folder holds nothing but regular files and folders, before it is written to.
-
-    Raises:
-        BadInput: a link, a pipe or a device is in it, or in a folder within.
-    """
+    """Raise BadInput if a folder contains a link, a pipe or a device, at any depth."""
     for entry in os.scandir(folder):
         if entry.is_dir(follow_symlinks=False):
             require_plain(Path(entry.path))
@@ -122,11 +111,7 @@ def require_plain(folder: Path) -> None:
 
 
 def check_input(path: Path | str, what: str = "file") -> int:
-    """Return the size of a file [bytes] that a library may open: regular, and not too large.
-
-    Raises:
-        BadInput: as `open_input`.
-    """
+    """Check a file that a library will open, and return its size [bytes]; see `open_input`."""
     with open_input(path, what) as file:
         return os.fstat(file.fileno()).st_size
 
@@ -138,7 +123,7 @@ def open_input(path: Path | str, what: str = "file",
 
     Args:
         path: of the file.
-        what: it should be, for the message, such as `radio map (.nc)`; in all functions here.
+        what: kind of file that is expected, for the message, such as `radio map (.nc)`.
         budget: of its bytes, checked before the first is read.
 
     Raises:
@@ -165,15 +150,11 @@ def open_input(path: Path | str, what: str = "file",
 
 
 def read_bytes(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES) -> bytes:
-    """Read a file.
-
-    Raises:
-        BadInput: as `open_input`.
-    """
+    """Read all bytes of a file; BadInput: see `open_input`."""
     with open_input(path, what, budget) as file:
-        # Memory for as much as is asked for is taken at once, so no more than the file has.
+        # `read` allocates the size that is asked for, so ask for the file's size only.
         data = _read(file, path, os.fstat(file.fileno()).st_size + 1)
-        while more := _read(file, path, _BLOCK_BYTES):  # it grows, or lies as those of /proc do
+        while more := _read(file, path, _BLOCK_BYTES):  # a growing file, or one of /proc
             data += more
             budget.check(len(data), path)
     return data
@@ -181,20 +162,12 @@ def read_bytes(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES
 
 def read_text(path: Path | str, what: str = "text file",
               budget: Budget = DOCUMENT_BYTES) -> str:
-    """Read a text in UTF-8, with or without a byte-order mark.
-
-    Raises:
-        BadInput: as `open_input`, or it is not UTF-8.
-    """
+    """Read a text in UTF-8, with or without a byte-order mark; BadInput if it is none."""
     return decode_text(read_bytes(path, what, budget), path)
 
 
 def decode_text(data: bytes, path: object) -> str:
-    """Decode a text in UTF-8, with or without a byte-order mark.
-
-    Raises:
-        BadInput: it is not UTF-8.
-    """
+    """Decode a text in UTF-8, with or without a byte-order mark; BadInput if it is none."""
     try:
         return data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
@@ -203,24 +176,20 @@ def decode_text(data: bytes, path: object) -> str:
 
 
 def read_json(path: Path | str, what: str = "JSON file") -> Any:
-    """Read a JSON document by the standard: NaN and infinity are refused.
-
-    Raises:
-        BadInput: as `read_text`, not JSON, nested too deep, or a number of too many digits.
-    """
+    """Read a JSON document; NaN and infinity are refused. BadInput: see `parse_json`."""
     return parse_json(read_text(path, what), path)
 
 
 def parse_json(text: str, source: object, allow_nan: bool = False) -> Any:
-    """Parse a JSON document by the standard: NaN and infinity are refused.
+    """Parse a JSON document.
 
     Args:
         text: of the document.
-        source: it is from; the message begins with it.
-        allow_nan: read them, as some programs write them; the caller checks every number.
+        source: file or other origin, with which messages begin.
+        allow_nan: accept NaN and infinity, which some programs write; the caller checks numbers.
 
     Raises:
-        BadInput: as `read_json`.
+        BadInput: not JSON, nested too deeply, or a number of too many digits.
     """
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is no JSON number")
@@ -235,13 +204,9 @@ def parse_json(text: str, source: object, allow_nan: bool = False) -> Any:
 
 
 def read_toml(path: Path | str, what: str = "TOML file") -> dict[str, Any]:
-    """Read a TOML document.
-
-    Raises:
-        BadInput: as `read_text`, not TOML, nested too deep, or a number of too many digits.
-    """
+    """Read a TOML document; BadInput if it is none, nested too deeply, or has too long numbers."""
     text = read_text(path, what, SETTINGS_BYTES)
-    # tomllib takes memory by the square of the parts of a key.
+    # The memory of tomllib grows with the square of the parts of a key.
     if re.search(rf"(?:^|[\[{{,])[ \t]*+{_KEY_PART}(?:{_KEY_DOT}{_KEY_PART}){{{NESTING.limit}}}",
                  text, re.MULTILINE):
         NESTING.refuse(path, f"a key of more than {NESTING.limit} parts")
@@ -256,13 +221,13 @@ def read_toml(path: Path | str, what: str = "TOML file") -> dict[str, Any]:
 @contextmanager
 def open_gzip(path: Path | str, what: str = "file",
               budget: Budget = FILE_BYTES) -> Iterator[IO[bytes]]:
-    """Open a file for reading; decompress it while it is read if its name ends in `.gz`, or `.GZ`.
+    """Open a file for reading, and decompress it if its name ends in `.gz` or `.GZ`.
 
     Yields:
-        buffered binary file of at most `budget` bytes; reading more, or a damaged one, is BadInput.
+        binary file of at most `budget` bytes; reading more, or damaged data, raises BadInput.
 
     Raises:
-        BadInput: as `open_input`.
+        BadInput: see `open_input`.
     """
     with open_input(path, what, budget) as file:
         if Path(path).suffix.lower() != ".gz":
@@ -275,10 +240,10 @@ def open_gzip(path: Path | str, what: str = "file",
 @contextmanager
 def bounded(file: IO[bytes], source: object, is_gzip: bool,
             budget: Budget = FILE_BYTES) -> Iterator[IO[bytes]]:
-    """Read at most `budget` bytes of an open file, such as one in a zip file, after decompression.
+    """Wrap an open file, such as a member of a zip file, so that decompression is bounded.
 
     Yields:
-        buffered binary file; reading more, or a damaged file, raises BadInput about `source`.
+        binary file of at most `budget` bytes; reading more, or damaged data, raises BadInput.
     """
     content = gzip.GzipFile(fileobj=file) if is_gzip else file
     with io.BufferedReader(_Bounded(content, source, budget), _BLOCK_BYTES) as buffered:
@@ -305,6 +270,7 @@ class _Bounded(io.RawIOBase):
 
 
 def _read(file: Any, path: object, size: int) -> bytes:
+    """Read from a file; BadInput if it is damaged or truncated."""
     try:
         return file.read(size)
     except (OSError, EOFError, zlib.error) as error:
@@ -316,17 +282,17 @@ def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None]
                    end: Callable[[str], None] = lambda tag: None,
                    budget: Budget = FILE_BYTES,
                    text: Callable[[str], None] | None = None) -> int:
-    """Call back for every element of an XML file, in the file's order; return the bytes read.
+    """Parse an XML file with callbacks for its elements; return the bytes read.
 
     Args:
         path: XML file.
-        start: Called as `start(tag, attributes, line)` where an element begins.
-        end: Called as `end(tag)` where it ends.
-        budget: Of the file's bytes.
-        text: Called with each piece of text between tags; None: texts are not read.
+        start: called as `start(tag, attributes, line)` at the beginning of an element.
+        end: called as `end(tag)` at its end.
+        budget: of the file's bytes.
+        text: called with each piece of text between tags; None: texts are not read.
 
     Raises:
-        BadInput: No such file, malformed XML (with line and column), declared entities, or a file
+        BadInput: no such file, malformed XML (with line and column), declared entities, or a file
             or a tag that is too large.
     """
     parser = expat.ParserCreate()

@@ -1,11 +1,10 @@
-"""Signals that end a command: Ctrl-C, termination, a closed terminal.
+"""Handle signals that end a command: Ctrl-C, termination, a closed terminal.
 
-Before the work begins, the first one ends the process with its message: nothing has to be undone.
-During the work it is raised as `Stopped`, so that temporaries are removed. Whatever runs then may
-swallow it, or turn it into an error of its own (Dr.Jit in a loop that it records, a module while it
-is imported, `__del__`): then it is raised again, and what became of it still counts as a stop. A
-second one does not disturb the removal of temporaries. The message counts the finished parts that
-the next run will not do again.
+Before the work begins, a signal ends the process with a message. During the work it is raised as
+`Stopped`, so that temporaries are removed. Code that is running may swallow it, or turn it into
+another error (Dr.Jit in a recorded loop, an import, `__del__`): then it is raised again. A second
+signal does not disturb the removal of temporaries. The message counts the finished parts that the
+next run can use.
 """
 
 import atexit
@@ -21,23 +20,23 @@ from typing import Any, NoReturn
 
 NUMBERS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP")
                 if hasattr(signal, name))
-AGAIN_S = 0.25  # between attempts to get through
+AGAIN_S = 0.25  # until a swallowed signal is raised again
 INTERRUPTED, TERMINATED = "interrupted", "terminated"
 _finished = 0
 
 
 class Stopped(BaseException):
-    """A signal. Typer would swallow a KeyboardInterrupt without a message."""
+    """Raised for a signal in place of KeyboardInterrupt, which Typer swallows without a message."""
 
 
 class _State:
     """State that the handlers share.
 
     Attributes:
-        raising: whether a signal is raised; before and after the work it ends the process.
-        deferred: depth of `deferred`.
+        raising: whether a signal is raised, as during the work; else it ends the process.
+        deferred: nesting depth of `deferred`.
         received: number of the first signal since the work began.
-        flying: the last `Stopped`, as long as something holds it.
+        flying: the last `Stopped`, until it is freed.
         after: exit status of the finished work.
     """
 
@@ -73,19 +72,19 @@ def begin() -> None:
 
 
 def end() -> None:
-    """Raise none any more; the work is done, or has been stopped."""
+    """Stop raising signals: the work is done, or has been stopped."""
     _state.raising = False
     if hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
 def finish(status: int) -> None:
-    """End the process with this status at the next signal, such as one at the end of Python."""
+    """Let a signal from now on end the process at once with this status."""
     _state.after = status
 
 
 def leave(status: int) -> NoReturn:
-    """End the process; at once if a signal has stopped it, whatever its threads still do."""
+    """Exit with a status; after a signal at once, without waiting for threads."""
     if _state.received is not None:
         os._exit(status)
     sys.exit(status)
@@ -97,13 +96,13 @@ def received() -> int | None:
 
 
 def word(number: int) -> str:
-    """Return what a signal did to the command, for the message."""
+    """Return `interrupted` or `terminated`, for the message about a signal."""
     return INTERRUPTED if number == signal.SIGINT else TERMINATED
 
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Let a few steps that belong together be done; a signal among them is raised after them."""
+    """Delay signals until the end of the block, so that its steps are done together."""
     if threading.current_thread() is not threading.main_thread():  # it gets no signals
         yield
         return
@@ -118,13 +117,13 @@ def deferred() -> Iterator[None]:
 
 @contextmanager
 def kept_from_children() -> Iterator[None]:
-    """Start processes that never get a Ctrl-C: this one ends them."""
+    """Start processes in this block that ignore Ctrl-C; this process ends them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     from multiprocessing.resource_tracker import ensure_running
 
-    ensure_running()  # it would let SIGINT through again, if it were started with the first process
+    ensure_running()  # started later, it would unblock SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -133,6 +132,7 @@ def kept_from_children() -> Iterator[None]:
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
+    """Raise `Stopped` during the work; before and after it end the process."""
     if _state.raising:
         if _state.received is None:
             _state.received = number
@@ -148,17 +148,19 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
 
 
 def _ignore() -> None:
-    """Let nothing disturb the end of Python, which restores the system's handlers too early."""
+    """Ignore signals at the exit of Python, which restores the default handlers too early."""
     for number in NUMBERS:
         signal.signal(number, signal.SIG_IGN)
 
 
 def _on_alarm(number: int, frame: FrameType | None) -> None:
+    """Raise a signal again that was swallowed."""
     if _state.raising and _state.received is not None:
         _raise_unless_flying()
 
 
 def _raise_unless_flying() -> None:
+    """Raise `Stopped` unless one is being handled, and try again after `AGAIN_S`."""
     if not _state.raising or _state.deferred:
         return
     if hasattr(signal, "setitimer"):
@@ -186,7 +188,7 @@ def note_finished() -> None:
 
 
 def after_interrupt() -> str:
-    """Return what is kept and how to go on: part of a message."""
+    """Return the part of a message that says which finished parts are kept, and how to go on."""
     if not _finished:
         return "nothing is kept; run the same command again"
     parts = "1 finished part is" if _finished == 1 else f"{_finished:,} finished parts are"

@@ -1,7 +1,7 @@
-"""Tables of an SQLite file of a stranger.
+"""Read tables of a stranger's SQLite file.
 
-Only what a scan of a table needs is used of SQLite: no view, trigger, virtual table, computed
-column, function or second file is ever evaluated.
+Only plain table scans are allowed: no view, trigger, virtual table, computed column, function or
+second file is evaluated.
 """
 
 import sqlite3
@@ -19,7 +19,7 @@ _ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_PRAGMA)
 
 @contextmanager
 def open_tables(path: Path, what: str) -> Iterator[sqlite3.Connection]:
-    """Open a database so that it can do nothing but read this one file.
+    """Open a database read-only, with everything but table scans disabled.
 
     Raises:
         BadInput: no such file, no SQLite, or one that another program has open.
@@ -61,7 +61,7 @@ def require_table(database: sqlite3.Connection, name: str) -> None:
 
 def scan(database: sqlite3.Connection, table: str, columns: list[str],
          budget: Budget = FEATURES) -> Iterator[tuple]:
-    """Yield columns of every row of a table that `require_table` let pass.
+    """Yield columns of every row of a table that passed `require_table`.
 
     Raises:
         BadInput: too many rows.
@@ -79,7 +79,7 @@ def scan(database: sqlite3.Connection, table: str, columns: list[str],
 
 
 def stored_columns(database: sqlite3.Connection, table: str) -> list[tuple]:
-    """Return number, name, type, … of a table's columns, without those that are computed."""
+    """Return number, name, type, … of a table's stored columns, without computed ones."""
     return database.execute(f"PRAGMA table_info({_quoted(table)})").fetchall()
 
 

@@ -1,8 +1,4 @@
-"""Texts of strangers as pages, figures and spreadsheets may show them.
-
-Nothing is hidden or endless in them, and a spreadsheet finds no formula: what looks like one gets
-an apostrophe.
-"""
+"""Make texts of strangers safe to show: no hidden characters, bounded length, no formulas."""
 
 import re
 from datetime import UTC, datetime
@@ -21,30 +17,30 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 def shown(text: str, max_length: int = MAX_TEXT) -> str:
-    r"""Return a text with its hidden characters as `\x1b` or `\u202e`, cut where it is too long."""
+    r"""Escape the hidden characters of a text, such as `\x1b` or `\u202e`, and cut a long one."""
     cut = text if len(text) <= max_length else text[:max_length - 1] + "…"
     return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1], cut)
 
 
 def moment(time_s: float) -> str:
-    """Return the date and time (UTC) of seconds since 1970."""
+    """Return the date and time (UTC) of a time in seconds since 1970."""
     return datetime.fromtimestamp(time_s, UTC).isoformat(sep=" ", timespec="seconds")
 
 
 def percent(share: float) -> str:
-    """Return a share as a percentage that is neither 0 nor 100 where the share is not."""
+    """Return a share as a percentage, in words below 1 % and above 99 %."""
     if 0 < share < 0.01:
         return "under 1%"
     return "over 99%" if 0.99 < share < 1 else f"{share:.0%}"
 
 
 def shortly(value: float) -> str:
-    """Return a number with three digits, or all before the point."""
+    """Return a number with three significant digits, or as a whole number from 1000."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def shown_data(value: Any) -> Any:
-    """Return data for a script with every text in it as `shown`, but for packed arrays."""
+    """Apply `shown` to every text in nested data, except packed arrays."""
     if isinstance(value, str):
         return shown(value)
     if isinstance(value, list):
@@ -54,33 +50,34 @@ def shown_data(value: Any) -> Any:
     return value
 
 
-def quoted(text: Any) -> Any:
-    """Return a cell or a name as it is written to CSV, the same object where nothing changes."""
+def escape_formula(text: Any) -> Any:
+    """Prefix a text with an apostrophe if a spreadsheet would take it for a formula."""
     if isinstance(text, str) and _FORMULA.match(text) and not _NUMBER.fullmatch(text):
         return f"'{text}"
     return text
 
 
-def unquoted(text: Any) -> Any:
-    """Return what `quoted` was given."""
+def unescape_formula(text: Any) -> Any:
+    """Undo `escape_formula`."""
     is_quoted = isinstance(text, str) and text.startswith("'") and _FORMULA.match(text)
     return text[1:] if is_quoted else text
 
 
-def with_quotes(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table with `quoted` texts and names of columns."""
-    table = table.rename(columns=quoted)
+def escape_formulas(table: pd.DataFrame) -> pd.DataFrame:
+    """Apply `escape_formula` to all texts and column names of a table."""
+    table = table.rename(columns=escape_formula)
     for name in table.columns:
         if table[name].dtype.kind not in "biufmM":
             texts = table[name]
-            odd = {text: quoted(text) for text in texts.unique() if quoted(text) is not text}
-            if odd:
-                table[name] = texts.astype(object).map(lambda text, odd=odd: odd.get(text, text))
+            escaped = {text: escape_formula(text) for text in texts.unique()}
+            if any(safe is not text for text, safe in escaped.items()):
+                table[name] = texts.astype(object).map(
+                    lambda text, escaped=escaped: escaped.get(text, text))
     return table
 
 
-def without_quotes(table: pd.DataFrame) -> pd.DataFrame:
-    """Return a table whose cells are `unquoted`; names of columns stay."""
+def unescape_formulas(table: pd.DataFrame) -> pd.DataFrame:
+    """Apply `unescape_formula` to all texts of a table, but not to its column names."""
     table = table.copy(deep=False)
     for name in table.columns:
         if table[name].dtype.kind in "OU" or isinstance(table[name].dtype, pd.StringDtype):
@@ -88,6 +85,6 @@ def without_quotes(table: pd.DataFrame) -> pd.DataFrame:
             is_quoted = texts.str.startswith("'", na=False).to_numpy(dtype=bool)
             if is_quoted.any():
                 texts = texts.copy()
-                texts[is_quoted] = texts[is_quoted].map(unquoted)
+                texts[is_quoted] = texts[is_quoted].map(unescape_formula)
                 table[name] = texts
     return table

@@ -38,11 +38,11 @@ from radiotwin.geo import (
 )
 from radiotwin.io.budgets import DOCUMENT_BYTES
 from radiotwin.io.cells import (
+    cell_text,
     check_suffix,
     column_names,
     read_cells,
     require_pyarrow,
-    shown,
     write_csv,
 )
 from radiotwin.io.files import atomic_path
@@ -478,8 +478,8 @@ def read_antenna_files(path: Path, names: Iterable[str], are_rows: bool = True
             where = f"row {row + 2}" if are_rows else "column antenna"
             file = require_within(path.parent, path.parent / name, f"{path}, {where}")
             if not file.exists():
-                raise BadInput(f"{path}, {where}: antenna {shown(name)} is no file of a pattern in "
-                               "the table's folder; put it there, or call the column "
+                raise BadInput(f"{path}, {where}: antenna {cell_text(name)} is no file of a "
+                               "pattern in the table's folder; put it there, or call the column "
                                "antenna_model if it names a product")
             files[name] = read_bytes(file, "pattern of an antenna", DOCUMENT_BYTES)
             parse_pattern(file, files[name])

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from radiotwin.errors import BadInput
 from radiotwin.geo import between_frames, is_same_frame, to_local
 from radiotwin.io.budgets import DEVICES, ROWS
-from radiotwin.io.cells import as_numbers, as_text, listed, refuse, shown
+from radiotwin.io.cells import as_numbers, as_text, cell_text, listed, refuse
 from radiotwin.io.forms import Origin, name_fault
 from radiotwin.links.plausible import (
     HEIGHTS_M,
@@ -374,8 +374,8 @@ def unused_columns(path: Path | str, header: Iterable[str], used: Collection[str
     for name in unused:
         near = _plain(name) if _plain(name) in plain else misspelt(_plain(name), plain)
         if near:
-            raise BadInput(f"{path}: column {shown(name)} is nearly {plain[near]!r}; correct its "
-                           "name, or leave the column out")
+            raise BadInput(f"{path}: column {cell_text(name)} is nearly {plain[near]!r}; correct "
+                           "its name, or leave the column out")
     return _unused_note(path, unused)
 
 
@@ -417,12 +417,12 @@ def _columns(path: Path | str, header: Sequence[str],
     for name in unused:
         plain = _plain(name)
         if _IN_PARTS.fullmatch(plain):
-            raise BadInput(f"{path}: column {shown(name)} is a part of an angle; give latitude and "
-                           "longitude in decimal degrees, in one column each")
+            raise BadInput(f"{path}: column {cell_text(name)} is a part of an angle; give latitude "
+                           "and longitude in decimal degrees, in one column each")
         near = misspelt(plain, known)
         if plain not in known and plain not in keys and near \
                 and known[near].quantity not in found:
-            raise BadInput(f"{path}: column {shown(name)} is nearly a name of "
+            raise BadInput(f"{path}: column {cell_text(name)} is nearly a name of "
                            f"{known[near].quantity}; correct its name, or leave the column out. "
                            f"The table has {listed(header)}")
     return found, unused
@@ -479,8 +479,8 @@ def _numbers(table: SiteTable, quantity: str, convert: Convert | None, length_un
             span = f" from {given.min():g} to {given.max():g}" if len(given) else ""
             endings = " or ".join(f"{name}_{unit}" for unit in list(units)[:1] + [
                 unit for unit in ("ft", "w", "mhz") if unit in units])
-            raise BadInput(f"{table.path}: column {shown(name)}: the unit of its numbers{span} is "
-                           f"not known; end its name in it: {endings}"
+            raise BadInput(f"{table.path}: column {cell_text(name)}: the unit of its numbers{span} "
+                           f"is not known; end its name in it: {endings}"
                            + (", or give length_unit" if units is _LENGTHS
                               and length_unit is not None else ""))
     numbers = np.where(np.isnan(by_cell), convert(numbers), by_cell)

@@ -1,9 +1,9 @@
-"""What all commands share: `--quiet` and `--json`, one message at the end, and an exit status.
+"""Run a command: the options `--quiet` and `--json`, one error message, and the exit status.
 
 | status | |
 |---|---|
 | 0 | done |
-| 1 | failed while running, by a mistake of ours, too |
+| 1 | failed while running, also by an error in this program |
 | 2 | input that cannot be used |
 | 128 + signal | 129 terminal closed, 130 interrupted, 141 nobody reads the output, 143 ended |
 """
@@ -39,20 +39,20 @@ QUIET = Annotated[bool, typer.Option(
     "--quiet", "-q", help="Print nothing but warnings and errors.")]
 JSON = Annotated[bool, typer.Option(
     "--json", help="Print tables and messages as one JSON document.")]
-NOBODY_READS = 141  # as the shell has it for a command that SIGPIPE has ended
+NOBODY_READS = 141  # 128 + SIGPIPE, as shells report it
 MAX_ERROR_CHARACTERS = 300
 _ClickError: Any = typer.BadParameter.__mro__[2]  # Typer has no name of its own for it
 
 
 def add_output_options(app: typer.Typer) -> None:
-    """Add `--quiet`, and `--json` where there are tables, to every command of an app."""
+    """Add `--quiet` to every command of an app, and `--json` to those that print tables."""
     for command in app.registered_commands:
         if command.callback is not None:
             command.callback = with_output_options(command.callback, command.name in TABLES)
 
 
 def with_output_options(command: Callable[..., Any], prints_tables: bool) -> Callable[..., Any]:
-    """Return a command with the options `--quiet` and, where it prints tables, `--json`."""
+    """Wrap a command with the options `--quiet` and, if it prints tables, `--json`."""
     @functools.wraps(command)
     def run(*args: Any, quiet: bool = False, as_json: bool = False, **options: Any) -> None:
         with output(quiet, as_json):
@@ -65,12 +65,12 @@ def with_output_options(command: Callable[..., Any], prints_tables: bool) -> Cal
 
 def with_options(command: Callable[..., Any], signature: inspect.Signature,
                  added: dict[str, tuple[Any, Any]]) -> Callable[..., Any]:
-    """Declare more options of a command; Typer reads them from its signature and annotations.
+    """Declare further options of a command, in the signature and annotations that Typer reads.
 
     Args:
-        command: takes all options as keywords; it is changed.
-        signature: its parameters so far.
-        added: name -> annotation and default of the options to add.
+        command: takes all options as keywords; it is modified.
+        signature: its present parameters.
+        added: name -> annotation and default of each new option.
     """
     parameters = [*signature.parameters.values()] + [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
@@ -83,9 +83,9 @@ def with_options(command: Callable[..., Any], signature: inspect.Signature,
 
 @contextmanager
 def output(quiet: bool, as_json: bool) -> Iterator[None]:
-    """Print text as usual, or nothing, or all of it as one JSON document at the end.
+    """Let the block print as usual; or, if quiet, nothing; or its results as one JSON document.
 
-    Quiet also shows no progress. The document is `console.collected`, on success.
+    Quiet also hides progress. The document is `console.collected`; it is printed on success.
     """
     before = console.quiet, progress.silent
     console.quiet, progress.silent = quiet or as_json, quiet or progress.silent
@@ -105,7 +105,7 @@ def output(quiet: bool, as_json: bool) -> Iterator[None]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON has it: NaN and infinity as null, numpy's numbers as Python's."""
+    """Convert a value for JSON: NaN and infinity to null, numpy's numbers to Python's."""
     if isinstance(value, dict):
         return {str(name): _plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
@@ -116,7 +116,7 @@ def _plain(value: Any) -> Any:
 
 
 class _OutputLost(Exception):
-    """Standard output takes no more. No OSError, which Typer and Rich have their own ways with."""
+    """Raised if standard output cannot be written; an OSError would be handled by Typer or Rich."""
 
 
 class _Output:
@@ -142,18 +142,15 @@ class _Output:
 
 
 def exit_status(work: Callable[[], Any], kept: str | Callable[[], str]) -> int:
-    """Do the work of a command; print one message for whatever keeps it from being done.
+    """Run a command, print one message about an error, and return the exit status (see above).
 
     With `--json` on the command line the message is also on standard output:
     `{"error": {"message": "...", "status": 2}}`.
 
     Args:
         work: a Typer app, or any function; it may end the process itself.
-        kept: part of the message after a signal: what is kept and how to go on; or a function that
-            returns it.
-
-    Returns:
-        exit status, as this module has them.
+        kept: part of the message after a signal, that says which results are kept and how to go on;
+            or a function that returns it.
     """
     _open_standard_streams()
     signals.handle()
@@ -183,11 +180,11 @@ def exit_status(work: Callable[[], Any], kept: str | Callable[[], str]) -> int:
 
 
 def _explained(error: BaseException, kept: str) -> tuple[int, str]:
-    """Return exit status and message of what has ended the work."""
+    """Return the exit status and the message for an exception."""
     if isinstance(error, SystemExit) and not error.code:
         return 0, ""
     number = signals.received()
-    if number is not None:  # whatever it has become on its way
+    if number is not None:  # libraries may have turned the signal into another error
         return 128 + number, f"{signals.word(number)}; {kept}"
     if isinstance(error, SystemExit):
         return (error.code, "") if isinstance(error.code, int) else (1, str(error.code))
@@ -213,7 +210,7 @@ def _explained(error: BaseException, kept: str) -> tuple[int, str]:
 
 
 def _usage(error: Any) -> str:
-    """Return the message about wrong options or arguments; none where it is the help itself."""
+    """Return the message about wrong options or arguments; empty if the help was shown."""
     message = error.format_message()
     if message.startswith("Usage:"):  # a command without the arguments that it needs
         error.show()
@@ -223,7 +220,7 @@ def _usage(error: Any) -> str:
 
 
 def _mistake(error: BaseException) -> str:
-    """Save the traceback of an error that should not be; return the message about it."""
+    """Save the traceback of an unexpected error, and return a message that names its file."""
     said = f"unexpected error while running {_command()}: {type(error).__name__}{_said(error)}"
     try:
         handle, path = tempfile.mkstemp(prefix="radiotwin-error-", suffix=".txt")
@@ -246,6 +243,7 @@ def _said(error: BaseException) -> str:
 
 
 def _command() -> str:
+    """Return the command line, for messages."""
     name = "radiotwin" if "marl" not in sys.argv[0] else "python -m marl.fedqmix"
     return printable(shlex.join([name, *sys.argv[1:]]))[:MAX_ERROR_CHARACTERS]
 
@@ -259,7 +257,7 @@ def _folder_is_gone() -> bool:
 
 
 def _open_standard_streams() -> None:
-    """Make all three writable: an output file would become the stream that is closed."""
+    """Open closed standard streams: else the next opened file would become one of them."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -273,7 +271,7 @@ def _open_standard_streams() -> None:
 
 
 def _close_lost_output() -> None:
-    """Keep Python from complaining when it flushes an output that takes nothing."""
+    """Redirect streams that cannot be written, so that Python's exit does not complain."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()

@@ -1,11 +1,11 @@
-"""numba's compiler, without two of its traps.
+"""Import numba's `njit` with two of its faults mended.
 
-numba imports the package `coverage` where there is one, takes a folder of that name on the path for
-it, and fails. The output of `radiotwin coverage` may be such a folder, in the working directory.
+numba imports the package `coverage`, and fails if a folder of that name is on the path. The output
+of `radiotwin coverage` may be such a folder, in the working directory.
 
-numba compiles a function again when its own file has changed, and not when a function that it calls
-has changed in another file: after an update the old code would go on, with other arguments. So what
-is kept of a file of this package also belongs to the compiled functions in the files beside it.
+numba compiles a cached function again if its own file has changed, but not if a function that it
+calls has changed in another file. Here the cache of a file also depends on the other files with
+compiled functions in its folder.
 """
 
 import os
@@ -20,7 +20,7 @@ __all__ = ["List", "njit"]
 
 
 def _path_without_folder(name: str) -> list[str]:
-    """Return the entries of `sys.path` in which a name is not that of a folder without code."""
+    """Return `sys.path` without the entries in which a name is only a folder without code."""
     found = find_spec(name) if name not in sys.modules else None
     folders: list[str] = []
     if found is not None and found.origin is None:
@@ -42,14 +42,14 @@ _stamp_of_file = _Locator.get_source_stamp
 
 @lru_cache
 def _compiled_files_hash(folder: Path) -> str | None:
-    """Return the hash of the files of a folder with compiled functions; None: there are none."""
+    """Return the hash of the files with compiled functions in a folder; None if there are none."""
     contents = [path.read_bytes() for path in sorted(folder.glob("*.py"))]
     compiled = [content for content in contents if __name__.encode() in content]
     return sha256(b"".join(compiled)).hexdigest() if compiled else None
 
 
 def _stamp(self: Any) -> Any:
-    """Return what kept code must have been compiled from to be used."""
+    """Return the stamp of the sources, which must be equal for cached code to be used."""
     others = _compiled_files_hash(Path(self._py_file).parent)
     return _stamp_of_file(self) if others is None else (_stamp_of_file(self), others)
 

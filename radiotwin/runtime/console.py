@@ -1,6 +1,6 @@
-"""What commands print: messages, warnings, tables, and one progress display for all.
+"""Print messages, warnings, tables and progress to the terminal.
 
-Names come from strangers' files: what a terminal would obey is shown as an escape.
+Names come from strangers' files: control characters are shown as escapes.
 """
 
 import logging
@@ -38,15 +38,12 @@ _displays: list[Progress] = []  # at most one: a terminal has room for one displ
 
 
 def printable(text: str) -> str:
-    """Return a text with escapes in place of what a terminal would obey or could not show.
-
-    Tabs and line feeds are kept.
-    """
+    """Escape the control characters of a text, except tabs and line feeds."""
     return _OBEYED.sub(lambda match: repr(match[0])[1:-1], text)
 
 
 class PrintableConsole(Console):
-    """A console on which no text gives orders to the terminal, whatever prints it."""
+    """A Rich console that escapes the control characters of every text."""
 
     def render(self, renderable: RenderableType,
                options: ConsoleOptions | None = None) -> Iterable[Segment]:
@@ -62,14 +59,14 @@ collected: dict[str, Any] = {}
 
 
 def complain(message: str) -> None:
-    """Print one message on standard error, without markup and without wrapping inside paths."""
-    with suppress(OSError):  # standard error is closed, or its disk is full: nobody to tell
+    """Print an error message on standard error, without markup and without wrapping."""
+    with suppress(OSError):  # standard error is closed, or its disk is full
         error_console.print("[bold red]radiotwin:[/] ", end="")
         error_console.print(printable(message), markup=False, soft_wrap=True)
 
 
 def notice(message: str) -> None:
-    """Print one line about the run itself on standard error; nothing if it is empty."""
+    """Print a line about the run on standard error, unless it is empty."""
     if message and not console.quiet:
         error_console.print(f"radiotwin: {message}", markup=False, soft_wrap=True)
 
@@ -81,10 +78,7 @@ def say(message: str) -> None:
 
 
 def show_warnings_plainly() -> None:
-    """Show warnings of both packages as one line each, once, without source lines, and no others.
-
-    Each model that is fitted to the same measurements says the same of them.
-    """
+    """Show UserWarnings of radiotwin and marl as one line each, once; hide all other warnings."""
     shown: set[str] = set()
 
     def show(message: Warning | str, category: type[Warning], filename: str, lineno: int,
@@ -100,7 +94,7 @@ def show_warnings_plainly() -> None:
                 error_console.print(text, markup=False, soft_wrap=True)
 
     warnings.showwarning = show
-    if logging.lastResort is not None:  # of libraries that log; nothing else sets up logging
+    if logging.lastResort is not None:  # libraries log to it, since logging is not set up
         logging.lastResort.setFormatter(_PrintableLog())
 
 
@@ -110,7 +104,7 @@ class _PrintableLog(logging.Formatter):
 
 
 def result(name: str, value: Any) -> None:
-    """Add an entry to the document of `--json`, such as numbers that a table shows rounded."""
+    """Add an entry to the document of `--json`, such as a number that a table rounds."""
     collected[name] = value
 
 
@@ -120,7 +114,7 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
     Args:
         title: line above it.
         columns: heading -> `left` or `right`.
-        rows: cells; of floats two decimals or, of small ones, digits are printed, of NaN a dash.
+        rows: cells; floats get two decimals, small ones two digits, NaN a dash.
     """
     names = [heading or f"column {number}" for number, heading in enumerate(columns, start=1)]
     collected.setdefault("tables", []).append(
@@ -136,11 +130,7 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
 
 
 def print_table(table: Table, to: Console) -> None:
-    """Print a table, whose columns overflow by `fold`, with all of its text.
-
-    A file or a pipe has no width: there lines are as long as they need to be. On a terminal, what
-    is wider than it goes on in the next line of its cell.
-    """
+    """Print a table without cutting its text: wrapped on a terminal, in long lines to a file."""
     if to.is_terminal:
         to.print(table)
         return
@@ -153,6 +143,7 @@ def print_table(table: Table, to: Console) -> None:
 
 
 def _text(cell: Any) -> str:
+    """Return the printable text of a cell, see `print_rows`."""
     if isinstance(cell, float):
         return "–" if cell != cell else f"{cell:.2g}" if 0 < abs(cell) < 0.005 else f"{cell:.2f}"
     return printable(str(cell)).replace("\n", "\\n").replace("\t", "\\t")
@@ -161,14 +152,14 @@ def _text(cell: Any) -> str:
 @contextmanager
 def progress(description: str, total: float | None, lines: bool = False,
              ) -> Iterator[Callable[..., None]]:
-    """Show a progress bar on standard error; show nothing where that is no terminal.
+    """Show a progress bar on standard error if that is a terminal.
 
-    A bar inside another one gets a line below it in the same display.
+    An inner bar gets a line below the outer one.
 
     Args:
         description: text before the bar.
         total: number of steps; None if unknown.
-        lines: where that is no terminal, print a line every ten seconds.
+        lines: without a terminal, print a line every ten seconds.
 
     Yields:
         `advance(n=1, description=None)`, which adds `n` steps and may change the text.
@@ -203,10 +194,10 @@ def progress(description: str, total: float | None, lines: bool = False,
 
 
 class _Lines:
-    """Progress in a file: a line every ten seconds, also while nothing advances.
+    """Progress as lines in a file, every ten seconds.
 
     Attributes:
-        over: set where the work ends.
+        over: set at the end of the work.
     """
 
     def __init__(self, description: str, total: float | None) -> None:

@@ -1,6 +1,6 @@
-"""Whether work can run on a GPU of NVIDIA: found out by running some of it there.
+"""Find out whether tracing and training work on an NVIDIA GPU, by a trial.
 
-A link is traced in a process of its own: a wrong library or driver may abort it.
+The trial link is traced in another process, which a wrong library or driver may abort.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ from radiotwin.errors import BadInput, optional_package
 
 TIMEOUT_S = 120  # a first run compiles its kernels
 TOLERANCE_DB = 0.01
-# A link of 100 m in free space, and one through a sheet of metal, which no ray passes.
+# Trace a link of 100 m in free space, and one through a sheet of metal.
 _PROGRAM = """
 import sys
 import numpy as np
@@ -54,14 +54,14 @@ _ASK_GPUS = ("nvidia-smi", "--query-gpu=name,memory.total,driver_version",
 
 
 class TrialFailed(Exception):
-    """The link could not be traced; the message is the reason."""
+    """Raised if the trial link cannot be traced; the message is the reason."""
 
 
 def trace_trial_link(device: str) -> float:
-    """Return the gain of a link of 100 m in free space at 2.4 GHz [dB], on `cpu` or `cuda`.
+    """Trace a link of 100 m in free space at 2.4 GHz on `cpu` or `cuda`; return its gain [dB].
 
     Raises:
-        TrialFailed: it cannot be traced, a ray went through a wall, or the gain is not Friis'.
+        TrialFailed: tracing fails, a ray went through a wall, or the gain is not Friis'.
     """
     command = [sys.executable, "-P", "-c", _PROGRAM, device]
     try:
@@ -81,7 +81,7 @@ def trace_trial_link(device: str) -> float:
 
 @dataclass(frozen=True)
 class Gpu:
-    """A GPU that the driver knows."""
+    """A GPU that the driver lists."""
 
     name: str
     memory_bytes: int
@@ -92,7 +92,7 @@ class Gpu:
 
 
 def gpus() -> list[Gpu]:
-    """Return the GPUs that NVIDIA's tool lists; none where there is no such tool."""
+    """Return the GPUs that `nvidia-smi` lists; empty without that tool."""
     if shutil.which(_ASK_GPUS[0]) is None:
         return []
     answer = subprocess.run(_ASK_GPUS, check=False, capture_output=True, text=True)
@@ -103,7 +103,7 @@ def gpus() -> list[Gpu]:
 
 
 def has_driver() -> bool:
-    """Return whether NVIDIA's driver is on this machine; without it there is nothing to try."""
+    """Return whether NVIDIA's driver is installed."""
     name = os.environ.get(DRIVER_VARIABLE) or (
         "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
     try:
@@ -118,7 +118,7 @@ NO_DRIVER = "there is no NVIDIA driver on this machine"
 
 @cache
 def tracing_refusal() -> str | None:
-    """Return why rays cannot be traced on a GPU, None if they can: one link is tried."""
+    """Return why rays cannot be traced on a GPU, from a trial link; None if they can."""
     if not has_driver():
         return NO_DRIVER
     try:
@@ -130,7 +130,7 @@ def tracing_refusal() -> str | None:
 
 @cache
 def torch_refusal() -> str | None:
-    """Return why PyTorch cannot train on a GPU, None if it can: one product is tried."""
+    """Return why PyTorch cannot train on a GPU, from a trial product; None if it can."""
     torch = optional_package("torch", "torch is not installed (`pip install 'radiotwin[nn]'`)")
     if not torch.cuda.is_available():
         return (NO_DRIVER if not has_driver() else
@@ -144,16 +144,16 @@ def torch_refusal() -> str | None:
 
 
 def tracing_device(wanted: str) -> Device:
-    """Return where rays are traced: `cpu`, `cuda`, or of `auto` a GPU where that works.
+    """Resolve the option `--device` for tracing: `auto` becomes `cuda` if that works, else `cpu`.
 
     Raises:
-        BadInput: Another word, or `cuda` where it does not work.
+        BadInput: another word, or `cuda` and it does not work.
     """
     return _device(wanted, "tracing")
 
 
 def torch_device(wanted: str) -> Device:
-    """Return where networks are trained; as `tracing_device`."""
+    """Resolve the option `--device` for training, like `tracing_device`."""
     return _device(wanted, "training")
 
 
@@ -173,10 +173,9 @@ def _device(wanted: str, work: Literal["tracing", "training"]) -> Device:
 
 
 def share_of_gpu(memory_bytes: int) -> float:
-    """Return the part of a GPU that a worker gets: as many share one as its memory holds.
+    """Return the share of a GPU for a worker that needs so much memory, with Ray's four decimals.
 
-    It is above 0 and at most 1, with four decimals, in which Ray counts. A worker whose memory is
-    not known (0) gets all of it.
+    It is above 0 and at most 1; 1 if the memory is unknown (0).
     """
     memories = [gpu.memory_bytes for gpu in gpus()]
     if not memories or not memory_bytes:

@@ -1,11 +1,10 @@
-"""Jobs run where the user wants: in this process, on workers of this machine, or on a Ray cluster.
+"""Run jobs in this process, on worker processes of this machine, or on a Ray cluster.
 
-The executor keeps the order of the pieces, tries them again, fills the cache and shows progress,
-whatever the workers are. Those of this machine are loky's, one pool of one process each, so that it
-is known whose piece a dead one had, and the others go on. loky rather than the pools of Python: its
-processes are spawned without running the user's script again (no `if __name__ == "__main__"`
-needed, also in notebooks), get an environment of their own before any library is imported, and
-their death is an error instead of a deadlock.
+The executor keeps the order of the pieces, retries them, fills the cache and shows progress. Each
+local worker is a loky pool of one process, so that the piece of a dead worker is known and the
+others go on. Unlike Python's pools, loky starts processes without running the user's script again
+(no `if __name__ == "__main__"` needed), sets their environment before any library is imported, and
+reports their death as an error instead of a deadlock.
 """
 
 import logging
@@ -50,10 +49,10 @@ __all__ = ["AUTO", "Executor", "Job", "LocalPool", "Resources", "open_executor",
            "worker_count"]
 
 _NO_LEAK_CHECK = {"LOKY_MAX_MEMORY_LEAK_SIZE": "1e15"}  # the memory is bounded here
-CHECK_S = 0.5  # between looks at the memory of the workers
-RETRIES = 1  # of a piece whose worker died of something else than memory, before it is halved
+CHECK_S = 0.5  # between checks of the workers' memory
+RETRIES = 1  # of a piece whose worker died, but not of memory, before the piece is halved
 AUTO = "auto"
-PATIENCE_S = 20.0  # of `auto`: workers take about five seconds to start
+PATIENCE_S = 20.0  # work that takes longer gets workers; they take about five seconds to start
 MAX_WORKERS = 10_000
 
 
@@ -63,10 +62,10 @@ class Executor:
     Results are the same to the bit, and in the order of the pieces, wherever they were computed.
 
     Args:
-        pool: Workers; None: this process.
-        patience_s: Work that takes less is done in this process: workers are started when what is
-            left would take longer, judging by the pieces so far.
-        say: Called with one line when workers are started.
+        pool: of workers; None: this process.
+        patience_s: start workers if the remaining pieces would take longer than this in this
+            process, extrapolated from the pieces so far.
+        say: called with one line when workers are started.
     """
 
     def __init__(self, pool: Pool | None = None, patience_s: float = 0.0,
@@ -77,16 +76,15 @@ class Executor:
 
     @property
     def is_worth_it(self) -> bool:
-        """Whether other processes work already, or had better, as the work goes on for long."""
+        """Whether workers are running, or the executor has been open longer than `patience_s`."""
         return self._pool is not None and (
             self._has_workers or time.monotonic() - self._opened_s >= self._patience_s)
 
     def run_ahead(self, job: Job[P, R], pieces: Sequence[P], cache: Cache[P, R]) -> None:
-        """Run in other processes what this one will need, for it to find it in the cache.
+        """Fill the cache by worker processes with results that this process will need.
 
-        Without other processes, or where they are not worth it, nothing is done. A piece that
-        cannot be run there is left to this process, where its error shows; that it could not is
-        said. Arguments are those of `run`.
+        Nothing is done unless `is_worth_it`. A piece that fails is left to this process, where its
+        error shows, with a message. Arguments are those of `run`.
         """
         if self.is_worth_it:
             missing = deque(_Todo(piece, lambda result: None) for piece in pieces
@@ -103,16 +101,16 @@ class Executor:
         """Run a job.
 
         Args:
-            job: Function and what it needs.
-            pieces: Its arguments.
-            cache: Results of earlier runs, and of this one as soon as they are there; None: none.
+            job: function and resources.
+            pieces: arguments of the function.
+            cache: of finished results; new ones are added at once. None: no cache.
 
         Returns:
-            Results in the order of the pieces.
+            results in the order of the pieces.
 
         Raises:
-            RunFailed: Workers died of a piece again and again, or cannot be had.
-            Exception: Whatever the function raised; then the other pieces are given up.
+            RunFailed: workers died repeatedly on one piece, or cannot be started.
+            Exception: any error of the function; the other pieces are cancelled.
         """
         kept = cache or NoCache()
         results: list[Any] = [None] * len(pieces)
@@ -135,7 +133,7 @@ class Executor:
 
     def _run_here(self, job: Job, todo: "deque[_Todo]", cache: Cache,
                   advance: Callable[..., None], patience_s: float) -> None:
-        """Run pieces in this process until it has taken so long, or what is left would."""
+        """Run pieces in this process until these, or the rest by extrapolation, exceed a time."""
         first_s = total_s = 0.0
         done = 0
         while todo and (self._pool is None or max(
@@ -151,7 +149,7 @@ class Executor:
 
     def _run_there(self, job: Job, todo: "deque[_Todo]", cache: Cache,
                    advance: Callable[..., None]) -> bool:
-        """Run pieces on workers; return whether there are any."""
+        """Run pieces on workers; return False if the pool has none."""
         assert self._pool is not None
         workers = self._pool.prepare(_pickled(job), job.resources, len(todo))
         if not workers:
@@ -169,13 +167,13 @@ class Executor:
 
 @dataclass
 class _Todo(Generic[P]):
-    """A piece that is to be run.
+    """A piece to run.
 
     Attributes:
         piece: argument of the function.
-        deliver: takes its result.
-        deaths: number of workers that died of it.
-        is_half: whether it is half of a piece that was too large.
+        deliver: called with its result.
+        deaths: number of workers that died while they ran it.
+        is_half: whether it is half of a piece whose worker died.
     """
 
     piece: P
@@ -185,7 +183,7 @@ class _Todo(Generic[P]):
 
 
 class _Run(Generic[P, R]):
-    """A job on workers."""
+    """Run of one job on workers."""
 
     def __init__(self, job: Job[P, R], todo: "deque[_Todo[P]]", cache: Cache[P, R],
                  advance: Callable[..., None]) -> None:
@@ -193,7 +191,7 @@ class _Run(Generic[P, R]):
         self._shown: set[Any] = set()
 
     def on(self, workers: Sequence[Worker]) -> None:
-        """Keep every worker at work until nothing is left."""
+        """Hand pieces to idle workers until all are done."""
         idle = list(workers)
         running: dict[Future[Outcome], tuple[Worker, _Todo[P]]] = {}
         try:
@@ -208,12 +206,13 @@ class _Run(Generic[P, R]):
                     self._take(future, worker, one)
                 for worker, _ in running.values():
                     worker.check()
-        except BaseException:  # interrupted, too: what others still do is of no use
+        except BaseException:  # also a signal: the running pieces are not needed any more
             for worker, _ in running.values():
                 worker.close()
             raise
 
     def _take(self, future: "Future[Outcome]", worker: Worker, one: "_Todo[P]") -> None:
+        """Store a result; retry the piece if its worker died; else raise the function's error."""
         error = future.exception()
         if error is None:
             self._finish(one, future.result())
@@ -230,7 +229,7 @@ class _Run(Generic[P, R]):
         self._advance(self._job.size(one.piece))
 
     def _show(self, outcome: Outcome) -> None:
-        """Show what a worker warned of and logged, each text once."""
+        """Repeat the warnings and log records of a worker, each text once."""
         for message in outcome.messages:
             if message not in self._shown:
                 self._shown.add(message)
@@ -242,7 +241,7 @@ class _Run(Generic[P, R]):
                 logging.getLogger(name).log(level, "%s", text)
 
     def _again(self, one: "_Todo[P]", death: Death) -> None:
-        """Try a piece again after its worker has died: whole, or else in halves."""
+        """Retry a piece after its worker died: as a whole, then in halves; else raise RunFailed."""
         one.deaths += 1
         if not death.memory and one.deaths <= RETRIES:
             self._todo.appendleft(one)
@@ -282,6 +281,7 @@ class _Run(Generic[P, R]):
 
 
 def _pickled(job: Job) -> bytes:
+    """Pickle the function of a job; RunFailed if that is impossible."""
     import cloudpickle  # unlike pickle it takes functions of a script or a notebook
 
     try:
@@ -292,7 +292,7 @@ def _pickled(job: Job) -> bytes:
 
 
 def _said(job: Job, workers: Sequence[Worker], pool: Pool) -> str:
-    """Return the line about the workers of a job."""
+    """Return the message about the number and size of a job's workers."""
     resources = job.resources
     parts = ["1 core" if resources.cores == 1 else f"{resources.cores} cores"]
     if resources.memory_bytes:
@@ -312,7 +312,7 @@ class LocalPool(Pool):
     """Processes of this machine.
 
     Args:
-        workers: Most of them; None: as many as there are cores and memory.
+        workers: their number; None: as many as cores and memory allow.
     """
 
     name = "this machine"
@@ -322,7 +322,7 @@ class LocalPool(Pool):
         self._workers: list[_LocalWorker] = []
 
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
-        """Return workers for a job; those that are there already are used again."""
+        """Return workers for a job, at most `count`; running ones are used again."""
         room, on_gpu = self.room(resources), _room_on_gpu(resources)
         wanted = min(self._most or min(room, on_gpu, _cores() // resources.cores), count)
         if self._most is None and wanted < 2:
@@ -346,11 +346,11 @@ class LocalPool(Pool):
         return self._workers
 
     def room(self, resources: Resources) -> int:
-        """Return how many workers fit into memory; the number of cores where it is not known."""
+        """Return how many workers fit into memory; the number of cores if that is unknown."""
         free = free_memory_bytes()
         if free is None or not resources.memory_bytes:
             return max(self._most or 0, _cores() // resources.cores)
-        # What workers take now is free once they are given the next job.
+        # Present workers free their memory when they get the next job.
         return (free + sum(each.memory_bytes for each in self._workers)) // resources.memory_bytes
 
     def close(self) -> None:
@@ -362,7 +362,7 @@ class LocalPool(Pool):
 
 
 def _room_on_gpu(resources: Resources) -> int:
-    """Return how many workers share one GPU; CUDA gives all of a machine the first one."""
+    """Return how many workers fit on the first GPU, which CUDA gives to all processes."""
     if not resources.gpu_share:
         return sys.maxsize
     return int(1 / resources.gpu_share + SHARE_ROUNDING)
@@ -375,7 +375,7 @@ def _cores() -> int:
 
 
 def start_process(environment: dict[str, str]) -> tuple[Any, "Future[int]"]:
-    """Return loky's pool of one new process, which gets no Ctrl-C; and its number, once begun."""
+    """Start a process that ignores Ctrl-C; return its loky pool and a future of its process id."""
     import loky
     from loky.backend import resource_tracker
 
@@ -386,6 +386,8 @@ def start_process(environment: dict[str, str]) -> tuple[Any, "Future[int]"]:
 
 
 class _LocalWorker(Worker):
+    """A process of this machine; it is killed if it exceeds its memory."""
+
     def __init__(self) -> None:
         self.function, self.resources = b"", Resources()
         self._sent = b""
@@ -395,7 +397,7 @@ class _LocalWorker(Worker):
 
     @property
     def memory_bytes(self) -> int:
-        """Memory that the process takes now."""
+        """Present memory of the process."""
         begun = self._begun.done() and self._begun.exception() is None
         return resident_bytes(self._begun.result()) if begun else 0
 
@@ -442,17 +444,17 @@ class _LocalWorker(Worker):
 @contextmanager
 def open_executor(workers: str = AUTO, cluster: str | None = None,
                   say: Callable[[str], None] = lambda text: None) -> Iterator[Executor]:
-    """Open a place where jobs run; all its processes have ended afterwards.
+    """Open an executor of jobs; all its processes end with the block.
 
     Args:
-        workers: Number of processes. `1`: this one. `auto`: as many as there are cores and memory,
-            where the work takes long enough to be worth it.
-        cluster: None: this machine. `auto`: a Ray cluster of its own on this machine. Else the
-            address of a Ray cluster.
-        say: Called with a line about the workers of each job.
+        workers: number of processes. `1`: this process. `auto`: as many as cores and memory allow,
+            if the work takes longer than `PATIENCE_S`.
+        cluster: None: this machine. `auto`: a new Ray cluster on this machine. Else the address of
+            a Ray cluster.
+        say: called with a line about the workers of each job.
 
     Raises:
-        BadInput: Not a number of workers, or no such cluster.
+        BadInput: `workers` is no number of workers, or there is no such cluster.
     """
     count = worker_count(workers)
     if cluster is None and (count == 1 or (count is None and usable_cores() == 1)):
@@ -472,11 +474,7 @@ def open_executor(workers: str = AUTO, cluster: str | None = None,
 
 
 def worker_count(workers: str) -> int | None:
-    """Return the number of processes that the user gives; None for `auto`.
-
-    Raises:
-        BadInput: not a number of workers.
-    """
+    """Parse the option `--workers`; None for `auto`. BadInput if it is no number from 1."""
     if workers == AUTO:
         return None
     if not (workers.isascii() and workers.isdigit() and 0 < int(workers) <= MAX_WORKERS):

@@ -1,7 +1,6 @@
-"""A job, a function over pieces of work, and the interface of a place for it.
+"""Jobs (a function over pieces of work), and the interfaces of pools and workers that run them.
 
-A place has workers, each of which runs one piece at a time. Some of the code here runs in their
-processes.
+A worker runs one piece at a time. Some functions here run in worker processes.
 """
 
 import logging
@@ -22,7 +21,7 @@ from radiotwin.runtime.processes import die_with_parent
 
 P = TypeVar("P")
 R = TypeVar("R")
-SHARE_ROUNDING = 1e-6  # ten tenths are one
+SHARE_ROUNDING = 1e-6  # of shares of a GPU: ten tenths are one
 P_contra = TypeVar("P_contra", contravariant=True)
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS",
                     "NUMEXPR_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -34,11 +33,11 @@ class Resources:
     """Resources of one worker.
 
     Attributes:
-        memory_bytes: Memory that it takes; 0: not known.
-        is_bound: Whether that is the most that it may take: beyond, a worker of this machine is
-            ended, and its piece tried again in halves. Otherwise it is only planned with.
-        cores: Threads that it may run.
-        gpu_share: Part of a GPU, 0 to 1.
+        memory_bytes: of memory; 0: not known.
+        is_bound: whether that is an upper bound: a local worker that exceeds it is killed, and its
+            piece retried in halves. Otherwise it only limits the number of workers.
+        cores: threads.
+        gpu_share: part of a GPU, 0 to 1.
     """
 
     memory_bytes: int = 0
@@ -51,14 +50,14 @@ class Cache(Protocol[P_contra, R]):
     """Results of finished pieces, kept between runs."""
 
     def get(self, piece: P_contra) -> tuple[R] | None:
-        """Return the result of a piece in a tuple; None where there is none."""
+        """Return the result of a piece in a tuple; None if there is none."""
 
     def put(self, piece: P_contra, result: R, messages: list[str], seconds: float) -> None:
-        """Keep the result of a piece, with the warnings and the time that it came with."""
+        """Store the result of a piece with its warnings and its computing time."""
 
 
 class NoCache:
-    """Keeps nothing."""
+    """A cache that stores nothing."""
 
     def get(self, piece: object) -> None:
         """Return None."""
@@ -71,18 +70,18 @@ class NoCache:
 class Job(Generic[P, R]):
     """A pure function over pieces.
 
-    Its result must not depend on the process that computes it, nor on the pieces before: then it
-    does not depend on the number of workers either.
+    Its result must not depend on the process or on earlier pieces; then it does not depend on the
+    number of workers.
 
     Attributes:
-        description: Shown with its progress.
-        function: One piece -> its result. It is sent to each worker once, and may keep there what
-            takes long to make, such as a compiled kernel; it is not pickled with that.
-        resources: Of a worker.
-        size: Piece -> steps of the progress bar.
-        halve: Piece -> two pieces that need half the memory; None: it cannot be halved.
-        join: Results of both halves -> result of the piece. It may differ from that of the whole
-            piece, so it is kept as the halves', not as the piece's.
+        description: shown with the progress.
+        function: piece -> result. It is sent to each worker once, and may keep objects there that
+            take long to make, such as a compiled kernel, but not pickle them.
+        resources: of a worker.
+        size: piece -> steps of the progress bar.
+        halve: piece -> two pieces that need half the memory; None: it cannot be halved.
+        join: results of both halves -> result of the piece. That may differ from the result of the
+            whole piece, so only the halves are cached.
     """
 
     description: str
@@ -95,10 +94,7 @@ class Job(Generic[P, R]):
 
 @dataclass
 class Outcome:
-    """Result of a piece, with the texts of its warnings, what it logged, and how long it took.
-
-    Records are (logger, level, text), from warnings upwards.
-    """
+    """Result of a piece, its warnings, log records (logger, level, text), and computing time."""
 
     result: Any
     messages: list[str] = field(default_factory=list)
@@ -107,16 +103,16 @@ class Outcome:
 
 
 class PieceRunner:
-    """The function of the job that a worker's process has last been given."""
+    """Worker-side holder of the present job's function."""
 
     def __init__(self) -> None:
         self._function: Callable[[Any], Any] | None = None
 
     def run(self, piece: Any, function: bytes | None = None) -> Outcome:
-        """Run a piece; with a function, pickled, where it is another one than before."""
+        """Run a piece; a pickled function replaces the present one first."""
         if function is not None:
-            self._function = None  # its memory is free before that of the next one is taken
-            self._function = pickle.loads(function)  # of the process that started this one
+            self._function = None  # frees its memory first
+            self._function = pickle.loads(function)  # sent by the process that started this one
         assert self._function is not None
         outcome = Outcome(None)
         started = time.perf_counter()
@@ -130,20 +126,19 @@ _of_this_process = PieceRunner()
 
 
 def run_piece(piece: Any, function: bytes | None = None) -> Outcome:
-    """Run a piece in a process that is nothing but a worker; see `PieceRunner.run`."""
+    """Run a piece in a local worker process; see `PieceRunner.run`."""
     return _of_this_process.run(piece, function)
 
 
 def begin(parent: int) -> int:
-    """Prepare a worker's process, which ends with its parent; return its number."""
-    if hasattr(signal, "SIGINT"):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the driver ends
+    """Initialise a worker process, which ends with its parent; return its process id."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent ends
     die_with_parent(parent)
     return os.getpid()
 
 
 def peak_bytes() -> int:
-    """Return the most memory that this process has taken so far; 0 where that is not known."""
+    """Return the peak memory of this process; 0 if unknown."""
     if os.name != "posix":
         return 0
     import resource
@@ -153,13 +148,13 @@ def peak_bytes() -> int:
 
 
 def thread_variables(cores: int) -> dict[str, str]:
-    """Return the environment of a worker that may run so many threads."""
+    """Return the environment variables that limit a worker's threads."""
     return dict.fromkeys(THREAD_VARIABLES, str(cores))
 
 
 @contextmanager
 def _noted(outcome: Outcome) -> Iterator[None]:
-    """Note what is warned of and logged, for the process that shows it."""
+    """Collect warnings and log records of the block in an outcome."""
     handler = _Noting(outcome)
     root = logging.getLogger()
     root.addHandler(handler)
@@ -173,6 +168,8 @@ def _noted(outcome: Outcome) -> Iterator[None]:
 
 
 class _Noting(logging.Handler):
+    """Log handler that collects records from warnings upwards."""
+
     def __init__(self, outcome: Outcome) -> None:
         super().__init__(logging.WARNING)
         self._outcome = outcome
@@ -183,56 +180,61 @@ class _Noting(logging.Handler):
 
 @dataclass(frozen=True)
 class Death:
-    """Why a worker has ended while it ran a piece, and whether for certain of too much memory."""
+    """Reason why a worker died while it ran a piece, and whether it exceeded its memory."""
 
     reason: str
     memory: bool = False
 
 
 class Worker(ABC):
-    """Runs one piece at a time, in a process of its own; a dead one is replaced by `submit`."""
+    """A process that runs one piece at a time; `submit` starts a new one after a death."""
 
     @abstractmethod
     def submit(self, piece: Any) -> "Future[Outcome]":
-        """Begin with a piece of the job that the pool was last prepared for."""
+        """Start a piece of the job that the pool was last prepared for."""
 
     @abstractmethod
     def death(self, error: BaseException) -> Death | None:
-        """Return why the worker has died; None if `error` was raised by the function."""
+        """Return why the worker died; None if `error` was raised by the function."""
 
     @abstractmethod
     def raised(self, error: BaseException) -> BaseException:
-        """Return what the function raised, without what the backend made of it."""
+        """Return the error that the function raised, unwrapped from the backend's."""
 
     @abstractmethod
     def close(self) -> None:
-        """End the process, whatever it does."""
+        """Kill the process."""
 
     @abstractmethod
     def check(self) -> None:
-        """End the worker if it takes more memory than it may."""
+        """Kill the worker if it exceeds its memory."""
 
 
 class Pool(ABC):
-    """A place for work.
+    """A set of workers.
 
     Attributes:
-        name: as messages have it, such as `this machine`.
+        name: for messages, such as `this machine`.
     """
 
     name: str
 
     @abstractmethod
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
-        """Return workers for a job of so many pieces, and no more of them.
+        """Return workers for a job.
 
-        The function is pickled. There are none where other processes would not be faster than this
-        one.
+        Args:
+            function: pickled.
+            resources: of each worker.
+            count: number of pieces, and largest number of workers.
+
+        Returns:
+            none if workers would not be faster than this process.
 
         Raises:
-            RunFailed: so many workers of this size cannot be had.
+            RunFailed: the requested workers do not fit on the machine.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End all workers, whatever they do."""
+        """Kill all workers."""

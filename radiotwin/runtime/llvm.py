@@ -1,9 +1,9 @@
-"""Choice of a libLLVM that Dr.Jit can use, before Dr.Jit is imported.
+"""Choose a libLLVM that Dr.Jit can use, before Dr.Jit is imported.
 
-Dr.Jit loads the first libLLVM that it finds when it is imported, and never another one. A version
-below 15 leaves it without a CPU backend ("could not be found", though it was); 15 and 16 load, and
-abort the process at the first kernel that they cannot compile. So the newest library from
-`MIN_VERSION` on that loads is named to it. A library is loaded in a process of its own.
+Dr.Jit loads the first libLLVM that it finds, once. A version below 15 leaves it without a CPU
+backend ("could not be found", though it was); 15 and 16 abort the process at the first kernel that
+they cannot compile. So the newest library from `MIN_VERSION` on that loads is chosen. Libraries are
+tried in another process.
 
 `python -m radiotwin.runtime.llvm` prints the library that would be used, or the reason why there is
 none, with exit status 1.
@@ -48,7 +48,7 @@ class Candidate:
 
     Attributes:
         path: of the file.
-        version: by its name, else as it reports it; None if neither gives one.
+        version: from the file name, else as reported by the library; None if unknown.
     """
 
     path: Path
@@ -60,6 +60,7 @@ class Candidate:
 
 
 def _version_in_name(name: str) -> tuple[int, ...] | None:
+    """Return the version in a file name of libLLVM; None if it has none."""
     match = _NAME.fullmatch(name)
     digits = match and (match["before"] or match["after"])
     return tuple(map(int, digits.split("."))) if digits else None
@@ -67,7 +68,10 @@ def _version_in_name(name: str) -> tuple[int, ...] | None:
 
 @cache
 def reported_version(path: Path) -> tuple[int, ...] | str:
-    """Return the version that a library reports, or why it does not; below 16 it cannot."""
+    """Return the version that a library reports, or the reason why it reports none.
+
+    Versions below 16 cannot report it.
+    """
     try:
         answer = subprocess.run([sys.executable, "-P", "-c", _ASK_VERSION, str(path)], check=False,
                                 capture_output=True, text=True, timeout=TIMEOUT_S)
@@ -80,7 +84,7 @@ def reported_version(path: Path) -> tuple[int, ...] | str:
 
 
 def search_folders() -> list[Path]:
-    """Return the folders where systems, Homebrew, MacPorts, conda and LLVM's installer put it."""
+    """Return the folders where Linux, Homebrew, MacPorts, conda and LLVM put libLLVM."""
     folders = [Path(found) for pattern in _FOLDERS for found in sorted(Path("/").glob(pattern[1:]))]
     for prefix in (sys.prefix, sys.base_prefix, os.environ.get("CONDA_PREFIX")):
         if prefix:
@@ -93,7 +97,7 @@ def search_folders() -> list[Path]:
 
 
 def _loader_files() -> list[Path]:
-    """Return the libraries that the dynamic loader of Linux knows."""
+    """Return the libLLVM files that the dynamic loader of Linux knows."""
     ldconfig = shutil.which("ldconfig") or shutil.which("ldconfig", path="/sbin:/usr/sbin")
     if ldconfig is None or platform.system() != "Linux":
         return []
@@ -111,7 +115,7 @@ def find() -> list[Candidate]:
     for folder in search_folders():
         files += sorted(file for pattern in ("libLLVM*", "LLVM-C.dll")
                         for file in folder.glob(pattern))
-    # Links are resolved: one library has many names, and a link without a version points to one.
+    # Links are resolved, as one library has many names.
     paths = {file.resolve(): None for file in files
              if _NAME.fullmatch(file.name) and file.is_file()}
     if os.environ.get(VARIABLE):
@@ -125,7 +129,7 @@ def find() -> list[Candidate]:
 
 
 def rejection(candidate: Candidate) -> str | None:
-    """Return the reason why a library cannot be used, or None if it can."""
+    """Return the reason why a library cannot be used; None if it can."""
     too_old = f"too old: Dr.Jit needs version {MIN_VERSION} or newer"
     if candidate.version is not None and candidate.version[0] < MIN_VERSION:
         return too_old
@@ -136,7 +140,7 @@ def rejection(candidate: Candidate) -> str | None:
 
 
 def _eligible() -> list[Candidate]:
-    """Return the candidates; only that of DRJIT_LIBLLVM_PATH where it is set, as in Dr.Jit."""
+    """Return the candidates; only the one in DRJIT_LIBLLVM_PATH if that is set, as Dr.Jit does."""
     candidates = find()
     if not os.environ.get(VARIABLE):
         return candidates
@@ -145,15 +149,12 @@ def _eligible() -> list[Candidate]:
 
 
 def choose() -> Candidate | None:
-    """Return the newest libLLVM that works, or None.
-
-    Where DRJIT_LIBLLVM_PATH is set, only that one is considered.
-    """
+    """Return the newest libLLVM that works, or that in DRJIT_LIBLLVM_PATH; None if none works."""
     return next((candidate for candidate in _eligible() if rejection(candidate) is None), None)
 
 
 def available() -> bool:
-    """Return whether rays can be traced on this machine's processor."""
+    """Return whether rays can be traced on this machine's CPU."""
     return choose() is not None
 
 
@@ -196,12 +197,10 @@ def advice() -> str:
 
 
 def prepare() -> None:
-    """Choose a libLLVM and set DRJIT_LIBLLVM_PATH.
-
-    Call it before drjit, mitsuba or sionna.rt is imported.
+    """Set DRJIT_LIBLLVM_PATH to a libLLVM that works; call it before Dr.Jit is imported.
 
     Raises:
-        RunFailed: no libLLVM works, or Dr.Jit was imported earlier and took one that does not.
+        RunFailed: no libLLVM works, or Dr.Jit was imported already with one that does not.
     """
     if "drjit" in sys.modules:
         if sys.modules["drjit"].detail.llvm_version()[0] >= MIN_VERSION:

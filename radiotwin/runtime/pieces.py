@@ -1,10 +1,9 @@
-"""Finished parts of long work, kept between runs: a killed run goes on where it was.
+"""Cache of finished parts of long work, so that a killed run goes on where it was.
 
-A part is the result of a function of known inputs. Its name is the hash of all that decides it: the
-inputs, the sources of this package, and the versions of the libraries that compute it. So whatever
-asks for the same part gets the same bits, and nothing is ever out of date.
+A part is the result of a function. Its name is the hash of the inputs, of the sources of this
+package, and of the versions of the libraries that compute it, so that no part is ever out of date.
 
-Work keeps its parts inside `with keep_pieces():`; elsewhere `kept` only calls the function.
+Parts are cached inside `with keep_pieces():`; elsewhere `kept` only calls the function.
 """
 
 from __future__ import annotations
@@ -37,33 +36,32 @@ Piece = tuple[dict[str, np.ndarray], Any]
 P = TypeVar("P")
 T = TypeVar("T")
 
-MIN_SECONDS = 0.05  # a part that took less is made again sooner than it is written
-LEFT_SHARE = 0.9  # of the limit, after the oldest parts were removed
+MIN_SECONDS = 0.05  # a part that took less is computed again faster than it is written
+LEFT_SHARE = 0.9  # of the size limit, to which the cache is reduced
 LIBRARIES = ("numpy", "scipy", "numba", "embreex", "torch", "sionna-rt", "mitsuba", "drjit")
 _DAMAGE = (BadInput, OSError, ValueError, KeyError, TypeError, IndexError, AttributeError,
            EOFError, zipfile.BadZipFile)
 
 
 def pieces_folder() -> Path:
-    """Return the folder of the parts: in `RADIOTWIN_CACHE`, or the user's folder of caches."""
-    own = os.environ.get("RADIOTWIN_CACHE")
-    if own:
-        return Path(own) / "pieces"
+    """Return the folder of the parts: in `RADIOTWIN_CACHE`, or in the user's cache folder."""
+    if given := os.environ.get("RADIOTWIN_CACHE"):
+        return Path(given) / "pieces"
     caches = os.environ.get("XDG_CACHE_HOME")
     return (Path(caches) if caches else Path.home() / ".cache") / "radiotwin" / "pieces"
 
 
 @dataclass(eq=False)
 class PieceStore:
-    """Parts in a folder.
+    """Cached parts in a folder, and what this run did with them.
 
     Attributes:
         folder: of the files.
-        earlier: parts that this run took from an earlier one.
-        made: parts that it made.
-        saved: of these, those that were written.
-        failed: why nothing more is written; empty while all is well.
-        shown: warnings of parts that this run has shown.
+        earlier: number of parts that were read from an earlier run.
+        made: number of parts that were computed.
+        saved: number of parts that were written.
+        failed: why writing has stopped; empty if it has not.
+        shown: warnings of parts that have been shown.
     """
 
     folder: Path
@@ -77,7 +75,7 @@ class PieceStore:
 
     @property
     def progress(self) -> str:
-        """How many parts were taken from an earlier run; empty where none was."""
+        """Message with the number of parts from an earlier run; empty if there are none."""
         if not self.earlier:
             return ""
         return (f"{self.earlier} of {self.earlier + self.made} parts were kept from an earlier "
@@ -85,7 +83,7 @@ class PieceStore:
 
     def get(self, name: str, unpack: Callable[[dict[str, np.ndarray], Any], T],
             ) -> tuple[T, list[str]] | None:
-        """Return a part and the warnings that it came with; None where it is absent or damaged."""
+        """Read a part and its warnings; None if it is absent or damaged."""
         path = self.folder / f"{name}.npz"
         try:
             if not path.is_file():
@@ -95,7 +93,7 @@ class PieceStore:
         except _DAMAGE:
             return None
         with suppress(OSError):
-            os.utime(path)  # the oldest use, not the oldest part, is removed first
+            os.utime(path)  # the least recently used part is removed first
         return value
 
     def put(self, name: str, piece: Piece, messages: list[str]) -> None:
@@ -106,7 +104,7 @@ class PieceStore:
         if len(data) > PIECE_BYTES.limit:
             return
         try:
-            # Not flushed to the disk: a part that a power failure has damaged is made again.
+            # Not flushed to the disk: a part that a power failure damages is computed again.
             with atomic_path(self.folder / f"{name}.npz", flush=False) as temporary:
                 temporary.write_bytes(data)
         except (BadInput, RunFailed, OSError) as error:
@@ -140,7 +138,7 @@ class PieceStore:
         return count
 
     def _shrink(self, more: int) -> None:
-        """Count bytes that were written; remove the oldest parts if there are too many."""
+        """Add written bytes to the size; remove the least recently used parts above the limit."""
         if self._bytes is None:
             self._bytes = sum(size for _, size, _ in self.files())
         else:
@@ -158,7 +156,7 @@ class PieceStore:
 
 
 def cache_content() -> dict[str, Any]:
-    """Return what is kept of finished and of killed runs.
+    """Return the content of the cache, by kind of part.
 
     Returns:
         `folder`, `bytes`, `limit_bytes`, and `parts`: kind -> `parts` (their number) and `bytes`.
@@ -174,7 +172,7 @@ def cache_content() -> dict[str, Any]:
 
 
 def clear_cache() -> int:
-    """Remove all that is kept of finished and of killed runs; return the number of parts."""
+    """Remove all parts from the cache; return their number."""
     return PieceStore(pieces_folder()).clear()
 
 
@@ -183,13 +181,13 @@ _stores: list[PieceStore] = []  # the last one is in use
 
 @contextmanager
 def keep_pieces(folder: Path | None = None) -> Iterator[PieceStore]:
-    """Keep finished parts of the work inside, and take those of earlier runs.
+    """Cache finished parts of the work in the block, and use those of earlier runs.
 
     Args:
         folder: of the parts; None: `pieces_folder`.
 
     Yields:
-        the store, which counts.
+        the store, with its counts.
     """
     store = PieceStore(pieces_folder() if folder is None else folder)
     _stores.append(store)
@@ -200,7 +198,7 @@ def keep_pieces(folder: Path | None = None) -> Iterator[PieceStore]:
 
 
 def with_pieces(function: Callable[[P], T]) -> Callable[[P], T]:
-    """Return a function that keeps parts where this process does, in other processes, too."""
+    """Wrap a function so that it uses this process's cache in worker processes, too."""
     return _Keeping(function, _stores[-1].folder) if _stores else function
 
 
@@ -217,20 +215,20 @@ class _Keeping(Generic[P, T]):
 
 
 def keeps() -> bool:
-    """Return whether parts are kept now: inside `keep_pieces`."""
+    """Return whether parts are cached now, inside `keep_pieces`."""
     return bool(_stores)
 
 
 def kept(kind: str, inputs: tuple, make: Callable[[], T], pack: Callable[[T], Piece | None],
          unpack: Callable[[dict[str, np.ndarray], Any], T]) -> T:
-    """Return the result of a function, from an earlier run where there is one.
+    """Return the result of a function, from the cache if it is there.
 
     Args:
         kind: of the part; letters, digits and dashes.
-        inputs: all that decides it; what `content_hash` knows, else the part is not kept.
+        inputs: everything that the result depends on; not cached unless `content_hash` accepts it.
         make: the function.
-        pack: its result -> arrays and what JSON can hold; None if that cannot hold it.
-        unpack: the reverse, to the bit; any error of it means that the part is damaged.
+        pack: result -> arrays and JSON data; None: it is not cached.
+        unpack: the inverse, to the bit; an error means that the part is damaged.
     """
     return kept_with_name(kind, inputs, make, pack, unpack)[0]
 
@@ -238,7 +236,7 @@ def kept(kind: str, inputs: tuple, make: Callable[[], T], pack: Callable[[T], Pi
 def kept_with_name(kind: str, inputs: tuple, make: Callable[[], T],
                    pack: Callable[[T], Piece | None],
                    unpack: Callable[[dict[str, np.ndarray], Any], T]) -> tuple[T, str]:
-    """Return the result of a function as `kept`, and the hash of its inputs; "" without one."""
+    """Return the result of a function like `kept`, and the part's name; `""` if not cached."""
     parts: KeptParts[None, T] = KeptParts(kind, lambda _: inputs, pack, unpack)
     name = parts.name(None)
     if not name:
@@ -255,12 +253,11 @@ def kept_with_name(kind: str, inputs: tuple, make: Callable[[], T],
 
 @dataclass(frozen=True, eq=False)
 class KeptParts(Generic[P, T]):
-    """Parts of one kind in the store in use, by the pieces of work that they are of.
+    """`jobs.Cache` over the store in use, for parts of one kind.
 
     Attributes:
-        kind: as of `kept`.
-        inputs: piece -> all that decides its part; what `content_hash` knows, else it is not kept.
-        pack, unpack: as of `kept`.
+        kind, pack, unpack: see `kept`.
+        inputs: piece -> everything that its result depends on, see `kept`.
     """
 
     kind: str
@@ -269,7 +266,7 @@ class KeptParts(Generic[P, T]):
     unpack: Callable[[dict[str, np.ndarray], Any], T]
 
     def name(self, piece: P) -> str:
-        """Return the name of a part; "" where nothing is kept, or its inputs have no hash."""
+        """Return the name of a piece's part; "" without a cache, or if its inputs have no hash."""
         if not _stores:
             return ""
         try:
@@ -278,18 +275,18 @@ class KeptParts(Generic[P, T]):
             return ""
 
     def get(self, piece: P) -> tuple[T] | None:
-        """Return a part in a tuple, with its warnings shown; None where there is none."""
+        """Return the part of a piece in a tuple, and show its warnings; None if there is none."""
         name = self.name(piece)
         return self.find(name) if name else None
 
     def put(self, piece: P, value: T, messages: list[str], seconds: float) -> None:
-        """Keep a part that was made, with the warnings that were shown, and the time it took."""
+        """Store the part of a piece, with its warnings and its computing time [s]."""
         name = self.name(piece)
         if name:
             self.keep(name, value, messages, seconds)
 
     def find(self, name: str) -> tuple[T] | None:
-        """Return the part of a name as `get` does."""
+        """Return the part with a name, like `get`."""
         store = _stores[-1]
         found = store.get(name, self.unpack)
         if found is None:
@@ -305,7 +302,7 @@ class KeptParts(Generic[P, T]):
         return (value,)
 
     def keep(self, name: str, value: T, messages: list[str], seconds: float) -> None:
-        """Keep the part of a name as `put` does."""
+        """Store the part under a name, like `put`."""
         store = _stores[-1]
         store.shown.update(messages)
         store.made += 1
@@ -317,7 +314,7 @@ class KeptParts(Generic[P, T]):
 
 @cache
 def versions() -> tuple[str, ...]:
-    """Return hashes and versions of the code that makes parts."""
+    """Return the versions of the libraries, and the hash of this package's sources."""
     from importlib.metadata import PackageNotFoundError, version
 
     found = [platform.python_version(), platform.machine()]
@@ -334,7 +331,7 @@ def versions() -> tuple[str, ...]:
 
 @contextmanager
 def noted_warnings() -> Iterator[list[str]]:
-    """Yield a list that gets the texts of the warnings that are shown meanwhile."""
+    """Collect the texts of UserWarnings of the block, which are shown as well."""
     # `warnings.catch_warnings` would forget which ones were shown before.
     show, messages = warnings.showwarning, list[str]()
 

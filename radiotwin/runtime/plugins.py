@@ -1,4 +1,4 @@
-"""Classes that installed packages add under an entry-point group."""
+"""Load the classes that installed packages register under an entry-point group."""
 
 import warnings
 from collections.abc import Callable
@@ -9,19 +9,17 @@ from typing import Any
 
 @cache  # to read what all packages declare takes tens of milliseconds
 def entry_points(group: str) -> metadata.EntryPoints:
-    """Return the entry points of a group."""
+    """Return the entry points of a group, such as `radiotwin.effects`."""
     return metadata.entry_points(group=group)
 
 
 def load_plugins(group: str, register: Callable[[Any], Any], what: str) -> None:
-    """Register every class that a package adds to a group, such as `radiotwin.effects`.
-
-    Warns where one cannot be loaded or registered, and goes on without it.
+    """Register every class of an entry-point group; warn about those that cannot be used.
 
     Args:
         group: of entry points.
-        register: is called with each class; may refuse it with an exception.
-        what: they are, for the warning, such as `effect`.
+        register: called with each class; may refuse it with an exception.
+        what: kind of class, for the warning, such as `effect`.
     """
     for point in entry_points(group=group):
         try:

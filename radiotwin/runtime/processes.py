@@ -1,4 +1,4 @@
-"""This process, its machine and its threads: memory, cores, the end together with its parent."""
+"""Memory, cores and threads of this process, and its end together with its parent."""
 
 import ctypes
 import os
@@ -16,14 +16,13 @@ PARENT_CHECK_S = 1.0
 _GROUPS = Path("/sys/fs/cgroup")
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-MOST = 4  # more wait for each other: the parts between run one at a time
+MAX_THREADS = 4  # more threads wait for each other in the serial parts
 
 
 def die_with_parent(parent: int) -> None:
-    """Have this process end when the one that started it is killed, or has died already.
+    """Let this process end when its parent has died.
 
-    On Linux the kernel sees to it, even in a long computation; elsewhere a thread looks once a
-    second (on Windows nothing does).
+    The kernel does this on Linux; elsewhere a thread checks once a second (not on Windows).
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))  # PR_SET_PDEATHSIG of sys/prctl.h
@@ -34,21 +33,23 @@ def die_with_parent(parent: int) -> None:
 
 
 def _watch(parent: int) -> None:
+    """Exit once the parent process has died."""
     while os.getppid() == parent:
         time.sleep(PARENT_CHECK_S)
     os._exit(1)
 
 
 def free_memory_bytes() -> int | None:
-    """Return the memory that can be taken without swapping; None where it is not known.
+    """Return the memory that can be allocated without swapping; None if unknown.
 
-    The least of what the machine has and of what the control group of this process may still take.
+    It is the smaller of the machine's free memory and the rest of this process's control group.
     """
     found = [_machine_bytes(), _group_bytes()]
     return min((each for each in found if each is not None), default=None)
 
 
 def _machine_bytes() -> int | None:
+    """Return the available memory of the machine; on macOS all memory; None if unknown."""
     with suppress(OSError, ValueError, IndexError):
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -59,10 +60,9 @@ def _machine_bytes() -> int | None:
 
 
 def _group_bytes() -> int | None:
-    """Return what a container may still take: control groups of version 2, then 1.
+    """Return the free memory of a container: control groups of version 2, then 1.
 
-    Pages of files that were not used lately count as used, and are given back where memory is
-    short.
+    File pages that were not used lately are counted as used there, but can be freed.
     """
     for limit, used, of, files in (
             ("memory.max", "memory.current", "memory.stat", "inactive_file"),
@@ -75,7 +75,7 @@ def _group_bytes() -> int | None:
 
 
 def _counted(path: Path, name: str) -> int:
-    """Return a number of a file with a name and a number in each line; 0 where it is not there."""
+    """Read a value from a file of lines `name number`; 0 if it is missing."""
     with suppress(OSError, ValueError):
         for line in path.read_text().splitlines():
             if line.startswith(f"{name} "):
@@ -84,7 +84,7 @@ def _counted(path: Path, name: str) -> int:
 
 
 def resident_bytes(pid: int) -> int:
-    """Return the memory of a process; 0 where that is not known, or the process has ended."""
+    """Return the resident memory of a process; 0 if that is unknown, or it has ended."""
     with suppress(OSError, ValueError, IndexError, AttributeError):
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
@@ -99,21 +99,20 @@ def usable_cores() -> int:
 
 
 def allowed_cores() -> int:
-    """Return the number of cores that this process may use: no more than OMP_NUM_THREADS."""
+    """Return the number of cores that this process may use, at most OMP_NUM_THREADS."""
     limit = os.environ.get("OMP_NUM_THREADS", "")
     return min(usable_cores(), max(int(limit), 1) if limit.isdigit() else usable_cores())
 
 
 def thread_count() -> int:
-    """Return how many threads may run: the process's cores, no more than OMP_NUM_THREADS."""
-    return min(allowed_cores(), MOST)
+    """Return the number of threads for `in_threads`: allowed cores, at most `MAX_THREADS`."""
+    return min(allowed_cores(), MAX_THREADS)
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Return a function's results in the order of its arguments, one a call.
+    """Call a function with each item, in threads; return the results in the order of the items.
 
-    The function changes nothing that other calls read. A progress bar of its own needs one that is
-    open around all.
+    The function must be thread-safe. A progress bar in it needs an outer one around the call.
     """
     listed = list(items)
     count = min(thread_count(), len(listed))

@@ -1,4 +1,4 @@
-"""Workers on a Ray cluster: one actor each."""
+"""Run jobs on a Ray cluster, with one actor for each worker."""
 
 import contextlib
 import json
@@ -31,9 +31,9 @@ from radiotwin.runtime.pieces import versions
 from radiotwin.runtime.processes import usable_cores
 
 OWN = "auto"
-STORE_BYTES = 128 * 2**20  # for objects, of a cluster of our own: pieces and results are small
-START_S = 120  # for workers of a cluster to begin
-STOP_S = 20
+STORE_BYTES = 128 * 2**20  # object store of our own cluster: pieces and results are small
+START_S = 120  # timeout for workers to start
+STOP_S = 20  # timeout for our own cluster to end
 # All are read when Ray is imported. Without the possibility of other machines Ray listens on the
 # loopback interface only; that variable's name is from the systems where this is the default.
 _OF_OWN_CLUSTER = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
@@ -63,12 +63,12 @@ class RayPool(Pool):
     """Actors of a Ray cluster.
 
     Args:
-        address: Of a cluster that runs, HOST:PORT; `auto`: one of its own on this machine, with a
-            token, on the loopback interface, without a dashboard; it ends with the pool.
-        workers: Most of them; None: as many as the cluster has free cores and memory for.
+        address: HOST:PORT of a running cluster; `auto`: start a cluster on this machine, with a
+            token, on the loopback interface, without a dashboard, which ends with the pool.
+        workers: their number; None: as many as free cores and memory of the cluster allow.
 
     Raises:
-        BadInput: No Ray, no such cluster, or one that runs other versions.
+        BadInput: Ray is not installed, there is no such cluster, or it runs other versions.
     """
 
     name = "a Ray cluster"
@@ -107,7 +107,7 @@ class RayPool(Pool):
         self._require_same_versions(address)
 
     def _require_same_versions(self, address: str) -> None:
-        """Refuse a node whose Python, radiotwin or libraries are not those of this process."""
+        """Raise BadInput about a node with other versions of Python, radiotwin or libraries."""
         ray = self._ray
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -132,11 +132,7 @@ class RayPool(Pool):
                     "the same on all, or results would differ")
 
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
-        """Return workers for a job.
-
-        Raises:
-            RunFailed: the cluster has no room for one, or for the number that was asked for.
-        """
+        """Return workers for a job; RunFailed if the cluster has no room for the requested ones."""
         wanted = min(self._capacity(resources), count)
         same = [each for each in self._workers if each.resources == resources][:wanted]
         for each in self._workers:
@@ -150,6 +146,7 @@ class RayPool(Pool):
         return self._workers
 
     def _capacity(self, resources: Resources) -> int:
+        """Return the number of workers to start; RunFailed if they do not fit on the cluster."""
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         needs = {"CPU": resources.cores, "memory": resources.memory_bytes,
                  "GPU": resources.gpu_share}
@@ -175,7 +172,7 @@ class RayPool(Pool):
 
 
 class _Head:
-    """A cluster of our own; it ends when this process does."""
+    """A Ray cluster on this machine that ends with this process."""
 
     def __init__(self, cores: int) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="radiotwin-ray-"))
@@ -187,7 +184,7 @@ class _Head:
         assert self._process.stdin is not None and self._process.stdout is not None
         options = {"num_cpus": cores, "_temp_dir": str(self._folder),
                    "object_store_memory": STORE_BYTES,
-                   # Processes that it would start beforehand have not the workers' environment.
+                   # Processes started in advance would not have the workers' environment.
                    "_system_config": {"prestart_worker_first_driver": False}}
         self._process.stdin.write(json.dumps(options) + "\n")
         self._process.stdin.flush()
@@ -213,6 +210,8 @@ class _Head:
 
 
 class _RayWorker(Worker):
+    """An actor of a Ray cluster."""
+
     def __init__(self, ray: Any, resources: Resources) -> None:
         self._ray, self.resources = ray, resources
         self.function: Any = None
@@ -247,7 +246,7 @@ class _RayWorker(Worker):
         return getattr(error, "cause", None) or error
 
     def check(self) -> None:
-        """Do nothing: Ray ends workers that a node is short of memory for."""
+        """Do nothing: Ray kills workers if a node is short of memory."""
 
     def close(self) -> None:
         if self._actor is not None:
@@ -257,7 +256,7 @@ class _RayWorker(Worker):
 
 @contextlib.contextmanager
 def _own_handlers() -> Iterator[None]:
-    """Keep the handler of SIGTERM, which Ray replaces by its own."""
+    """Restore the handler of SIGTERM, which Ray replaces."""
     before = signal.getsignal(signal.SIGTERM)
     try:
         yield
@@ -267,12 +266,12 @@ def _own_handlers() -> Iterator[None]:
 
 
 def _versions() -> tuple[str, ...]:
-    """Return `versions()`: Ray takes functions, and that is a cached one."""
+    """Return `versions()` as a plain function, which Ray needs."""
     return versions()
 
 
 def _require_token() -> None:
-    """Set what a cluster of our own needs: a token, above all, without which it runs any code."""
+    """Set the environment of our own cluster, with a token; without one it would run any code."""
     if any(os.environ.get(name) != value for name, value in _OF_OWN_CLUSTER.items()):
         if "ray" in sys.modules:
             raise BadInput("--cluster auto: this process imported Ray before its token was set; "
@@ -282,12 +281,13 @@ def _require_token() -> None:
 
 
 def _first_line(error: BaseException) -> str:
+    """Return the first line of an error's message; the last one of a traceback."""
     lines = [line for line in str(error).strip().splitlines() if line.strip()]
     return (lines[-1] if "Traceback" in str(error) else lines[0])[:300] if lines else \
         type(error).__name__
 
 
 def _named(version: str) -> str:
-    """Return a version as a message has it; that of the sources is a hash."""
+    """Return a version for a message; the hash of the sources is shortened."""
     return version if " " in version or "." in version or not version.isalnum() else \
         f"radiotwin's sources {version[:8]}"

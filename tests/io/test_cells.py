@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.io.cells import as_numbers, listed, read_cells, shown, write_csv
+from radiotwin.io.cells import as_numbers, cell_text, listed, read_cells, write_csv
 
 ROOT = Path(__file__).parents[2]
 MIB = 2**20
@@ -236,5 +236,5 @@ def test_numbers_of_thousands_of_digits():
 
 
 def test_long_cells_and_many_columns_are_cut_in_messages():
-    assert shown("a'b") == repr("a'b") and len(shown("x" * 10**6)) < 100 and "\x1b" not in shown("\x1b[2J")
+    assert cell_text("a'b") == repr("a'b") and len(cell_text("x" * 10**6)) < 100 and "\x1b" not in cell_text("\x1b[2J")
     assert listed("ab") == "a, b" and listed(map(str, range(1000))).endswith("49, … (1,000 columns)")

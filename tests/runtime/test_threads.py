@@ -4,10 +4,10 @@ import threading
 
 import pytest
 
-from radiotwin.runtime.processes import MOST, in_threads, thread_count
+from radiotwin.runtime.processes import MAX_THREADS, in_threads, thread_count
 
 
-@pytest.mark.parametrize("limit, most", [("1", 1), ("2", 2), ("0", 1), ("", MOST), ("many", MOST)])
+@pytest.mark.parametrize("limit, most", [("1", 1), ("2", 2), ("0", 1), ("", MAX_THREADS), ("many", MAX_THREADS)])
 def test_the_environment_limits_threads(monkeypatch, limit, most):
     monkeypatch.setenv("OMP_NUM_THREADS", limit)
     assert 1 <= thread_count() <= most

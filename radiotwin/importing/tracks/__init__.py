@@ -1,4 +1,4 @@
-"""Positions of receivers from tracks of their own, at the times of a log's readings."""
+"""Take the positions of receivers from separate tracks, at the times of a log's readings."""
 
 import re
 from datetime import UTC, datetime
@@ -25,13 +25,13 @@ _READERS = {".gpx": read_gpx, ".kml": read_kml, ".nmea": read_nmea, ".nma": read
 
 def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
                tally: Tally) -> tuple[pd.DataFrame, list[str]]:
-    """Fill in the positions that a log does not have from tracks; count the links that none has.
+    """Fill in missing receiver positions of links from tracks; count and drop the rest.
 
     Returns:
-        links with `latitude, longitude, altitude` and, where a track has them, angles; and notes.
+        links with `latitude, longitude, altitude` and, if a track has them, angles; and notes.
 
     Raises:
-        BadInput: a track that cannot be read, no times, or times that have none in common.
+        BadInput: a track cannot be read, there are no times, or log and track do not overlap.
     """
     if not settings.track:
         return links, []
@@ -43,7 +43,7 @@ def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
     notes: list[str] = []
     columns = {name: links[name].to_numpy(dtype=float, copy=True) for name in COLUMNS
                if name in links}
-    # A height that the log or the settings give is not that of the track.
+    # A height of the log or the settings is not replaced by that of the track.
     has_height = links.reindex(columns=[*HEIGHTS]).notna().any(axis=1).to_numpy()
     without = np.ones(len(links), dtype=bool)
     for name in ("latitude", "x"):
@@ -52,18 +52,18 @@ def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
     for track in settings.track:
         fixes = _read(track, settings.time_zone)
         notes += fixes.notes
-        own = without & (links["receiver"].to_numpy() == track.receiver
-                         if track.receiver else np.True_)
-        if not own.any():
+        needed = without & (links["receiver"].to_numpy() == track.receiver
+                            if track.receiver else np.True_)
+        if not needed.any():
             raise BadInput(f"{track.file}: no reading needs it: " + (
                 f"receiver {track.receiver!r} is none of {listed(links['receiver'].unique())}"
                 if track.receiver else "the log has positions of its own"))
-        _check_common(source, track, time_s[own] - track.time_offset_s, fixes)
-        found = fixes.at(time_s[own] - track.time_offset_s, settings.track_max_gap_s)
+        _check_common(source, track, time_s[needed] - track.time_offset_s, fixes)
+        found = fixes.at(time_s[needed] - track.time_offset_s, settings.track_max_gap_s)
         for name, values in found.items():
             column = columns.setdefault(name, np.full(len(links), np.nan))
-            missing = np.isnan(column[own]) & ~(has_height[own] & (name == "altitude"))
-            column[own] = np.where(missing, values, column[own])
+            missing = np.isnan(column[needed]) & ~(has_height[needed] & (name == "altitude"))
+            column[needed] = np.where(missing, values, column[needed])
     links = links.assign(**columns).set_index("row")
     lost = without & np.isnan(columns["latitude"])
     return tally.drop(links, lost, f"no position of the track within {settings.track_max_gap_s:g} "
@@ -71,6 +71,7 @@ def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
 
 
 def _read(track: TrackFile, zone: str | None) -> Fixes:
+    """Read a track with the reader of its format."""
     path = Path(track.file)
     if is_rosbag(path):
         return read_rosbag(path, track.topic)
@@ -96,7 +97,7 @@ def _read(track: TrackFile, zone: str | None) -> Fixes:
 
 
 def _check_common(source: Source, track: TrackFile, time_s: np.ndarray, fixes: Fixes) -> None:
-    """Refuse a track of another time, as a log in another time zone has."""
+    """Raise BadInput if track and log do not overlap in time, as with a wrong time zone."""
     first_s, last_s = np.nanmin(time_s), np.nanmax(time_s)
     if last_s < fixes.time_s[0] or first_s > fixes.time_s[-1]:
         off_h = (first_s - fixes.time_s[0]) / 3600
@@ -110,5 +111,5 @@ def _check_common(source: Source, track: TrackFile, time_s: np.ndarray, fixes: F
 def _stamp(time_s: float) -> str:
     try:
         return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
-    except (ValueError, OverflowError, OSError):  # of years that no calendar has
+    except (ValueError, OverflowError, OSError):  # no calendar year
         return f"{time_s:g} s"

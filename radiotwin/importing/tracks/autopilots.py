@@ -1,12 +1,12 @@
-"""Tracks of flight logs: ArduPilot's DataFlash and MAVLink logs, and PX4's ULog.
+"""Read tracks from flight logs: ArduPilot's DataFlash and MAVLink logs, and PX4's ULog.
 
 A DataFlash log (.bin, or as text .log) describes itself: FMT messages have the name, length and
-fields of each kind [1]. A telemetry log (.tlog) has MAVLink packets [2], each behind the time of
-its arrival [us, UTC].
+fields of each kind [1]. A telemetry log (.tlog) has MAVLink packets [2], each after the time of its
+arrival [us, UTC].
 
 A ULog (.ulg) [3] is a header of 16 bytes and messages: size (2 bytes), type (1 byte), body. pyulog
-looks for messages from every byte of damage on, and takes memory for as many fields as a format
-declares: it gets only the messages that a track needs, checked before.
+is slow on damaged files and allocates as many fields as a format declares, so it gets only the
+messages that a track needs, after a check.
 
 [1] ArduPilot, libraries/AP_Logger/LogStructure.h: the letters of formats
 [2] https://mavlink.io/en/guide/serialization.html and message_definitions/common.xml
@@ -39,11 +39,11 @@ _GPS_EPOCH_S = 315_964_800  # 1980-01-06 in UTC
 _WEEK_S = 604_800.0
 _LEAPS = ((1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (1_230_768_000, 15),
           (1_136_073_600, 14), (915_148_800, 13))
-"""Since when [s, UTC], and by how much GPS time is ahead [s] (IERS Bulletin C)."""
-_FIX_3D = 3  # GPS_Status: below it there is no height
+"""Start [s, UTC] and GPS time minus UTC [s] (IERS Bulletin C)."""
+_FIX_3D = 3  # GPS_Status with a height
 _POSITION, _ATTITUDE = 33, 30  # GLOBAL_POSITION_INT, ATTITUDE
 _PACKETS = {_POSITION: ("<IiiiihhhH", 104), _ATTITUDE: ("<Iffffff", 39)}
-"""Message -> its fields, and the byte that its check sum begins from (CRC_EXTRA)."""
+"""Message -> struct of its fields, and the extra byte of its check sum (CRC_EXTRA)."""
 _ANGLES = ("roll_deg", "pitch_deg", "heading_deg")
 _ULOG_MAGIC = b"ULog\x01\x12\x35"
 _MAX_BODY = 2**16  # of a message, by the format
@@ -58,11 +58,7 @@ def _content(path: Path) -> bytes:
 
 
 def read_dataflash(path: Path) -> Fixes:
-    """Read the positions and the attitude of a DataFlash log, binary or a text.
-
-    Raises:
-        BadInput: it has no positions with a time of GPS.
-    """
+    """Read positions and attitude from a DataFlash log, binary or text; BadInput without GPS."""
     content = _content(path)
     is_text = content[:4] == b"FMT,"
     gps: list[list[float]] = []  # since start, week, since its start, place
@@ -91,7 +87,7 @@ def read_dataflash(path: Path) -> Fixes:
 
 
 def _nearest(attitude: np.ndarray, clock_s: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the angles (n,) [degrees] at the nearest of the times of an attitude (m, 4)."""
+    """Return the angles (n,) [deg] of an attitude (m, 4) at the nearest times."""
     if not len(attitude):
         return {}
     after = np.searchsorted(attitude[:, 0], clock_s).clip(0, len(attitude) - 1)
@@ -101,7 +97,7 @@ def _nearest(attitude: np.ndarray, clock_s: np.ndarray) -> dict[str, np.ndarray]
 
 
 def _messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the GPS and ATT messages of a binary log; damage is passed over."""
+    """Yield the GPS and ATT messages of a binary log; damaged parts are skipped."""
     lengths = {_FMT: _FMT_BYTES}
     kinds: dict[int, tuple[str, str, list[str]]] = {}
     at = content.find(_MAGIC)
@@ -114,8 +110,8 @@ def _messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
         if len(body) < length - 3:
             return  # cut off
         if content[at + 2] == _FMT:
-            number, own, name, letters, labels = struct.unpack("<BB4s16s64s", body)
-            lengths[number] = max(own, 3)
+            number, size, name, letters, labels = struct.unpack("<BB4s16s64s", body)
+            lengths[number] = max(size, 3)
             text = [part.rstrip(b"\0").decode("ascii", "replace")
                     for part in (name, letters, labels)]
             if text[0] in ("GPS", "ATT") and all(letter in _LETTERS for letter in text[1]):
@@ -132,7 +128,7 @@ def _messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
 
 
 def _text_messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
-    """Yield the GPS and ATT messages of a log as text, whose numbers have their units."""
+    """Yield the GPS and ATT messages of a text log, in which numbers are scaled already."""
     labels: dict[str, list[str]] = {}
     for line in content.decode("ascii", "replace").splitlines():
         fields = [field.strip() for field in line.split(",")]
@@ -149,11 +145,7 @@ def _text_messages(content: bytes) -> Iterator[tuple[str, dict[str, float]]]:
 
 
 def read_tlog(path: Path) -> Fixes:
-    """Read the positions and the attitude of a telemetry log, of the vehicle with most of them.
-
-    Raises:
-        BadInput: it has no two positions.
-    """
+    """Read the track of the vehicle with most positions in a telemetry log; BadInput if none."""
     positions: dict[int, list[list[float]]] = {}
     attitudes: dict[int, list[list[float]]] = {}
     damaged = 0
@@ -183,10 +175,7 @@ def read_tlog(path: Path) -> Fixes:
 
 
 def _packets(content: bytes) -> Iterator[tuple[float, int, int, bytes | None]]:
-    """Yield time [s], vehicle, message and content of the packets that are needed.
-
-    The content is None where the check sum is wrong.
-    """
+    """Yield time [s], vehicle, message and content (None if damaged) of the needed packets."""
     at = 0
     while at + 16 < len(content):
         magic, length = content[at + 8], content[at + 9]
@@ -223,10 +212,7 @@ def _checksum(data: bytes) -> int:
 
 
 def _needed_messages(path: Path, topics: Collection[str]) -> io.BytesIO:
-    """Return a ULog with the formats, subscriptions and data of some topics only.
-
-    One that was cut off ends with its last whole message.
-    """
+    """Copy the formats, subscriptions and data of some topics from a ULog, up to a truncation."""
     result = io.BytesIO()
     subscribed: set[bytes] = set()
     count = 0
@@ -263,7 +249,7 @@ def _needed_messages(path: Path, topics: Collection[str]) -> io.BytesIO:
 
 
 def _check_fields(path: Path, name: str, fields: str) -> None:
-    """Refuse nested fields, and arrays that no message can hold."""
+    """Raise BadInput about nested fields, and arrays that are too large for a message."""
     found = [_FIELD.fullmatch(field) for field in fields.rstrip(";").split(";")]
     if not all(found) or sum(int(each[1] or 1) for each in found if each) > _MAX_BODY:
         raise BadInput(f"{path}: its topic {name} has an unusual format; convert its position to "
@@ -271,9 +257,9 @@ def _check_fields(path: Path, name: str, fields: str) -> None:
 
 
 def read_ulog(path: Path) -> Fixes:
-    """Read a flight log: the estimated position, else that of the GNSS receiver; and the attitude.
+    """Read positions (estimated, else of the GNSS receiver) and attitude from a PX4 flight log.
 
-    Times count from the start of the autopilot; the GNSS receiver's UTC places them.
+    Its times count from the start of the autopilot; the GNSS receiver gives UTC.
 
     Raises:
         BadInput: pyulog is not installed, the log is damaged, or has no position or no UTC.

@@ -1,4 +1,4 @@
-"""Positions over time, in the order of time."""
+"""`Fixes`: the track of a receiver, that is positions over time."""
 
 from dataclasses import dataclass
 
@@ -14,9 +14,12 @@ COLUMNS = ("latitude", "longitude", "altitude", *ANGLES)
 
 @dataclass(frozen=True)
 class Fixes:
-    """Positions of one receiver at times (n,) [s since 1970 UTC], ascending.
+    """Positions of one receiver over time.
 
-    Each column of `COLUMNS` is (n,) [degrees, m]; NaN where unknown.
+    Attributes:
+        time_s: (n,) ascending [s since 1970 UTC].
+        values: column of `COLUMNS` -> (n,) [deg, m]; NaN: unknown.
+        notes: on the file.
     """
 
     time_s: np.ndarray
@@ -24,10 +27,10 @@ class Fixes:
     notes: tuple[str, ...] = ()
 
     def at(self, time_s: np.ndarray, max_gap_s: float) -> dict[str, np.ndarray]:
-        """Interpolate between neighbouring positions, at times (m,) [s since 1970 UTC].
+        """Interpolate at times (m,) [s since 1970 UTC].
 
         Returns:
-            column -> (m,); NaN where no two neighbours are so close in time.
+            column -> (m,); NaN if the neighbouring positions are more than `max_gap_s` apart.
         """
         after = np.searchsorted(self.time_s, time_s).clip(1, max(len(self.time_s) - 1, 1))
         before = after - 1
@@ -55,10 +58,10 @@ class Fixes:
 
 def make_fixes(source: object, time_s: np.ndarray, values: dict[str, np.ndarray],
                notes: tuple[str, ...] = ()) -> Fixes:
-    """Sort positions by time (n,) [s since 1970 UTC]; of several at one time the last one counts.
+    """Sort positions by time (n,) [s since 1970 UTC], and keep the last one of each time.
 
     Raises:
-        BadInput: fewer than two have a time and a position, or more than a few are off the Earth.
+        BadInput: fewer than two have a time and a position, or many are no latitude or longitude.
     """
     known = np.isfinite(time_s) & np.isfinite(values["latitude"]) & np.isfinite(values["longitude"])
     known &= (values["latitude"] != 0) | (values["longitude"] != 0)

@@ -1,14 +1,13 @@
-"""Positions from recordings of ROS: bags of ROS 1 [1], and of ROS 2 in SQLite (.db3) or MCAP [2].
+"""Read tracks from ROS bags: of ROS 1 [1], and of ROS 2 in SQLite (.db3) or MCAP [2].
 
 A bag of ROS 1 is a sequence of records: length and fields of a header, length and data; chunks hold
-connections (topic and type) and messages. An MCAP file is one, too: type (1 byte), length (8
-bytes), content. Their index is not used: it is what a recording that was cut off lacks, and a few
-bytes of it can name any place of the file many times. A few bytes of bz2, lz4 or Zstandard can
-stand for gigabytes, so chunks are decompressed within budgets.
+connections (topic and type) and messages. An MCAP file is also a sequence: type (1 byte), length (8
+bytes), content. Their index is not used: a truncated recording has none, and a hostile one may
+refer to one place many times. Chunks are decompressed within budgets, as a few bytes of bz2, lz4 or
+Zstandard can expand to gigabytes.
 
-Messages of type sensor_msgs/NavSatFix are decoded by rosbags, which makes Python code of the
-message definitions that a bag brings along, and runs it. Those of a stranger's bag are not given to
-it: the type is decoded by the definition that rosbags has.
+Messages of type sensor_msgs/NavSatFix are decoded by rosbags with its own definition of the type.
+rosbags would compile and run the definitions in a stranger's bag.
 
 [1] https://wiki.ros.org/Bags/Format/2.0
 [2] https://mcap.dev/spec
@@ -34,12 +33,12 @@ from radiotwin.io.inputs import open_input, require_within
 from radiotwin.io.sqlite_tables import open_tables, require_table, scan
 
 FIX = "sensor_msgs/msg/NavSatFix"
-"""Type of the messages that are read."""
+"""Type of position messages."""
 _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7  # values of the field `op`
 _STANDARD_MD5 = ("2d3a8cd499b9b4a0249fb98fd05cfa48", "*")  # of NavSatFix
 Fields = dict[bytes, bytes]
-_ZSTD = b"\x28\xb5\x2f\xfd"  # a message that was compressed by itself; CDR begins with 0
+_ZSTD = b"\x28\xb5\x2f\xfd"  # start of a single compressed message; CDR starts with 0
 _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK, _DATA_END = 3, 4, 5, 6, 15
 _ENCODINGS = {"cdr": False, "ros1": True}
@@ -53,10 +52,10 @@ class Chunks:
         self._path, self._total = path, 0
 
     def open(self, compression: str, data: bytes) -> bytes:
-        """Decompress a chunk by `none` or nothing, `bz2`, `lz4` or `zstd`.
+        """Decompress a chunk (`none`, `""`, `bz2`, `lz4` or `zstd`) within the budgets.
 
         Raises:
-            BadInput: unknown compression, damaged, or more than the budget of a chunk or a file.
+            BadInput: unknown compression, damaged, or too large.
         """
         if compression in ("none", ""):
             result = data
@@ -96,7 +95,7 @@ _MAKERS: dict[str, Callable[[], Any]] = {"bz2": bz2.BZ2Decompressor, "lz4": _lz4
 
 
 class BagMessage(NamedTuple):
-    """A message that is not decoded yet: serialised as ROS 1 does, else CDR as ROS 2."""
+    """A message that is not decoded yet, in the serialisation of ROS 1 or ROS 2 (CDR)."""
 
     topic: str
     time_ns: int
@@ -105,12 +104,12 @@ class BagMessage(NamedTuple):
 
 
 def is_fix(kind: str) -> bool:
-    """Return whether a type, as ROS 1 or ROS 2 names it, is that of the messages to read."""
+    """Return whether a type, named by ROS 1 or ROS 2, is that of position messages."""
     return kind in (FIX, "sensor_msgs/NavSatFix")
 
 
 def _ros1_messages(path: Path) -> Iterator[BagMessage]:
-    """Yield the position messages of a ROS 1 bag; one that was cut off ends with its last chunk."""
+    """Yield the position messages of a ROS 1 bag, up to the last complete chunk."""
     topics: dict[bytes, str] = {}
     chunks = Chunks(path)
     with open_input(path, "ROS bag (.bag)") as file:
@@ -126,7 +125,7 @@ def _ros1_messages(path: Path) -> Iterator[BagMessage]:
 
 
 def _messages(path: Path, chunk: bytes, topics: dict[bytes, str]) -> Iterator[BagMessage]:
-    """Yield the messages of a chunk; adds to the topics, by the number of their connection."""
+    """Yield the position messages of a chunk; new connections are added to `topics`."""
     for fields, data in _records(path, io.BytesIO(chunk), (_MESSAGE, _CONNECTION)):
         if fields[b"op"][0] == _MESSAGE:
             topic = topics.get(fields[b"conn"])
@@ -146,7 +145,7 @@ def _messages(path: Path, chunk: bytes, topics: dict[bytes, str]) -> Iterator[Ba
 
 def _records(path: Path, file: IO[bytes],
              wanted: Collection[int]) -> Iterator[tuple[Fields, bytes]]:
-    """Yield fields and data of the wanted records, up to one that is cut off."""
+    """Yield fields and data of the wanted records, up to a truncated one."""
     while len(start := file.read(4)) == 4:
         size, = struct.unpack("<I", start)
         ROW_BYTES.check(size, f"{path}: a record's header")
@@ -166,7 +165,7 @@ def _records(path: Path, file: IO[bytes],
 
 
 def _fields(header: bytes) -> Fields:
-    """Return the fields of a header, each with its length before `name=value`."""
+    """Parse the fields of a header: each is a length and `name=value`."""
     fields, at = {}, 0
     while at < len(header):
         size, = struct.unpack_from("<I", header, at)
@@ -177,7 +176,7 @@ def _fields(header: bytes) -> Fields:
 
 
 def _ros2_table_messages(path: Path) -> Iterator[BagMessage]:
-    """Yield the position messages of a ROS 2 bag in SQLite, of any version of its tables."""
+    """Yield the position messages of a ROS 2 bag in SQLite."""
     chunks = Chunks(path)
     try:
         with open_tables(path, "ROS 2 bag (.db3)") as database:
@@ -197,7 +196,7 @@ def _ros2_table_messages(path: Path) -> Iterator[BagMessage]:
 
 
 def _mcap_messages(path: Path) -> Iterator[BagMessage]:
-    """Yield the position messages of an MCAP file; one that was cut off ends with a chunk."""
+    """Yield the position messages of an MCAP file, up to the last complete chunk."""
     walk = _Walk(path)
     with open_input(path, "recording (.mcap)") as file:
         if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
@@ -209,7 +208,7 @@ def _mcap_messages(path: Path) -> Iterator[BagMessage]:
 
 
 class _Walk:
-    """Knows the channels of positions that have been met."""
+    """Walk over the records of an MCAP file, with the channels of positions found so far."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -218,6 +217,7 @@ class _Walk:
         self._channels: dict[int, tuple[str, bool]] = {}  # topic, and whether of ROS 1
 
     def messages(self, file: IO[bytes], is_chunk: bool = False) -> Iterator[BagMessage]:
+        """Yield the position messages of a file, or of a chunk."""
         begin = file.tell()
         end = file.seek(0, io.SEEK_END)
         file.seek(begin)
@@ -251,7 +251,7 @@ class _Walk:
         return self._chunks.open(compression, body[at + 8:at + 8 + size])
 
     def _declare(self, kind: int, body: bytes) -> None:
-        """Note a schema of positions, or a channel that has one."""
+        """Note a schema of positions, or a channel of one."""
         number, = struct.unpack_from("<H", body)
         if kind == _SCHEMA:
             if is_fix(_text(body, 2)[0]):
@@ -265,7 +265,7 @@ class _Walk:
 
 
 def _text(body: bytes, at: int) -> tuple[str, int]:
-    """Return a text with its length before it, and where it ends."""
+    """Read a text with its length before it; return also the position after it."""
     size, = struct.unpack_from("<I", body, at)
     return body[at + 4:at + 4 + size].decode(), at + 4 + size
 
@@ -275,18 +275,22 @@ _CONTAINERS: dict[str, Callable[[Path], Iterator[BagMessage]]] = {
 
 
 def is_rosbag(path: Path) -> bool:
-    """Return whether a path is that of a ROS bag: a file by its name, or a folder."""
+    """Return whether a path is a ROS bag: a file with such a suffix, or a folder."""
     return path.suffix.lower() in (*_CONTAINERS, ".zstd") or path.is_dir()
 
 
 def read_rosbag(path: Path, topic: str | None = None) -> Fixes:
-    """Read the positions of a ROS 1 bag (.bag) or a ROS 2 bag (.mcap, .db3, or the folder of it).
+    """Read the positions of a ROS 1 bag (.bag) or a ROS 2 bag (.mcap, .db3, or its folder).
 
-    Times are those of the messages' headers, else those of the recording. Messages without a fix
-    are left out. Without a topic there is to be only one with positions.
+    Times are those of the messages' headers, else of the recording. Messages without a fix are left
+    out.
+
+    Args:
+        path: of the bag.
+        topic: None: the only topic with positions.
 
     Raises:
-        BadInput: rosbags is not installed, the bag is damaged or has no such topic, or several.
+        BadInput: rosbags is not installed, the bag is damaged, or the topic is missing.
     """
     decode = _decoders(path)
     topics: dict[str, array[float]] = {}
@@ -309,7 +313,7 @@ def read_rosbag(path: Path, topic: str | None = None) -> Fixes:
 
 
 def _decoders(path: Path) -> tuple[Callable[[bytes, str], Any], Callable[[bytes, str], Any]]:
-    """Return what decodes messages of ROS 2, and of ROS 1."""
+    """Return the functions that decode messages of ROS 2, and of ROS 1."""
     types = optional_package(
         "rosbags.typesys", f"{path}: ROS bags need the package rosbags; `pip install "
                            "radiotwin[ros]`, or convert its positions to GPX or a table")
@@ -331,7 +335,7 @@ def _parts(path: Path) -> list[Path]:
 
 
 def _row(fix: Any, time_ns: int) -> tuple[float, float, float, float]:
-    """Return time, latitude, longitude and altitude; NaN where there was no fix."""
+    """Return time [s], latitude, longitude [deg] and altitude [m]; NaN latitude without a fix."""
     stamp = fix.header.stamp
     time_s = stamp.sec + stamp.nanosec / 1e9 or time_ns / 1e9
     is_known = fix.status.status >= 0  # STATUS_NO_FIX is -1

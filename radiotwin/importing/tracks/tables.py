@@ -1,7 +1,7 @@
-"""Tracks in tables: exports of flight logs (Airdata, Litchi, DJI), loggers, and declared columns.
+"""Read tracks from tables: exports of flight logs (Airdata, Litchi, DJI), and of loggers.
 
-A column is known by its usual names, with its unit at the end: `altitude_above_seaLevel(feet)`,
-`OSD.yaw [360]`, `height_m`. Altitudes are those above the sea, never above the start or the ground.
+A column is recognised by a usual name with its unit at the end: `altitude_above_seaLevel(feet)`,
+`OSD.yaw [360]`, `height_m`. Altitudes are above the sea, never above the start or the ground.
 """
 
 import re
@@ -31,7 +31,7 @@ _NAMES = {
     "heading": "heading, compass heading, osd yaw, yaw, course heading",
     "pitch": "pitch, osd pitch", "roll": "roll, osd roll",
     "day": "custom date, date, gps date, utc date", "hour": "custom update time, time, gps time"}
-"""Quantity -> names in the order in which they count."""
+"""Quantity -> column names in order of preference."""
 _UNIT = re.compile(r"\s*[(\[]([^)\]]*)[)\]]\s*$|_(m|ft|deg|s|ms|utc)$")
 _LENGTHS = {**dict.fromkeys(("m", "meter", "meters", "metre", "metres"), METRES["m"]),
             **dict.fromkeys(("ft", "feet", "foot"), METRES["ft"])}
@@ -46,7 +46,7 @@ def _plain(name: str) -> str:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Return the plain name of a column, and its unit in lower case, or `""`."""
+    """Split the name of a column into its plain name, and its unit in lower case, or `""`."""
     unit = _UNIT.search(name)
     if unit is None:
         return _plain(name), ""
@@ -54,11 +54,11 @@ def _split(name: str) -> tuple[str, str]:
 
 
 def _find(header: list[str], quantity: str, unit: str | None = None) -> str | None:
-    """Return the column of a quantity, of a unit if one is given, or None."""
+    """Find the column of a quantity, in a given unit (None: any); None if there is none."""
     columns = {_split(name): name for name in reversed(header)}
     for word in map(_plain, _NAMES[quantity].split(",")):
-        for (plain, own), name in columns.items():
-            if plain == word and (unit is None or own == unit):
+        for (plain, column_unit), name in columns.items():
+            if plain == word and (unit is None or column_unit == unit):
                 return name
     return None
 
@@ -67,9 +67,9 @@ def read_track_table(path: Path, track: TrackFile, zone: str | None) -> Fixes:
     """Read a table of positions over time.
 
     Args:
-        path: of any format of `read_source`.
-        track: with what is declared of its columns, times and lengths.
-        zone: of times without an offset from UTC, where the track does not say.
+        path: in any format of `read_source`.
+        track: declares columns, times and lengths.
+        zone: of times without an offset from UTC, if the track declares none.
 
     Raises:
         BadInput: no column of time, latitude or longitude, or cells that cannot be read.
@@ -110,7 +110,7 @@ def read_track_table(path: Path, track: TrackFile, zone: str | None) -> Fixes:
 
 def _times(source: Source, header: list[str], track: TrackFile,
            zone: str | None) -> tuple[np.ndarray, str]:
-    """Return the times (n,) [s since 1970 UTC], and what they are from."""
+    """Read the times (n,) [s since 1970 UTC]; return also the names of their columns."""
     zone = track.time_zone or zone
     if spec := track.columns.get("time"):
         time_s = seconds(source, spec, track.time_format or _form(source, spec), zone or "UTC")
@@ -132,7 +132,7 @@ def _times(source: Source, header: list[str], track: TrackFile,
 
 
 def _form(source: Source, spec: str) -> str:
-    """Return the form of times: of numbers it is known by their size."""
+    """Return the format of a column of times; for numbers it follows from their size."""
     numbers = as_numbers(as_text(source.cells(spec, "time")))
     known = numbers[np.isfinite(numbers)]
     if not len(known):
@@ -147,9 +147,9 @@ def _form(source: Source, spec: str) -> str:
 
 
 def _finer(source: Source, header: list[str], time_s: np.ndarray) -> np.ndarray:
-    """Return times of whole seconds with the decimals of a column of milliseconds since the start.
+    """Refine times of whole seconds by a column of milliseconds since the start, if there is one.
 
-    Each second was cut off, so that the start is the latest that any row gives.
+    The seconds are truncated, so the start is the latest that any row gives.
     """
     names = {_split(name): name for name in header}
     spec = next((names[key] for key in names if key[0] == "time"
@@ -162,7 +162,7 @@ def _finer(source: Source, header: list[str], time_s: np.ndarray) -> np.ndarray:
 
 
 def _day_and_hour(source: Source, day: str, hour: str, zone: str | None) -> np.ndarray:
-    """Return times [s] of a column of dates, month first where it has slashes, and one of hours."""
+    """Read times [s] from a column of dates (month first with slashes) and one of hours."""
     texts = {name: as_text(source.cells(name, "time")) for name in (day, hour)}
     forms: Mapping[str, tuple[str, ...]] = {day: _DAY_FORMATS, hour: _HOUR_FORMATS}
     chosen = []

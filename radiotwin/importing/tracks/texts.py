@@ -22,7 +22,7 @@ from radiotwin.errors import BadInput
 from radiotwin.importing.log_files import Lines
 from radiotwin.importing.tracks.fixes import ANGLES, Fixes, make_fixes
 from radiotwin.io.budgets import DOCUMENT_BYTES, ROWS
-from radiotwin.io.cells import shown
+from radiotwin.io.cells import cell_text
 from radiotwin.io.inputs import open_gzip, parse_elements, parse_json
 
 _DAY_S = 86_400.0
@@ -32,9 +32,7 @@ _PLACE = ("latitude", "longitude", "altitude")
 
 
 def read_nmea(path: Path) -> Fixes:
-    """Read the positions of NMEA 0183 sentences of any talker.
-
-    Sentences whose check sum is wrong are left out.
+    """Read the track of NMEA 0183 sentences of any talker, without damaged ones.
 
     Raises:
         BadInput: no date, or fewer than two positions.
@@ -74,7 +72,7 @@ def read_nmea(path: Path) -> Fixes:
 
 
 def _sentence(line: str) -> tuple[list[str], bool]:
-    """Return the fields of a sentence, and whether its check sum is wrong."""
+    """Split an NMEA sentence into fields; return also whether its check sum is wrong."""
     body, star, check = line.strip().partition("*")
     if not body.startswith("$"):
         return [""], False
@@ -87,11 +85,11 @@ def _sentence(line: str) -> tuple[list[str], bool]:
 
 def _add(rows: list[list[float]], seconds: float, day: float, place: list[str],
          height_m: float) -> None:
-    """Add a position; RMC and GGA of one time are one."""
+    """Add a position, or complete the last one by the other sentence (RMC, GGA) of its time."""
     latitude, longitude = _degrees(place[0], place[1]), _degrees(place[2], place[3])
     if rows and rows[-1][0] == seconds:
         row = rows[-1]
-        row[1] = day  # GGA before RMC had the date before, maybe of another day
+        row[1] = day  # GGA came before RMC, with the date of the previous one
         if np.isnan(row[4]):
             row[2:] = [latitude, longitude, height_m]
         return
@@ -99,7 +97,7 @@ def _add(rows: list[list[float]], seconds: float, day: float, place: list[str],
 
 
 def _days(seconds: np.ndarray, day: np.ndarray) -> np.ndarray:
-    """Return the day of each position: the last date, one later after each midnight since."""
+    """Return the day of each position: the last date, plus one after each midnight since."""
     result = np.array(day)
     first = int(np.argmax(np.isfinite(day))) if len(day) else 0
     if len(day):
@@ -134,7 +132,7 @@ def _time_s(where: object, text: str) -> float:
         stamp = datetime.fromisoformat(text)
         return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
     except (ValueError, OverflowError):
-        raise BadInput(f"{where}: time {shown(text)} is not ISO 8601; leave that point out"
+        raise BadInput(f"{where}: time {cell_text(text)} is not ISO 8601; leave that point out"
                        ) from None
 
 
@@ -142,12 +140,12 @@ def _numbers(path: Path, texts: Sequence[Any]) -> list[float]:
     try:
         numbers = [float(text) for text in texts[:3]]
     except (TypeError, ValueError):
-        raise BadInput(f"{path}: {shown(texts)} is no place; leave that point out") from None
+        raise BadInput(f"{path}: {cell_text(texts)} is no place; leave that point out") from None
     return numbers + [np.nan] * (3 - len(numbers))
 
 
 class _Rows:
-    """Rows that are collected from the elements of an XML file while it is parsed."""
+    """Base of parsers that collect rows from the elements of an XML file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -157,11 +155,11 @@ class _Rows:
 
     @abstractmethod
     def start(self, name: str, attributes: dict[str, str], line: int) -> None:
-        """Take the start of an element."""
+        """Handle the start of an element."""
 
     @abstractmethod
     def end(self, name: str, text: str) -> None:
-        """Take the end of an element, with its text."""
+        """Handle the end of an element, with its text."""
 
     def _start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         self._text = ""
@@ -202,16 +200,12 @@ class _Points(_Rows):
         try:
             return float(text)
         except ValueError:
-            raise BadInput(f"{self.path}, line {self._line}: {name} = {shown(text)} is not a "
+            raise BadInput(f"{self.path}, line {self._line}: {name} = {cell_text(text)} is not a "
                            "number") from None
 
 
 def read_gpx(path: Path) -> Fixes:
-    """Read the track points of a GPX file; times without an offset are UTC, as GPX prescribes.
-
-    Raises:
-        BadInput: no GPX, or fewer than two track points have a time.
-    """
+    """Read the track points of a GPX file (times are UTC); BadInput if fewer than two have one."""
     columns = np.array(_Points(path).rows, dtype=float).reshape(-1, 4).T
     return make_fixes(path, columns[0], dict(zip(_PLACE, columns[1:])))
 
@@ -256,7 +250,7 @@ class _Track(_Rows):
 
 
 def read_kml(path: Path) -> Fixes:
-    """Read the tracks of a KML file; altitudes that are above the ground are left out.
+    """Read the tracks of a KML file, without altitudes above the ground.
 
     Raises:
         BadInput: no KML, or fewer than two places with a time.
@@ -283,10 +277,10 @@ def _part(value: object, name: str) -> dict[str, Any]:
 
 
 def read_geojson(path: Path) -> Fixes | None:
-    """Read the lines of a GeoJSON file that have times; None if it has none (as of points).
+    """Read the lines with times of a GeoJSON file; None if there are none.
 
     Raises:
-        BadInput: a line has not as many times as places.
+        BadInput: a line has another number of times than of positions.
     """
     with open_gzip(path, "GeoJSON file") as file:
         text = file.read()
@@ -299,10 +293,10 @@ def read_geojson(path: Path) -> Fixes | None:
     for feature in features if isinstance(features, list) else []:
         geometry, properties = _part(feature, "geometry"), _part(feature, "properties")
         lines = geometry.get("coordinates") or []
-        own = _part(properties, "coordinateProperties")
+        by_coordinate = _part(properties, "coordinateProperties")
         times = next((each for each in (
             properties.get("coordTimes"), properties.get("times"),
-            own.get("times")) if isinstance(each, list)), None)
+            by_coordinate.get("times")) if isinstance(each, list)), None)
         if geometry.get("type") == "LineString":
             lines, times = [lines], [times]
         elif geometry.get("type") != "MultiLineString":
