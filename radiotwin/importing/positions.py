@@ -32,7 +32,6 @@ _MAX_PLACES = 1000  # of one device; with more it is taken to move all the time
 SAME_BAND = 1.05  # ratio of carriers of one band, within which 20 lg f changes by 0.4 dB
 MIN_SPREAD_DEG = 0.5  # of positions, to search for placeholders 100 km away
 MIN_PLACES, MIN_REPEATS = 4, 3  # of a moving receiver; readings at a placeholder position
-APART_M = 100_000.0  # distance from all other readings of a glitch
 FAST_M_S, NEAR_M = 340.0, 1000.0  # speed and jump of a glitch; smaller ones are errors of a fix
 MIN_READINGS = 10  # of a receiver, to find glitches
 MOVING_M = 1.0  # spread of a device's positions above which it moves
@@ -295,7 +294,7 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     if settings.place_m:
         links = links.assign(device=_place_names(source, links, device_m, settings.place_m))
     keep = ~_are_glitches(links, receiver_m)
-    links = tally.drop(links, ~keep, f"position {APART_M / 1000:.0f} km from all others, or one "
+    links = tally.drop(links, ~keep, f"position {FAR_M / 1000:.0f} km from all others, or one "
                                      f"that takes {FAST_M_S:.0f} m/s to and fro", "", source.where)
     receiver_m, device_m = receiver_m[keep], device_m[keep]
     _check_near(source, links, receiver_m, "receiver")
@@ -410,11 +409,11 @@ def _are_glitches(links: pd.DataFrame, receiver_m: np.ndarray) -> np.ndarray:
     ends = np.flatnonzero(np.diff(np.sort(receiver), append=-1)) + 1
     for rows in np.split(known[np.argsort(receiver, kind="stable")], ends[:-1]):
         place_m = receiver_m[rows, :2]
-        if len(rows) < MIN_READINGS or (np.ptp(place_m, axis=0) < APART_M / 2).all():
+        if len(rows) < MIN_READINGS or (np.ptp(place_m, axis=0) < FAR_M / 2).all():
             continue
         distance_m = np.linalg.norm(place_m - np.median(place_m, axis=0), axis=1)
         order_m = np.sort(distance_m)
-        gaps = np.flatnonzero(np.diff(order_m) > APART_M)
+        gaps = np.flatnonzero(np.diff(order_m) > FAR_M)
         if len(gaps) and are_few(len(rows) - 1 - gaps[0], len(rows)):
             glitch[rows[distance_m > order_m[gaps[0]]]] = True
     if "time_s" in links:

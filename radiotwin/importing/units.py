@@ -16,6 +16,7 @@ from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.source import Source, constants_of
 from radiotwin.io.cells import EMPTY, as_numbers, as_text, cell_text
+from radiotwin.links.links import ELSEWHERE_M
 from radiotwin.links.site_table import METRES
 
 _UNIT_IN_NAME = re.compile(r"(?:[_ (\[]|(?<=[a-z])(?=[MF]))((?i:m|met(?:er|re)s?|ft|feet))[)\]]?$")
@@ -38,7 +39,6 @@ SECONDS_PER_YEAR = 31_556_952  # Gregorian mean
 UTC_OFFSET = r"[Tt ]\d\d(?::?\d\d){0,2}(?:\.\d+)? ?(?:[Zz]|[+-]\d\d(?::?\d\d)?)$"
 """End of an ISO 8601 time with an offset, extended or basic, from the hour on."""
 NEAR_S = 1.0  # between two successive readings whose positions are compared
-ELSEWHERE_M = 20.0  # positions farther apart than this and `FAST_M_S` are two places at once
 FAST_M_S = 100.0  # fastest receiver
 MIN_PAIRS = 3  # of readings at two places; fewer may be a bad fix
 MIN_SHARE = 0.02  # of such pairs among successive readings

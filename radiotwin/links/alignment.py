@@ -13,11 +13,11 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import is_same_frame, origin_text
 from radiotwin.io.forms import MAX_POSITION_M, Origin
 from radiotwin.links.checks import (
-    MAX_OUTSIDE,
     SURE,
     chance_inside,
     map_corners_m,
     outside_map,
+    require_on_map,
 )
 from radiotwin.links.measurements import Measurements
 from radiotwin.scene import Scene
@@ -72,7 +72,9 @@ def in_scene_frame(measurements: Measurements, scene: Scene | Path | str,
     if not related:
         _require_fit(measurements, scene)
     elif shift_m is not None and any(shift_m):
-        _refuse_off_map(measurements, scene, shift_m)
+        require_on_map(measurements.receiver_m, scene,
+                       f"the shift by {shift_m[0]:g}, {shift_m[1]:g} m takes them there; correct "
+                       "its size and its signs (metres east, north)")
     return measurements
 
 
@@ -122,18 +124,6 @@ def in_known_frame(measurements: Measurements, origin: Origin | None, owner: str
                   f"{origin_text(origin)}: positions are converted (moved by {moved_m[0]:+.1f} m "
                   f"east, {moved_m[1]:+.1f} m north)", stacklevel=3)
     return converted
-
-
-def _refuse_off_map(measurements: Measurements, scene: Scene,
-                    shift_m: tuple[float, float]) -> None:
-    """Raise BadInput if most receivers are off the map after a translation that the user gave."""
-    low_m, high_m = map_corners_m(scene)
-    outside = outside_map(measurements.receiver_m, scene)
-    if len(outside) and outside.mean() > MAX_OUTSIDE:
-        raise BadInput(f"the shift by {shift_m[0]:g}, {shift_m[1]:g} m takes {outside.mean():.1%} "
-                       f"of the links' receivers off the 3D map, which goes from ({low_m[0]:.0f}, "
-                       f"{low_m[1]:.0f}) to ({high_m[0]:.0f}, {high_m[1]:.0f}) m; correct its size "
-                       "and its signs (metres east, north)")
 
 
 def _require_fit(measurements: Measurements, scene: Scene) -> None:

@@ -169,16 +169,20 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
     return [*notes.values(), *receiver_notes(receiver_m, scene)]
 
 
-def require_on_map(receiver_m: np.ndarray, scene: Scene) -> np.ndarray:
-    """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool; BadInput if most are."""
+def require_on_map(receiver_m: np.ndarray, scene: Scene, remedy: str = "") -> np.ndarray:
+    """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool; BadInput if most are.
+
+    The message ends with the remedy; by default it tells another place from another frame.
+    """
     outside = outside_map(receiver_m, scene)
-    if outside.mean() > MAX_OUTSIDE:
+    if outside.sum() > MAX_OUTSIDE * len(outside):
         low_m, high_m = map_corners_m(scene)
         apart_m = np.hypot(*(np.nanmedian(receiver_m[:, :2], axis=0) - (low_m + high_m) / 2))
-        remedy = (f"they are {apart_m / 1000:,.0f} km from it, so it is a map of another place, or "
-                  "an origin is wrong: give the scene of the place of the measurements"
-                  if apart_m > ELSEWHERE_M else "give measurements and scene in one frame, in "
-                  "metres; feet and degrees are not converted")
+        remedy = remedy or (
+            f"they are {apart_m / 1000:,.0f} km from it, so it is a map of another place, or an "
+            "origin is wrong: give the scene of the place of the measurements"
+            if apart_m > ELSEWHERE_M else "give measurements and scene in one frame, in metres; "
+            "feet and degrees are not converted")
         raise BadInput(
             f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, "
             f"which goes from ({low_m[0]:.0f}, {low_m[1]:.0f}) to ({high_m[0]:.0f}, "

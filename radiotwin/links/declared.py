@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from radiotwin.scene import Scene
 
 MAX_EIRP_APART_DB = 0.5  # rounding between a declared EIRP and that of power, cable and antenna
-MAX_NAMED = 6  # devices in a message
 
 
 @dataclass(frozen=True)
@@ -271,7 +270,7 @@ def antenna_of_uavs(scene: Scene | None, receivers: Sequence[str]
     if not others:
         return scene.uav_antenna, []
     return None, ["the antenna that the scene declares for its UAVs is not used, and is a part of "
-                  f"what is learnt: receivers {some(others, MAX_NAMED)} are none of its UAVs"]
+                  f"what is learnt: receivers {some(others)} are none of its UAVs"]
 
 
 def match_learnt_law(names: Sequence[str], declared: Declared, learnt: Declared, scene: Scene | None
@@ -297,7 +296,7 @@ def match_learnt_law(names: Sequence[str], declared: Declared, learnt: Declared,
             names, radios, [radio.tx_power_dbm or 0.0 for radio in learnt.radios],
             "the median of the twin's devices", scene)
     elif declared.knows_powers:
-        notes.append(f"tx_power_dbm of {some(names, MAX_NAMED)} is not used: the twin was learnt "
+        notes.append(f"tx_power_dbm of {some(names)} is not used: the twin was learnt "
                      "from received powers of devices that declared none; declare theirs in "
                      "devices.csv and fit again")
         radios = tuple(replace(radio, tx_power_dbm=None) for radio in radios)
@@ -334,4 +333,4 @@ def _missing(names: Sequence[str], radios: tuple[Radio, ...], lacks: Callable[[R
              text: str) -> list[str]:
     """Return the note `text` with the names of the radios that lack a value; empty if none does."""
     missing = [name for name, radio in zip(names, radios, strict=True) if lacks(radio)]
-    return [text.format(some(missing, MAX_NAMED))] if missing else []
+    return [text.format(some(missing))] if missing else []

@@ -368,7 +368,7 @@ def _notes(links: Links, rows: list[np.ndarray], limits_db: np.ndarray,
     for receivers, what in (([r for r in lost if r not in unsure], "are blank at any level"),
                             (unsure, "may be blank at any level, or below a limit")):
         if receivers:
-            names = some([links.receiver_names[r] for r in receivers], MAX_NAMED)
+            names = some([links.receiver_names[r] for r in receivers])
             notes.append(f"links of receiver {names} {what}: they count as lost, "
                          "not as weak")
     return notes

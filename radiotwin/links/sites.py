@@ -26,7 +26,6 @@ OTHER_END = {"device": "receiver", "receiver": "device"}
 SAME_DIRECTION_DEG = 5.0  # azimuths this close belong to one antenna, or two side by side
 MIN_REPEATS = 20  # of a device, to estimate its scatter
 SHARED_DB, SHARED_RATIO = 3.0, 2.0  # scatter of two transmitters: least, and over that of others
-MAX_NAMED = 4  # pairs in a note
 MAX_RELATIVES = 4  # further ones add little
 SAME_M = 3.0  # accuracy of a phone's position outdoors
 PLACE_M = 30.0  # side of squares with correlated errors, in which the median difference is taken
@@ -185,9 +184,9 @@ def end_notes(links: Links) -> list[str]:
         pairs = [f"{links.device_names[device]} and {names[member]}" for device, member
                  in inseparable_pairs(links.device[heard], getattr(links, end)[heard]).items()]
         if pairs:
-            notes.append(f"device and {end} are never apart ({some(pairs, MAX_NAMED)}): what one "
-                         f"of the two has wrong, an offset or a drift, may be the other's; let "
-                         f"another {end} read the device, or this one another device")
+            notes.append(f"device and {end} are never apart ({some(pairs)}): what one of the two "
+                         f"has wrong, an offset or a drift, may be the other's; let another {end} "
+                         f"read the device, or this one another device")
     return notes
 
 

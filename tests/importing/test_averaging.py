@@ -2,9 +2,8 @@
 
 import numpy as np
 import pandas as pd
-import pytest
 
-from radiotwin.importing.repeats import average, in_wavelengths
+from radiotwin.importing.repeats import average
 
 
 def track(x_m, level_db, **others):
@@ -53,17 +52,10 @@ def test_tracks_are_not_mixed():
     assert sorted(result["level_db"].round(9)) == [-80, -60, -50, -40] and set(result["quality"]) == {2}
 
 
-def test_headings_are_averaged_round_the_circle():
-    result = average(track([0, 1], [-80, -80], heading_deg=[350.0, 20.0]), 10.0, "power")
-    assert result["heading_deg"][0] == pytest.approx(5)
-
-
-def test_rolls_and_pitches_are_averaged_round_the_circle():
+def test_angles_are_averaged_round_the_circle():
     """A drone upside down, and a logger that counts from 0 to 360."""
-    result = average(track([0, 1, 20], [-80] * 3, roll_deg=[179.0, -177.0, 5.0], pitch_deg=[358.0, 4.0, np.nan]), 10.0, "power")
+    result = average(track([0, 1, 20], [-80] * 3, heading_deg=[350.0, 20.0, 90.0], roll_deg=[179.0, -177.0, 5.0],
+                           pitch_deg=[358.0, 4.0, np.nan]), 10.0, "power")
+    np.testing.assert_allclose(result["heading_deg"], [5, 90])
     np.testing.assert_allclose(result["roll_deg"], [-179, 5])
     np.testing.assert_allclose(result["pitch_deg"], [1, np.nan])
-
-
-def test_a_length_in_wavelengths():
-    assert in_wavelengths(10.0, 299_792_458.0) == 10

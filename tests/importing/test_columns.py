@@ -79,10 +79,3 @@ def test_rows_are_chosen_by_numbers_of_any_length(bring_in, cells, value):
     assert list(result.table["device"]) == ["a"]
     with pytest.raises(BadInput, match="column c never is 1234568 or 1234568.5 or none of them .only.; it is"):
         bring_in(text, length_unit="m", columns=columns, only={"c": [1234568, 1234568.5, "none of them"]})
-
-
-def test_seconds_with_and_without_decimals(bring_in):
-    columns = {"x": "x", "y": "y", "device": "d", "level": "l", "time": "t"}
-    text = "x,y,d,l,t\n0,0,a,-80,2024.03.01_10.00.00\n1,0,a,-81,2024.03.01_10.00.01.250\n"
-    result = bring_in(text, length_unit="m", columns=columns, time_format="%Y.%m.%d_%H.%M.%S", time_zone="UTC")
-    assert (result.table["time_s"] % 60).tolist() == [0, 1.25]

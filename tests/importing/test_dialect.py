@@ -67,21 +67,9 @@ def test_texts_without_a_header(read):
     assert table == ROWS
 
 
-def test_rows_that_end_with_a_separator(read):
-    _, table = read("Zeit;Zelle;\n1;A;\n2;B;\n")
-    assert table == [["Zeit", "Zelle"], ["1", "A"], ["2", "B"]]
-    _, table = read("Zeit;Zelle\n1;A;\n2;B;\n")
-    assert table == [["Zeit", "Zelle"], ["1", "A"], ["2", "B"]]
-
-
 def test_a_line_that_was_cut_off_is_told(read):
     source, table = read(text_of(";") + "4;48.4;11.8")
     assert table == ROWS and "1 line after the table" in source.notes[0]
-
-
-def test_a_damaged_row_within_the_table_is_refused(read):
-    with pytest.raises(BadInput, match="line 3 has 2 fields, the header has 5; every row needs as many"):
-        read(text_of(";").replace("2;48.2;11.6;B;-90.25", "2;48.2"))
 
 
 @pytest.mark.parametrize("rows", [300, 500, 30_000])

@@ -211,19 +211,6 @@ def test_degrees_that_are_none(bring_in, text, message):
                  columns={"device": "cell", "latitude": "lat", "longitude": "lon", "level": "level"})
 
 
-@pytest.mark.parametrize(("table", "message"), [
-    ("colour,x,y\na,1,2\n", r"column 'device' is missing"),
-    ("device,x,y\na,1,2\na,1,2\n", "row 3, column device: 'a' occurs twice"),
-    ("device,height\na,1\n", "there is no position"),
-    ("device,latitude,longitude\na,95,2\n", "row 2, column latitude: '95' is no latitude"),
-    ("device,x,y,frequency_hz\na,1,2,2.4\n", "row 2, column frequency_hz: '2.4' is no frequency"),
-])
-def test_tables_of_positions_that_cannot_be_used(bring_in, local, tmp_path, table, message):
-    (tmp_path / "sites.csv").write_text(table)
-    with pytest.raises(BadInput, match=message):
-        bring_in(HEAD + "a,0,0,-80\n", columns=local, length_unit="m", devices=str(tmp_path / "sites.csv"))
-
-
 def test_another_folder_is_not_replaced(bring_in, local, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").write_text("years")

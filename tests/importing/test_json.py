@@ -75,19 +75,6 @@ def test_a_node_that_moves_is_the_receiver_wherever_its_position_is(bring_in, pa
     assert bring_in(lines([stack]), "log.json").report["files"][0]["format"] == "things-stack-mapper"
 
 
-def test_a_node_at_rest_is_the_device(bring_in):
-    event = {"deviceInfo": {"devEui": "1"}, "time": "2024-05-01T10:00:00Z", "object": {"latency": 3, "length": 2}, "rxInfo": [
-        {"gatewayId": "g", "rssi": -80, "snr": 9, "location": {"latitude": 48.2, "longitude": 11.5}}]}
-    assert bring_in(lines([event]), "log.json").report["files"][0]["format"] == "chirpstack"
-
-
-def test_one_position_beyond_the_pole_is_left_out(bring_in):
-    records = [*RECORDS * 4, {**RECORDS[0], "lat": -677.7}]
-    records = [{**each, "n": i} for i, each in enumerate(records)]
-    report = bring_in(lines(records), "log.jsonl", columns=COLUMNS).report
-    assert report["kept"] == 16 and report["left_out"][0]["reason"] == "no latitude (beyond 90°)"
-
-
 def test_geojson_of_another_system(bring_in):
     """In UTM zone 32 the meridian of 9 degrees is at 500 km east, and its points are east of each other by metres."""
     features = [{"type": "Feature", "properties": {"cell": "A", "rssi": -80 - i},

@@ -46,21 +46,6 @@ def test_formats_that_lack_something(bring_in, form, message):
         bring_in(rows(MIDNIGHT), **{**MAPPING, "time_format": form, "columns": MAPPING["columns"] | {"time": "t"}})
 
 
-@pytest.mark.parametrize(("form", "values"), [
-    ("serial date", ["45350.5", "45350.50001157407"]), ("epoch us", ["1709121600000000", "1709121601000000"]),
-    ("epoch ns", ["1709121600000000000", "1709121601000000000"])])
-def test_times_of_spreadsheets_and_data_bases(bring_in, form, values):
-    """Day 45350 of a spreadsheet is 28 February 2024."""
-    given = {**MAPPING, "time_format": form, "columns": MAPPING["columns"] | {"time": "t"}}
-    assert list(bring_in(rows(values), **given).table["time_s"]) == pytest.approx([1709121600, 1709121601], abs=0.01)
-
-
-def test_what_is_below_thermal_noise_is_no_level(bring_in):
-    levels = [-80 - i for i in range(30)] + [-200, -174]
-    report = bring_in(rows([f"10:00:{i:02}" for i in range(32)], levels), **MAPPING).report
-    assert report["left_out"][0]["reason"] == "impossible level" and report["left_out"][0]["readings"] == 2
-
-
 @pytest.mark.parametrize(("code", "side"), [(-1, "above"), (-160, "below")])
 def test_a_level_far_from_all_others_is_told(bring_in, code, side):
     levels = [-80 - i for i in range(30)] + [code, code]
@@ -119,11 +104,6 @@ def test_one_fix_that_is_none(bring_in, latitude, longitude, left_out):
 def test_two_campaigns_are_no_glitches(bring_in):
     text = "x,l,d\n" + "".join(f"{i + 300_000 * (i > 20)},{-80 - i % 9},a\n" for i in range(40))
     assert bring_in(text, columns={"x": "x", "y": "always 0", "level": "l", "device": "d"}, length_unit="m").report["kept"] == 40
-
-
-def test_clocks_of_twelve_hours_are_told(bring_in):
-    notes = bring_in(rows(["12:59:58", "12:59:59", "01:00:00"]), **MAPPING).report["warnings"]
-    assert any("row 4: the clock goes back by 11:59:59" in note for note in notes)
 
 
 def test_a_far_gateway_is_no_glitch(bring_in):

@@ -82,13 +82,6 @@ def test_rows_of_all_files_count(tmp_path, bring_in):
     assert [each["row"] for each in report["bad_rows"]] == ["a.csv: row 7", "b.csv: row 7"]
 
 
-def test_an_open_quotation_mark_can_be_a_letter(bring_in):
-    content = text(changed(5, [*ROWS[5][:3], '"A', "-85"]))
-    with pytest.raises(BadInput, match="--no-quotes"):
-        bring_in(content, **MAPPING)
-    assert len(bring_in(content, **MAPPING, quotes=False).table) == 12
-
-
 def test_blanks_within_cells_need_names_of_their_parts(bring_in):
     content = text([[row[0].replace("T", " "), *row[1:]] for row in ROWS], sep=" ")
     with pytest.raises(BadInput, match="--header"):

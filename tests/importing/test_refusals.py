@@ -84,7 +84,7 @@ def test_options_that_messages_name_exist():
         "skip_bad_rows", "quotes", "path_loss", "list_name"} and "level" in Columns.model_fields
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_column_a_list_a_sheet_that_is_not_used_is_told(bring_in, tmp_path, seed):
     rng = np.random.default_rng(seed)
     name = "".join(rng.choice(list("abcdefghijk_ "), size=8)).strip() + "q"
@@ -106,9 +106,3 @@ def test_a_column_a_list_a_sheet_that_is_not_used_is_told(bring_in, tmp_path, se
     book.save(tmp_path / "made.xlsx")
     report = bring_in((tmp_path / "made.xlsx").read_bytes(), "log.xlsx", **GIVEN).report
     assert report["kept"] == 6 and any(f"not read: {name}" in note for note in report["warnings"])
-
-
-def test_rows_that_are_kept_and_left_out_add_up(bring_in):
-    text = HEAD + ROWS + "2024-05-01T10:01:00Z,7,0\n" + ROWS.splitlines()[0] + "\n" + ROWS.replace(",a,", ",b,").replace("-8", "20")
-    report = bring_in(text + "2024-05-01T10:01:09Z,9,0,a,-99\n", **GIVEN).report
-    assert report["readings"] == report["kept"] + sum(each["readings"] for each in report["left_out"]) == 15

@@ -23,6 +23,9 @@ NOON = datetime(2022, 7, 6, 12, 0, 0, 250_000, tzinfo=UTC).timestamp()
 @pytest.mark.parametrize(("text", "form", "zone"), [
     ("1657108800.25", "epoch s", None),
     ("1657108800250", "epoch ms", None),
+    ("1657108800250000", "epoch us", None),
+    ("1657108800250000000", "epoch ns", None),
+    ("44748.50000289352", "serial date", "UTC"),
     ("2022-07-06T12:00:00.25Z", "ISO 8601", None),
     ("2022-07-06T14:00:00.25+02:00", "ISO 8601", "America/Denver"),  # an offset is worth more than a zone
     ("2022-07-06 06:00:00.25", "ISO 8601", "America/Denver"),  # daylight saving: UTC-6

@@ -18,13 +18,6 @@ def layout(data: bytes) -> CsvLayout:
     return layout
 
 
-@pytest.mark.parametrize(("data", "rows"), [
-    (b"a,b\n1,2\n\n\n3,4", 3), (b"a,b\r\n1,2\r\n\r\n", 2), (b"a,b\r1,2\r3,4", 3), (b'"a",b\n"1\n2",3\n', 2),
-    (b"\n\n\xef\xbb\xbfa,b\n", 1), (b"\xef\xbb\xbfa,b\n1,2\n", 2)])
-def test_header_and_rows(data, rows):
-    assert layout(data).rows == rows and len(layout(data).header) == 2
-
-
 @pytest.mark.parametrize("first", [b"", b'"1,",2\n'])
 def test_rows_are_counted_the_same_over_blocks_and_with_quotation_marks(monkeypatch, first):
     monkeypatch.setattr("radiotwin.io.cells._BLOCK_BYTES", 64)
@@ -48,7 +41,3 @@ def test_one_endless_line_is_refused_before_it_is_memory(monkeypatch, data):
         assert tracemalloc.get_traced_memory()[1] < 16 * MIB
     finally:
         tracemalloc.stop()
-
-
-def test_names_of_columns_lose_their_quotes():
-    assert layout(b"'=a, '-b ,''=c,'d,-1\n").header == ["=a", "-b", "'=c", "'d", "-1"]

@@ -28,10 +28,3 @@ def test_other_cells_are_refused(tmp_path, row, words):
     path.write_text(HEADER + row + "\n")
     with pytest.raises(BadInput, match=words):
         read_table(path, KINDS)
-
-
-def test_a_table_that_is_no_table(tmp_path):
-    path = tmp_path / "residuals.csv.gz"
-    path.write_bytes(b"\x1f\x8bno gzip")
-    with pytest.raises(BadInput, match="residuals.csv.gz"):
-        read_table(path, KINDS)

