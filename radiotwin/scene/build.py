@@ -216,30 +216,8 @@ def _material_table(report: BuildReport) -> Table:
 class BuildOptions:
     """How to read a city model or a map, and what to add to it.
 
-    Attributes:
-        frequency_hz: Frequency of the scene's radio [Hz].
-        materials: Name of a material in the file -> ITU material; of a map as `with_materials`.
-        bbox: Part to keep, which becomes the extent: (x_min, y_min, x_max, y_max) [m] in the file's
-            frame, after `scale` and `up`; of a map (south, west, north, east) [degrees].
-        devices: Number of devices to place on free ground.
-        uavs: Number of UAVs to place near the middle.
-        seed: Seed of the placement.
-        origin: WGS84 position of x = y = 0; None: the middle of a map, unknown for a city model.
-        extent_m: (x_min, x_max, y_min, y_max) of the lattice [m], in the file's frame; of a map,
-            from its origin. None: `bbox`, or around the buildings.
-        step_m: Step of the lattice [m]; None: chosen by the extent.
-        altitudes_m: Altitudes of the lattice [m]; None: chosen by the roofs.
-        scale: City model: factor from the file's unit to metres; None: metres, with a warning if it
-            seems to be another unit.
-        up: City model: axis of the file that points up, "x", "y" or "z"; None: z, with an error if
-            it seems to be another.
-        default_height_m: Map: height of buildings without one [m]; None: 10, with a warning.
-        height_column, ground_column: Map: columns of heights, `NAME[:UNIT]`, and of the ground's
-            elevation, which is subtracted.
-        material_table: Map: materials by tag.
-        terrain, terrain_unit: Map: GeoTIFF of the ground's heights; their unit if it names none.
-        crs: Map: coordinate reference system of a file that names none.
-        layers: Map: layers to read; empty: those with buildings.
+    Attributes have the names and meanings of the arguments of `radiotwin.build_scene`. `scale` and
+    `up` are for city models only, those from `default_height_m` on for maps only.
     """
 
     frequency_hz: float = 2.4e9

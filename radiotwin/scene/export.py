@@ -1,6 +1,7 @@
 """Export of a scene's city: XML and PLY for Sionna RT and Mitsuba, glTF, OBJ."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -72,20 +73,14 @@ def _write_gltf(shapes: list[CityShape], path: Path) -> None:
             metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True))
         mesh.apply_transform(Y_UP)
         model.add_geometry(mesh, node_name=shape.name, geom_name=shape.name)
+    options: dict[str, Any] = {"include_normals": False, "tree_postprocessor": (
+        lambda tree: tree["asset"].update(generator="radiotwin"))}
     if path.suffix.lower() == ".glb":
-        data = trimesh.exchange.gltf.export_glb(model, include_normals=False,
-                                                tree_postprocessor=_sign)
+        data = trimesh.exchange.gltf.export_glb(model, **options)
     else:
-        data = trimesh.exchange.gltf.export_gltf(model, include_normals=False,
-                                                 embed_buffers=True,
-                                                 tree_postprocessor=_sign)["model.gltf"]
+        data = trimesh.exchange.gltf.export_gltf(model, embed_buffers=True, **options)["model.gltf"]
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
-
-
-def _sign(tree: dict) -> None:
-    """Enter radiotwin as the generator of a glTF document."""
-    tree["asset"]["generator"] = "radiotwin"
 
 
 def _write_obj(shapes: list[CityShape], path: Path) -> None:

@@ -106,13 +106,7 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """The shapes of a file of any format.
-
-    Attributes:
-        names: Names of the shapes as in the file.
-        load: Function of a shape's index that reads its mesh.
-        materials_of: Function of indices that finds the shapes' materials, and problems with them.
-    """
+    """Names of the shapes in a file, and functions of their indices: their meshes, materials."""
 
     names: Sequence[str]
     load: Callable[[int], RawMesh]

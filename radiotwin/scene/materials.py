@@ -180,17 +180,12 @@ def permittivity(name: str, frequency_hz: float) -> tuple[float, float, bool]:
     frequency_ghz = frequency_hz / 1e9
     ranges = ITU_TABLE[itu_material(name).itu or ""]  # an ITU material has a name
     in_range = next((row for row in ranges if row[0] <= frequency_ghz <= row[1]), None)
-    if in_range is None:
-        nearest_ghz, row = min(((end, row) for row in ranges for end in row[:2]),
-                               key=lambda pair: abs(pair[0] - frequency_ghz))
-        return *_power_laws(row, nearest_ghz), False
-    return *_power_laws(in_range, frequency_ghz), True
-
-
-def _power_laws(row: tuple[float, ...], frequency_ghz: float) -> tuple[float, float]:
-    """Return relative permittivity and conductivity [S/m] by a row of `ITU_TABLE`."""
-    _, _, a, b, c, d = row
-    return a * frequency_ghz**b, c * frequency_ghz**d
+    row = in_range
+    if row is None:
+        frequency_ghz, row = min(((end, row) for row in ranges for end in row[:2]),
+                                 key=lambda pair: abs(pair[0] - frequency_ghz))
+    a, b, c, d = row[2:]
+    return a * frequency_ghz**b, c * frequency_ghz**d, in_range is not None
 
 
 def ranges_text(name: str) -> str:

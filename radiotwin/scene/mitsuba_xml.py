@@ -269,7 +269,7 @@ class _Reader:
     def __init__(self, path: Path, scene_folder: bool) -> None:
         self.city = DeclaredCity()
         self.scene_folder = scene_folder
-        self.parameters: dict[str, str] = {}  # name -> value, by <default>
+        self.parameters: dict[str, str] = {}  # name -> value, by the first <default>
         self.lengths: list[int] = []  # of the parameters' names, the longest first
         self.substituted = 0  # characters that parameters were replaced by
         self.folders = [path.parent]
@@ -293,7 +293,10 @@ class _Reader:
             node = waiting.pop()
             if node.tag == "default":
                 self._substitute(node)
-                self._declare(node.attributes.get("name", ""), node.attributes.get("value", ""))
+                name = node.attributes.get("name", "")
+                self.parameters.setdefault(name, node.attributes.get("value", ""))
+                if name and len(name) not in self.lengths:
+                    self.lengths = sorted([*self.lengths, len(name)], reverse=True)
                 continue
             if node.tag not in ("include", "path", "bsdf", "shape"):
                 continue
@@ -321,12 +324,6 @@ class _Reader:
             raise BadInput(f"{node.position}: more than {MAX_INCLUDE_DEPTH} files include each "
                            "other, or one itself; remove the loop")
         self._read_file(path, files)
-
-    def _declare(self, name: str, value: str) -> None:
-        """Declare a parameter; the first value of a name holds."""
-        self.parameters.setdefault(name, value)
-        if name and len(name) not in self.lengths:
-            self.lengths = sorted([*self.lengths, len(name)], reverse=True)
 
     def _substitute(self, node: Node) -> None:
         """Replace `$name` in an element's attributes by the parameter's value.

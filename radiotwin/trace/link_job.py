@@ -340,43 +340,28 @@ class _Solve:
         return self.__dict__ | {"_city": city, "_solver": None}
 
 
-class SolveLinks(_Solve):
-    """Computes the gains of a batch along paths in the whole city, see `PathGains`."""
-
-    def __call__(self, piece: LinkBatch) -> np.ndarray:
-        """Return the gains (n,) of a batch [dB]."""
-        if self._solver is None or self._solver.settings.batch_receivers != piece.batch_receivers:
-            settings = replace(self._settings, batch_receivers=piece.batch_receivers)
-            self._solver = PathGains(self._city, self._frequency_hz, settings)
-        return self._solver.gains(piece.device_m, piece.points_m, piece.antennas)
-
-
-class SolveTiles(_Solve):
-    """Computes the gains of a batch along paths in its tile of the city.
+class SolvePaths(_Solve):
+    """Computes the gains of a batch along paths, see `PathGains`, in its tile or the whole city.
 
     The solver of the last tile is kept: consecutive batches may share it.
-
-    Attributes:
-        shapes: Number of shapes in the last tile.
     """
 
     def __init__(self, scene: Scene, settings: SolverSettings) -> None:
         super().__init__(scene, settings)
-        self._city = PackedCity.of(read_city(scene.xml_path))
-        self.geometry_bytes = GEOMETRY_COPIES * self._city.nbytes
-        self._solved: tuple[Tile, int] | None = None
-        self.shapes = 0
+        if settings.is_tiled:
+            self._city = PackedCity.of(read_city(scene.xml_path))
+            self.geometry_bytes = GEOMETRY_COPIES * self._city.nbytes
+        self._solved: tuple[Tile | None, int] | None = None
 
     def __call__(self, piece: LinkBatch) -> np.ndarray:
         """Return the gains (n,) of a batch [dB]."""
-        assert piece.tile is not None
         if self._solver is None or self._solved != (piece.tile, piece.batch_receivers):
             self._solver = None  # frees the memory of the last tile first
             settings = replace(self._settings, batch_receivers=piece.batch_receivers)
-            kept = self._city.near(piece.tile)
-            self.shapes = int(kept.sum())
-            part = self._city.part(kept)
-            self._solver = PathGains(part or None, self._frequency_hz, settings)
+            city = self._city
+            if piece.tile is not None:
+                city = city.part(city.near(piece.tile)) or None
+            self._solver = PathGains(city, self._frequency_hz, settings)
             self._solved = piece.tile, piece.batch_receivers
         return self._solver.gains(piece.device_m, piece.points_m, piece.antennas)
 
@@ -403,7 +388,7 @@ def link_job(scene: Scene, settings: SolverSettings,
         BadInput: The scene has antennas, and the solver is `map`.
     """
     if settings.solver == "paths":
-        solve = SolveTiles(scene, settings) if settings.is_tiled else SolveLinks(scene, settings)
+        solve = SolvePaths(scene, settings)
         return Job(description, solve, _resources(settings, solve.geometry_bytes), len,
                    LinkBatch.halves, lambda first, second: np.concatenate([first, second]))
     if scene.has_antennas:

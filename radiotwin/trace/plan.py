@@ -23,9 +23,9 @@ from radiotwin.trace.link_job import (
     link_job,
     with_radius,
 )
-from radiotwin.trace.run import device_indices, noise_figures, open_store
+from radiotwin.trace.run import detected, device_indices, noise_figures, open_store
 from radiotwin.trace.settings import FINER, QUALITIES, SolverSettings
-from radiotwin.trace.solver import IMPOSSIBLE_DB, PathGains
+from radiotwin.trace.solver import PathGains
 
 CALIBRATED = 6  # batches that are timed; the first one also compiles kernels
 NOISE_SHARE = 0.1  # additional time for the noise: 1 % of the links with ten times the rays
@@ -255,6 +255,5 @@ def _solve(scene: Scene, settings: SolverSettings, calls: list[tuple[int, np.nda
                                   (scene.device_antennas[device], scene.uav_antenna)))
         solved = len(solver.batches(len(points_m))) * settings.batch_receivers
         seconds.append((time.perf_counter() - started) / solved)
-    gain_db = np.concatenate(gains)
-    gain_db[(gain_db < scene.config.gain_limit_db) | (gain_db == IMPOSSIBLE_DB)] = np.nan
+    gain_db = detected(np.concatenate(gains), scene.config.gain_limit_db)
     return np.append(gain_db, np.median(seconds[1:]))  # the first call compiles the kernels

@@ -166,6 +166,11 @@ def exchange_figures(gain_db: np.ndarray, exchanged_db: np.ndarray, los: np.ndar
         "exchanged_nlos_doubtful_share": float(np.mean(np.abs(nlos_db) > DOUBT_DB))}
 
 
+def detected(gain_db: np.ndarray, limit_db: float) -> np.ndarray:
+    """Set gains below the limit of detection, and impossible ones, to NaN."""
+    return np.where((gain_db < limit_db) | (gain_db == IMPOSSIBLE_DB), np.nan, gain_db)
+
+
 def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
     """Return the default file of a scene's traced map."""
     name = "-".join(["truth", *(devices or [])])
@@ -254,14 +259,14 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
     gain_db, counts = _censor(raw_db, inside, impossible, limit_db)
     rows, columns, finer_db = solve_finer(scene, settings, store, index, executor)
     outside = ~inside[columns]
-    finer_db[(finer_db < limit_db) | (finer_db == IMPOSSIBLE_DB)] = np.nan
+    finer_db = detected(finer_db, limit_db)
     figures |= noise_figures(gain_db[rows, columns][:, outside].ravel(),
                              finer_db[:, outside].ravel())
     if settings.solver == "paths":
         turned, exchanged_db = solve_exchanged(scene, settings, store, index, executor,
                                                columns[outside])
-        exchanged_db[(exchanged_db < limit_db) | (exchanged_db == IMPOSSIBLE_DB)] = np.nan
-        figures |= exchange_figures(gain_db[:, turned], exchanged_db, los[:, turned])
+        figures |= exchange_figures(gain_db[:, turned], detected(exchanged_db, limit_db),
+                                    los[:, turned])
     attributes = {"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
                   "scene": scene.config.name, "scene_hash": scene.content_hash(),
                   "trace_hash": store.hash, **settings.attributes(), **counts, **figures,

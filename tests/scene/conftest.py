@@ -1,5 +1,6 @@
 """Small cities, written by hand as ASCII PLY and XML, so that no writer of the package is trusted by its own tests."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,12 @@ class CityFile:
         body = "\n".join([*self.materials, *self.shapes])
         self.path.write_text(f'<scene version="2.1.0">\n{body}\n</scene>\n')
         return self.path
+
+
+@pytest.fixture
+def scene_folder(small_scene, tmp_path):
+    """A copy of the folder of `preset:small`, to be changed."""
+    return Path(shutil.copytree(small_scene.folder, tmp_path / "scene", ignore=shutil.ignore_patterns("cache")))
 
 
 @pytest.fixture

@@ -91,11 +91,6 @@ def test_rows_of_one_direction_must_agree(tmp_path, name, text, same, other, mes
         read_pattern(write(tmp_path, text.format(other), name))
 
 
-def test_no_pattern(tmp_path):
-    with pytest.raises(BadInput, match="none.msi does not exist"):
-        read_pattern(tmp_path / "none.msi")
-
-
 @pytest.mark.filterwarnings("error")
 def test_a_grid_is_counted_before_it_is_made(tmp_path):
     """Seen: 40,000 rows, no two with a common angle, are a grid of 1.6 billion cells."""

@@ -60,11 +60,6 @@ def test_directions_as_the_antenna_sees_them(azimuth_deg, tilt_deg, ray, seen):
     assert gain == pytest.approx(beam(*map(float, seen)), abs=0.05)
 
 
-def test_any_shape_of_rays():
-    rays = np.random.default_rng(0).normal(size=(4, 5, 3))
-    assert Antenna(GRID, 12, 3).gain_dbi(rays).shape == (4, 5)
-
-
 @pytest.mark.parametrize(("azimuth_deg", "east_north", "gain_dbi"), [
     (0, (1, 0), 5), (0, (-1, 0), -5), (90, (0, -1), 5), (90, (0, 1), -5), (225, (-1, 1), 5)])
 def test_azimuths_of_a_pattern_are_clockwise(azimuth_deg, east_north, gain_dbi):

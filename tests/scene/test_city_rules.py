@@ -12,12 +12,6 @@ from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 GROUND = '<shape type="rectangle" id="g"><transform><scale value="50"/></transform><ref id="mat-concrete"/></shape>'
 
 
-@pytest.fixture
-def folder(small_scene, tmp_path):
-    shutil.copytree(small_scene.folder, tmp_path / "scene", ignore=shutil.ignore_patterns("cache"))
-    return tmp_path / "scene"
-
-
 def add(folder, text, before="</scene>"):
     """city.xml with a text before its end."""
     path = folder / "city.xml"
@@ -48,27 +42,27 @@ def add(folder, text, before="</scene>"):
     ('<shape type="ply"><string name="filename" value="$x/ground.ply"/></shape>', "has a \\$, which is not allowed"),
     ('<shape type="cube" id="$x"/>', "has a \\$"), ('<shape type="cube" to_world="1"/>', "'to_world', which is not"),
 ])
-def test_what_is_refused(folder, read, text, message):
+def test_what_is_refused(scene_folder, read, text, message):
     with pytest.raises(BadInput, match=rf"city\.xml, line \d+: .*{message}"):
-        read(add(folder, "\n" + text + "\n"))
+        read(add(scene_folder, "\n" + text + "\n"))
 
 
-def test_a_file_name_is_checked_as_it_is_used(folder, tmp_path):
+def test_a_file_name_is_checked_as_it_is_used(scene_folder, tmp_path):
     """Seen: a decoy in the folder satisfied the check, and a parameter led elsewhere."""
-    shutil.copy(folder / "meshes" / "ground.ply", tmp_path / "secret.ply")
-    (folder / "$x").mkdir()
-    shutil.copy(folder / "meshes" / "ground.ply", folder / "$x" / "secret.ply")
+    shutil.copy(scene_folder / "meshes" / "ground.ply", tmp_path / "secret.ply")
+    (scene_folder / "$x").mkdir()
+    shutil.copy(scene_folder / "meshes" / "ground.ply", scene_folder / "$x" / "secret.ply")
     declared = '<default name="x" value=".."/><shape type="ply"><string name="filename" value="$x/secret.ply"/></shape>'
     with pytest.raises(BadInput, match="<default> is not allowed"):
-        read_triangles(add(folder, declared))
+        read_triangles(add(scene_folder, declared))
     with pytest.raises(BadInput, match="leads out of"):  # as a foreign file, for build-scene
-        read_mitsuba_xml(folder / "city.xml")
+        read_mitsuba_xml(scene_folder / "city.xml")
 
 
-def test_what_is_read_by_hand(folder):
+def test_what_is_read_by_hand(scene_folder):
     """Every element and type that the rules allow."""
-    before = len(read_city(folder / "city.xml"))
-    add(folder, GROUND + '''
+    before = len(read_city(scene_folder / "city.xml"))
+    add(scene_folder, GROUND + '''
       <bsdf type="twosided" id="mat-itu_brick"><bsdf type="diffuse"><rgb name="reflectance" value="0.1, 0.2, 0.3"/></bsdf></bsdf>
       <bsdf type="radio-material" id="own"><float name="relative_permittivity" value="5"/><integer name="n" value="1"/></bsdf>
       <shape type="merge"><shape type="cube" id="c"><transform name="to_world"><rotate z="1" angle="20"/>
@@ -76,6 +70,6 @@ def test_what_is_read_by_hand(folder):
         <ref id="mat-itu_brick" name="bsdf"/></shape></shape>
       <shape type="sphere" id="s"><float name="radius" value="3"/><point name="center" value="1 2 40"/>
         <boolean name="flip" value="false"/><ref id="own" name="bsdf"/></shape>''')
-    shapes = read_city(folder / "city.xml")
+    shapes = read_city(scene_folder / "city.xml")
     assert [shape.name for shape in shapes[before:]] == ["g", "c", "s"]
     assert [shape.material.itu for shape in shapes[before:]] == ["concrete", "brick", None]

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.presets import building_meshes, preset_boxes
 from tests.terrains import incline, terrain_map
@@ -107,18 +106,6 @@ def test_the_answer_does_not_depend_on_the_chunk(random_links, monkeypatch):
     monkeypatch.setattr("radiotwin.scene.citymap.CHUNK", 7)
     np.testing.assert_array_equal(city.line_of_sight(a_m, b_m), whole[0])
     np.testing.assert_array_equal(city.metres_inside(a_m, b_m), whole[1])
-
-
-def test_a_damaged_scene_is_bad_input(tmp_path):
-    with pytest.raises(BadInput, match="does not exist"):
-        CityMap.from_xml(tmp_path / "city.xml")
-    (tmp_path / "city.xml").write_text("<scene>")
-    with pytest.raises(BadInput, match="malformed XML"):
-        CityMap.from_xml(tmp_path / "city.xml")
-    (tmp_path / "city.xml").write_text(
-        '<scene><shape type="ply"><string name="filename" value="meshes/no.ply"/></shape></scene>')
-    with pytest.raises(BadInput, match="no.ply does not exist"):
-        CityMap.from_xml(tmp_path / "city.xml")
 
 
 def test_metres_inside_count_overlapping_solids_once():

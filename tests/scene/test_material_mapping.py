@@ -102,13 +102,11 @@ def test_own_constants_under_an_itu_name_get_another(empty_city):
             "m",
             r"allowed: 0 to 1e\+10",
         ),
-        *((f'<bsdf type="radio-material" id="m"><float name="{name}" value="1e308"/></bsdf>', "m", "is not possible")
-          for name in ("relative_permittivity", "conductivity", "thickness")),
-        (
-            '<bsdf type="radio-material" id="m"><float name="scattering_coefficient" value="2"/></bsdf>',
-            "m",
-            "0 to 1",
+        *(
+            (f'<bsdf type="radio-material" id="m"><float name="{name}" value="1e308"/></bsdf>', "m", "is not possible")
+            for name in ("relative_permittivity", "conductivity", "thickness")
         ),
+        ('<bsdf type="radio-material" id="m"><float name="scattering_coefficient" value="2"/></bsdf>', "m", "0 to 1"),
     ],
 )
 def test_errors(empty_city, bsdf, identifier, message):
@@ -121,18 +119,12 @@ def test_errors(empty_city, bsdf, identifier, message):
 
 def test_no_number(empty_city):
     with pytest.raises(BadInput, match="line 3.*'thick'"):
-        mapped(
-            empty_city,
-            '<bsdf type="radio-material" id="m"><float name="thickness" value="thick"/></bsdf>',
-            "m",
-        )
+        mapped(empty_city, '<bsdf type="radio-material" id="m"><float name="thickness" value="thick"/></bsdf>', "m")
 
 
 @pytest.mark.parametrize("key", ["mat-red", "red"])
 def test_override(empty_city, key):
-    material, problems = mapped(
-        empty_city, '<bsdf type="diffuse" id="mat-red"/>', "mat-red", {key: "itu_brick"}
-    )
+    material, problems = mapped(empty_city, '<bsdf type="diffuse" id="mat-red"/>', "mat-red", {key: "itu_brick"})
     assert material == Material("brick", itu="brick") and not problems
 
 

@@ -40,8 +40,7 @@ def test_rectangle_is_two_units_wide_and_looks_up(empty_city):
 def test_a_mirrored_rectangle_still_looks_up(empty_city):
     mesh = load_shape(
         only_shape(
-            empty_city,
-            '<shape type="rectangle" id="a"><transform name="to_world"><scale x="-3"/></transform></shape>',
+            empty_city, '<shape type="rectangle" id="a"><transform name="to_world"><scale x="-3"/></transform></shape>'
         )
     )
     np.testing.assert_allclose(area_vector(mesh), [0, 0, 12])
@@ -68,9 +67,7 @@ def test_obj_with_quads_negative_indices_and_objects(empty_city):
         "o one\nv 0 0 0\nv 2 0 0\nv 2 3 0\nv 0 3 0\nvt 0 0\nvn 0 0 1\nf 1/1/1 2/1/1 3/1/1 4/1/1\n"
         "o two\nv 0 0 5\nv 1 0 5\nv 0 1 5\nf -3//1 -2//1 -1//1\n"
     )
-    mesh = load_shape(
-        only_shape(empty_city, '<shape type="obj"><string name="filename" value="a.obj"/></shape>')
-    )
+    mesh = load_shape(only_shape(empty_city, '<shape type="obj"><string name="filename" value="a.obj"/></shape>'))
     assert mesh.polygons == 1 and len(mesh.faces) == 3
     np.testing.assert_allclose(area_vector(mesh), [0, 0, 6.5])
 
@@ -89,29 +86,21 @@ def test_concave_polygon_keeps_its_area_and_sense(empty_city, rotation):
     for order, sense in ((range(1, 7), 1), (range(6, 0, -1), -1)):
         (empty_city.folder / "a.obj").write_text(lines + "f " + " ".join(map(str, order)) + "\n")
         empty_city.shapes.clear()
-        mesh = load_shape(
-            only_shape(empty_city, '<shape type="obj"><string name="filename" value="a.obj"/></shape>')
-        )
+        mesh = load_shape(only_shape(empty_city, '<shape type="obj"><string name="filename" value="a.obj"/></shape>'))
         np.testing.assert_allclose(area_vector(mesh), sense * rotation @ [0, 0, 7.0], atol=1e-12)
         corners = mesh.vertices[mesh.faces]
-        areas = (
-            np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-        )
+        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
         assert areas.sum() == pytest.approx(7.0)  # no overlap
 
 
 def test_face_that_names_a_missing_vertex(empty_city):
     (empty_city.folder / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 7\n")
     with pytest.raises(BadInput, match="names vertex 6, there are 3"):
-        load_shape(
-            only_shape(empty_city, '<shape type="obj"><string name="filename" value="a.obj"/></shape>')
-        )
+        load_shape(only_shape(empty_city, '<shape type="obj"><string name="filename" value="a.obj"/></shape>'))
 
 
 def test_clean_welds_and_drops_slivers():
-    vertices = np.array(
-        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 1e-6], [1, 1, 0], [0, 1, 0], [0.5, 0, 0], [9, 9, 9]]
-    )
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 0, 1e-6], [1, 1, 0], [0, 1, 0], [0.5, 0, 0], [9, 9, 9]])
     faces = np.array([[0, 1, 2], [3, 4, 5], [0, 6, 1], [1, 3, 2]])
     welded, kept, dropped = clean(vertices, faces)
     assert len(welded) == 4 and dropped == 2
@@ -119,23 +108,27 @@ def test_clean_welds_and_drops_slivers():
     assert np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     ) == pytest.approx([1, 1])
-    assert (
-        len({tuple(sorted(pair)) for face in kept for pair in zip(face, np.roll(face, 1))}) == 5
-    )  # one shared
+    assert len({tuple(sorted(pair)) for face in kept for pair in zip(face, np.roll(face, 1))}) == 5  # one shared
 
 
 def triangle(vertices="0 0 0\n1 0 0\n0 1 0\n", face="3 0 1 2\n"):
-    return ("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-            f"element face 1\nproperty list uchar int vertex_indices\nend_header\n{vertices}{face}")
+    return (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face 1\nproperty list uchar int vertex_indices\nend_header\n{vertices}{face}"
+    )
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(("text", "message"), [
-    (triangle(vertices="0 0 0\n1 nan 0\n0 1 0\n"), "vertex 2 is not finite"),
-    (triangle(vertices="0 0 0\n1 1e400 0\n0 1 0\n"), "vertex 2 is not finite"),
-    (triangle(vertices="0 0 0\n1 1e300 0\n0 1 0\n"), "vertex 2 is 1e[+]300 from the origin"),
-    (triangle(face="3 0 1 -1\n"), "names vertex -1, there are 3"), (triangle(face="3 0 1 3\n"), "names vertex 3"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (triangle(vertices="0 0 0\n1 nan 0\n0 1 0\n"), "vertex 2 is not finite"),
+        (triangle(vertices="0 0 0\n1 1e400 0\n0 1 0\n"), "vertex 2 is not finite"),
+        (triangle(vertices="0 0 0\n1 1e300 0\n0 1 0\n"), "vertex 2 is 1e[+]300 from the origin"),
+        (triangle(face="3 0 1 -1\n"), "names vertex -1, there are 3"),
+        (triangle(face="3 0 1 3\n"), "names vertex 3"),
+    ],
+)
 def test_what_no_mesh_may_say(empty_city, text, message):
     empty_city.add("a", None, text=text)
     with pytest.raises(BadInput, match=message):
@@ -143,12 +136,15 @@ def test_what_no_mesh_may_say(empty_city, text, message):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize(("shape", "message"), [
-    ('<shape type="cube"><transform><scale value="1e300"/></transform></shape>', "line 3, after the transform"),
-    ('<shape type="sphere"><float name="radius" value="1e308"/></shape>', "line 3: a radius of 1e[+]308"),
-    ('<shape type="sphere"><point name="center" x="east"/></shape>', "line 3: <point> has 'east'"),
-    ('<shape type="ply"><string name="filename" value="%s"/></shape>' % ("a" * 300), "leads out of|does not exist"),
-])
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ('<shape type="cube"><transform><scale value="1e300"/></transform></shape>', "line 3, after the transform"),
+        ('<shape type="sphere"><float name="radius" value="1e308"/></shape>', "line 3: a radius of 1e[+]308"),
+        ('<shape type="sphere"><point name="center" x="east"/></shape>', "line 3: <point> has 'east'"),
+        ('<shape type="ply"><string name="filename" value="%s"/></shape>' % ("a" * 300), "leads out of|does not exist"),
+    ],
+)
 def test_what_no_shape_may_say(empty_city, shape, message):
     with pytest.raises(BadInput, match=message):
         load_shape(only_shape(empty_city, shape))

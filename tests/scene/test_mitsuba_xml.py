@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
+from radiotwin.scene.mitsuba_xml import Node, read_mitsuba_xml, read_numbers, read_vector
 
 
 def write(tmp_path, body, name="a.xml"):
@@ -47,9 +47,7 @@ def test_operations_apply_one_after_the_other(tmp_path):
 
 
 def test_rotation_about_a_slanted_axis_permutes_the_axes(tmp_path):
-    path = write(
-        tmp_path, '<shape type="cube"><transform><rotate x="1" y="1" z="1" angle="120"/></transform></shape>'
-    )
+    path = write(tmp_path, '<shape type="cube"><transform><rotate x="1" y="1" z="1" angle="120"/></transform></shape>')
     matrix = read_mitsuba_xml(path).shapes[0].to_world
     np.testing.assert_allclose(matrix[:3, :3], [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)
 
@@ -90,11 +88,7 @@ def test_undeclared_parameter(tmp_path):
 def test_included_file_finds_its_own_meshes(tmp_path):
     (tmp_path / "part").mkdir()
     (tmp_path / "part" / "m.ply").write_text("")
-    write(
-        tmp_path / "part",
-        '<shape type="ply" id="inner"><string name="filename" value="m.ply"/></shape>',
-        "p.xml",
-    )
+    write(tmp_path / "part", '<shape type="ply" id="inner"><string name="filename" value="m.ply"/></shape>', "p.xml")
     path = write(tmp_path, '<include filename="part/p.xml"/><shape type="cube" id="outer"/>')
     shapes = read_mitsuba_xml(path).shapes
     assert [shape.name for shape in shapes] == ["inner", "outer"]
@@ -149,3 +143,28 @@ def test_many_folders_and_long_names(tmp_path):
         read_mitsuba_xml(write(tmp_path, "".join(f'<path value="p{i}"/>' for i in range(200))))
     with pytest.raises(BadInput, match="is not the name of a file: it has 5,000 characters"):
         read_mitsuba_xml(write(tmp_path, f'<shape type="ply"><string name="filename" value="{"a" * 5000}"/></shape>'))
+
+
+def node(tmp_path, **attributes):
+    return Node("scale", attributes, tmp_path / "a.xml", 3)
+
+
+@pytest.mark.parametrize("text", ["", "1 2", "nan", "inf", "1e400", "1_000", "\u0663", "0x10", "1" * 5000, "1 " * 10**6])
+def test_what_is_no_number(tmp_path, text):
+    with pytest.raises(BadInput, match=r"a\.xml, line 3: <scale> has '.{0,70}' where 1 finite") as error:
+        read_numbers(node(tmp_path), text, (1,))
+    assert len(str(error.value)) < 300 + len(str(tmp_path))
+
+
+def test_vectors(tmp_path):
+    np.testing.assert_array_equal(read_vector(node(tmp_path, value="2"), 0), [2, 2, 2])
+    np.testing.assert_array_equal(read_vector(node(tmp_path, y="-1e1"), 1), [1, -10, 1])
+
+
+def test_files_that_include_others_have_one_budget(tmp_path, monkeypatch):
+    write(tmp_path, '<shape type="cube"/><shape type="cube"/>', "b.xml")
+    path = write(tmp_path, '<include filename="b.xml"/>')
+    assert len(read_mitsuba_xml(path).shapes) == 2
+    monkeypatch.setenv("RADIOTWIN_MAX_ELEMENTS", "4")
+    with pytest.raises(BadInput, match=r"a\.xml: 5 XML elements; at most 4 .* RADIOTWIN_MAX_ELEMENTS"):
+        read_mitsuba_xml(path)

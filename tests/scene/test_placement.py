@@ -15,11 +15,7 @@ from radiotwin.scene.placement import (
 )
 
 EXTENT = Extent(x_min_m=-100, x_max_m=100, y_min_m=0, y_max_m=300)
-HOUSES = [
-    (-80, -40, 40, 120, 30.0),
-    (0, 60, 40, 80, 20.0),
-    (-20, 20, 130, 170, 80.0),
-]  # x0, x1, y0, y1, height
+HOUSES = [(-80, -40, 40, 120, 30.0), (0, 60, 40, 80, 20.0), (-20, 20, 130, 170, 80.0)]  # x0, x1, y0, y1, height
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +58,7 @@ def test_devices_are_clear_of_buildings_and_apart(buildings, seed):
 
 def test_devices_stand_on_the_ground_that_there_is(buildings):
     slope = CityMap(
-        np.array([[-100, 0, 10], [100, 0, 10], [100, 300, 40], [-100, 300, 40.0]]),
-        np.array([[0, 1, 2], [0, 2, 3]]),
+        np.array([[-100, 0, 10], [100, 0, 10], [100, 300, 40], [-100, 300, 40.0]]), np.array([[0, 1, 2], [0, 2, 3]])
     )
     for device in place_devices(5, BuiltGrid.over(EXTENT, buildings), slope, np.random.default_rng(0)):
         assert device.z_m == pytest.approx(10 + device.y_m / 10 + 1.5, abs=0.02)
@@ -83,10 +78,7 @@ def test_no_room_for_devices(buildings):
 def test_uavs_start_beside_the_tower(buildings):
     lattice = LatticeConfig(step_m=20, altitudes_m=[50, 90])
     low, high, again = place_uavs(3, EXTENT, lattice, buildings)
-    assert (high.start_x_m, high.start_y_m) == (
-        0,
-        140,
-    )  # above the tower: the lattice position nearest to (0, 150)
+    assert (high.start_x_m, high.start_y_m) == (0, 140)  # above the tower: the lattice position nearest to (0, 150)
     assert not (abs(low.start_x_m) <= 20 and 130 <= low.start_y_m <= 170)
     assert (again.altitude_m, again.uav) == (50, "uav3")
     assert (low.start_x_m, low.start_y_m) == (low.terminal_x_m, low.terminal_y_m)
@@ -98,9 +90,7 @@ def test_no_free_lattice_position(buildings):
         place_uavs(1, extent, LatticeConfig(step_m=10, altitudes_m=[20]), buildings)
 
 
-@pytest.mark.parametrize(
-    "tops, lowest", [([], 30), ([12.0] * 10, 30), ([20.1] * 10, 35), ([10.0] * 99 + [300], 30)]
-)
+@pytest.mark.parametrize("tops, lowest", [([], 30), ([12.0] * 10, 30), ([20.1] * 10, 35), ([10.0] * 99 + [300], 30)])
 def test_altitudes(tops, lowest):
     assert choose_altitudes(np.array(tops)) == [lowest, lowest + 5, lowest + 10]
 
@@ -114,7 +104,7 @@ def test_extent_lies_on_the_lattice():
     assert choose_extent((-755.2, 655.1, -648, 480)).bounds == (-760, 660, -660, 480)
 
 
-def test_many_devices_and_uavs_take_little_time():
+def test_thousands_of_devices_and_uavs_are_placed():
     extent = Extent(x_min_m=0, x_max_m=3000, y_min_m=0, y_max_m=3000)
     grid = BuiltGrid.over(extent, None)
     devices = place_devices(2_000, grid, None, np.random.default_rng(0))

@@ -35,9 +35,7 @@ def test_picture_shows_heights_devices_and_starts(scene, tmp_path):
     assert len(np.unique((picture * 255).astype(int).reshape(-1, 3), axis=0)) > 50
 
 
-def test_a_strip_of_a_town_has_a_picture(town, tmp_path):
-    build_scene(town.write(), tmp_path / "scene", BuildOptions(devices=5))
-    scene = Scene.load(tmp_path / "scene")
+def test_a_strip_of_a_town_has_a_picture(scene, tmp_path):
     extent = scene.config.extent.model_copy(update={"x_min_m": -800.0, "x_max_m": 800.0, "y_min_m": 0.0, "y_max_m": 1.0})
     thin = Scene(scene.folder, scene.config.model_copy(update={"extent": extent, "devices": [], "uavs": []}))
     assert height_grid(thin)[0].shape == (2, 1000)

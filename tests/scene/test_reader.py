@@ -1,6 +1,5 @@
 """The city of a scene folder is read by one reader; the ray tracer gets only what it read."""
 
-import shutil
 
 import numpy as np
 import pytest
@@ -17,12 +16,6 @@ FOREIGN = """
 </scene>"""
 
 
-@pytest.fixture
-def folder(small_scene, tmp_path):
-    shutil.copytree(small_scene.folder, tmp_path / "scene", ignore=shutil.ignore_patterns("cache"))
-    return tmp_path / "scene"
-
-
 def change(folder, old, new):
     text = (folder / "city.xml").read_text()
     assert old in text
@@ -36,34 +29,34 @@ def written(xml_path, folder):
     return (folder / "city.xml").read_text()
 
 
-def test_nothing_foreign_is_passed_on(folder, tmp_path):
-    before = (folder / "city.xml").read_text()
-    assert written(change(folder, "\n</scene>", FOREIGN), tmp_path / "copy") == before
+def test_nothing_foreign_is_passed_on(scene_folder, tmp_path):
+    before = (scene_folder / "city.xml").read_text()
+    assert written(change(scene_folder, "\n</scene>", FOREIGN), tmp_path / "copy") == before
 
 
 @pytest.mark.llvm
-def test_mitsuba_does_not_read_the_file_of_the_scene(folder, small_scene):
+def test_mitsuba_does_not_read_the_file_of_the_scene(scene_folder, small_scene):
     """Rationale: Mitsuba loads plugins and files that an XML file names. Expected: it gets none of them."""
     from radiotwin.trace.solver import load_city
 
-    city = load_city(change(folder, "\n</scene>", FOREIGN), 2.4e9)
+    city = load_city(change(scene_folder, "\n</scene>", FOREIGN), 2.4e9)
     assert len(city.objects) == len(load_city(small_scene.xml_path, 2.4e9).objects)
 
 
-def test_a_transform_moves_the_shape_in_the_map_and_in_the_copy(folder, small_scene, tmp_path):
+def test_a_transform_moves_the_shape_in_the_map_and_in_the_copy(scene_folder, small_scene, tmp_path):
     moved = '<transform name="to_world"><translate z="7"/></transform>'
-    xml_path = change(folder, '<boolean name="face_normals"', moved + '<boolean name="face_normals"')
+    xml_path = change(scene_folder, '<boolean name="face_normals"', moved + '<boolean name="face_normals"')
     text = written(xml_path, tmp_path / "copy")
     assert "transform" not in text
     original, here, copied = (CityMap.from_xml(path / "city.xml").vertices
-                              for path in (small_scene.folder, folder, tmp_path / "copy"))
+                              for path in (small_scene.folder, scene_folder, tmp_path / "copy"))
     np.testing.assert_allclose(here, copied, atol=1e-5)
     assert 0 < np.count_nonzero(np.isclose(here - original, [0, 0, 7]).all(axis=1)) < len(here)
 
 
 @pytest.mark.parametrize("name", ["../../escape", "a/b", "mesh-ground", "GROUND", "__root__", "concrete"])
-def test_names_become_safe_and_unique(folder, tmp_path, name):
-    xml_path = change(folder, 'id="mesh-building_000"', f'id="{name}"')
+def test_names_become_safe_and_unique(scene_folder, tmp_path, name):
+    xml_path = change(scene_folder, 'id="mesh-building_000"', f'id="{name}"')
     written(xml_path, tmp_path / "copy")
     assert not list(tmp_path.glob("escape*"))
     shapes = read_city(xml_path)
@@ -76,23 +69,23 @@ def test_names_become_safe_and_unique(folder, tmp_path, name):
     ('<string name="type" value="concrete"', '<string name="type" value="kryptonite"', "kryptonite.*does not exist"),
     ('<ref id="mat-concrete"', '<ref id="mat-none"', "'mat-none' is used but not declared"),
     ('type="ply"', 'type="hair"', "line .*'hair' is not read")])
-def test_a_city_that_cannot_be_traced_is_bad_input(folder, old, new, message):
+def test_a_city_that_cannot_be_traced_is_bad_input(scene_folder, old, new, message):
     with pytest.raises(BadInput, match=message):
-        read_city(change(folder, old, new))
+        read_city(change(scene_folder, old, new))
 
 
-def test_unknown_materials_do_not_matter_for_the_map(folder):
-    change(folder, '<ref id="mat-concrete"', '<ref id="mat-none"')
-    assert Scene.load(folder).city.inside([[0.0, 0.0, -1.0]]).shape == (1,)
+def test_unknown_materials_do_not_matter_for_the_map(scene_folder):
+    change(scene_folder, '<ref id="mat-concrete"', '<ref id="mat-none"')
+    assert Scene.load(scene_folder).city.inside([[0.0, 0.0, -1.0]]).shape == (1,)
 
 
-def test_polygons_and_empty_cities_are_refused(folder):
-    (folder / "meshes" / "ground.ply").write_text(
+def test_polygons_and_empty_cities_are_refused(scene_folder):
+    (scene_folder / "meshes" / "ground.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
         "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
         "0 0 0\n1 0 0\n1 1 0\n0 1 0\n4 0 1 2 3\n")
     with pytest.raises(BadInput, match="not of triangles"):
-        read_triangles(folder / "city.xml")
-    (folder / "city.xml").write_text("<scene/>")
+        read_triangles(scene_folder / "city.xml")
+    (scene_folder / "city.xml").write_text("<scene/>")
     with pytest.raises(BadInput, match="names no meshes"):
-        read_triangles(folder / "city.xml")
+        read_triangles(scene_folder / "city.xml")

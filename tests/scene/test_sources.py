@@ -16,18 +16,14 @@ def test_unknown_sionna_scene_lists_the_known_ones():
         find_source("sionna:atlantis")
 
 
-@pytest.mark.parametrize(
-    "name, message", [("nothing.xml", "not a file.*munich"), ("city.dae", "'.dae' is not read")]
-)
+@pytest.mark.parametrize("name, message", [("nothing.xml", "not a file.*munich"), ("city.dae", "'.dae' is not read")])
 def test_not_a_scene_file(tmp_path, name, message):
     (tmp_path / "city.dae").write_text("")
     with pytest.raises(BadInput, match=message):
         find_source(tmp_path / name)
 
 
-@pytest.mark.parametrize(
-    "source, name", [("sionna:etoile", "etoile"), ("data/my city (2).xml", "my_city__2_")]
-)
+@pytest.mark.parametrize("source, name", [("sionna:etoile", "etoile"), ("data/my city (2).xml", "my_city__2_")])
 def test_scene_name(source, name):
     assert scene_name(source) == name
 

@@ -15,20 +15,13 @@ QUADS = {
 
 def box(x=(0, 10), y=(0, 10), z=(0, 10), sides=tuple(QUADS), inside_out=False):
     (x0, x1), (y0, y1), (z0, z1) = x, y, z
-    corners = np.array(
-        [(a, b, c) for c in (z0, z1) for a, b in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], dtype=float
-    )
-    faces = np.array(
-        [part for side in sides for a, b, c, d in [QUADS[side]] for part in ((a, b, c), (a, c, d))]
-    )
+    corners = np.array([(a, b, c) for c in (z0, z1) for a, b in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], dtype=float)
+    faces = np.array([part for side in sides for a, b, c, d in [QUADS[side]] for part in ((a, b, c), (a, c, d))])
     return corners, faces[:, ::-1] if inside_out else faces
 
 
 WALLS = ("south", "east", "north", "west")
-PLANE = (
-    np.array([[-100, -100, 0], [100, -100, 0], [100, 100, 0], [-100, 100, 0.0]]),
-    np.array([[0, 1, 2], [0, 2, 3]]),
-)
+PLANE = (np.array([[-100, -100, 0], [100, -100, 0], [100, 100, 0], [-100, 100, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 @pytest.mark.parametrize("sides", [tuple(QUADS), ("top", *WALLS), WALLS, ("top",)])
@@ -41,10 +34,7 @@ def test_only_inside_out_boxes_are_turned(sides):
 
 
 def test_courtyard_walls_face_the_courtyard():
-    outer, inner = (
-        box(x=(0, 30), y=(0, 30), sides=WALLS),
-        box(x=(10, 20), y=(10, 20), sides=WALLS, inside_out=True),
-    )
+    outer, inner = (box(x=(0, 30), y=(0, 30), sides=WALLS), box(x=(10, 20), y=(10, 20), sides=WALLS, inside_out=True))
     block = np.concatenate([outer[0], inner[0]]), np.concatenate([outer[1], inner[1] + 8])
     assert not Surfaces([block]).inward().any()
     assert Surfaces([(block[0], block[1][:, ::-1])]).inward().all()
@@ -63,16 +53,12 @@ def test_free_edges_of_an_open_bottom():
 
 def test_roof_apart_from_walls_is_a_seam():
     shapes = [box(sides=WALLS), box(sides=("top",)), box(x=(50, 60))]
-    used = [
-        (corners[np.unique(faces)], np.searchsorted(np.unique(faces), faces)) for corners, faces in shapes
-    ]
+    used = [(corners[np.unique(faces)], np.searchsorted(np.unique(faces), faces)) for corners, faces in shapes]
     assert Surfaces(used).seams().tolist() == [[0, 1]]
 
 
 def test_plane_under_boxes_is_ground_and_roofs_are_not():
-    surfaces = Surfaces(
-        [box(z=(0, 15)), PLANE, box(x=(30, 50), sides=("top",)), box(x=(30, 50), sides=WALLS)]
-    )
+    surfaces = Surfaces([box(z=(0, 15)), PLANE, box(x=(30, 50), sides=("top",)), box(x=(30, 50), sides=WALLS)])
     np.testing.assert_array_equal(surfaces.ground_faces(), surfaces.shape == 1)
 
 
@@ -97,9 +83,7 @@ def test_ground_within_one_mesh_with_the_buildings():
     """A city cut out of one sheet: the ground shares its vertices with the walls."""
     corners, faces = box(x=(-10, 10), y=(-10, 10), z=(0, 20), sides=("top", *WALLS))
     rim = np.array([[-60, -60, 0], [60, -60, 0], [60, 60, 0], [-60, 60, 0.0]])
-    ring = np.array(
-        [part for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)) for part in ((8 + a, 8 + b, b), (8 + a, b, a))]
-    )
+    ring = np.array([part for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)) for part in ((8 + a, 8 + b, b), (8 + a, b, a))])
     surfaces = Surfaces([(np.concatenate([corners, rim]), np.concatenate([faces, ring]))])
     np.testing.assert_array_equal(surfaces.ground_faces(), np.arange(len(surfaces.faces)) >= len(faces))
 
@@ -111,9 +95,7 @@ def test_boxes_alone_have_no_ground():
 def test_kept_faces_keep_their_places():
     surfaces = Surfaces([box(), box(x=(20, 30))])
     ((vertices, faces),) = surfaces.meshes(surfaces.shape == 1)
-    np.testing.assert_array_equal(
-        np.sort(vertices[faces].reshape(-1, 3), axis=0)[[0, -1]], [[20, 0, 0], [30, 10, 10]]
-    )
+    np.testing.assert_array_equal(np.sort(vertices[faces].reshape(-1, 3), axis=0)[[0, -1]], [[20, 0, 0], [30, 10, 10]])
 
 
 def test_level_is_the_height_of_most_of_the_area():

@@ -15,14 +15,10 @@ def folder(tmp_path):
         [
             CityShape(
                 "ground",
-                trimesh.Trimesh(
-                    [[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], [[0, 1, 2], [0, 2, 3]]
-                ),
+                trimesh.Trimesh([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], [[0, 1, 2], [0, 2, 3]]),
                 itu_material("wet_ground"),
             ),
-            CityShape(
-                "tower", tower.apply_translation([0, 0, 20]), itu_material("itu_concrete", thickness_m=0.3)
-            ),
+            CityShape("tower", tower.apply_translation([0, 0, 20]), itu_material("itu_concrete", thickness_m=0.3)),
             CityShape("shed", tower.copy().apply_translation([30, 0, -30]), own),
         ],
     )
@@ -55,6 +51,5 @@ def test_sionna_rt_loads_it(folder):
     assert tower.thickness[0] == pytest.approx(0.3)
     shed = scene.objects["shed"].radio_material
     assert [
-        float(value[0])
-        for value in (shed.relative_permittivity, shed.conductivity, shed.scattering_coefficient)
+        float(value[0]) for value in (shed.relative_permittivity, shed.conductivity, shed.scattering_coefficient)
     ] == pytest.approx([3.0, 0.1, 0.2])

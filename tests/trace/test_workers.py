@@ -81,10 +81,10 @@ def test_a_command_that_was_killed_goes_on_with_other_workers_to_the_same_bytes(
 
 def test_a_batch_in_halves_differs_little_from_the_whole(small_scene):
     """What is done where memory is short: a gain depends on the points beside it in rare cases only."""
-    from radiotwin.trace.link_job import LinkBatch, SolveLinks
+    from radiotwin.trace.link_job import LinkBatch, SolvePaths
 
     piece = LinkBatch("a", small_scene.device_m[0], points_of(small_scene)[:40], (None, None), 40)
-    solve = SolveLinks(small_scene, SETTINGS)
+    solve = SolvePaths(small_scene, SETTINGS)
     whole = solve(piece)
     halves = np.concatenate([solve(half) for half in piece.halves()])
     assert [half.batch_receivers for half in piece.halves()] == [20, 20]

@@ -80,11 +80,6 @@ class Prism:
     site: BaseGeometry | None = None
     ground_m: float = 0.0
 
-    def overlaps_in_height(self, other: "Prism") -> bool:
-        """Return whether the vertical extents of two prisms overlap."""
-        top_m = min(self.height.top_m, other.height.top_m)
-        return top_m > max(self.height.bottom_m, other.height.bottom_m)
-
 
 def make_prisms(
     features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float,
@@ -337,7 +332,8 @@ def find_overlaps(prisms: Sequence[Prism],
     for (a, b), shared_m2 in zip(contacts.pairs.tolist(), contacts.shared_m2.tolist()):
         first, second = prisms[a], prisms[b]
         if (shared_m2 > MIN_OVERLAP_M2 and first.name != second.name
-                and first.overlaps_in_height(second)):
+                and min(first.height.top_m, second.height.top_m)
+                > max(first.height.bottom_m, second.height.bottom_m)):
             found.append((first, second, shared_m2))
     return found
 
