@@ -49,7 +49,7 @@ COLUMNS = {"n": "links", "bias_db": "bias [dB]", "std_db": "standard deviation [
            "correlation": "correlation", "rmse_db": "RMSE [dB]", "mae_db": "MAE [dB]",
            "nll": "−log-likelihood [nats]"}
 LEARNT = {"combined": "all that was learnt together",
-          "map": "its map, which has the mean at a faultless receiver, also where nothing is heard"}
+          "map": "its map: mean level at a receiver without faults"}
 UNITS = {"deg": "°"}  # where a page does not write them as the file does
 MAX_ROWS = 40  # groups with more members are left out of the tables
 MAX_COLUMNS = 30  # of the scores

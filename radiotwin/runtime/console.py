@@ -211,6 +211,6 @@ class _Lines:
 
     def _print(self) -> None:
         while not self.over.wait(LINE_S):
-            of = "" if self._total is None else f" of {self._total:,.0f}"
+            of = "steps" if self._total is None else f"of {self._total:,.0f}"
             after_s = time.monotonic() - self._started
-            notice(f"{self._text} ({self._done:,.0f}{of}, {after_s:.0f} s)")
+            notice(f"{self._text} ({self._done:,.0f} {of} done after {after_s:.0f} s)")

@@ -100,6 +100,6 @@ def test_progress_in_a_file_is_a_line_now_and_then(out, monkeypatch):
         for text, done in (("second", "200"), ("third", "400")):
             advance(200, text)
             until = time.monotonic() + 60
-            while out.getvalue().count(f"radiotwin: {text} ({done} of 1,000, ") < 2 and time.monotonic() < until:
+            while out.getvalue().count(f"radiotwin: {text} ({done} of 1,000 done after ") < 2 and time.monotonic() < until:
                 time.sleep(0.01)
-            assert out.getvalue().count(f"radiotwin: {text} ({done} of 1,000, ") >= 2, "also while nothing advances"
+            assert out.getvalue().count(f"radiotwin: {text} ({done} of 1,000 done after ") >= 2, "also while nothing advances"
