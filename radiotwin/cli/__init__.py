@@ -1,8 +1,8 @@
-"""The command `radiotwin`.
+"""The entry point of the command `radiotwin`.
 
-A command that gives files of strangers to libraries in C and C++ runs in a process of its own. What
-these libraries take for granted is checked before they get a file; what no check foresaw may end
-the process. Then the one that waits for it still says which command it was, and exits with 2.
+Commands that pass strangers' files to libraries in C and C++ run in a child process. We check what
+these libraries assume about a file, but an unforeseen fault may still crash the process. Then its
+parent reports the command and the file, and exits with 2.
 """
 
 import os
@@ -15,7 +15,7 @@ from radiotwin.io import signals
 from radiotwin.runtime.processes import die_with_parent
 
 GUARDED = ("build-scene", "import")
-"""Commands of `radiotwin` that read other programs' files."""
+"""Commands that read other programs' files, and so run in a child process."""
 CRASHES = tuple(getattr(signal, name) for name in ("SIGSEGV", "SIGABRT", "SIGBUS", "SIGFPE",
                                                    "SIGILL") if hasattr(signal, name))
 
@@ -25,8 +25,8 @@ def main() -> None:
     signals.handle()  # before anything that takes time
     if sys.argv[1:2] and sys.argv[1] in GUARDED:
         _guard()
-    # On matrices as small as here several threads of a BLAS are slower than one, and wait busily;
-    # what can be done side by side has threads and workers of its own. Read when it is loaded.
+    # Our matrices are small: several BLAS threads are slower than one, and wait busily. Parallel
+    # work has threads and workers of its own. OpenBLAS reads the variable when it is loaded.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from radiotwin.cli.commands import app
     from radiotwin.io.signals import after_interrupt
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def _guard() -> None:
-    """Go on in a child, or end as it has ended."""
+    """Return in a child process that runs the command; the parent ends with its exit status."""
     try:
         status = go_on_in_a_child()
     except BadInput as error:
@@ -52,12 +52,12 @@ def _refuse(error: BadInput) -> None:
 
 
 def go_on_in_a_child() -> int | None:
-    """Return None in a child, which goes on, and in this process, once it has ended, its status.
+    """Fork; return None in the child, and in the parent the child's exit status.
 
-    Only where that is safe, on Linux before any library has threads; else None in this process.
+    Forks only where that is safe, on Linux before any library has threads; else returns None.
 
     Raises:
-        BadInput: a library has ended the child.
+        BadInput: a library crashed the child.
     """
     if sys.platform != "linux" or "numpy" in sys.modules:
         return None
@@ -75,7 +75,7 @@ def go_on_in_a_child() -> int | None:
         raise BadInput(f"{' '.join(sys.argv[1:3])}: a library ended on this file "
                        f"({signal.strsignal(-code)}): it breaks what its format promises. Export "
                        "it again, and please report it with the file")
-    if code < 0:  # killed from outside, or for want of memory
+    if code < 0:  # killed from outside, or out of memory
         if -code != signal.SIGKILL:
             signal.signal(-code, signal.SIG_DFL)
         os.kill(os.getpid(), -code)

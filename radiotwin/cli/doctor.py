@@ -1,4 +1,4 @@
-"""Checks of this machine: what works, and how to mend what does not."""
+"""Check which parts of radiotwin work on this machine, and name the remedy for the others."""
 
 import os
 import platform
@@ -30,9 +30,9 @@ class Diagnosis:
     """Findings about this machine.
 
     Attributes:
-        sections: heading -> rows of (item, finding).
-        problems: what keeps something from working, with the remedy; one line each.
-        cautions: what does not, but may later.
+        sections: rows of (item, finding) by heading.
+        problems: faults that stop something from working, each with its remedy.
+        cautions: shortages that may stop something later.
     """
 
     sections: dict[str, Rows] = field(default_factory=dict)
@@ -46,7 +46,7 @@ class Diagnosis:
 
 
 def diagnose() -> Diagnosis:
-    """Check everything that radiotwin needs; what may crash runs in a process of its own."""
+    """Check machine, GPU, packages and tracing; checks that may crash run in a child process."""
     diagnosis = Diagnosis()
     diagnosis.sections["System"] = [
         ("Python", f"{platform.python_version()} ({sys.executable})"),
@@ -67,8 +67,8 @@ def diagnose() -> Diagnosis:
 
 
 def print_diagnosis(diagnosis: Diagnosis, console: Console) -> None:
-    """Print findings about this machine, and remedies."""
-    def say(text: str, style: str | None = None) -> None:  # neither wraps paths nor reads markup
+    """Print findings and remedies."""
+    def say(text: str, style: str | None = None) -> None:  # no wrapped paths, no markup
         console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
     for heading, rows in diagnosis.sections.items():
@@ -85,6 +85,7 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console) -> None:
 
 
 def _check_machine(diagnosis: Diagnosis) -> Rows:
+    """List cores, memory and free disk; add cautions if there is little."""
     cores = usable_cores()
     memory_gib = _memory_gib()
     disk_gib = shutil.disk_usage(Path.cwd()).free / GIB
@@ -102,7 +103,7 @@ def _check_machine(diagnosis: Diagnosis) -> Rows:
 
 
 def _memory_gib() -> float | None:
-    """Return the memory of the machine, or its container's limit [GiB]; None if unknown."""
+    """Return the memory of the machine or the limit of its container [GiB]; None if unknown."""
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):  # Windows
@@ -157,6 +158,7 @@ def _check_packages(diagnosis: Diagnosis) -> Rows:
 
 
 def _check_llvm(diagnosis: Diagnosis) -> Rows:
+    """List every libLLVM found, with the chosen one; add a problem if none works."""
     chosen = llvm.choose()
     rows = [(str(candidate), "works, chosen" if candidate == chosen
              else llvm.rejection(candidate) or "works") for candidate in llvm.find()]

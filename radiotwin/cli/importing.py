@@ -11,7 +11,7 @@ from radiotwin.cli.options import parse_origin
 from radiotwin.errors import BadInput
 from radiotwin.runtime.console import print_rows, say
 
-_BAD_ROWS = 20  # that are printed
+_BAD_ROWS = 20  # at most so many are printed
 
 if TYPE_CHECKING:
     from radiotwin.importing.settings import Settings
@@ -159,6 +159,7 @@ def import_(
 
 
 def _print(report: dict[str, Any]) -> None:
+    """Print readings read, left out and kept, files, ranges, origin, bad rows and warnings."""
     rows = [["read", "", report["readings"], f"{report['rows']} rows"]]
     rows += [[item["reason"], item["column"], -item["readings"], item["first"]]
              for item in report["left_out"]]
@@ -193,14 +194,17 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def _tables(settings: "Settings") -> list[str]:
-    """Return the options of all tables of positions, which a file may not name in any folder."""
+    """Return options that name devices, receivers and tracks, for a repetition of the command.
+
+    import.toml cannot name tables outside its folder, so the command line has to.
+    """
     options = [text for name in ("devices", "receivers") if (table := getattr(settings, name))
                for text in (f"--{name}", table)]
     tracks, topics = settings.track, {track.topic for track in settings.track}
     if len(topics) != 1 or any(track.time_offset_s or track.columns or track.time_format
                                or track.time_zone or track.length_unit or "=" in track.file
                                for track in tracks):
-        return options  # none, or what only a file can say
+        return options  # no tracks, or settings of them that have no option
     for track in tracks:
         options += ["--track", f"{track.receiver}={track.file}" if track.receiver else track.file]
     topic = topics.pop()
@@ -208,7 +212,7 @@ def _tables(settings: "Settings") -> list[str]:
 
 
 def _tracks(texts: list[str] | None, given: dict[str, Any]) -> list[dict[str, Any]] | None:
-    """Parse `FILE` or `RECEIVER=FILE`; what is given besides holds for all."""
+    """Parse `FILE` or `RECEIVER=FILE` of --track; `given` are settings of all tracks."""
     given = {name: value for name, value in given.items() if value is not None}
     if texts is None:
         if given:
@@ -222,7 +226,7 @@ def _tracks(texts: list[str] | None, given: dict[str, Any]) -> list[dict[str, An
 
 
 def _choices(texts: list[str] | None) -> dict[str, list[str]] | None:
-    """Parse `COLUMN=A|B`."""
+    """Parse `COLUMN=A|B` of --only into allowed values by column."""
     if texts is None:
         return None
     chosen = {}
@@ -235,14 +239,14 @@ def _choices(texts: list[str] | None) -> dict[str, list[str]] | None:
 
 
 def _number(value: float | None, name: str) -> str:
-    """Format a number; degrees of a position with five decimals (1e-5 degrees is a metre)."""
+    """Format a value of a column; degrees with five decimals (1e-5 degrees is a metre)."""
     if value is None:
         return "–"
     return f"{value:.5f}" if name in ("latitude", "longitude") else f"{value:.2f}"
 
 
 def _values(text: str | None) -> list[float | str] | None:
-    """Parse a list of numbers; what is not a finite number is a text."""
+    """Split `A,B,…` into finite numbers and texts."""
     if text is None:
         return None
     values: list[float | str] = []

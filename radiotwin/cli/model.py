@@ -21,6 +21,7 @@ from radiotwin.cli.options import (
     in_frame_of,
     keep_scene_apart,
     open_model,
+    parse_numbers,
     split_names,
 )
 from radiotwin.errors import BadInput
@@ -77,6 +78,7 @@ def fit(
 
 
 def _print_twin(twin: "Twin", title: str) -> None:
+    """Print positions, the fitted law, and held-out errors of the channel models."""
     from radiotwin.twin.selection import LOCATED_BY, HeldOut
 
     table, columns = twin.positions, {"device": "left", "role": "left", "x [m]": "right",
@@ -102,6 +104,7 @@ def _print_twin(twin: "Twin", title: str) -> None:
 
 
 def _note(device: "TwinDevice") -> str:
+    """Return whether a device was not located, or has a second likely place; else nothing."""
     if not device.located:
         return "not located: the data do not say where it is"
     if device.second_mode:
@@ -137,24 +140,16 @@ def map_(
         raise BadInput(f"{twin} is a radio map already; give the file to write with --out")
     place = Path(os.path.realpath(twin))  # unlike resolve, it takes links in a circle
     out = out or place.with_name(f"{place.name}.nc")
+    heights_m = None if altitudes is None else parse_numbers("--altitudes", altitudes)
     world = Scene.load(scene)
     check_map_target(out, world)
     keep_inputs(out, twin, *world.files)
     keep_others(out, force, "device", "x_m", "y_m", "z_m", "gain_db", "los")
     with open_model(twin) as source:
         written = export_map(source, world, out, devices=split_names(devices),
-                             altitudes_m=_altitudes(altitudes), name=str(twin), tell=notice)
+                             altitudes_m=heights_m, name=str(twin), tell=notice)
     z, y, x = written.lattice.shape
     say(f"wrote {out}: {len(written.devices)} devices, {z} altitudes of {x} by {y} positions")
-
-
-def _altitudes(text: str | None) -> list[float] | None:
-    if text is None:
-        return None
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise BadInput(f"--altitudes {text!r} are not numbers; give metres, as 50,60") from None
 
 
 def compare(
@@ -274,9 +269,9 @@ def close_loop(
     expected = (f"{len(data):,} links: usually {minutes / 2:.1f} to {2 * minutes:.1f} min of "
                 "processor time, more where other work runs")
     inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
-    # Two workers are no faster than the threads of one process: they are for who asks for them.
-    some = "1" if workers == AUTO and cluster is None else workers
-    with keep_pieces() as pieces, open_executor(some, cluster, notice) as executor, \
+    # Two workers are no faster than the threads of one process: only on request.
+    wanted = "1" if workers == AUTO and cluster is None else workers
+    with keep_pieces() as pieces, open_executor(wanted, cluster, notice) as executor, \
             progress("closing the loop", total=None, lines=True) as advance:
         def show(text: str) -> None:
             if text == BASE_FITTED:
@@ -301,6 +296,7 @@ def close_loop(
 
 
 def _print(report: dict[str, Any]) -> None:
+    """Print anomalies, held-out errors before and after, and effects of a close-loop report."""
     from radiotwin.report import anomaly_words
     from radiotwin.report.labels import name_label
 
@@ -332,7 +328,7 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def _estimate(estimate: dict[str, Any]) -> list[float | str]:
-    """Return value and interval as the table shows them."""
+    """Return value, low and high of a parameter; texts if it is a reference or undetermined."""
     from radiotwin.report.closeloop_words import is_reference
 
     if is_reference(estimate):

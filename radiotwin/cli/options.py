@@ -68,7 +68,7 @@ Cluster = Annotated[str | None, typer.Option(
 
 @contextmanager
 def open_model(path: Path) -> "Iterator[RadioMap | Twin]":
-    """Open a radio map (.nc, .zarr), whose values stay in its file, or load a twin's folder.
+    """Open a radio map (.nc, .zarr) without reading its values, or load a twin from its folder.
 
     Raises:
         BadInput: it is neither.
@@ -85,24 +85,21 @@ def open_model(path: Path) -> "Iterator[RadioMap | Twin]":
 
 
 def split_names(text: str | None) -> list[str] | None:
-    """Return the names of `A,B`; None for all."""
+    """Split `A,B,…` into names; None for no text, which stands for all."""
     return text.split(",") if text else None
 
 
 def parse_origin(text: str | None) -> "Origin | None":
-    """Return the origin of `LATITUDE,LONGITUDE` or `LATITUDE,LONGITUDE,ALTITUDE`; None for none.
+    """Parse `LATITUDE,LONGITUDE` or `LATITUDE,LONGITUDE,ALTITUDE`; None for None.
 
     Raises:
-        BadInput: anything else, or a place that is not on the earth.
+        BadInput: not two or three numbers, or a place that is not on the earth.
     """
     from radiotwin.io.forms import as_origin
 
     if text is None:
         return None
-    values = _numbers(text)
-    if len(values) not in (2, 3):
-        raise BadInput(f"--origin {text!r} is not two or three numbers; give LATITUDE,LONGITUDE or "
-                       "LATITUDE,LONGITUDE,ALTITUDE in degrees and metres")
+    values = parse_numbers("--origin", text, None, "LATITUDE,LONGITUDE[,ALTITUDE]")
     try:
         return as_origin(values)
     except BadInput as error:
@@ -111,66 +108,65 @@ def parse_origin(text: str | None) -> "Origin | None":
 
 def in_frame_of(scene: "Scene | None", measurements: "Measurements",
                 shift: str | None) -> "Measurements":
-    """Return measurements in the frame of a scene, if there is one, after a shift `DX,DY` [m].
+    """Convert measurements to a scene's frame, or shift them by `DX,DY` [m] into it.
 
     Raises:
-        BadInput: not two numbers, no scene to shift to, or frames that cannot be related.
+        BadInput: not two numbers, a shift without a scene, or frames that cannot be related.
     """
     from radiotwin.links.alignment import in_scene_frame
 
-    shift_m = None if shift is None else _numbers(shift)
-    if shift_m is not None and len(shift_m) != 2:
-        raise BadInput(f"--shift {shift!r} is not two numbers; give DX,DY in metres, such as "
-                       "12,-40")
-    if scene is None:
-        if shift_m is not None:
-            raise BadInput("--shift moves measurements into the frame of a scene, and none is "
-                           "given; add --scene, or leave it out")
-        return measurements.on_ground(None)
-    return in_scene_frame(measurements, scene,
-                          None if shift_m is None else (shift_m[0], shift_m[1]))
+    shift_m = None
+    if shift is not None:
+        dx_m, dy_m = parse_numbers("--shift", shift, 2, "DX,DY in metres, such as 12,-40")
+        shift_m = dx_m, dy_m
+    if scene is not None:
+        return in_scene_frame(measurements, scene, shift_m)
+    if shift_m is not None:
+        raise BadInput("--shift moves measurements into the frame of a scene, and none is given; "
+                       "add --scene, or leave it out")
+    return measurements.on_ground(None)
 
 
 def keep_scene_apart(out: Path, scene: "Scene | None") -> None:
-    """Raise BadInput if the folder of a result is that of the scene, which would get its files."""
+    """Raise BadInput if results would be written to the scene's own folder."""
     if scene is not None and is_within(scene.folder, out) and is_within(out, scene.folder):
         raise BadInput(f"cannot write {out}: it is the scene's folder; choose another output "
                        "folder")
 
 
-def parse_numbers(option: str, text: str, count: int | None = None) -> list[float]:
-    """Return the numbers of an option's `A,B,…`, of which there are `count`, or at least one.
+def parse_numbers(option: str, text: str, count: int | None = None,
+                  form: str = "A,B,…") -> list[float]:
+    """Parse an option's value as finite numbers with commas between them.
+
+    Args:
+        option: its name, for the message.
+        text: value of the option.
+        count: required number of numbers; None: one or more.
+        form: what to give, for the message.
 
     Raises:
-        BadInput: they are not so many finite numbers.
+        BadInput: not so many finite numbers.
     """
-    values = _numbers(text)
-    if not values or (count is not None and len(values) != count):
-        wanted = "numbers" if count is None else f"{count} numbers"
-        raise BadInput(f"{option} {text!r} is not {wanted} with commas between them")
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if not values or len(values) != (count or len(values)) or not all(map(math.isfinite, values)):
+        wanted = f"{count} numbers" if count else "numbers"
+        raise BadInput(f"{option} {text!r} is not {wanted} with commas between them; give {form}")
     return values
 
 
 def parse_extent(text: str | None) -> tuple[float, float, float, float] | None:
-    """Return x_min, x_max, y_min, y_max [m] of `XMIN,YMIN,XMAX,YMAX`; None for none.
+    """Parse `XMIN,YMIN,XMAX,YMAX` into x_min, x_max, y_min, y_max [m]; None for None.
 
     Raises:
-        BadInput: they are not four numbers, or a minimum is not below its maximum.
+        BadInput: not four numbers, or a minimum is not below its maximum.
     """
     if text is None:
         return None
-    values = _numbers(text)
-    if len(values) != 4 or not (values[0] < values[2] and values[1] < values[3]):
-        raise BadInput(f"--extent {text!r} is not an area; give XMIN,YMIN,XMAX,YMAX in metres, "
-                       "the minimum below the maximum")
-    x_min, y_min, x_max, y_max = values
+    form = "XMIN,YMIN,XMAX,YMAX in metres, the minimum below the maximum"
+    x_min, y_min, x_max, y_max = parse_numbers("--extent", text, 4, form)
+    if not (x_min < x_max and y_min < y_max):
+        raise BadInput(f"--extent {text!r} is not an area; give {form}")
     return x_min, x_max, y_min, y_max
-
-
-def _numbers(text: str) -> list[float]:
-    """Return the finite numbers of a list; none of them where one is not."""
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        return []
-    return values if all(map(math.isfinite, values)) else []

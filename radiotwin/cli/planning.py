@@ -85,7 +85,7 @@ def plan(
 
 
 def _show(planned: "PlannedFlights", wanted: float, confidence: float) -> None:
-    """Print what is promised, of all data and of each device, and the sizes."""
+    """Print the promised shares of all data and of each device, and the sizes compared."""
     from marl.promise import smallest
     from radiotwin.display import count
 

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from radiotwin.trace import SolverSettings
 
 Bounds = tuple[float, float, float, float]
-SAME_HEIGHT_M = 5.0  # of receivers: one altitude of the lattice is enough
-MAX_BUSY = 1.3  # times the time of an idle machine, from which on a plan says so
+SAME_HEIGHT_M = 5.0  # receivers' heights within this span get one altitude of the lattice
+MAX_BUSY = 1.3  # ratio to the time of an idle machine from which on a plan reports it as busy
 
 
 def build_scene(
@@ -144,7 +144,7 @@ def build_scene(
 
 
 def _measured(path: Path, on_terrain: bool) -> tuple[float | None, list[float] | None]:
-    """Return the frequency [Hz] and the lattice's altitudes [m] of measurements; None: unknown."""
+    """Return the devices' frequency [Hz] and altitudes for the lattice [m]; None if unknown."""
     import numpy as np
 
     from radiotwin.links.measurements import read_measurements
@@ -219,10 +219,12 @@ def export(
 
 
 def _content(folder: Path) -> list[str]:
+    """Return the sorted names in a folder, those of folders with a slash."""
     return sorted(f"{path.name}/" if path.is_dir() else path.name for path in folder.iterdir())
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:
+    """Parse values `NAME=ITU` of --material."""
     pairs = {}
     for text in texts:
         name, equals, itu = text.partition("=")
@@ -234,13 +236,12 @@ def _pairs(texts: list[str]) -> dict[str, str]:
 
 
 def _bounds(text: str | None) -> Bounds | None:
+    """Parse the four numbers of --bbox; None for None."""
     if text is None:
         return None
-    try:
-        first, second, third, fourth = (float(part) for part in text.split(","))
-    except ValueError:
-        raise BadInput(f"--bbox {text!r} is not four numbers; give XMIN,YMIN,XMAX,YMAX in metres, "
-                       "or of a map SOUTH,WEST,NORTH,EAST in degrees") from None
+    first, second, third, fourth = parse_numbers(
+        "--bbox", text, 4, "XMIN,YMIN,XMAX,YMAX in metres, or of a map SOUTH,WEST,NORTH,EAST in "
+        "degrees")
     return first, second, third, fourth
 
 
@@ -303,6 +304,7 @@ def trace(
 
 
 def _print_plan(scene: "Scene", settings: "SolverSettings", devices: list[str] | None) -> None:
+    """Print what is left to trace: batches, memory, and time by the number of workers."""
     from radiotwin.trace.plan import plan_trace
 
     plan = plan_trace(scene, settings, devices)
@@ -392,7 +394,9 @@ def paths(
     keep_others(out, force)
     points_m = read_points(points, scene.config.origin, scene.city)
     found = list_paths(scene, points_m, out, split_names(devices),
-                       None if velocity is None else _speeds(velocity), bandwidth_hz)
+                       None if velocity is None else parse_numbers(
+                           "--velocity", velocity, 3, "VX,VY,VZ [m/s], such as 10,0,0 for "
+                           "eastwards"), bandwidth_hz)
     reasons = found["reason"].to_series().value_counts()
     if scene.city.terrain is not None:
         say("the ground is a terrain: paths reflect off its triangles and diffract where it folds "
@@ -403,19 +407,13 @@ def paths(
         + ("; gains include the antennas of scene.toml" if scene.has_antennas else ""))
 
 
-def _speeds(text: str) -> list[float]:
-    try:
-        east, north, up = (float(part) for part in text.split(","))
-    except ValueError:
-        raise BadInput(f"--velocity {text!r} is not three numbers; give VX,VY,VZ [m/s], such as "
-                       "10,0,0 for eastwards") from None
-    return [east, north, up]
-
-
 def _settings(scene: "Scene", points_m: "np.ndarray", devices: list[str] | None,
               quality: str | None, target_db: float | None, **others: str | int | float | None
               ) -> "SolverSettings":
-    """Return the settings of a quality, or those that reach a target, with what they cost."""
+    """Return solver settings of a quality, or of the cheapest quality that reaches a target [dB].
+
+    Prints error and time of each quality tried.
+    """
     from radiotwin.runtime.pieces import keep_pieces
     from radiotwin.trace import SolverSettings, choose_quality
 

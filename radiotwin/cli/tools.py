@@ -54,11 +54,11 @@ def doctor() -> None:
 def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Remove all of it.")] = False,
 ) -> None:
-    """Show what is kept of finished and of killed runs.
+    """Show the cache of finished parts of runs.
 
-    close-loop, fit, compare, gains and demo keep finished parts there, so that a killed run goes on
-    where it was. The folder is that of the environment variable RADIOTWIN_CACHE, and the oldest
-    parts are removed when there are more bytes than RADIOTWIN_MAX_CACHE_BYTES.
+    close-loop, fit, compare, gains and demo keep finished parts there, so that a killed run can be
+    resumed. The environment variable RADIOTWIN_CACHE names the folder. The oldest parts are removed
+    when the cache exceeds RADIOTWIN_MAX_CACHE_BYTES.
     """
     from radiotwin.runtime.pieces import cache_content, clear_cache
 

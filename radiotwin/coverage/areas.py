@@ -1,6 +1,6 @@
-"""Cells of a coverage map, and shares of areas: of the extent and of polygons, by level and server.
+"""The grid of a coverage map, and covered shares of the extent and of polygons.
 
-Receivers are in the middle of the cells, at a height above the ground.
+A receiver is in the middle of each cell, at a height above the ground.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,28 +20,29 @@ from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
 from radiotwin.geo import to_local
 from radiotwin.io.budgets import COVERAGE_CELLS
+from radiotwin.maps.export.geotiff import require_origin
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import GROUND_M, CityMap
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.readers.gis_files import read_geojson
 from radiotwin.scene.surfaces import Surfaces
 
-BLOCK_CELLS = 100_000  # that are predicted at a time: bounds the memory
-SINR_CLASSES_DB = (20.0, 13.0, 0.0, -5.0)  # excellent, good, fair, poor, as drive tests show it
-RATE_CLASSES = (0.9, 0.5, 0.25, 0.1)  # of the greatest rate
+BLOCK_CELLS = 100_000  # cells predicted at a time: bounds memory
+SINR_CLASSES_DB = (20.0, 13.0, 0.0, -5.0)  # excellent, good, fair, poor, as in drive-test reports
+RATE_CLASSES = (0.9, 0.5, 0.25, 0.1)  # lower ends, as shares of the maximum rate
 PROBABILITY_CLASSES = (0.95, 0.9, 0.75, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
 class CoverageGrid:
-    """Square cells, and the receiver in the middle of each.
+    """Grid of square cells, with a receiver in the middle of each.
 
     Attributes:
         x_m: (nx,) middles of the cells, ascending [m].
         y_m: (ny,) likewise [m].
         step_m: side of a cell [m].
-        height_m: of the receivers above the ground; of a radio map, as its altitudes [m].
-        above_ground: whether it is above the ground.
+        height_m: of the receivers [m].
+        above_ground: whether the height counts from the ground, else from the datum.
     """
 
     x_m: np.ndarray
@@ -53,7 +54,7 @@ class CoverageGrid:
     @classmethod
     def over(cls, bounds_m: tuple[float, float, float, float], step_m: float,
              height_m: float) -> "CoverageGrid":
-        """Return the whole cells that fit into an area, from its south-west corner on.
+        """Fill an area with whole cells, starting in its south-west corner.
 
         Args:
             bounds_m: (x_min, x_max, y_min, y_max) [m].
@@ -76,10 +77,10 @@ class CoverageGrid:
 
     @classmethod
     def of_map(cls, lattice: Lattice, level: int) -> "CoverageGrid":
-        """Return the cells around the positions of a radio map at one of its altitudes.
+        """Return cells centred on the positions of a radio map, at the altitude of index `level`.
 
         Raises:
-            BadInput: they are not equally far apart, so that they have no cells, or too many.
+            BadInput: the positions are not evenly spaced, or too many.
         """
         step_m = lattice.step_m
         if not step_m or any(not np.allclose(np.diff(axis), step_m, rtol=0, atol=1e-6 * step_m)
@@ -103,23 +104,23 @@ class CoverageGrid:
                 float(self.y_m[0] - half_m), float(self.y_m[-1] + half_m))
 
     def blocks(self) -> Iterator[slice]:
-        """Yield slices of rows, of at most `BLOCK_CELLS` cells where a row is shorter."""
+        """Yield slices of rows: as many as `BLOCK_CELLS` cells allow, at least one."""
         rows = max(1, BLOCK_CELLS // len(self.x_m))
         for start in range(0, len(self.y_m), rows):
             yield slice(start, min(start + rows, len(self.y_m)))
 
     def receivers_m(self, rows: slice, city: CityMap) -> np.ndarray:
-        """Return the positions (n, 3) of the receivers of some rows [m], see `at_height`."""
+        """Return positions (n, 3) [m] of the receivers in a slice of rows, see `at_height`."""
         x, y = (each.ravel() for each in np.meshgrid(self.x_m, self.y_m[rows]))
         return self.at_height(x, y, city)
 
     def at_height(self, x_m: np.ndarray, y_m: np.ndarray, city: CityMap) -> np.ndarray:
-        """Return positions (n, 3) at the receivers' height [m].
+        """Return positions (n, 3) [m] at the receivers' height.
 
         Args:
             x_m: (n,) to the east [m].
             y_m: (n,) to the north [m].
-            city: 3D map with the ground that they stand on, see `with_terrain`.
+            city: 3D map with the ground below the receivers, see `with_terrain`.
         """
         bottom_m = city.ground_height_m(x_m, y_m) if self.above_ground else 0.0
         return np.column_stack([x_m, y_m, np.broadcast_to(bottom_m + self.height_m, x_m.shape)])
@@ -127,7 +128,7 @@ class CoverageGrid:
 
 @lru_cache(maxsize=2)  # a map is large
 def with_terrain(city: CityMap) -> CityMap:
-    """Return the map with its ground as the terrain, where that is not flat at the datum."""
+    """Return the map with its ground faces as terrain, unless the ground is flat at the datum."""
     if city.terrain is not None:
         return city
     ground = Surfaces([(city.vertices, city.faces)]).ground_faces()
@@ -140,10 +141,10 @@ def with_terrain(city: CityMap) -> CityMap:
 
 @dataclass(frozen=True, eq=False)
 class Area:
-    """A polygon whose covered share is wanted.
+    """A polygon to report the covered share of.
 
     Attributes:
-        name: for tables.
+        name: shown in tables.
         outline: polygon or multipolygon in the scene's frame [m].
     """
 
@@ -161,11 +162,8 @@ def read_areas(path: Path | str, scene: Scene) -> list[Area]:
     Raises:
         BadInput: no polygon, a scene without an origin, or a file that cannot be read.
     """
-    path, origin = Path(path), scene.config.origin
-    if origin is None:
-        raise BadInput(f"{path}: its longitudes and latitudes need the scene's position, and "
-                       f"{scene.folder / 'scene.toml'} has no [origin]; add one with latitude_deg "
-                       "and longitude_deg of x = y = 0")
+    path = Path(path)
+    origin = require_origin(scene, f"{path}: its longitudes and latitudes need")
     features = read_geojson(path).features
     if not features:
         raise BadInput(f"{path} holds no polygon; draw the area as a polygon and export it as "
@@ -198,18 +196,21 @@ def class_lists(settings: CoverageSettings, bandwidth_hz: float) -> dict[str, tu
 def area_records(dataset: xr.Dataset, grid: CoverageGrid, transmitters: Sequence[Transmitter],
                  settings: CoverageSettings, classes: dict[str, tuple[float, ...]],
                  areas: Sequence[Area]) -> list[dict[str, Any]]:
-    """Return the shares of the whole extent, and of each polygon.
+    """Compute covered shares of the whole extent and of each polygon.
 
-    Shares are of the cells that are not left out; a cell counts where its middle is in the area.
-    Nothing detected is below every threshold.
+    A cell belongs to an area if its middle does. Cells inside buildings do not count, unless there
+    is an indoor loss. A cell where nothing is detected is below every threshold.
 
     Args:
-        dataset: as of `Coverage`.
+        dataset: see `Coverage.dataset`.
         grid: its cells.
-        transmitters: names of the servers.
-        settings: threshold, reliability, and whether cells inside buildings count.
-        classes: thresholds of each raster.
+        transmitters: the servers, by index.
+        settings: threshold, reliability and indoor loss.
+        classes: descending thresholds by raster, see `class_lists`.
         areas: polygons.
+
+    Returns:
+        A record for the extent, then one for each polygon.
 
     Raises:
         BadInput: no cell of a polygon is predicted.
@@ -233,7 +234,7 @@ def area_records(dataset: xr.Dataset, grid: CoverageGrid, transmitters: Sequence
 
 
 def cells_in(outline: BaseGeometry, grid: CoverageGrid) -> np.ndarray:
-    """Return whether the middle of each cell (ny, nx) lies in an outline."""
+    """Return a mask (ny, nx) of the cells whose middle is inside an outline."""
     shapely.prepare(outline)
     found = np.zeros(grid.shape, dtype=bool)
     for rows in grid.blocks():
@@ -245,6 +246,7 @@ def cells_in(outline: BaseGeometry, grid: CoverageGrid) -> np.ndarray:
 def _record(name: str, dataset: xr.Dataset, where: np.ndarray, grid: CoverageGrid,
             transmitters: Sequence[Transmitter], settings: CoverageSettings,
             classes: dict[str, tuple[float, ...]]) -> dict[str, Any]:
+    """Compute the shares of one area, given its mask of cells (ny, nx); see `area_records`."""
     cell_m2, n = grid.step_m**2, int(where.sum())
     power_dbm = dataset["received_power_dbm"].values[where]
     sd_db = (dataset["received_power_sd_db"].values[where].astype(float)
@@ -269,16 +271,16 @@ def _record(name: str, dataset: xr.Dataset, where: np.ndarray, grid: CoverageGri
 
 def _covered(power_dbm: np.ndarray, sd_db: np.ndarray | None, threshold_dbm: float,
              reliability: float) -> dict[str, float]:
-    """Return the share of cells that reach a threshold: by the median, and with certainty.
+    """Compute which share of cells reaches a threshold [dBm].
 
-    `share_reliable` counts cells whose location probability is at least the reliability,
-    `mean_probability` is the expected share of the area; both are of cells whose deviation is
-    known.
+    `share` counts cells whose median power does, `share_reliable` cells whose location probability
+    is at least the reliability; `mean_probability` is the mean location probability. The last two
+    use the cells whose standard deviation is known.
     """
     found = {"threshold": threshold_dbm, "share": float((power_dbm >= threshold_dbm).mean())}
     if sd_db is None:
         return found
-    # Nothing is certain of a power whose deviation a map does not tell.
+    # No location probability without a standard deviation.
     known = np.isnan(power_dbm) | np.isfinite(sd_db)
     if known.any():
         power_dbm, sd_db = power_dbm[known], sd_db[known]

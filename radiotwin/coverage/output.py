@@ -1,10 +1,8 @@
-"""Files of a coverage prediction: tables, NetCDF, GeoTIFF, KMZ, and a GeoPackage.
+"""Write a coverage prediction as tables, NetCDF, GeoTIFF, KMZ and GeoPackage.
 
-The GeoPackage (OGC 12-128r18, version 1.3) has the areas of each class as vectors, and the
-transmitters. It is made in memory: GDAL swallows some errors of a full disk, and writes the time of
-day; the same layers are the same bytes here, and are written like any other file.
-
-Maps, overlays and vectors share the classes of the rasters, with their labels and colours.
+The GeoPackage (OGC 12-128r18, version 1.3) has the area of each class as polygons, and the
+transmitters as points. It is built in memory by SQLite: GDAL ignores some errors of a full disk and
+writes the time of day, so its bytes would differ from run to run.
 """
 
 import io
@@ -35,14 +33,19 @@ from radiotwin.errors import BadInput
 from radiotwin.geo import local_crs, to_geographic
 from radiotwin.io.cells import write_csv
 from radiotwin.io.files import atomic_file
-from radiotwin.maps.export.geotiff import GDAL_OPTIONS, georeference, require_rasterio
+from radiotwin.maps.export.geotiff import (
+    GDAL_OPTIONS,
+    georeference,
+    require_origin,
+    require_rasterio,
+)
 from radiotwin.maps.export.kmz import OPACITY, Overlay, enlarged_png, write_overlays
 from radiotwin.scene import Scene
 
 BELOW_COLOUR = "#c9c9c9"
 SERVER_COLOURS = "tab20"
-GREYS = 14, 15  # of these: a building is grey
-# Title, unit in labels, factor from the raster's unit to it, colours from bad to good.
+GREYS = 14, 15  # colours of that palette not used: buildings are grey
+# Title; unit in labels; factor from the raster's unit to that; colour map from bad to good.
 _RASTERS: dict[str, tuple[str, str, float, str]] = {
     "received_power_dbm": ("Received power", "dBm", 1.0, "RdYlGn"),
     "sinr_db": ("SINR", "dB", 1.0, "RdYlGn"),
@@ -53,13 +56,13 @@ _RASTERS: dict[str, tuple[str, str, float, str]] = {
 
 @dataclass(frozen=True, eq=False)
 class Legend:
-    """Classes of a raster.
+    """Classes of a raster, with labels and colours; maps, overlays and vectors share them.
 
     Attributes:
         title: of the raster.
-        lower: (k,) lower end of each class but the last, descending; empty for servers.
-        labels: of each class, the best first; the last is what lies below all.
-        colours: of each class, `#rrggbb`.
+        lower: (k,) descending lower ends of all classes but the last; empty for best servers.
+        labels: one for each class, the best first; the last class is below all lower ends.
+        colours: one for each class, `#rrggbb`.
     """
 
     title: str
@@ -68,11 +71,7 @@ class Legend:
     colours: tuple[str, ...]
 
     def classes(self, values: np.ndarray) -> np.ndarray:
-        """Return the class of each value, -1 for NaN.
-
-        Args:
-            values: any shape; numbers of servers where there are no lower ends.
-        """
+        """Return the class of each value, any shape; -1 for NaN. A server's class is its index."""
         if not self.lower:
             return values.astype(np.int32)
         ends = np.asarray(self.lower[::-1], dtype=float)
@@ -81,12 +80,7 @@ class Legend:
 
 
 def legend_of(name: str, coverage: Coverage) -> Legend:
-    """Return the classes of a raster.
-
-    Args:
-        name: of a variable of `Coverage.dataset`, one of `drawn_rasters`.
-        coverage: of the network.
-    """
+    """Return the classes of a raster, by its name among `drawn_rasters`."""
     if name == "best_server":
         palette = colormaps[SERVER_COLOURS].colors  # type: ignore[attr-defined]
         both = [*range(0, len(palette), 2), *range(1, len(palette), 2)]  # strong before pale
@@ -105,13 +99,13 @@ def legend_of(name: str, coverage: Coverage) -> Legend:
 
 
 def drawn_rasters(coverage: Coverage) -> Sequence[str]:
-    """Return the names of the rasters that are drawn, in their order."""
+    """Return the names of the rasters to draw, in order."""
     return [name for name in ("received_power_dbm", "best_server", "sinr_db", "rate_bps",
                               "coverage_probability") if name in coverage.dataset]
 
 
 def file_stem(name: str) -> str:
-    """Return the name of a raster's files.
+    """Return the name of a raster's files without suffix.
 
     >>> file_stem("received_power_dbm")
     'received_power'
@@ -125,13 +119,13 @@ def _text(value: float) -> str:
     return f"{value:g}".replace("-", "−")
 
 
-LEGEND_ROWS = 24  # servers in a legend
+LEGEND_ROWS = 24  # at most so many servers in a legend
 RASTERS = ("received_power_dbm", "received_power_sd_db", "best_server", "snr_db", "sinr_db",
            "rate_bps", "coverage_probability")
 
 
 def _require_features() -> Any:
-    """Return the package rasterio's features; raise BadInput if it is missing."""
+    """Import `rasterio.features`; raise BadInput if it is not installed."""
     try:
         from rasterio import features
     except ImportError as error:
@@ -142,9 +136,9 @@ def _require_features() -> Any:
 
 
 def _write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
-    """Write a layer for each raster, with a multipolygon for each class, and one of transmitters.
+    """Write a layer for each raster, with a multipolygon for each class, and a transmitters layer.
 
-    Coordinates are WGS84 degrees; local metres, without a system, where the scene has no origin.
+    Coordinates are WGS84 degrees, or local metres if the scene has no origin.
     """
     features = _require_features()
     grid, origin = coverage.grid, scene.config.origin
@@ -183,7 +177,7 @@ def _write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
 
 
 def write_tables(coverage: Coverage, folder: Path) -> None:
-    """Write `coverage.json`, with everything, and `coverage.csv`, a row for each share."""
+    """Write the summary as `coverage.json`, and covered shares as rows of `coverage.csv`."""
     with atomic_file(folder / "coverage.json") as file:
         file.write(json.dumps(coverage.summary, indent=1, allow_nan=False,
                               ensure_ascii=False).encode())
@@ -192,7 +186,7 @@ def write_tables(coverage: Coverage, folder: Path) -> None:
 
 
 def _share_table(coverage: Coverage) -> pd.DataFrame:
-    """Return a row for each area, quantity and threshold: shares of the area, and square metres."""
+    """Return a row for each area, quantity and threshold: covered share and square metres."""
     rows = []
     for area in coverage.summary["areas"]:
         for quantity in ("received_power_dbm", "snr_db", "sinr_db", "rate_bps"):
@@ -212,8 +206,6 @@ def _write_netcdf(coverage: Coverage, scene: Scene, path: Path) -> None:
     dataset["indoor"] = dataset["indoor"].astype(np.int8)
     dataset.attrs["Conventions"] = "CF-1.11"
     if origin is not None:
-        from pyproj import CRS
-
         for name in dataset.data_vars:
             dataset[name].attrs["grid_mapping"] = "crs"
         dataset["crs"] = xr.Variable((), np.int32(0), CRS(local_crs(origin)).to_cf())
@@ -227,7 +219,7 @@ def _write_netcdf(coverage: Coverage, scene: Scene, path: Path) -> None:
 
 
 def _write_geotiffs(coverage: Coverage, scene: Scene, folder: Path) -> None:
-    """Write a GeoTIFF for each raster, north up: a band in its unit, NaN or -1 for no data."""
+    """Write each raster as a GeoTIFF of one band, north up; no data is NaN, or server -1."""
     rasterio = require_rasterio(folder / "received_power.tif")
     grid = coverage.grid
     tags = {name: str(value) for name, value in coverage.dataset.attrs.items()}
@@ -251,7 +243,7 @@ def _write_geotiffs(coverage: Coverage, scene: Scene, folder: Path) -> None:
 
 
 def _write_kmz(coverage: Coverage, scene: Scene, path: Path) -> None:
-    """Write an overlay for each raster, with the colours of its classes, for Google Earth."""
+    """Write each raster as an overlay in the colours of its classes, for Google Earth."""
     legends = {name: legend_of(name, coverage) for name in drawn_rasters(coverage)}
 
     def draw(name: str, legend: Legend) -> bytes:
@@ -270,7 +262,7 @@ def _write_kmz(coverage: Coverage, scene: Scene, path: Path) -> None:
 
 
 def _legend_png(legends: list[Legend]) -> bytes:
-    """Return the PNG of all legends, one below the other."""
+    """Draw all legends below each other; return the PNG."""
     rows = [min(len(each.labels), LEGEND_ROWS) + 1.6 for each in legends]
     figure = Figure(figsize=(2.3, 0.2 * sum(rows) + 0.1), facecolor="white")
     FigureCanvasAgg(figure)
@@ -288,14 +280,14 @@ def _legend_png(legends: list[Legend]) -> bytes:
 
 
 def available_formats(scene: Scene, wanted: list[str] | None) -> tuple[list[str], list[str]]:
-    """Return the formats to write, and a sentence on each that cannot be written.
+    """Return the formats that can be written for a scene, and the reasons why others cannot.
 
     Args:
         scene: of the coverage.
-        wanted: formats that must be written; None: all that can be.
+        wanted: formats required by the user; None: all that can be written.
 
     Raises:
-        BadInput: an unknown format, or one that is wanted and cannot be written.
+        BadInput: an unknown format, or a required one that cannot be written.
     """
     for name in wanted or ():
         if name not in FORMATS:
@@ -313,13 +305,13 @@ def available_formats(scene: Scene, wanted: list[str] | None) -> tuple[list[str]
 
 
 def write_formats(coverage: Coverage, scene: Scene, folder: Path, formats: list[str]) -> None:
-    """Write the rasters and vectors in some formats.
+    """Write rasters and vectors to a folder.
 
     Args:
         coverage: of the network.
-        scene: of it.
+        scene: of the coverage.
         folder: to write to.
-        formats: names of `FORMATS`; `png` is left to `radiotwin.report`.
+        formats: names among `FORMATS`; `radiotwin.report` writes `png`.
     """
     if "nc" in formats:
         _write_netcdf(coverage, scene, folder / "coverage.nc")
@@ -331,23 +323,16 @@ def write_formats(coverage: Coverage, scene: Scene, folder: Path, formats: list[
         _write_kmz(coverage, scene, folder / "coverage.kmz")
 
 
-def _check_origin(scene: Scene) -> None:
-    if scene.config.origin is None:
-        raise BadInput(f"coverage.kmz: Google Earth needs the position of the scene, and "
-                       f"{scene.folder / 'scene.toml'} has no [origin]; add one with latitude_deg "
-                       "and longitude_deg of x = y = 0")
-
-
 FORMATS: dict[str, Callable[[Scene], object]] = {
     "nc": lambda scene: None, "tif": lambda scene: require_rasterio(Path("received_power.tif")),
-    "gpkg": lambda scene: _require_features(), "kmz": _check_origin,
+    "gpkg": lambda scene: _require_features(),
+    "kmz": lambda scene: require_origin(scene, "coverage.kmz: Google Earth needs"),
     "png": lambda scene: None}
-"""Formats, and what raises BadInput where one cannot be written for a scene."""
+"""Formats by name, each with a check that raises BadInput if a scene cannot be written so."""
 FILES = frozenset({
     "coverage.json", "coverage.csv", "coverage.nc", "coverage.gpkg", "coverage.kmz",
     *(f"{file_stem(name)}{suffix}" for name in RASTERS for suffix in (".tif", ".png"))})
-"""Names of all files that are written to a folder."""
-
+"""Names of all files that `coverage` writes to its folder."""
 
 _APPLICATION, _VERSION = 0x47504B47, 10300  # "GPKG" (requirement 2)
 _CARTESIAN, _DEGREES = -1, 4326
@@ -372,13 +357,13 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT N
 
 @dataclass(frozen=True)
 class Layer:
-    """Features of one kind.
+    """A layer of a GeoPackage: n features of one geometry type.
 
     Attributes:
         name: of the layer.
-        kind: of all geometries, such as MULTIPOLYGON.
-        shapes: (n,) geometries of shapely, in longitude and latitude or in metres.
-        columns: Name -> (n,) texts or numbers; NaN is null.
+        kind: geometry type, such as MULTIPOLYGON.
+        shapes: (n,) shapely geometries, in longitude and latitude [degrees] or in metres.
+        columns: attributes (n,) by name, texts or numbers; NaN is null.
     """
 
     name: str
@@ -388,11 +373,11 @@ class Layer:
 
 
 def geopackage(layers: Iterable[Layer], in_degrees: bool) -> bytes:
-    """Return the bytes of a GeoPackage.
+    """Return the bytes of a GeoPackage; equal layers give equal bytes.
 
     Args:
-        layers: their names and those of their columns are identifiers.
-        in_degrees: coordinates are WGS84 degrees; else metres of a local frame.
+        layers: names of layers and columns must be SQL identifiers.
+        in_degrees: whether coordinates are WGS84 degrees, else metres of a local frame.
     """
     system = _DEGREES if in_degrees else _CARTESIAN
     with closing(sqlite3.connect(":memory:")) as database:
@@ -422,7 +407,7 @@ def geopackage(layers: Iterable[Layer], in_degrees: bool) -> bytes:
 
 
 def _blobs(shapes: np.ndarray, system: int) -> list[bytes]:
-    """Return geometries with the header of a GeoPackage (2.1.3), with the bounds, little endian."""
+    """Encode geometries as GeoPackage blobs (clause 2.1.3): header with bounds, then WKB."""
     bounds = shapely.bounds(shapes)[:, [0, 2, 1, 3]]
     return [struct.pack("<2sBBi4d", b"GP", 0, 0b11, system, *box) + body
             for box, body in zip(bounds, shapely.to_wkb(shapes, byte_order=1))]

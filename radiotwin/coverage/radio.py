@@ -1,4 +1,4 @@
-"""Settings of a coverage prediction, and what they decide: noise, interference and rate."""
+"""Settings of a coverage prediction; noise, interference, rate and location probability."""
 
 from dataclasses import dataclass, field
 
@@ -10,20 +10,20 @@ from radiotwin.errors import BadInput
 
 Bounds = tuple[float, float, float, float]
 MIN_STEP_M = 0.01
-REFERENCE_K = 290.0  # temperature that noise figures refer to (ITU-R P.372-16, Sec. 2)
-LEAKAGE_CHANNELS = 2  # neighbours on each side into which a transmitter leaks
+REFERENCE_K = 290.0  # reference temperature of noise figures (ITU-R P.372-16, Sec. 2)
+LEAKAGE_CHANNELS = 2  # adjacent channels on each side that a transmitter leaks into
 
 
 @dataclass(frozen=True)
 class RateModel:
-    """Rate of a link by its SINR: the attenuated and truncated Shannon bound.
+    """Rate of a link as a function of SINR: the attenuated and truncated Shannon bound.
 
     The rate over bandwidth is 0 below `min_sinr_db`, else the smaller of `max_bps_hz` and
     `share` log2(1 + SINR) (3GPP TR 36.942, Annex A.1; the defaults are those of its Table A.1 for
     the downlink of LTE).
 
     Attributes:
-        share: of Shannon's bound that an implementation reaches.
+        share: fraction of Shannon's bound that an implementation reaches.
         min_sinr_db: SINR below which nothing is received [dB].
         max_bps_hz: spectral efficiency of the highest modulation and code rate [bit/s/Hz].
     """
@@ -38,15 +38,15 @@ class CoverageSettings:
     """Settings of a coverage prediction.
 
     Attributes:
-        height_m: height of the receivers above the ground [m]; of a radio map, the one of its
-            altitudes to use. None: 1.5 m, or the map's lowest altitude.
+        height_m: height of the receivers above the ground [m]; with a radio map, one of its
+            altitudes. None: 1.5 m, or the map's lowest altitude.
         step_m: side of a cell [m]; None: 5 m, or the map's.
         extent_m: (x_min, x_max, y_min, y_max) [m]; None: that of the scene, or of the map.
-        tx_power_dbm: of transmitters that declare none [dBm]; None: that of the scene.
+        tx_power_dbm: default transmit power [dBm]; None: that of the scene.
         bandwidth_hz: None: that of the scene.
-        noise_figure_db: of the receivers [dB]; None: that which the scene's noise_dbm implies.
-        load: share of the time that transmitters which declare none are active, 0 to 1.
-        threshold_dbm: received power that the service needs [dBm].
+        noise_figure_db: of the receivers [dB]; None: derived from the scene's noise_dbm.
+        load: default share of the time that a transmitter is active, 0 to 1.
+        threshold_dbm: received power that the service requires [dBm].
         classes_dbm: lower ends of the legend's classes of received power, descending [dBm].
         reliability: share of the locations in a cell that must reach the threshold.
         indoor_loss_db: loss into buildings [dB]; None: cells inside buildings are left out.
@@ -70,8 +70,8 @@ class CoverageSettings:
     rate: RateModel = field(default_factory=RateModel)
 
     def check(self) -> None:
-        """Raise BadInput for an impossible value."""
-        limits = (
+        """Raise BadInput if a value is outside its allowed range."""
+        ranges = (
             ("height", self.height_m, 0.01, 1e5, "m"),
             ("step", self.step_m, MIN_STEP_M, 1e5, "m"),
             ("transmit power", self.tx_power_dbm, -100.0, 100.0, "dBm"),
@@ -85,7 +85,7 @@ class CoverageSettings:
             ("share of Shannon's bound", self.rate.share, 1e-3, 1.0, ""),
             ("least SINR", self.rate.min_sinr_db, -50.0, 50.0, "dB"),
             ("greatest spectral efficiency", self.rate.max_bps_hz, 1e-3, 100.0, "bit/s/Hz"))
-        for name, value, low, high, unit in limits:
+        for name, value, low, high, unit in ranges:
             if value is not None and not low <= value <= high:
                 given, least, greatest = (f"{each:g} {unit}".rstrip() for each in
                                           (value, low, high))
@@ -105,11 +105,7 @@ class CoverageSettings:
 
 
 def thermal_noise_dbm(bandwidth_hz: float) -> float:
-    """Return the thermal noise power k T0 B [dBm].
-
-    Args:
-        bandwidth_hz: of the receiver [Hz].
-    """
+    """Return the thermal noise power k T0 B [dBm] of a receiver's bandwidth [Hz]."""
     return float(10 * np.log10(Boltzmann * REFERENCE_K * bandwidth_hz / 1e-3))
 
 
@@ -129,15 +125,15 @@ def rate_bps(sinr_db: np.ndarray, bandwidth_hz: float, model: RateModel) -> np.n
 
 def location_probability(power_dbm: np.ndarray, sd_db: np.ndarray,
                          threshold_dbm: float) -> np.ndarray:
-    """Return the probability that log-normally distributed power reaches a threshold.
+    """Return the probability that log-normal received power reaches a threshold.
 
     Args:
-        power_dbm: median [dBm]; NaN: not detected.
-        sd_db: standard deviation, same shape [dB]; NaN: not known.
+        power_dbm: median power, any shape [dBm]; NaN: not detected.
+        sd_db: standard deviation, same shape [dB]; NaN: unknown.
         threshold_dbm: [dBm]
 
     Returns:
-        Of the same shape; 0 where nothing is detected, NaN where the deviation is not known.
+        Same shape; 0 if nothing is detected, NaN if the standard deviation is unknown.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         certain = np.where(power_dbm >= threshold_dbm, 1.0, 0.0)
@@ -148,35 +144,35 @@ def location_probability(power_dbm: np.ndarray, sd_db: np.ndarray,
 
 def channel_overlap(frequencies_hz: np.ndarray, bandwidth_hz: float,
                     aclr_db: float) -> np.ndarray:
-    """Return the share of a transmitter's power that falls into another one's channel.
+    """Return the share of a transmitter's power that falls into a receiver's channel.
 
-    A transmitter's power density is even within its channel, and lower by the leakage ratio in the
-    two neighbouring channels on each side; that of the standards holds for both. A receiver takes
-    in all of its channel and nothing else.
+    The transmitter's power density is flat within its channel, and lower by the leakage ratio in
+    the two adjacent channels on each side. The receiver's filter passes its whole channel and
+    nothing else.
 
     Args:
-        frequencies_hz: (f,) middles of the channels [Hz].
-        bandwidth_hz: of each channel [Hz].
-        aclr_db: adjacent-channel leakage ratio [dB].
+        frequencies_hz: (f,) centre frequencies [Hz].
+        bandwidth_hz: of every channel [Hz].
+        aclr_db: adjacent-channel leakage ratio [dB], of both adjacent channels.
 
     Returns:
-        (f, f), of the receiver's channel and of the transmitter's.
+        (f, f) shares; rows are receivers' channels, columns transmitters'.
     """
     apart = np.abs(frequencies_hz[:, None] - frequencies_hz) / bandwidth_hz
     inside = np.clip(1 - apart, 0, 1)
-    near = np.clip(LEAKAGE_CHANNELS + 1 - apart, 0, 1)  # within the channel and its neighbours
+    near = np.clip(LEAKAGE_CHANNELS + 1 - apart, 0, 1)  # within the channel or adjacent ones
     return inside + (near - inside) * 10 ** (-aclr_db / 10)
 
 
 class ServerTally:
-    """Best server and interference of n receivers, while transmitters are added one by one.
+    """Best server and interference at n receivers, updated as transmitters are added.
 
-    Others interfere with their power times their load, as far as it falls into the channel of the
-    best server.
+    Every transmitter but the best server interferes, with its power times its load times the share
+    that falls into the server's channel.
 
     Args:
         n: number of receivers.
-        overlap: (f, f) of the different channels, see `channel_overlap`.
+        overlap: (f, f) share of power from channel to channel, see `channel_overlap`.
     """
 
     def __init__(self, n: int, overlap: np.ndarray) -> None:
@@ -190,14 +186,14 @@ class ServerTally:
 
     def add(self, row: int, power_dbm: np.ndarray, sd_db: np.ndarray | float, load: float,
             channel: int) -> None:
-        """Add a transmitter.
+        """Add a transmitter: make it the best server where it is strongest, else interference.
 
         Args:
-            row: its number.
-            power_dbm: (n,) received from it [dBm]; NaN where it is not detected.
-            sd_db: (n,) standard deviation of that [dB].
-            load: share of the time that it is active.
-            channel: number of its channel.
+            row: index of the transmitter.
+            power_dbm: (n,) power received from it [dBm]; NaN if not detected.
+            sd_db: (n,) standard deviation of that power [dB].
+            load: share of the time that the transmitter is active.
+            channel: index of its channel.
         """
         heard = np.isfinite(power_dbm)
         best = heard & ((self.server < 0) | (power_dbm > self.power_dbm))
@@ -211,10 +207,6 @@ class ServerTally:
         self.server[best], self._load[best], self._channel[best] = row, load, channel
 
     def sinr_db(self, noise_dbm: float) -> np.ndarray:
-        """Return the (n,) ratio of the best server's power to noise and interference [dB].
-
-        Args:
-            noise_dbm: noise power [dBm].
-        """
+        """Return the SINR (n,) [dB] of the best server, for a noise power [dBm]."""
         others_mw = np.einsum("nf,fn->n", self._overlap[self._channel], self._others_mw)
         return self.power_dbm - 10 * np.log10(10 ** (noise_dbm / 10) + others_mw)

@@ -1,4 +1,4 @@
-"""Coverage of a network, block by block: best server, SINR, rate and location probability."""
+"""Predict a network's coverage: received power, best server, SINR, rate, location probability."""
 
 import warnings
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ from radiotwin.twin import Twin
 
 SCHEMA = "radiotwin.coverage/1"
 DEFAULT_HEIGHT_M, DEFAULT_STEP_M = 1.5, 5.0
-NOTED_RECEIVERS = 1_000  # whose links are compared with the range of a published law
+NOTED_RECEIVERS = 1_000  # sample whose links are checked against a law's validity range
 _ATTRIBUTES = {
     "received_power_dbm": (
         "dBm", "received power of the best server (NaN: not detected, or left out)"),
@@ -69,11 +69,11 @@ class Coverage:
         dataset: variables `received_power_dbm`, `best_server`, `snr_db`, `sinr_db`, `rate_bps`,
             `indoor` and, of a model with a standard deviation, `received_power_sd_db` and
             `coverage_probability`, each (y, x); coordinates x, y: middles of the cells [m].
-        transmitters: with power, load and frequency; `best_server` counts them.
-        summary: what `coverage.json` holds.
-        grid: cells.
-        settings: as given.
-        areas: polygons whose shares are in the summary.
+        transmitters: with power, load and frequency; `best_server` is an index into them.
+        summary: content of `coverage.json`.
+        grid: the cells.
+        settings: of the prediction.
+        areas: polygons with shares in the summary.
     """
 
     dataset: xr.Dataset
@@ -91,20 +91,20 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene | Path | str,
     """Predict the coverage of a network over a scene.
 
     Args:
-        source: of the gains: a twin, a radio map of the scene, or the name of a published law,
-            or `paths` for paths over the 3D map.
+        source: model of the gains: a twin, a radio map of the scene, the name of a published law,
+            or `paths`, which follows paths over the 3D map.
         scene: 3D map and radio.
         transmitters: None: the twin's devices, or those that the scene declares.
         settings: None: the defaults.
-        areas: polygons whose covered shares are wanted beside those of the extent.
+        areas: polygons to report covered shares of, beside the extent.
         devices: names of the transmitters to use; None: all.
 
     Returns:
-        Rasters, shares of areas, and the transmitters with all that was assumed of them.
+        Rasters, shares of areas, and the transmitters with their assumed settings.
 
     Raises:
-        BadInput: an impossible setting, a transmit power that is not known, or a source that does
-            not know a transmitter.
+        BadInput: an impossible setting, an unknown transmit power, or a transmitter that the
+            source lacks.
     """
     scene, settings = Scene.of(scene), settings or CoverageSettings()
     settings.check()
@@ -133,12 +133,16 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene | Path | str,
 def _transmitters(source: Twin | RadioMap | str, scene: Scene,
                   given: Sequence[Transmitter] | None, devices: list[str] | None,
                   settings: CoverageSettings) -> list[Transmitter]:
+    """Return the transmitters to predict, each with position, power, load and frequency.
+
+    Arguments and errors are those of `predict_coverage`; `given` is its `transmitters`.
+    """
     found = scene_transmitters(scene) if given is None else list(given)
     if isinstance(source, Twin):
         found = completed(source, twin_transmitters(source, found) if given is None else found)
     elif given is None and isinstance(source, RadioMap):
         by_name = {each.name: each for each in found}
-        # Where a device of the map is does not matter, and may not be declared.
+        # The map holds the gains, so positions of its devices are not needed.
         found = [by_name.get(name, Transmitter(name, np.full(3, np.nan)))
                  for name in source.devices]
     if isinstance(source, RadioMap):
@@ -173,13 +177,13 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
 
 
 def _outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Transmitter]:
-    """Return transmitters outside buildings; a scene's own are checked before.
+    """Move transmitters that are barely inside a building, within the map's accuracy, outside.
 
     Warns:
-        One is inside by no more than a map is off, and is moved.
+        A transmitter is moved.
 
     Raises:
-        BadInput: one is inside by more.
+        BadInput: a transmitter is deeper inside a building, or below the ground.
     """
     found = []
     for each in transmitters:
@@ -203,7 +207,7 @@ def _outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Transmitter
 
 def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Transmitter],
              settings: CoverageSettings) -> tuple[CoverageGrid, GainSource]:
-    """Return the cells, and the source of their gains."""
+    """Return the grid of cells, and the model of the gains there."""
     if isinstance(source, RadioMap):
         for name, value in (("step", settings.step_m), ("extent", settings.extent_m)):
             if value is not None:
@@ -227,7 +231,7 @@ def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Tra
 
 
 def _refuse_elsewhere(extent_m: Bounds | None, scene: Scene) -> None:
-    """Raise BadInput where the map shows nothing of an extent."""
+    """Raise BadInput if an extent (x_min, x_max, y_min, y_max) [m] does not overlap the map."""
     west, east, south, north = scene.config.extent.bounds
     if extent_m is None:
         return
@@ -239,7 +243,7 @@ def _refuse_elsewhere(extent_m: Bounds | None, scene: Scene) -> None:
 
 
 def _noise_figure_db(scene: Scene, settings: CoverageSettings) -> float:
-    """Return the noise figure that is given, or that the scene's noise power implies [dB]."""
+    """Return the receivers' noise figure [dB]: of the settings, or by the scene's noise power."""
     if settings.noise_figure_db is not None:
         return settings.noise_figure_db
     radio = scene.config.radio
@@ -255,7 +259,7 @@ def _noise_figure_db(scene: Scene, settings: CoverageSettings) -> float:
 def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], grid: CoverageGrid,
              settings: CoverageSettings, noise_dbm: float,
              bandwidth_hz: float) -> dict[str, np.ndarray]:
-    """Predict all cells, some rows at a time; return variables (ny, nx) by name."""
+    """Predict all cells in blocks of rows; return the variables (ny, nx) by name."""
     frequencies_hz = sorted({each.frequency_hz or 0.0 for each in transmitters})
     overlap = channel_overlap(np.array(frequencies_hz), bandwidth_hz, settings.aclr_db)
     shape, ground = grid.shape, with_terrain(scene.city)
@@ -299,6 +303,7 @@ def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], g
 
 def _dataset(values: dict[str, np.ndarray], transmitters: list[Transmitter], grid: CoverageGrid,
              attributes: dict[str, Any], scene: Scene) -> xr.Dataset:
+    """Return rasters as a dataset with coordinates, units and the scene's origin."""
     dataset = xr.Dataset({name: (("y", "x"), value) for name, value in values.items()},
                          coords={"y": grid.y_m, "x": grid.x_m,
                                  "transmitter": np.array([each.name for each in transmitters],
@@ -313,7 +318,7 @@ def _dataset(values: dict[str, np.ndarray], transmitters: list[Transmitter], gri
 
 
 def _some_receivers(dataset: xr.Dataset, grid: CoverageGrid, scene: Scene) -> np.ndarray:
-    """Return the positions (n, 3) of at most `NOTED_RECEIVERS` receivers that are not inside."""
+    """Sample at most `NOTED_RECEIVERS` outdoor cells; return receiver positions (n, 3) [m]."""
     outside = np.flatnonzero(~dataset["indoor"].values)
     chosen = outside[::max(1, -(-len(outside) // NOTED_RECEIVERS))]
     y_m, x_m = (axis[rows] for axis, rows in zip((grid.y_m, grid.x_m),
@@ -328,6 +333,7 @@ def _known(position_m: np.ndarray) -> list[float | None]:
 def _summary(dataset: xr.Dataset, transmitters: list[Transmitter], grid: CoverageGrid,
              gains: GainSource, settings: CoverageSettings, areas: Sequence[Area],
              bandwidth_hz: float, scene: Scene) -> dict[str, Any]:
+    """Return the content of `coverage.json`: settings, notes, transmitters, shares of areas."""
     left_out = int(dataset["indoor"].sum()) if settings.indoor_loss_db is None else 0
     notes = gains.notes(_some_receivers(dataset, grid, scene))
     nothing = np.isnan(dataset["received_power_dbm"].values) & (

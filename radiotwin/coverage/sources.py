@@ -1,4 +1,4 @@
-"""Sources of gains: a twin, a radio map, or a published law or paths over a scene's 3D map."""
+"""Levels for a coverage map from a twin, a radio map, a published law, or followed paths."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,24 +25,24 @@ from radiotwin.scene.citymap import FAR_M, CityMap
 from radiotwin.twin import Twin
 from radiotwin.twin.model.model import FittedModel
 
-NOTED_TRANSMITTERS = 100  # of a frequency, whose links are compared with a law's validity
-PATH_RECEIVERS = 5_000  # whose paths are followed at a time: bounds the memory
+NOTED_TRANSMITTERS = 100  # per frequency: their links are checked against a law's validity range
+PATH_RECEIVERS = 5_000  # per batch of followed paths: bounds memory
 Levels = tuple[np.ndarray, np.ndarray | None]
-"""(n,) mean [dB], NaN where it is not detected; and (n,) standard deviation [dB], None where it is
-not known."""
+"""Mean levels (n,) [dB], NaN if not detected; standard deviations (n,) [dB], None if unknown."""
 
 
 @dataclass(frozen=True, eq=False)
 class GainSource:
-    """Levels between transmitters and receivers.
+    """A model that predicts levels between transmitters and receivers.
 
     Attributes:
-        description: of the model, for people.
-        predict: gains with antennas, or received powers where `has_power`; of the row of a
-            transmitter, (n, 3) positions of the receivers [m], and the flat (y, x) index (n,) of
-            their cells.
-        notes: how far the levels can be trusted, a sentence each; of some receivers (n, 3) [m].
-        has_power: whether its levels are received powers, with the transmit power in them.
+        description: name of the model, shown to users.
+        predict: function of a transmitter's row, receiver positions (n, 3) [m], and flat (y, x)
+            indices (n,) of the receivers' cells. Returns gains through the antennas, or received
+            powers if `has_power`.
+        notes: function of sampled receiver positions (n, 3) [m]. Returns sentences on how far the
+            levels can be trusted.
+        has_power: whether levels are received powers, which include the transmit power.
     """
 
     description: str
@@ -52,15 +52,15 @@ class GainSource:
 
 
 def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the source for a scene without measurements.
+    """Return the levels of a model that needs no measurements.
 
     Args:
-        model: name of a published law, or `paths` for paths over the map.
+        model: name of a published law, or `paths`, which follows paths over the map.
         scene: 3D map.
         transmitters: each with a frequency.
 
     Raises:
-        BadInput: no such model, or one that is learnt.
+        BadInput: no such model, or one that is learnt from measurements.
     """
     kind, city = channel_named(model), with_terrain(scene.city)
     if kind is ImagePaths:
@@ -80,7 +80,7 @@ def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -
 
 def _source_of_law(kind: type[PublishedLaw], city: CityMap,
                    transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return a published law, and the pattern of each antenna along the straight line."""
+    """Return levels of a published law, plus each antenna's gain along the straight line."""
     device_m = np.array([each.position_m for each in transmitters])
 
     def links(receiver_m: np.ndarray, frequency_hz: float | None, row: int) -> LinkGeometry:
@@ -98,7 +98,7 @@ def _source_of_law(kind: type[PublishedLaw], city: CityMap,
         return mean_db, sd_db
 
     def notes(receiver_m: np.ndarray) -> list[str]:
-        """Return where links lie outside what the law was published for."""
+        """List in which respects links are outside the law's published validity range."""
         found = []
         for frequency_hz, law in laws.items():
             rows = [row for row, each in enumerate(transmitters)
@@ -113,7 +113,7 @@ def _source_of_law(kind: type[PublishedLaw], city: CityMap,
 
 
 def _source_of_paths(city: CityMap, transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the sum of the powers of all paths, each through the antenna; nothing is fitted."""
+    """Return levels as the power sum of all paths, each weighted by the antenna; no fit."""
     def predict(row: int, receiver_m: np.ndarray, index: np.ndarray) -> Levels:
         each = transmitters[row]
         parts = [np.empty(0)]
@@ -129,7 +129,7 @@ def _source_of_paths(city: CityMap, transmitters: Sequence[Transmitter]) -> Gain
         return np.concatenate(parts), None
 
     def notes(receiver_m: np.ndarray) -> list[str]:
-        """Return what share of the links is behind terrain, or beyond 5 km."""
+        """Report the share of links behind terrain, and of links longer than 5 km."""
         if not len(receiver_m):
             return []
         some_m = np.array([each.position_m for each in transmitters[:NOTED_TRANSMITTERS]])
@@ -145,41 +145,41 @@ def _source_of_paths(city: CityMap, transmitters: Sequence[Transmitter]) -> Gain
 
 
 def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the source of a twin: of its own devices, or its law for transmitters elsewhere.
+    """Return the levels of a twin, for its devices and for new transmitters.
 
-    Transmitters that were not measured get the law of all devices, and the pattern of their antenna
-    along the straight line. What the devices of the twin declare was taken off before the law was
-    learnt, so it may be declared anew; an antenna that they do not declare stays in their levels.
+    New transmitters get the law of all devices, plus their antenna's gain along the straight line.
+    Declared powers and antennas of the twin's devices were subtracted before the law was learnt, so
+    they may be declared anew. An undeclared antenna of a device is part of the learnt levels.
 
     Args:
         twin: learnt in the scene.
         scene: its 3D map.
-        transmitters: each is a device of the twin where it has the name and, to a metre, the place
-            of one.
+        transmitters: one with the name of a device of the twin, within a metre of it, is that
+            device; others are new.
 
     Raises:
-        BadInput: the twin is of another map, or of received powers and knows not all transmitters.
+        BadInput: the twin is of another map, or predicts received powers and lacks a transmitter.
     """
     twin.require_map(scene)
     twin.warn_of_another_scene(scene, scene.content_hash())
-    has_power, known = not twin.has_gains, len(twin.devices)
+    has_power, device_count = not twin.has_gains, len(twin.devices)
     located = {each.device: (row, each.position_m) for row, each in enumerate(twin.devices)
                if each.located}
     rows = []
     for each in transmitters:
-        row, position_m = located.get(each.name, (known, (np.nan, np.nan, np.nan)))
-        rows.append(row if np.allclose(position_m, each.position_m, atol=1.0) else known)
-    new = [each.name for each, row in zip(transmitters, rows) if row == known]
+        row, position_m = located.get(each.name, (device_count, (np.nan, np.nan, np.nan)))
+        rows.append(row if np.allclose(position_m, each.position_m, atol=1.0) else device_count)
+    new = [each.name for each, row in zip(transmitters, rows) if row == device_count]
     if new and has_power:
         raise BadInput(f"{new[0]} is not a device of the twin, whose levels are received "
                        "powers: what another transmitter would send is not known; declare "
                        "tx_power_dbm in devices.csv and fit again, or leave it out with --devices")
-    found = _notes_of_twin(twin, transmitters, rows, has_power)
-    measured_hz = [radio.frequency_hz for radio in twin.declared.radios] or [None] * known
+    notes = _notes_of_twin(twin, transmitters, rows, has_power)
+    measured_hz = [radio.frequency_hz for radio in twin.declared.radios] or [None] * device_count
     if any(each.frequency_hz not in (None, scene.config.radio.frequency_hz,
                                      *measured_hz[row:row + 1])
            for each, row in zip(transmitters, rows)):
-        found.append("transmitters of other frequencies get the twin's law, moved by 20 lg f as in "
+        notes.append("transmitters of other frequencies get the twin's law, moved by 20 lg f as in "
                      f"free space: it was learnt at {scene.config.radio.frequency_hz / 1e9:g} GHz")
     frequency_hz = scene.config.radio.frequency_hz if np.isnan(twin.declared.frequency_hz) \
         else twin.declared.frequency_hz
@@ -194,13 +194,14 @@ def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]
             levels = twin.predict(twin.links(receiver_m, device, scene).with_ends(
                 declared=isotropic))
             return levels.mean_db, levels.sd_db
-        radios = [Radio()] * (known + 1)
-        radios[rows[row]] = Radio(antenna=each.antenna, frequency_hz=each.frequency_hz)
-        if rows[row] < known:
-            if _antenna_of(twin, rows[row]) is None:  # it is a part of what was learnt
-                radios[rows[row]] = Radio(frequency_hz=each.frequency_hz)
+        is_measured = rows[row] < device_count
+        is_learnt = is_measured and _declared_antenna(twin, rows[row]) is None
+        radios = [Radio()] * (device_count + 1)
+        radios[rows[row]] = Radio(antenna=None if is_learnt else each.antenna,
+                                  frequency_hz=each.frequency_hz)
+        if is_measured:
             links = twin.links(receiver_m, device, scene).with_ends(
-                declared=Declared(tuple(radios[:known]), frequency_hz, False))
+                declared=Declared(tuple(radios[:device_count]), frequency_hz, False))
             levels = twin.predict(links)
             return levels.mean_db, levels.sd_db
         device_m = np.vstack([np.nan_to_num(twin.device_m), each.position_m])
@@ -214,64 +215,65 @@ def source_of_twin(twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]
         levels = unmeasured.predict(links)
         return levels.mean_db, levels.sd_db
 
-    return GainSource(f"twin: {twin.description}", predict, lambda receiver_m: found, has_power)
+    return GainSource(f"twin: {twin.description}", predict, lambda receiver_m: notes, has_power)
 
 
-def _antenna_of(twin: Twin, row: int) -> Antenna | None:
-    """Return the antenna that a device of a twin was declared to have when it was fitted."""
+def _declared_antenna(twin: Twin, row: int) -> Antenna | None:
+    """Return the antenna that was declared for a device when the twin was fitted."""
     return twin.declared.radios[row].antenna if twin.declared.radios else None
 
 
 def _notes_of_twin(twin: Twin, transmitters: Sequence[Transmitter], rows: list[int],
                    has_power: bool) -> list[str]:
-    """Return what is not measured, not known, or not used of transmitters, a sentence each.
+    """Return sentences on transmitters without measurements, and on antennas and powers not used.
 
     Args:
-        twin: that predicts.
+        twin: the model.
         transmitters: of the network.
-        rows: of each among the twin's devices; that after the last one: of none.
-        has_power: whether its levels are powers that nobody declares.
+        rows: row of each transmitter in `twin.devices`; len(twin.devices) for a new transmitter.
+        has_power: whether the twin predicts received powers of undeclared transmit powers.
     """
-    known, found = len(twin.devices), []
-    new = [each for each, row in zip(transmitters, rows) if row == known]
+    device_count, notes = len(twin.devices), []
+    new = [each for each, row in zip(transmitters, rows) if row == device_count]
     through = [each.name for each in new if each.antenna is not None]
     undeclared = [each.device for row, each in enumerate(twin.devices)
-                  if _antenna_of(twin, row) is None]
+                  if _declared_antenna(twin, row) is None]
     if new:
-        found.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
+        notes.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
                      "the twin's law for any device is used")
-    if through and len(undeclared) == known:
-        found.append("the law of the twin's devices contains whatever antennas they have, and the "
+    if through and len(undeclared) == device_count:
+        notes.append("the law of the twin's devices contains whatever antennas they have, and the "
                      f"antenna of {some(through)} is added to it: unless they are isotropic it "
                      "counts twice; declare their antennas in devices.csv (antenna, azimuth_deg, "
                      "tilt_deg) and fit again")
     unused = [each.name for each, row in zip(transmitters, rows)
-              if row < known and each.antenna is not None and _antenna_of(twin, row) is None]
+              if row < device_count and each.antenna is not None
+              and _declared_antenna(twin, row) is None]
     if unused:
-        found.append(f"the antenna of {some(unused)} is not used: it is in the measured levels; "
+        notes.append(f"the antenna of {some(unused)} is not used: it is in the measured levels; "
                      "declared in devices.csv when the twin is fitted, it can be another")
     if has_power and any(each.tx_power_dbm is not None for each in transmitters):
         powers = [each.name for each in transmitters if each.tx_power_dbm is not None]
-        found.append(f"tx_power_dbm of {some(powers)} is not used: the twin's levels are received "
+        notes.append(f"tx_power_dbm of {some(powers)} is not used: the twin's levels are received "
                      "powers of devices whose powers nobody declared; declare them in devices.csv "
                      "and fit again")
-    return found
+    return notes
 
 
 def source_of_map(radio_map: RadioMap, level: int,
                   transmitters: Sequence[Transmitter]) -> GainSource:
-    """Return the source of a radio map, with the antennas that it was made with.
+    """Return the levels of a radio map at one altitude, with the antennas of that map.
 
     Args:
         radio_map: of the scene.
-        level: number of the altitude to use.
-        transmitters: which must be in the map.
+        level: index of the altitude.
+        transmitters: devices of the map.
     """
     row_of = {name: row for row, name in enumerate(radio_map.devices)}
     dataset = radio_map.dataset
 
     def read(name: str, row: int, index: np.ndarray) -> np.ndarray:
-        """Return a variable at cells (n,); only the rows with them are read."""
+        """Read a variable at the cells with flat indices (n,); reads no other rows."""
         if not len(index):
             return np.empty(0)
         columns = dataset.sizes["x"]
@@ -287,7 +289,7 @@ def source_of_map(radio_map: RadioMap, level: int,
 
 
 def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Transmitter]:
-    """Return the located devices of a twin, with what is declared by that name."""
+    """Return the located devices of a twin as transmitters, with declarations of that name."""
     by_name = {each.name: each for each in declared}
     return [replace(by_name.get(each.device, Transmitter(each.device, np.empty(0))),
                     position_m=np.array(each.position_m, dtype=float))
@@ -295,7 +297,7 @@ def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Trans
 
 
 def completed(twin: Twin, transmitters: Sequence[Transmitter]) -> list[Transmitter]:
-    """Return transmitters with what they do not declare as devices of that name in a twin do."""
+    """Fill in radio settings that a transmitter lacks and the twin's device of that name has."""
     radio_of = dict(zip((each.device for each in twin.devices), twin.declared.radios))
     return [replace(each, **{name: getattr(radio_of[each.name], name) for name in (
         "tx_power_dbm", "cable_loss_db", "antenna", "frequency_hz") if getattr(each, name) is None})
@@ -303,7 +305,7 @@ def completed(twin: Twin, transmitters: Sequence[Transmitter]) -> list[Transmitt
 
 
 def altitude_row(radio_map: RadioMap, height_m: float | None) -> int:
-    """Return the number of the altitude of a map that a height names; its lowest for None.
+    """Return the index of a height [m] among a map's altitudes; of the lowest for None.
 
     Raises:
         BadInput: the map has no such altitude.

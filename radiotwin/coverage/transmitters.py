@@ -1,4 +1,4 @@
-"""Transmitters of a network: those that a scene declares, or a table of them."""
+"""Transmitters of a network, from a scene's devices or from a table."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.antennas import Antenna, parse_pattern
 
 _OPTIONAL = (*RADIO, "load")
-_NAMED = 10  # transmitters in a message
+_NAMED = 10  # at most so many names in a message
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,13 +27,13 @@ class Transmitter:
     """A transmitting antenna of a network.
 
     Attributes:
-        name: as in a scene or a table.
-        position_m: (3,) x, y, and z above the ground datum [m]; NaN where it is not known, as of a
-            radio map's devices.
-        tx_power_dbm: None: not declared [dBm].
-        cable_loss_db: between transmitter and antenna [dB]; None: not declared.
+        name: in the scene or the table.
+        position_m: (3,) x, y, and z above the ground datum [m]; NaN if unknown, such as that of a
+            radio map's device.
+        tx_power_dbm: transmit power [dBm]; None: not declared.
+        cable_loss_db: loss between transmitter and antenna [dB]; None: not declared.
         antenna: None: isotropic.
-        load: share of the time that it is active, 0 to 1; None: not declared.
+        load: share of the time that the transmitter is active, 0 to 1; None: not declared.
         frequency_hz: None: that of the scene.
     """
 
@@ -47,12 +47,12 @@ class Transmitter:
 
     @property
     def fed_dbm(self) -> float:
-        """Power that reaches the antenna [dBm]."""
+        """Power at the antenna's port [dBm]: transmit power minus cable loss."""
         return (self.tx_power_dbm or 0.0) - (self.cable_loss_db or 0.0)
 
 
 def scene_transmitters(scene: Scene) -> list[Transmitter]:
-    """Return the devices that a scene declares, with their antennas."""
+    """Return the devices of a scene as transmitters, with their antennas."""
     return [Transmitter(device.device, position_m, antenna=antenna) for device, position_m, antenna
             in zip(scene.config.devices, scene.device_m, scene.device_antennas)]
 
@@ -60,21 +60,21 @@ def scene_transmitters(scene: Scene) -> list[Transmitter]:
 def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
     """Read a table of transmitters, such as `devices.csv`.
 
-    Its columns have the usual names of their quantities, and the unit at the end, see
-    `radiotwin.links.site_table`: of a position with a height above the datum, the ground or the
-    sea, and optionally of power, EIRP, cable loss, load, frequency, and `antenna` (a file below the
-    table's folder) with azimuth and tilt (upwards) as in `scene.toml`.
+    A column's name is a quantity and its unit, see `radiotwin.links.site_table`. A position with a
+    height above datum, ground or sea is required. Power, EIRP, cable loss, load, frequency, and
+    `antenna` (a pattern file below the table's folder) with azimuth and tilt (upwards) are
+    optional.
 
     Args:
-        path: of a table in any format that `import` reads.
-        scene: whose frame the positions are converted to, where a `frame.toml` beside the table
-            declares theirs.
+        path: table in any format that `import` reads.
+        scene: positions are converted to its frame, if a `frame.toml` beside the table declares
+            another one.
 
     Returns:
         The transmitters in the order of the table.
 
     Warns:
-        A column is not used, or a value is probably not meant.
+        A column is not used, or a value is implausible.
 
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.
@@ -108,10 +108,10 @@ def read_transmitters(path: Path | str, scene: Scene) -> list[Transmitter]:
 
 
 def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Transmitter]:
-    """Return some transmitters, in the order of their names; None: all.
+    """Return the transmitters of given names, in that order; all for None.
 
     Raises:
-        BadInput: there is none of that name.
+        BadInput: there is no transmitter of a name.
     """
     if names is None:
         return transmitters
@@ -125,16 +125,16 @@ def select(transmitters: list[Transmitter], names: list[str] | None) -> list[Tra
 
 def with_defaults(transmitters: list[Transmitter], scene: Scene, tx_power_dbm: float | None,
                   load: float) -> list[Transmitter]:
-    """Return the transmitters with a power, a load and a frequency each.
+    """Fill in transmit power, load and frequency of transmitters that do not declare them.
 
     Args:
-        transmitters: as they are declared.
-        scene: its power is used where neither they nor `tx_power_dbm` say.
-        tx_power_dbm: of those that declare none [dBm].
-        load: of those that declare none.
+        transmitters: to complete.
+        scene: has the default frequency, and the transmit power if `tx_power_dbm` is None.
+        tx_power_dbm: default transmit power [dBm].
+        load: default load.
 
     Raises:
-        BadInput: a power that nobody declared.
+        BadInput: a transmit power that neither transmitter, scene nor `tx_power_dbm` declares.
     """
     radio = scene.config.radio
     unknown = [each.name for each in transmitters if each.tx_power_dbm is None]
@@ -156,7 +156,7 @@ def with_defaults(transmitters: list[Transmitter], scene: Scene, tx_power_dbm: f
 
 
 def _positions(path: Path, sites: SiteTable, scene: Scene) -> tuple[np.ndarray, list[str]]:
-    """Return positions (k, 3) in the scene's frame [m], and notes on odd ones."""
+    """Return positions (k, 3) in the scene's frame [m], and notes on implausible ones."""
     names, values = sites.names, sites.values
 
     def named(row: int) -> str:

@@ -1,7 +1,7 @@
-"""Radio maps in NetCDF and Zarr files: checked, read, and written block by block.
+"""Check, read and write radio maps in NetCDF and Zarr files, block by block.
 
-A file may be a stranger's: its form is checked before its values are read, and its values in parts.
-Then it is in memory, or stays open to be read in parts.
+A file may come from a stranger. Its layout is checked before its values are read, and its values in
+parts. Then it is loaded into memory, or stays open to be read in parts.
 """
 
 import math
@@ -36,12 +36,12 @@ SCHEMA = "radiotwin.radiomap/1"
 CONVENTIONS = "CF-1.11"  # https://cfconventions.org
 GRID_MAPPING = "crs"
 GROUND = "ground_m"  # coordinate of a map whose altitudes are above the ground
-GAIN_RANGE_DB = (-1_000.0, 200.0)  # far beyond any link: what is outside is an error
+GAIN_RANGE_DB = (-1_000.0, 200.0)  # far wider than of any link: gains outside are errors
 MAX_SIGMA_DB = 1_000.0
-BLOCK_VALUES = 200_000  # of a variable that are in memory at once
-_WHOLE_VALUES = 2**20  # of a variable that HDF5 stores in pieces of its own choice
-_CHUNK_CELLS = 256  # along y and x of a piece of a larger one
-_CACHE_BYTES = 2**26  # of unfinished pieces of a variable
+BLOCK_VALUES = 200_000  # values of a variable in memory at once
+_WHOLE_VALUES = 2**20  # up to so many values HDF5 chooses its chunks; larger variables get ours
+_CHUNK_CELLS = 256  # cells of such a chunk along y and along x
+_CACHE_BYTES = 2**26  # HDF5's cache of unfinished chunks of a variable
 ATTRIBUTES: dict[str, dict[str, str]] = {
     "x": {"units": "m", "long_name": "east"},
     "y": {"units": "m", "long_name": "north"},
@@ -51,7 +51,7 @@ ATTRIBUTES: dict[str, dict[str, str]] = {
     "sigma_db": {"units": "dB", "long_name": "standard deviation of the gain"},
     "los": {"long_name": "line of sight by the 3D map"},
 }
-# Attributes of the file only, by the CF conventions; in memory they would be in the way.
+# CF attributes that are written to files and dropped on reading.
 _CF_ATTRIBUTES: dict[str, dict[str, str | np.ndarray]] = {
     "x": {"axis": "X", "standard_name": "projection_x_coordinate"},
     "y": {"axis": "Y", "standard_name": "projection_y_coordinate"},
@@ -61,19 +61,19 @@ _CF_ATTRIBUTES: dict[str, dict[str, str | np.ndarray]] = {
 }
 MIN_STEP_M = 1e-3
 _NUMBERS = ("frequency_hz", "gain_limit_db", "origin_latitude_deg", "origin_longitude_deg",
-            "origin_altitude_m", "shadowing_share", "shadowing_length_m")  # among the attributes
+            "origin_altitude_m", "shadowing_share", "shadowing_length_m")  # numeric attributes
 _KNOWN = (*VARIABLES, *DIMS, GROUND, GRID_MAPPING)
-_LEVEL = 3  # of Zstandard: its default
+_LEVEL = 3  # compression level of Zstandard, its default
 MAKERS = "`radiotwin trace` or `radiotwin map`"
-_LINK_BYTES = 9  # gain and standard deviation in single precision, line of sight, not compressed
+_LINK_BYTES = 9  # uncompressed: gain and sigma in single precision, line of sight in a byte
 
 
 class MapBlock(NamedTuple):
-    """Part of a radio map; blocks come in the order of an array (device, z, y, x).
+    """A rectangular part of a radio map; blocks follow each other in C order.
 
     Attributes:
-        where: its slices of the four dims.
-        values: (device, z, y, x) part of each variable, by name.
+        where: slices of device, z, y and x.
+        values: the block (device, z, y, x) of each variable, by name.
     """
 
     where: tuple[slice, slice, slice, slice]
@@ -82,14 +82,14 @@ class MapBlock(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MapStream:
-    """A radio map that is made block by block, while it is written: it need not fit in memory.
+    """A radio map computed block by block while it is written, so that it need not fit in memory.
 
     Attributes:
         devices: names.
         lattice: of the map.
         attributes: provenance.
         variables: `gain_db`, `los` and, of a learned map, `sigma_db`.
-        make: returns the variables, each (z, y, x), of a device on a part of the lattice.
+        make: computes the variables (z, y, x) of a device on a part of the lattice.
     """
 
     devices: list[str]
@@ -99,7 +99,7 @@ class MapStream:
     make: Callable[[str, Lattice], dict[str, np.ndarray]]
 
     def blocks(self) -> Iterator[MapBlock]:
-        """Make all blocks, with a progress bar."""
+        """Compute all blocks in order, with a progress bar."""
         parts = list(parts_of(self.lattice.shape))
         with progress("mapping", total=len(self.devices) * len(parts)) as advance:
             for row, device in enumerate(self.devices):
@@ -111,26 +111,26 @@ class MapStream:
                     advance(1)
 
     def placed(self, origin: Origin | None) -> "MapStream":
-        """Return the same map with another origin of the local frame, or with none."""
+        """Return the map with the origin of its local frame replaced; None removes it."""
         return replace(self, attributes=placed_attributes(self.attributes, origin))
 
     def selected(self, devices: list[str], lattice: Lattice) -> "MapStream":
-        """Return the map of some of its devices on some levels of its lattice."""
+        """Return the map of the given devices on the given levels of its lattice."""
         return replace(self, devices=devices, lattice=lattice)
 
     def thinned(self, step: int) -> "MapStream":
-        """Return the map of every n-th position in x and in y."""
+        """Return the map of every `step`-th position in x and in y."""
         every = slice(None, None, step)
         return replace(self, lattice=self.lattice.part(slice(None), every, every))
 
     @property
     def header(self) -> xr.Dataset:
-        """Coordinates and attributes of the dataset that it would be."""
+        """Dataset of coordinates and attributes, without variables."""
         return header(self.devices, self.lattice, self.attributes)
 
 
 def _check_values(device: str, values: dict[str, np.ndarray]) -> None:
-    """Refuse gains that no link has, before they become infinite in single precision."""
+    """Raise BadInput for gains or sigmas outside their range, before single precision overflows."""
     for name, (low, high) in (("gain_db", GAIN_RANGE_DB), ("sigma_db", (0.0, MAX_SIGMA_DB))):
         if name in values and not ((values[name] >= low) & (values[name] <= high)
                                    | np.isnan(values[name])).all():
@@ -140,7 +140,7 @@ def _check_values(device: str, values: dict[str, np.ndarray]) -> None:
 
 
 POWERS = "device_tx_power_dbm"
-"""Attribute: declared transmit powers by device [dBm], as JSON; gains are without them."""
+"""Attribute with declared transmit powers by device [dBm], as JSON; gains do not include them."""
 
 
 def header(devices: list[str], lattice: Lattice, attributes: dict[str, Any] | None) -> xr.Dataset:
@@ -159,15 +159,15 @@ def header(devices: list[str], lattice: Lattice, attributes: dict[str, Any] | No
 
 def placed_attributes(attributes: dict[Hashable, Any] | dict[str, Any],
                       origin: Origin | None) -> dict[str, Any]:
-    """Return the attributes of a map with another origin of the local frame, or with none."""
+    """Replace the origin of the local frame in a map's attributes; None removes it."""
     return {str(name): value for name, value in attributes.items()
             if not str(name).startswith("origin_")} | origin_attributes(origin)
 
 
 def parts_of(shape: tuple[int, ...]) -> Iterator[tuple[slice, slice, slice]]:
-    """Return slices of (z, y, x), in the order of an array, of at most `BLOCK_VALUES` each.
+    """Cut a lattice (z, y, x) into slices of at most `BLOCK_VALUES` positions, in C order.
 
-    A small lattice is one part; others are cut into levels, rows and, if need be, columns.
+    A small lattice is one part. A larger one is cut into levels, rows and, if necessary, columns.
     """
     levels, rows, columns = shape
     if levels * rows * columns <= BLOCK_VALUES:
@@ -187,7 +187,7 @@ def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[
                  path: Path | str) -> None:
     """Write a radio map as compressed NetCDF-4 by the CF conventions; see `write_parts`.
 
-    HDF5 crashes where a write fails: it writes to a file that keeps the error until the end.
+    HDF5 crashes if a write fails, so `atomic_file` hides write errors from it until the end.
     """
     import h5netcdf  # type: ignore[import-untyped]
 
@@ -213,13 +213,13 @@ def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[
                 variable.attrs.update(attributes | ({"dtype": "bool"} if is_bool else {}))
             for block in blocks:
                 if getattr(file, "error", None) is not None:
-                    break  # the disk is full: the rest would be made for nothing
+                    break  # the disk is full: computing the rest would be in vain
                 for name, values in block.values.items():
                     opened[name][block.where] = values.astype(opened[name].dtype, copy=False)
 
 
 def is_zarr(path: Path | str) -> bool:
-    """Return whether the name of a radio map is that of a Zarr folder."""
+    """Return whether a path has the suffix of a Zarr folder."""
     return Path(path).suffix.lower() == ZARR
 
 
@@ -245,7 +245,7 @@ def with_cf(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def without_cf(dataset: xr.Dataset) -> xr.Dataset:
-    """Remove the attributes that a file has beside those in memory."""
+    """Remove the CF attributes that only files have."""
     dataset = dataset.drop_vars(GRID_MAPPING, errors="ignore")
     dataset.attrs.pop("Conventions", None)
     for name in dataset.variables:
@@ -256,7 +256,10 @@ def without_cf(dataset: xr.Dataset) -> xr.Dataset:
 
 
 def form_problem(dataset: xr.Dataset) -> str | None:
-    """Return the first reason why a dataset is not a radio map that is seen without its values."""
+    """Check variables, dims, dtypes and attributes; return the first fault, None for a radio map.
+
+    Reads no values.
+    """
     for name in VARIABLES:
         if name not in dataset.data_vars:
             if name == "sigma_db":
@@ -289,7 +292,7 @@ def form_problem(dataset: xr.Dataset) -> str | None:
 
 
 def _are_powers(text: object) -> bool:
-    """Return whether an attribute holds powers [dBm] by name, as JSON."""
+    """Return whether a text is JSON of powers [dBm] by device name."""
     try:
         powers_dbm = parse_json(str(text), POWERS)
     except BadInput:
@@ -299,7 +302,7 @@ def _are_powers(text: object) -> bool:
 
 
 def axis_problem(dataset: xr.Dataset) -> str | None:
-    """Return the first reason why the axes of a dataset cannot be those of a radio map."""
+    """Check coordinates, ground heights and device names; return the first fault, or None."""
     for axis in "xyz":
         values = dataset[axis].values
         if (values.dtype.kind not in "iuf" or not np.isfinite(values).all()
@@ -323,9 +326,9 @@ def axis_problem(dataset: xr.Dataset) -> str | None:
 
 
 def _value_problem(dataset: xr.Dataset) -> str | None:
-    """Return the first reason why the values of a dataset cannot be those of a radio map.
+    """Check gains, sigmas and lines of sight; return the first fault, or None.
 
-    They are read in parts, each of whole pieces as the file stores them.
+    Values are read in parts of whole chunks of the file.
     """
     names = [name for name in VARIABLES if name in dataset]
     regions = {name: list(_regions(dataset[name])) for name in names}
@@ -340,6 +343,7 @@ def _value_problem(dataset: xr.Dataset) -> str | None:
 
 
 def _part_problem(name: str, values: np.ndarray) -> str | None:
+    """Check values of the variable `name`; return the first fault, or None."""
     if name == "los":
         is_right = values.dtype == bool or np.isin(values, (0, 1)).all()
         return None if is_right else "los holds other values than 0 and 1"
@@ -359,7 +363,7 @@ def _part_problem(name: str, values: np.ndarray) -> str | None:
 
 
 def _regions(values: xr.DataArray) -> Iterator[tuple[slice, ...]]:
-    """Return slices that cover an array, of whole pieces of its file; small pieces are joined."""
+    """Cut an array into slices of whole chunks of its file; small chunks are joined."""
     encoding: dict[Any, Any] = values.encoding
     stored = encoding.get("chunks") or encoding.get("chunksizes") or (1,) * values.ndim
     step = [min(part, size) for part, size in zip(stored, values.shape)]
@@ -372,24 +376,24 @@ def _regions(values: xr.DataArray) -> Iterator[tuple[slice, ...]]:
 
 
 def _require_zarr(path: Path) -> Any:
-    """Return the package zarr, which writes or reads a map."""
+    """Import zarr; raise BadInput if it is not installed."""
     return optional_package(
         "zarr", f"{path}: Zarr needs the package zarr, which is not installed; install it with "
                 "`pip install 'radiotwin[zarr]'`, or take a .nc file")
 
 
 def _check_zarr_target(path: Path) -> None:
-    """Raise BadInput unless a Zarr folder can be written under a name."""
+    """Raise BadInput unless a Zarr folder can be written to a path."""
     _require_zarr(path)
     require_folder(path, ("*",), mark=METADATA)
 
 
 def _write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[MapBlock],
                path: Path | str) -> None:
-    """Write a radio map as a Zarr folder by the CF conventions; arguments as of `write_parts`.
+    """Write a radio map as a Zarr folder by the CF conventions; see `write_parts`.
 
-    Each block is a piece of its own, so that one block is in memory. The folder is written beside
-    its place and renamed.
+    Each block is a chunk, so one block is in memory at a time. The folder is written under a
+    temporary name, then renamed.
     """
     path = Path(path)
     _check_zarr_target(path)
@@ -420,7 +424,7 @@ def _write_zarr(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[M
 
 @contextmanager
 def _open_zarr(path: Path) -> Iterator[xr.Dataset]:
-    """Open a Zarr folder after checking it; values stay in it until they are asked for."""
+    """Check and open a Zarr folder; values are read on access."""
     zarr = _require_zarr(path)
     missing = check_zarr(path, _KNOWN, MAP_STREAM_VALUES)
     if any(missing.values()):
@@ -441,10 +445,9 @@ def _open_zarr(path: Path) -> Iterator[xr.Dataset]:
 
 @contextmanager
 def open_dataset(path: Path) -> Iterator[xr.Dataset]:
-    """Open a radio map, NetCDF-4 or Zarr, whose values stay in its file until they are asked for.
+    """Open a radio map, NetCDF-4 or Zarr, of which values are read on access.
 
-    All of it has been read once, in parts, and checked. The dataset can be read until the context
-    ends.
+    All values are read once, in parts, to check them. The dataset is open until the context ends.
 
     Raises:
         BadInput: no such file, damaged, or not a radio map.
@@ -460,7 +463,7 @@ def load_dataset(path: Path) -> xr.Dataset:
     """Read a radio map, NetCDF-4 or Zarr, into memory.
 
     Raises:
-        BadInput: as `open_dataset`, or it is too large to be in memory.
+        BadInput: see `open_dataset`, or the map is too large for the memory.
     """
     with _opened(path) as opened:
         dataset = _prepared(path, opened, is_loaded=True)
@@ -470,7 +473,7 @@ def load_dataset(path: Path) -> xr.Dataset:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[xr.Dataset]:
-    """Open a file as it is, after the checks that its library needs."""
+    """Open a NetCDF or Zarr dataset, after checks that protect the library that reads it."""
     if not path.exists():
         raise BadInput(f"{path} does not exist; {MAKERS} makes a radio map")
     with ExitStack() as stack:
@@ -485,7 +488,7 @@ def _opened(path: Path) -> Iterator[xr.Dataset]:
 
 
 def _prepared(path: Path, opened: xr.Dataset, is_loaded: bool = False) -> xr.Dataset:
-    """Return the map in a dataset, as it is in memory, once all of it has been checked."""
+    """Check an opened dataset whole; return its radio map without CF attributes and encoding."""
     with _reported(path):
         problem, dataset = form_problem(opened), opened
         if problem is None:
@@ -502,7 +505,7 @@ def _prepared(path: Path, opened: xr.Dataset, is_loaded: bool = False) -> xr.Dat
 
 @contextmanager
 def _reported(path: Path) -> Iterator[None]:
-    """Turn what the libraries raise for a damaged file into a message."""
+    """Turn any exception of the reading libraries into BadInput."""
     try:
         yield
     except BadInput:
@@ -513,17 +516,17 @@ def _reported(path: Path) -> Iterator[None]:
 
 
 def _as_bool(stored: xr.Variable) -> xr.Variable:
-    """Return 0 and 1 as booleans, each when it is read."""
+    """Return a variable of 0 and 1 as booleans, converted on access."""
     marked = stored.copy(deep=False)
     marked.attrs["dtype"] = "bool"  # as xarray marks booleans in files
     return decode_cf_variable("los", marked)
 
 
 def check_target(path: Path | str) -> None:
-    """Check that a radio map can be written under a name; call it before long work.
+    """Check that a radio map can be written to a path; call it before long work.
 
     Raises:
-        BadInput: it cannot be written, or something else is there.
+        BadInput: the path cannot be written, or holds something else.
         RunFailed: the disk is full.
     """
     if is_zarr(path):
@@ -533,7 +536,7 @@ def check_target(path: Path | str) -> None:
 
 
 def size_of(shape: tuple[int, ...], devices: int) -> str:
-    """Return, for people, the size of a map of shape (z, y, x) that is written part by part."""
+    """Describe the size of a map (z, y, x) of so many devices that is written part by part."""
     parts = list(parts_of(shape))
     values = max(math.prod(each.stop - each.start for each in part) for part in parts)
     return (f"{devices * math.prod(shape):,} links in {devices * len(parts):,} parts, of which one "
@@ -548,7 +551,7 @@ def write_parts(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[M
     Args:
         top: coordinates and attributes of the map.
         dtypes: of its variables, by name.
-        blocks: of it, in the order of an array.
+        blocks: all blocks of the map, in C order.
         path: of the file or folder.
 
     Raises:

@@ -1,7 +1,4 @@
-"""The radio map: channel gain at every lattice position for every device; and a difference of two.
-
-Both draw themselves into any axes, and give themselves to GIS programs as rows.
-"""
+"""`RadioMap`: channel gain at every lattice position for every device; and `MapDifference`."""
 
 from __future__ import annotations
 
@@ -63,18 +60,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 DIFFERENCE = "difference_db"
-SAME_M = 1e-3  # positions nearer than this are one [m]
+SAME_M = 1e-3  # two maps' positions may differ by this [m]
 
 
 def origin_of(attributes: dict[str, Any]) -> Origin | None:
-    """Return the origin of a map's frame by its attributes; None where they do not have it."""
+    """Return the origin of a map's frame from its attributes; None if they lack it."""
     found = {name: float(attributes[f"origin_{name}"]) for name in Origin.model_fields
              if f"origin_{name}" in attributes}
     return Origin(**found) if {"latitude_deg", "longitude_deg"} <= found.keys() else None
 
 
 class OverDevices(Summarised):
-    """Base of what has values for each device over a lattice.
+    """Base class of datasets with a value for each device and lattice position.
 
     Attributes:
         dataset: variables with dims (device, z, y, x), coordinates x, y, z [m], provenance.
@@ -89,11 +86,11 @@ class OverDevices(Summarised):
     @property
     @abstractmethod
     def variables(self) -> tuple[str, ...]:
-        """Names of the variables; the first one is drawn."""
+        """Names of the variables; `plot` draws the first."""
 
     @abstractmethod
     def _look(self, values: np.ndarray) -> tuple[str, str, dict[str, Any]]:
-        """Return the beginning of the title, the label of the colours, and their scale."""
+        """Return the title's first part, the colour bar's label, and options of the colours."""
 
     @property
     def devices(self) -> list[str]:
@@ -102,18 +99,18 @@ class OverDevices(Summarised):
 
     @property
     def tx_power_dbm(self) -> dict[str, float]:
-        """Declared transmit powers by device [dBm]; empty: the map does not know them."""
+        """Declared transmit powers by device [dBm]; empty if the map has none."""
         powers_dbm = json.loads(self.dataset.attrs.get(POWERS, "{}"))
         return {name: float(powers_dbm[name]) for name in self.devices if name in powers_dbm}
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """Provenance."""
+        """Provenance, such as source, frequency, solver settings, seed and origin."""
         return {str(name): value for name, value in self.dataset.attrs.items()}
 
     @property
     def origin(self) -> Origin | None:
-        """Of the local frame; None where it is not known."""
+        """Origin of the local frame; None if unknown."""
         return origin_of(self.attributes)
 
     def to_xarray(self) -> xr.Dataset:
@@ -123,14 +120,14 @@ class OverDevices(Summarised):
     def plot(self, device: str | None = None, altitude_m: float | None = None,
              ax: Axes | None = None, *, scene: Scene | None = None,
              geographic: bool | None = None) -> Axes:
-        """Draw the values of one device at one altitude; white where there are none.
+        """Draw the values of one device at one altitude; missing ones are white.
 
         Args:
-            device: name; None: the first one.
-            altitude_m: one of the map's [m]; None: the lowest.
+            device: name; None: the first device.
+            altitude_m: one of the map's altitudes [m]; None: the lowest.
             ax: axes of matplotlib to draw into; None: a new figure.
-            scene: whose buildings are outlined and in which the device is marked; None: neither.
-            geographic: whether axes are longitude and latitude; None: where the origin is known.
+            scene: draw outlines of its buildings and mark the device; None: neither.
+            geographic: whether axes are longitude and latitude; None: if the origin is known.
 
         Returns:
             The axes.
@@ -184,24 +181,24 @@ class OverDevices(Summarised):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MapDifference(OverDevices):
-    """Gain of one map minus that of another.
+    """Gain of one map minus the gain of another.
 
-    Of a map of distributions (`sigma_db`) the mean counts, also where a link would not be detected;
-    `score_map` compares with a truth as it is detected.
+    If a map has `sigma_db`, its mean gain is subtracted, even below the limit of detection.
+    `score_map` compares detected levels instead.
 
     Attributes:
         dataset: variable `difference_db` (float32, NaN where either map has no gain) with dims
-            (device, z, y, x); attributes `minuend` and `subtrahend` are the sources of the maps.
+            (device, z, y, x); attributes `minuend` and `subtrahend` name the maps' sources.
     """
 
     dataset: xr.Dataset
 
     @classmethod
     def of(cls, first: xr.Dataset, second: xr.Dataset) -> MapDifference:
-        """Subtract the gains of a map's dataset from those of another, over the same lattice.
+        """Subtract the gains of the second map's dataset from those of the first.
 
         Raises:
-            BadInput: other devices, other positions, other ground, or another frame.
+            BadInput: the maps differ in devices, positions, ground or frame.
         """
         names = [[str(name) for name in each["device"].values] for each in (first, second)]
         if set(names[0]) != set(names[1]):
@@ -237,28 +234,28 @@ class MapDifference(OverDevices):
 
     @property
     def difference_db(self) -> np.ndarray:
-        """(device, z, y, x) difference [dB]; NaN where either map has no gain."""
+        """Difference of the gains (device, z, y, x) [dB]; NaN where either map has no gain."""
         return self.dataset[DIFFERENCE].values
 
     @property
     def rmse_db(self) -> float:
-        """Root of the mean square over all links that both maps have [dB]; NaN without one."""
+        """Root mean square difference over all links in both maps [dB]; NaN if there is none."""
         known = self.difference_db[np.isfinite(self.difference_db)].astype(float)
         return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
     @property
     def mean_db(self) -> float:
-        """Mean over all links that both maps have [dB]; NaN without one."""
+        """Mean difference over all links in both maps [dB]; NaN if there is none."""
         known = self.difference_db[np.isfinite(self.difference_db)].astype(float)
         return float(known.mean()) if len(known) else float("nan")
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """The one variable."""
+        """`difference_db`."""
         return (DIFFERENCE,)
 
     def _look(self, values: np.ndarray) -> tuple[str, str, dict[str, Any]]:
-        """Red is where the first map has more."""
+        """Return title, label and colours; red: the first map has more gain."""
         high_db = residual_range_db(values)
         names = " − ".join(plain(self.dataset.attrs[each], 40) or "map"
                            for each in ("minuend", "subtrahend"))
@@ -296,7 +293,7 @@ class RadioMap(OverDevices):
         """Build a map from arrays.
 
         Args:
-            devices: names of the devices, (n,).
+            devices: (n,) names.
             lattice: of the map.
             gain_db: channel gain [dB], (n, z, y, x) or (n, z * y * x); NaN where not detected.
             los: line of sight by the 3D map, of the same shape.
@@ -314,7 +311,7 @@ class RadioMap(OverDevices):
 
     @classmethod
     def collect(cls, stream: MapStream | RadioMap) -> RadioMap:
-        """Return a map in memory: all blocks of a stream, or all values of an opened map."""
+        """Compute all blocks of a stream, or read all values of an opened map, into memory."""
         if isinstance(stream, RadioMap):
             return cls(stream.dataset.load())
         shape = (len(stream.devices), *stream.lattice.shape)
@@ -341,19 +338,19 @@ class RadioMap(OverDevices):
     @classmethod
     @contextmanager
     def open(cls, path: Path | str) -> Iterator[RadioMap]:
-        """Open a NetCDF-4 file, or a Zarr folder, whose values stay there until they are used.
+        """Open a NetCDF-4 file, or a Zarr folder; values are read on access.
 
-        It has been read once, in parts, and checked. `save`, `blocks` and `selected` keep one part
-        in memory, `dataset.isel` what it selects; `gain_db` and `los` read everything.
+        All values are read once, in parts, to check them. `save`, `blocks` and `selected` hold one
+        part in memory, `dataset.isel` the selection; `gain_db` and `los` read everything.
 
         Args:
             path: as `save` makes it.
 
         Yields:
-            The map; its values can be read until the context ends.
+            The map, open until the context ends.
 
         Raises:
-            BadInput: as `load`.
+            BadInput: see `load`.
         """
         with open_dataset(Path(path)) as dataset:
             yield cls(dataset)
@@ -372,7 +369,7 @@ class RadioMap(OverDevices):
                     self.blocks(), path)
 
     def require_of(self, scene: Scene) -> None:
-        """Raise BadInput unless the map was made for a scene as it is now, with all its devices."""
+        """Raise BadInput unless the map was made for this version of a scene, with all devices."""
         known = set(self.devices)
         missing = [device.device for device in scene.config.devices if device.device not in known]
         if missing or not self.is_over_lattice_of(scene) \
@@ -383,7 +380,7 @@ class RadioMap(OverDevices):
                            f"{scene.folder} ({what}); run `radiotwin trace` again")
 
     def is_over_lattice_of(self, scene: Scene) -> bool:
-        """Return whether the map is over a scene's lattice."""
+        """Return whether the map's positions are those of a scene's lattice."""
         return self.lattice.equals(scene.lattice)
 
     def _look(self, values: np.ndarray) -> tuple[str, str, dict[str, Any]]:
@@ -393,11 +390,7 @@ class RadioMap(OverDevices):
                 {"cmap": GAIN_COLOURS, "vmin": low_db, "vmax": high_db})
 
     def __sub__(self, other: RadioMap) -> MapDifference:
-        """Return the difference of the gains, see `MapDifference`.
-
-        Raises:
-            BadInput: other devices, other positions, or another frame.
-        """
+        """Subtract another map's gains; see `MapDifference.of`."""
         if not isinstance(other, RadioMap):
             return NotImplemented
         return MapDifference.of(self.dataset, other.dataset)
@@ -429,7 +422,7 @@ class RadioMap(OverDevices):
              f"latitude {origin.latitude_deg:g}°, longitude {origin.longitude_deg:g}°")))
 
     def blocks(self) -> Iterator[MapBlock]:
-        """Return the map in parts, as `MapStream.blocks` makes them."""
+        """Read the map block by block, as `MapStream.blocks` computes one."""
         arrays = {name: self.dataset[name].variable for name in self.variables}
         for row in range(self.dataset.sizes["device"]):
             for part in parts_of(self.lattice.shape):
@@ -438,23 +431,23 @@ class RadioMap(OverDevices):
                                        for name, array in arrays.items()})
 
     def placed(self, origin: Origin | None) -> RadioMap:
-        """Return the same map with another origin of the local frame, or with none."""
+        """Return the map with the origin of its local frame replaced; None removes it."""
         dataset = self.dataset.copy()
         dataset.attrs = placed_attributes(dataset.attrs, origin)
         return RadioMap(dataset)
 
     def selected(self, devices: list[str], lattice: Lattice) -> RadioMap:
-        """Return the map of some of its devices on some levels of its lattice."""
+        """Return the map of the given devices on the given levels of its lattice."""
         return RadioMap(self.dataset.sel(device=devices, z=lattice.z_m))
 
     def thinned(self, step: int) -> RadioMap:
-        """Return the map of every n-th position in x and in y."""
+        """Return the map of every `step`-th position in x and in y."""
         every = slice(None, None, step)
         return RadioMap(self.dataset.isel(y=every, x=every))
 
     @property
     def header(self) -> xr.Dataset:
-        """Coordinates and attributes."""
+        """Dataset of coordinates and attributes, without the variables."""
         return self.dataset.drop_vars(self.variables)
 
     @property
@@ -464,7 +457,7 @@ class RadioMap(OverDevices):
 
     @property
     def lattice(self) -> Lattice:
-        """Positions of the map."""
+        """Positions at which the map has values."""
         x_m, y_m, z_m = (self.dataset[axis].values.astype(float) for axis in "xyz")
         ground_m = self.dataset[GROUND].values.astype(float) if GROUND in self.dataset else None
         return Lattice(x_m, y_m, z_m, ground_m)

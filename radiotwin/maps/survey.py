@@ -1,10 +1,11 @@
-"""A simulated campaign: UAVs fly through a truth map and bring back measurements.
+"""Simulate a measurement campaign: UAVs fly through a truth map and read levels.
 
-The truth is traced, any other radio map, or the statistical one of Chen et al. 2023: a distance law
-per LoS class, and shadowing. The flights are by the model of that paper (Sec. II), too: one lattice
-step north, west, south or east costs 1 battery unit, a hover 0.5; a UAV stays on the map and must
-be able to reach its terminal. A flight pattern takes the grid of an altitude, the start, the
-battery and a source of random numbers, and returns one cell (row, column) per slot.
+The truth is a traced map, any other radio map, or the statistical one of Chen et al. 2023: a
+log-distance law for each class of line of sight, and shadowing. Flights follow the model of that
+paper (Sec. II): a lattice step north, west, south or east costs 1 battery unit, a hover 0.5. A UAV
+stays on the map and keeps enough battery to reach its terminal. A flight pattern is a function of
+the grid of an altitude, start, battery and random generator; it returns a cell (row, column) for
+each slot.
 """
 
 from pathlib import Path
@@ -26,14 +27,14 @@ from radiotwin.scene.config import UavConfig
 MOVES = np.array([(1, 0), (0, -1), (-1, 0), (0, 1)])  # north, west, south, east as (row, column)
 MOVE_COST = 1.0  # battery units
 HOVER_COST = 0.5  # battery units
-UNREACHABLE = np.iinfo(np.int64).max // 4  # a number of moves; sums of a few do not overflow
+UNREACHABLE = np.iinfo(np.int64).max // 4  # number of moves; small enough to add a few
 Cell = tuple[int, int]
-_MAX_FLIGHTS = 100_000  # far beyond any campaign: a typing error
-_MAX_NOISE_DB = 50.0  # as is this: receivers are off by some decibels
+_MAX_FLIGHTS = 100_000  # more is taken for a typing error
+_MAX_NOISE_DB = 50.0  # likewise: receivers' errors are a few decibels
 
 
 class FlightGrid:
-    """The cells of one altitude.
+    """Cells of one altitude, with the number of moves between them.
 
     Args:
         allowed: (ny, nx) bool; False inside buildings.
@@ -46,7 +47,7 @@ class FlightGrid:
         self._steps: dict[Cell, np.ndarray] = {}
 
     def steps_to(self, cell: Cell) -> np.ndarray:
-        """Return the moves from every cell (ny, nx) to `cell`; UNREACHABLE if there is no way."""
+        """Count the moves from every cell (ny, nx) to `cell`; UNREACHABLE if there is no way."""
         cell = (int(cell[0]), int(cell[1]))
         if cell not in self._steps:
             steps = np.full(self.allowed.shape, UNREACHABLE)
@@ -64,7 +65,7 @@ class FlightGrid:
         return self._steps[cell]
 
     def steps_home(self, cell: Cell) -> int:
-        """Return the number of moves from a cell to the terminal."""
+        """Count the moves from a cell to the terminal."""
         return int(self.steps_to(self.terminal)[tuple(cell)])
 
     def neighbours(self, cell: Cell) -> list[Cell]:
@@ -75,7 +76,7 @@ class FlightGrid:
                 if 0 <= row < rows and 0 <= column < columns and self.allowed[row, column]]
 
     def path(self, start: Cell, end: Cell, rng: np.random.Generator) -> list[Cell]:
-        """Draw one of the shortest paths: its cells after the start; none if there is no way."""
+        """Draw a shortest path at random; return its cells after the start, none if unreachable."""
         steps, cells, cell = self.steps_to(end), [], start
         while steps[tuple(cell)] > 0:
             nearer = [n for n in self.neighbours(cell) if steps[n] < steps[tuple(cell)]]
@@ -90,13 +91,13 @@ NLOS_LAW = LogDistanceLine(-35.0, 3.04, 5**0.5)
 
 
 def segmented_truth(scene: Scene | Path | str) -> RadioMap:
-    """Return mean gain and shadowing of the segmented law over a lattice, through the antennas.
+    """Compute mean gain and shadowing of the segmented law over a scene's lattice, with antennas.
 
-    The mean is given below sensitivity, too: a survey draws the shadowing before it decides what is
-    detected.
+    The mean is not censored at the sensitivity, since a survey draws the shadowing before it
+    decides what is detected.
 
     Args:
-        scene: City, devices and lattice.
+        scene: city, devices and lattice.
 
     Returns:
         A map with `sigma_db`.
@@ -124,10 +125,10 @@ def segmented_truth(scene: Scene | Path | str) -> RadioMap:
 
 
 def read_truth(scene: Scene, truth: str = "traced") -> RadioMap:
-    """Return the radio map that a command's option `--truth` names.
+    """Read the radio map that the option `--truth` names.
 
     Args:
-        scene: the world to fly in.
+        scene: to fly in.
         truth: `traced` (SCENE/truth.nc), `segmented` (statistical), or the path of a radio map.
 
     Raises:
@@ -144,17 +145,17 @@ def read_truth(scene: Scene, truth: str = "traced") -> RadioMap:
     return RadioMap.load(truth)
 
 
-# A map says nothing of its links' paths. In a street, two walls and the ground give 16 paths of at
-# most four reflections, each weaker than the direct one: 9 off the walls, 7 off the ground, too.
+# In a street, two walls and the ground give at most 16 paths of up to four reflections, each weaker
+# than the direct one: 9 off the walls alone, 7 also off the ground.
 _MAX_PATHS = 16
 
 
 def _require_possible(scene: Scene, truth: RadioMap) -> None:
     """Raise BadInput if a traced link with line of sight is far above free space.
 
-    The bound is free space (ITU-R P.525-4, eq. 4) between the peaks of the antennas, and 12 dB, or
-    24 dB where fields were added: 16 paths as strong as the direct one. Maps that are not of gains
-    at points (the solver `map`, statistical truths) are not checked.
+    The bound is the free-space gain (ITU-R P.525-4, eq. 4) between the antennas' peaks plus 12 dB,
+    or plus 24 dB if fields were added: 16 paths as strong as the direct one. Statistical truths and
+    maps of the solver `map`, which averages over cells, are not checked.
     """
     attributes = truth.dataset.attrs
     if attributes.get("source") != "raytrace" or attributes.get("solver") != "paths":
@@ -181,7 +182,7 @@ def _require_possible(scene: Scene, truth: RadioMap) -> None:
 
 def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
                     ) -> list[Cell]:
-    """Fly straight to random cells, as long as there is battery for one and home again."""
+    """Fly straight to random cells while the battery suffices for one more and the way home."""
     cells = [start]
     while True:
         left = battery - MOVE_COST * (len(cells) - 1)
@@ -196,7 +197,7 @@ def random_waypoint(grid: FlightGrid, start: Cell, battery: float, rng: np.rando
 
 def lawnmower(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
               ) -> list[Cell]:
-    """Fly parallel lanes, as narrow as the battery allows, in a random direction and order."""
+    """Fly parallel lanes, as close together as the battery allows; direction and order random."""
     cells = [start]
     for corner in _lane_ends(grid.allowed.shape, battery, rng):
         if grid.steps_home(corner) == UNREACHABLE:
@@ -209,7 +210,7 @@ def lawnmower(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Gene
 
 
 def _lane_ends(shape: tuple[int, ...], battery: float, rng: np.random.Generator) -> list[Cell]:
-    """Return the ends of the lanes in the order in which they are flown."""
+    """Return both ends of each lane, in the order of the flight."""
     along = int(rng.integers(2))  # axis that lanes run along
     lane_length, width = shape[along], shape[1 - along]
     lanes_affordable = max(int(battery / MOVE_COST // lane_length), 2)
@@ -226,7 +227,7 @@ def _lane_ends(shape: tuple[int, ...], battery: float, rng: np.random.Generator)
 
 def random_walk(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Generator
                 ) -> list[Cell]:
-    """Move or hover with equal chances in every slot, as long as the terminal stays in reach."""
+    """Move or hover with equal probability in every slot while the terminal stays in reach."""
     cells, left = [start], battery
     while True:
         options = [(cell, MOVE_COST) for cell in grid.neighbours(cells[-1])]
@@ -246,24 +247,24 @@ PATTERNS = {"random-waypoint": random_waypoint, "lawnmower": lawnmower, "random-
 def fly_survey(scene: Scene | Path | str, truth: RadioMap | str = "traced", *, flights: int = 5,
                pattern: str = "random-waypoint", seed: int = 0, noise_db: float | None = None
                ) -> Measurements:
-    """Fly and measure.
+    """Simulate flights of a scene's UAVs through a truth map, and the levels they measure.
 
     Args:
         scene: UAVs, devices and sensitivity.
-        truth: Map over the scene's lattice, or what `read_truth` takes for one; where it has
-            `sigma_db`, shadowing is drawn anew for every link.
-        flights: Number of flights; in each, every UAV of the scene flies once.
-        pattern: Key of `PATTERNS`.
-        seed: Seed of paths and noise; the n-th flight does not depend on the number of flights.
-        noise_db: Standard deviation of the receiver's measurement error [dB]; None: 1, and 0 with a
-            truth that has shadowing of its own (`sigma_db`).
+        truth: map over the scene's lattice, or an argument of `read_truth`; if it has `sigma_db`,
+            shadowing is drawn anew for every link.
+        flights: number of flights; in each, every UAV of the scene flies once.
+        pattern: key of `PATTERNS`.
+        seed: of paths and noise; the n-th flight does not depend on the number of flights.
+        noise_db: standard deviation of the receivers' measurement error [dB]; None: 1, or 0 if the
+            truth has shadowing (`sigma_db`).
 
     Returns:
-        The measurements; unknown devices are without x and y.
+        The measurements; unknown devices have no x and y.
 
     Raises:
-        BadInput: An unknown pattern, no flight, no UAV, more rows than a table may have, a map of
-            another scene, or one with gains that physics does not allow.
+        BadInput: an unknown pattern, no flight, no UAV, more rows than a table may have, a map of
+            another scene, or gains that are physically impossible.
     """
     scene = Scene.of(scene)
     if isinstance(truth, str):
@@ -303,7 +304,7 @@ def fly_survey(scene: Scene | Path | str, truth: RadioMap | str = "traced", *, f
 
 
 def declared_devices(scene: Scene) -> pd.DataFrame:
-    """Return rows of `devices.csv` as a survey knows them: unknown ones with their height only."""
+    """Return a scene's devices as rows of `devices.csv`; of unknown ones only the height."""
     rows = [(device.device,
              *((device.x_m, device.y_m) if device.role == "anchor" else (np.nan, np.nan)),
              device.z_m, device.role)
@@ -312,10 +313,10 @@ def declared_devices(scene: Scene) -> pd.DataFrame:
 
 
 def fly(scene: Scene, uav: UavConfig, pattern: str, rng: np.random.Generator) -> np.ndarray:
-    """Fly one UAV once: (slots, 2) cells (row, column) from its start to its terminal.
+    """Simulate one flight of a UAV; return its cells (slots, 2) from start to terminal.
 
     Raises:
-        BadInput: The battery does not reach from the start to the terminal.
+        BadInput: the battery does not reach from the start to the terminal.
     """
     lattice = scene.lattice
     start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m),
@@ -337,15 +338,16 @@ def _level(scene: Scene, uav: UavConfig) -> int:
 
 
 def _lattice_index(scene: Scene, uav: UavConfig, cells: np.ndarray) -> np.ndarray:
+    """Return the flat index (slots,) in the lattice of cells (slots, 2) at a UAV's altitude."""
     level = np.full(len(cells), _level(scene, uav))
     return np.ravel_multi_index((level, cells[:, 0], cells[:, 1]), scene.lattice.shape)
 
 
 def heading_deg(cells: np.ndarray) -> np.ndarray:
-    """Return the heading (slots,) along the cells (slots, 2) of a flight, clockwise from north.
+    """Return the heading (slots,) [degrees clockwise from north] along cells (slots, 2).
 
-    It is that of the last move; the first slot has that of the next move. It is 0 where the UAV
-    never moves.
+    A slot has the heading of the last move, slots before the first move that of the first move. A
+    UAV that never moves has heading 0.
     """
     moves = np.diff(cells, axis=0)
     heading = pd.Series(np.full(len(cells), np.nan))
@@ -358,8 +360,14 @@ def link_table(scene: Scene, flight: str, receiver: str, index: np.ndarray, leve
                time_s: np.ndarray, heading_deg: np.ndarray) -> pd.DataFrame:
     """Return the measurements of one receiver on one flight as rows of `Measurements.table`.
 
-    Positions are flat indices (slots,) of the lattice, gains (devices, slots) [dB] with NaN where
-    not detected, times [s] and headings [degrees] (slots,) each.
+    Args:
+        scene: devices and lattice.
+        flight: name.
+        receiver: name.
+        index: (slots,) flat index of the receiver's position in the lattice.
+        level_db: (devices, slots) gain [dB]; NaN: not detected.
+        time_s: (slots,) [s].
+        heading_deg: (slots,) [degrees].
     """
     devices, slots = len(level_db), len(index)
     position_m = scene.lattice.positions_m[index]
@@ -373,6 +381,7 @@ def link_table(scene: Scene, flight: str, receiver: str, index: np.ndarray, leve
 
 
 def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: float) -> None:
+    """Raise BadInput for arguments of `fly_survey` that cannot be flown."""
     path = scene.folder / "scene.toml"
     if pattern not in PATTERNS:
         raise BadInput(f"pattern {pattern!r} is unknown; allowed are {', '.join(PATTERNS)}")

@@ -97,7 +97,7 @@ BAD = {
     "unknown law": ("scene --transmitters sites.csv --model okumura", ["channel model 'okumura' is unknown"]),
     "classes": ("scene --transmitters sites.csv --classes x", ["--classes 'x' is not numbers"]),
     "rate": ("scene --transmitters sites.csv --rate 1,2", ["--rate '1,2' is not 3 numbers"]),
-    "extent": ("scene --transmitters sites.csv --extent 1,2,3", ["--extent '1,2,3' is not an area"]),
+    "extent": ("scene --transmitters sites.csv --extent 1,2,3", ["--extent '1,2,3' is not 4 numbers"]),
     "load": ("scene --transmitters sites.csv --load 2", ["a load of 2 is not possible"]),
     "formats": ("scene --transmitters sites.csv --formats shp", ["unknown format 'shp'"]),
     "polygon": ("scene --transmitters sites.csv --polygon none.geojson", ["none.geojson does not exist"]),

@@ -31,7 +31,7 @@ BAD = {
     "not PBF": ("a.osm.pbf", "x", "", ["a.osm.pbf is not a readable .osm.pbf file"]),
     "not a package": ("a.gpkg", "x", "", ["a.gpkg is not a readable GeoPackage"]),
     "no file": ("b.osm", "", "", ["a.osm does not exist; give the path of a map"]),
-    "box": ("a.osm", f"<osm>{NODES}{BOX}</osm>", "--bbox 1,2,3", ["--bbox '1,2,3' is not four numbers"]),
+    "box": ("a.osm", f"<osm>{NODES}{BOX}</osm>", "--bbox 1,2,3", ["--bbox '1,2,3' is not 4 numbers"]),
     "box upside down": ("a.osm", f"<osm>{NODES}{BOX}</osm>", "--bbox 2,0,1,3", ["the south below the north"]),
     "height": ("a.osm", f"<osm>{NODES}{BOX}</osm>", "--height-default -3", ["default height of -3 m"]),
     "material": ("a.osm", f"<osm>{NODES}{BOX}</osm>", "--material brick=cheese", ["no ITU material 'cheese'"]),

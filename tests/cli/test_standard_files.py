@@ -96,7 +96,7 @@ BAD = {
     "map map.nc --scene scene -o a.xls": "unknown format '.xls'",
     "map map.nc --scene scene -o a.tif --devices d9": "device 'd9' is not in the map",
     "map map.nc --scene scene -o a.tif --altitudes 61": "altitude 61 m is not in the map",
-    "map map.nc --scene scene -o a.tif --altitudes high": "--altitudes 'high' are not numbers",
+    "map map.nc --scene scene -o a.tif --altitudes high": "--altitudes 'high' is not numbers",
     "map scene/city.nc --scene scene -o a.tif": "does not exist",
     "map map.nc --scene scene -o none/../map.nc/a.tif": "cannot write",
     "gains scene --points none.csv": "none.csv does not exist",

@@ -1,4 +1,4 @@
-"""Radio maps in the file formats of other programs, chosen by the file name."""
+"""Write radio maps in file formats of other programs, chosen by the suffix."""
 
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -9,7 +9,7 @@ import numpy as np
 from radiotwin.display import some
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import MAP_VALUES
-from radiotwin.maps.export.geotiff import write_geotiff
+from radiotwin.maps.export.geotiff import require_origin, write_geotiff
 from radiotwin.maps.export.kmz import write_kmz
 from radiotwin.maps.export.tables import write_csv, write_dataset, write_numpy
 from radiotwin.maps.file import MapStream
@@ -21,13 +21,13 @@ EXPORTERS: dict[str, Callable[[RadioMap, Scene, Path], None]] = {
     ".tif": write_geotiff, ".kmz": write_kmz}
 STREAMED: dict[str, Callable[[RadioMap | MapStream, Scene, Path], None]] = {
     ".nc": write_dataset, ".zarr": write_dataset, ".csv": write_csv, ".tif": write_geotiff}
-"""Formats that a map is written to while it is made."""
-_NAMED = 20  # devices, or altitudes, in a message
+"""Formats to which a map can be written block by block while it is computed."""
+_NAMED = 20  # at most so many devices or altitudes in a message
 
 
 def write_map(radio_map: RadioMap | MapStream, scene: Scene, path: Path,
               exporters: dict[str, Callable[[RadioMap, Scene, Path], None]]) -> None:
-    """Write a map in the format of a file name, block by block where the format allows it.
+    """Write a map in the format of the path's suffix, block by block if the format allows it.
 
     Args:
         radio_map: map to write.
@@ -36,7 +36,7 @@ def write_map(radio_map: RadioMap | MapStream, scene: Scene, path: Path,
         exporters: by suffix.
 
     Raises:
-        BadInput: the map is too large to be in memory, as the format needs it.
+        BadInput: the format requires the map in memory, and it is too large.
     """
     if path.suffix in STREAMED:
         STREAMED[path.suffix](radio_map, scene, path)
@@ -50,7 +50,7 @@ def write_map(radio_map: RadioMap | MapStream, scene: Scene, path: Path,
 
 def check_format(path: Path, scene: Scene,
                  formats: Collection[str] = tuple(EXPORTERS)) -> None:
-    """Check that a radio map of a scene can be written under a file name.
+    """Check that a radio map of a scene can be written in the format of a path's suffix.
 
     Args:
         path: of the output; its suffix chooses the format.
@@ -58,15 +58,13 @@ def check_format(path: Path, scene: Scene,
         formats: suffixes that can be written.
 
     Raises:
-        BadInput: no exporter writes the suffix, or it needs an origin and the scene has none.
+        BadInput: an unknown suffix, or .kmz for a scene without an origin.
     """
     if path.suffix not in formats:
         raise BadInput(f"{path}: unknown format {path.suffix!r}; allowed are "
                        f"{', '.join(formats)}")
-    if path.suffix == ".kmz" and scene.config.origin is None:
-        raise BadInput(f"{path}: Google Earth needs the position of the scene, and "
-                       f"{scene.folder / 'scene.toml'} has no [origin]; add one with latitude_deg "
-                       "and longitude_deg of x = y = 0")
+    if path.suffix == ".kmz":
+        require_origin(scene, f"{path}: Google Earth needs")
 
 
 def select(radio_map: RadioMap | MapStream, devices: list[str] | None,

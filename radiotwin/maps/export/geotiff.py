@@ -109,6 +109,14 @@ def require_rasterio(path: Path) -> Any:
                     ".csv")
 
 
+def require_origin(scene: Scene, purpose: str) -> Origin:
+    """Return a scene's origin; raise BadInput that begins with the purpose if it has none."""
+    if scene.config.origin is None:
+        raise BadInput(f"{purpose} the position of the scene, and {scene.folder / 'scene.toml'} "
+                       "has no [origin]; add one with latitude_deg and longitude_deg of x = y = 0")
+    return scene.config.origin
+
+
 def georeference(x_m: np.ndarray, y_m: np.ndarray, step_m: float,
                  origin: Origin | None) -> dict[str, Any]:
     """Return the reference system and the transform of a raster, north up, for rasterio.

@@ -1,7 +1,7 @@
-"""Rasters for Google Earth: a KMZ file with overlays, such as one for each device and altitude.
+"""Write rasters as KMZ for Google Earth, with an overlay for each device and altitude.
 
-Overlays are placed by their four corners (gx:LatLonQuad of Google's KML extension [1]), as the
-local frame is slightly rotated against the meridians. Cells that are not detected are transparent.
+Overlays are placed by their four corners (gx:LatLonQuad of Google's KML extension [1]), since the
+local frame is slightly rotated against the meridians. Cells without a gain are transparent.
 
 [1] https://developers.google.com/kml/documentation/kmlreference
 """
@@ -26,7 +26,7 @@ from radiotwin.geo import to_geographic
 from radiotwin.io.budgets import MAP_PICTURES
 from radiotwin.io.files import atomic_file
 from radiotwin.io.forms import Origin
-from radiotwin.maps.export.geotiff import cell_size_m
+from radiotwin.maps.export.geotiff import cell_size_m, require_origin
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 
@@ -40,10 +40,10 @@ class Overlay:
     """A picture on the ground.
 
     Attributes:
-        folder: name of the folder that it is in; of each, one picture is shown at a time.
+        folder: name of its folder, of which one picture is shown at a time.
         name: of the overlay.
-        is_visible: whether it is shown at first.
-        draw: returns its PNG, north up.
+        is_visible: whether the overlay is shown at first.
+        draw: returns the picture as PNG, north up.
     """
 
     folder: str
@@ -53,12 +53,10 @@ class Overlay:
 
 
 def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
-    """Write a KMZ file with a folder for each device and a legend.
-
-    The first device is shown at first, and one altitude at a time. The scene has an origin.
+    """Write a KMZ file with a legend and a folder for each device; shows the first device.
 
     Raises:
-        BadInput: the lattice is not regular.
+        BadInput: the lattice is not regular, or the scene has no origin.
     """
     values_db = radio_map.gain_db[np.isfinite(radio_map.gain_db)]
     low_db, high_db = np.quantile(values_db, [0.01, 0.995]) if len(values_db) else (-1.0, 0.0)
@@ -93,12 +91,14 @@ def write_overlays(path: Path, scene: Scene, bounds_m: tuple[float, float, float
         path: of the .kmz file.
         scene: with an origin.
         bounds_m: (x_min, x_max, y_min, y_max) of every picture [m].
-        overlays: pictures; those of a folder one after the other.
-        marks: name -> x and y of points to mark [m].
+        overlays: pictures, sorted by folder.
+        marks: x and y of points to mark, by name [m].
         legend: PNG for the left edge of the view.
+
+    Raises:
+        BadInput: the scene has no origin.
     """
-    origin = scene.config.origin
-    assert origin is not None, "check_format refuses scenes without"
+    origin = require_origin(scene, f"{path}: Google Earth needs")
     ET.register_namespace("", KML)
     ET.register_namespace("gx", GX)
     document = ET.Element(f"{{{KML}}}kml")
@@ -139,6 +139,7 @@ def _store(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
 
 
 def _add(parent: ET.Element, tag: str, space: str = KML, **texts: str) -> ET.Element:
+    """Add an element with a child element for each text; return it."""
     element = ET.SubElement(parent, f"{{{space}}}{tag}")
     for name, text in texts.items():
         ET.SubElement(element, f"{{{KML}}}{name}").text = text
@@ -154,9 +155,9 @@ def _corners(bounds_m: tuple[float, float, float, float], origin: Origin) -> str
 
 
 def enlarged_png(pixels: np.ndarray) -> bytes:
-    """Return the PNG of a raster (ny, nx, 4), south first, at least 512 pixels wide or high.
+    """Return the PNG of a raster (ny, nx, 4), south row first, enlarged to 512 pixels or more.
 
-    Viewers blur what they enlarge.
+    Viewers would blur a smaller picture.
     """
     times = -(-512 // max(pixels.shape))
     enlarged = pixels[::-1].repeat(times, axis=0).repeat(times, axis=1)
