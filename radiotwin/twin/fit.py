@@ -39,7 +39,8 @@ from radiotwin.twin.twin import Twin
 # nearer than 100,000, in 2.5 times the time; measured ones err alike where they are close together.
 MAX_LINKS = 150_000
 HEIGHT_NEEDED = ("with a 3D map every position needs one. Fill it in, in metres above the ground "
-                 "of the scene (about 1.5 for a phone in the hand)")
+                 "of the scene (about 1.5 for a phone in the hand), here or in the table for "
+                 "`radiotwin import --devices`")
 
 
 def fit_twin(measurements: Measurements | pd.DataFrame | Path | str, scene: Scene | Path | str,
