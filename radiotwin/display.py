@@ -1,7 +1,6 @@
-"""How objects show themselves: a line, a table in a notebook, axes of a plot, rows for a GIS.
+"""Show objects: one line, a table in a notebook, axes of a plot, rows for a GIS.
 
-Axes of a plot from above are metres of the local frame, or degrees where its origin is known. All
-plots and figures share the colours and titles here.
+Axes of a plan view are metres of the local frame, or degrees if its origin is known.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import PathCollection, QuadMesh
 
-TICKS = 6  # of an axis in degrees, whose labels are long
-LABEL_SHARE = 0.85  # of the height of the axes that a colour bar takes
+TICKS = 6  # on an axis in degrees, whose labels are long
+LABEL_SHARE = 0.85  # height of a colour bar over that of the axes
 GAIN_COLOURS = "viridis"
 DIFFERENCE_COLOURS = "RdBu_r"  # of model − truth, red: the model predicts more
 RESIDUAL_COLOURS = "RdBu"  # of measured − predicted, red: less was measured than predicted
@@ -36,7 +35,7 @@ MAX_LINE = 200
 
 
 def new_axes(ax: Axes | None) -> Axes:
-    """Return axes to draw into: the user's, or those of a new figure of pyplot, for notebooks."""
+    """Return the given axes, or those of a new figure."""
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt
@@ -56,12 +55,10 @@ class PlotFrame:
 
     @classmethod
     def choose(cls, origin: Origin | None, geographic: bool | None) -> PlotFrame:
-        """Return the frame of a plot: longitude and latitude, or metres.
-
-        With `geographic` None it is longitude and latitude if the origin is known.
+        """Choose longitude and latitude, or metres; `geographic` None: by whether origin is known.
 
         Raises:
-            BadInput: longitude and latitude are wanted and the origin is not known.
+            BadInput: longitude and latitude are requested without an origin.
         """
         if geographic and origin is None:
             raise BadInput("longitude and latitude cannot be drawn: the origin of the frame is not "
@@ -69,14 +66,14 @@ class PlotFrame:
         return cls(None if geographic is False else origin)
 
     def at(self, x_m: Any, y_m: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return coordinates on the axes of points of the local frame [m], in any shape."""
+        """Convert local positions [m], in any shape, to coordinates on the axes."""
         x_m, y_m = np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float)
         if self.origin is None:
             return x_m, y_m
         return to_geographic(self.origin, x_m, y_m)
 
     def prepare(self, ax: Axes) -> None:
-        """Label the axes, and give both the same scale on the ground."""
+        """Label the axes and set the same scale [m] on both."""
         if self.origin is None:
             ax.set(xlabel="x, east [m]", ylabel="y, north [m]", aspect="equal")
             return
@@ -97,7 +94,7 @@ def draw_cells(ax: Axes, frame: PlotFrame, x_m: np.ndarray, y_m: np.ndarray, val
                **look: Any) -> QuadMesh:
     """Draw values (ny, nx) in cells around positions x (nx,) and y (ny,), ascending [m].
 
-    NaN stays empty; `look` is that of `Axes.pcolormesh`.
+    NaN stays empty; `look` is passed to `Axes.pcolormesh`.
     """
     corners = frame.at(*np.meshgrid(_edges(x_m, y_m), _edges(y_m, x_m)))
     return ax.pcolormesh(*corners, values, rasterized=True, linewidth=0, **look)
@@ -105,7 +102,7 @@ def draw_cells(ax: Axes, frame: PlotFrame, x_m: np.ndarray, y_m: np.ndarray, val
 
 def draw_points(ax: Axes, frame: PlotFrame, x_m: np.ndarray, y_m: np.ndarray,
                 **look: Any) -> PathCollection:
-    """Draw points of the local frame [m]; `look` is that of `Axes.scatter`."""
+    """Draw points of the local frame [m]; `look` is passed to `Axes.scatter`."""
     return ax.scatter(*frame.at(x_m, y_m), **look)
 
 
@@ -115,7 +112,7 @@ def add_colour_bar(ax: Axes, drawn: Any, label: str, extend: str = "neither") ->
 
 
 def add_legend(ax: Axes) -> None:
-    """Add a legend below the axes where something in them has a label."""
+    """Add a legend below the axes if anything in them has a label."""
     handles, labels = ax.get_legend_handles_labels()
     if handles:
         by_label = dict(zip(labels, handles))
@@ -124,7 +121,7 @@ def add_legend(ax: Axes) -> None:
 
 
 def _edges(along_m: np.ndarray, across_m: np.ndarray) -> np.ndarray:
-    """Return the (n + 1,) borders of cells; a single one is as wide as those across."""
+    """Return the (n + 1,) borders of cells; a single cell is as wide as those across."""
     if len(along_m) > 1:
         step_m = np.diff(along_m)
     else:
@@ -134,19 +131,19 @@ def _edges(along_m: np.ndarray, across_m: np.ndarray) -> np.ndarray:
 
 
 def plain(text: str, max_length: int = 100) -> str:
-    """Return a foreign text for a figure: short, on one line, nothing hidden, and no formula."""
+    """Make a foreign text safe for a figure: short, on one line, escaped, without formulas."""
     return " ".join(shown(text, max_length).split()).replace("$", r"\$")
 
 
 def residual_range_db(residual_db: np.ndarray) -> float:
-    """Return the end of a symmetric colour scale [dB] that 95 % of the finite values are within."""
+    """Return the end of a symmetric colour scale [dB] that contains 95 % of the finite values."""
     finite = np.abs(residual_db[np.isfinite(residual_db)])
     high_db = float(np.quantile(finite, 0.95)) if len(finite) else 0.0
     return float(np.clip(np.ceil(high_db), *RESIDUAL_RANGE_DB))
 
 
 def level_range_db(level_db: np.ndarray) -> tuple[float, float]:
-    """Return the ends of a colour scale [dB] that nearly all finite values are within."""
+    """Return the ends of a colour scale [dB] that contains nearly all finite values."""
     finite = level_db[np.isfinite(level_db)]
     if not len(finite):
         return -1.0, 0.0
@@ -159,9 +156,9 @@ class Summary:
     """Facts about an object.
 
     Attributes:
-        kind: its class.
-        line: what it is, without its class.
-        facts: subject and finding of each row of the table.
+        kind: class of the object.
+        line: short description, without the class.
+        facts: rows of the table: subject and finding.
     """
 
     kind: str
@@ -183,15 +180,15 @@ class Summary:
 
 
 class Summarised(ABC):
-    """An object that shows its summary: in a terminal one line, in a notebook a table."""
+    """Base of objects that show a summary: one line in a terminal, a table in a notebook."""
 
     @property
     @abstractmethod
     def _summary(self) -> Summary:
-        """Summary that is shown."""
+        """Summary of the object."""
 
     def __bool__(self) -> bool:
-        return True  # of no devices or links, too
+        return True  # also without devices or links
 
     def __repr__(self) -> str:
         return self._summary.text()
@@ -209,15 +206,15 @@ def count(number: int, noun: str) -> str:
     return f"{number:,} {noun}" + "s" * (number != 1)
 
 
-def some(names: Iterable[object], most: int = 5) -> str:
-    """Return the first names of a list, and how many there are."""
+def some(names: Iterable[object], max_names: int = 5) -> str:
+    """Join the first names of a list, and say how many there are if some are omitted."""
     texts = [str(name) for name in names]
-    more = f", … ({len(texts):,} in all)" if len(texts) > most else ""
-    return ", ".join(texts[:most]) + more
+    more = f", … ({len(texts):,} in all)" if len(texts) > max_names else ""
+    return ", ".join(texts[:max_names]) + more
 
 
 def span(low: float, high: float, unit: str) -> str:
-    """Return a range of values with its unit; a dash where nothing is finite.
+    """Return a range of values with its unit; a dash if they are not finite.
 
     >>> span(-101.26, -60.0, "dB")
     '−101.3 to −60 dB'
@@ -229,11 +226,13 @@ def span(low: float, high: float, unit: str) -> str:
 
 def geo_data_frame(table: pd.DataFrame, origin: Origin | None, *, position_m: np.ndarray | None
                    = None, geometry: Any = None) -> GeoDataFrame:
-    """Return a table of n rows with a geometry in metres of the local frame.
+    """Add a geometry in metres of the local frame to a table of n rows.
 
-    The geometry is points (n, 2) or (n, 3) [m], none for a row with NaN, or other shapes (n,). Its
-    reference system is that of the frame, if the origin is known: `.to_crs(4326)` gives longitude
-    and latitude.
+    Args:
+        table: n rows.
+        origin: of the frame; if known, `.to_crs(4326)` gives longitude and latitude.
+        position_m: points (n, 2) or (n, 3) [m]; NaN: none.
+        geometry: other shapes (n,), in place of points.
 
     Raises:
         BadInput: GeoPandas is not installed.

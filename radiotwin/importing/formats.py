@@ -168,9 +168,9 @@ class Format:
         result = {}
         for quantity, entries in self.columns.items():
             for entry in (entries,) if isinstance(entries, str) else entries:
-                own = {name: _found(_plain(name), actual) for name in columns_of(entry, ())}
-                if all(own.values()):
-                    for name, found in own.items():
+                columns = {name: _found(_plain(name), actual) for name in columns_of(entry, ())}
+                if all(columns.values()):
+                    for name, found in columns.items():
                         entry = entry.replace(name, found)
                     result[quantity] = entry
                     break

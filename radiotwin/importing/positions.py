@@ -117,8 +117,8 @@ def _numbered(names: pd.Series, since_s: np.ndarray) -> pd.Series:
     """Rename repeated names (n,) to `NAME@1`, … in the order of time."""
     order = np.lexsort((np.arange(len(names)), np.nan_to_num(since_s, nan=-np.inf)))
     number = names.iloc[order].groupby(names.iloc[order]).cumcount() + 1
-    several = names.duplicated(keep=False)
-    return names.mask(several, names + "@" + number.reindex(names.index).astype(str))
+    repeated = names.duplicated(keep=False)
+    return names.mask(repeated, names + "@" + number.reindex(names.index).astype(str))
 
 
 def _at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -> pd.DataFrame:
@@ -488,7 +488,7 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                   moving_m: float) -> pd.DataFrame:
     """Make the table `devices.csv` of the links' devices; BadInput if a device moves.
 
-    `declared_as` is the name in the table of devices for those that `_by_carrier` renamed.
+    `declared_as` maps names that `_by_carrier` made to the names in the table of devices.
     """
     by_device = pd.DataFrame(device_m, columns=["x_m", "y_m", "z_m"], index=links.index).groupby(
         links["device"].to_numpy(), sort=False)

@@ -274,7 +274,7 @@ def _names(source: Source, name: str, spec: str, shared: pd.DataFrame,
 
 
 def _level_columns(source: Source, settings: Settings) -> list[LevelColumn]:
-    """Return all columns of levels."""
+    """Return the column of levels, or those of all wide blocks."""
     if not settings.wide:
         return [LevelColumn(str(settings.columns.level), {})]
     found = [column for block in settings.wide for column in _wide_columns(source, block)]
@@ -288,7 +288,7 @@ def _level_columns(source: Source, settings: Settings) -> list[LevelColumn]:
 
 def _wide_columns(source: Source, block: Wide) -> list[LevelColumn]:
     """Return the columns of levels that match the patterns of a block."""
-    own = block.model_dump(exclude_none=True, exclude={"level", "level_offset_db"})
+    specs = block.model_dump(exclude_none=True, exclude={"level", "level_offset_db"})
     found: list[LevelColumn] = []
     names = list(map(str, source.table))
     for pattern in [block.level] if isinstance(block.level, str) else block.level:
@@ -297,21 +297,21 @@ def _wide_columns(source: Source, block: Wide) -> list[LevelColumn]:
         if not matches:
             raise BadInput(f"{source.path}: no column fits {pattern!r} (wide.level); the file has "
                            f"{listed(names)}. Correct the mapping")
-        found += [LevelColumn(name, {key: spec.replace("*", star) for key, spec in own.items()},
+        found += [LevelColumn(name, {key: spec.replace("*", star) for key, spec in specs.items()},
                               block.level_offset_db) for name, star in matches.items()]
-    for name in own.keys() & set(NAMES):
+    for name in specs.keys() & set(NAMES):
         in_columns = [_names_a_column(source, column, column.own[name]) for column in found]
         if any(in_columns) and not all(in_columns):
             column = found[in_columns.index(False)]
-            raise BadInput(f"{source.path}: wide.{name} = {own[name]!r} names columns of the file "
-                           f"for some columns of levels, but for {column.spec} there is no column "
-                           f"{column.own[name]!r}; the file has {listed(names)}. Correct the "
-                           "mapping")
+            raise BadInput(f"{source.path}: wide.{name} = {specs[name]!r} names columns of the "
+                           f"file for some columns of levels, but for {column.spec} there is no "
+                           f"column {column.own[name]!r}; the file has {listed(names)}. Correct "
+                           "the mapping")
     return found
 
 
 def _naming_notes(source: Source, settings: Settings) -> list[str]:
-    """Return notes on names that are made of those of columns, as a misspelt column would be."""
+    """Note devices or receivers that are named after a pattern, which may be a misspelt column."""
     notes = []
     for block in settings.wide:
         for end in ("device", "receiver"):
@@ -328,7 +328,7 @@ def _naming_notes(source: Source, settings: Settings) -> list[str]:
 
 
 def _match(pattern: str, name: str) -> str | None:
-    """Return the text that `*` stands for, the name if there is no `*`, or None (no match)."""
+    """Match a name with a pattern; return the text in place of `*`, or the name without `*`."""
     if "*" not in pattern:
         return name if name == pattern else None
     before, after = pattern.split("*", 1)
@@ -340,13 +340,13 @@ def _match(pattern: str, name: str) -> str | None:
 
 def _spec(settings: Settings, level: LevelColumn, name: str) -> str:
     """Return the column of a quantity, for messages."""
-    own = name.removeprefix("device_") if "device" in level.own else name
-    return level.own.get(own) or getattr(settings.columns, name, None) or name
+    key = name.removeprefix("device_") if "device" in level.own else name
+    return level.own.get(key) or getattr(settings.columns, name, None) or name
 
 
 def _without_no_degrees(source: Source, links: pd.DataFrame, prefix: str, name: str, spec: str,
                         tally: Tally) -> pd.DataFrame:
-    """Return links without the few whose latitude or longitude is none; many are refused."""
+    """Drop links with an impossible latitude or longitude; BadInput if there are many."""
     limit = MAX_DEGREES[name]
     bad = links[prefix + name].abs() > limit
     if not are_few(bad.sum(), len(bad)):
@@ -366,14 +366,14 @@ class Logs:
 
     Attributes:
         source: all files, for messages only.
-        links: as of `build_links`, one after the other.
+        links: of all files, see `build_links`.
         level_column: of `measurements.csv`.
         rows: of all files.
         readings: in these rows.
         files: name, rows, readings, format and unused columns of each file, for the report.
         notes: on how files were read.
         format: of all files, or None.
-        bad_rows: those that were left out, as of `BadRows`.
+        bad_rows: unreadable rows that were left out, see `BadRows.rows`.
     """
 
     source: Source
@@ -389,12 +389,10 @@ class Logs:
 
 def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
               on_progress: Callable[[str], None]) -> Logs:
-    """Read files; what the settings do not say is from each file's format.
-
-    Readings that are left out are counted, and progress is the name of each step.
+    """Read all files of an import; undeclared settings come from each file's format.
 
     Raises:
-        BadInput: all that is wrong, with file, row and column.
+        BadInput: all errors, with file, row and column.
     """
     problems, bad_rows = Problems(), BadRows(settings.skip_bad_rows)
     parts: list[pd.DataFrame] = []
@@ -411,27 +409,27 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
         bad_rows.prefix = f"{file.name}: " * (len(files) > 1)
         with problems.noted():
             source = read_source(file, settings, may_be, bad_rows)
-            own, format_name, caution = _settings_of(source, settings, by_default)
+            file_settings, format_name, caution = _settings_of(source, settings, by_default)
             source = _numbered_from(source, rows, bad_rows.prefix)
             wheres.append((rows, source.where))
             rows += len(source)
             ROWS.check(rows, "all files")
-            source = _without_cut_rows(source, own)
+            source = _without_cut_rows(source, file_settings)
             count = len(source) + sum(number for _, number, _ in source.left_out)
             on_progress("links")
-            links, per_row = _links_of(source, own, tally, problems, name)
+            links, per_row = _links_of(source, file_settings, tally, problems, name)
             if not per_row:
                 continue
             for reason, number, place in source.left_out:
                 tally.count(reason, "", number * per_row, place)
-            if own.read_at == "device":
+            if file_settings.read_at == "device":
                 links[READS] = 1.0
             parts.append(links)
             formats.add(format_name)
-            level_column = LEVEL_COLUMN[str(own.level_unit)]  # one for all files
+            level_column = LEVEL_COLUMN[str(file_settings.level_unit)]  # one for all files
             records.append({"file": file.name, "rows": count, "readings": count * per_row,
-                            "format": format_name, "not_used": _unused(source, own)})
-            notes += [*source.notes, *_naming_notes(source, own),
+                            "format": format_name, "not_used": _unused(source, file_settings)})
+            notes += [*source.notes, *_naming_notes(source, file_settings),
                       *([f"{file.name}: {caution}"] if caution else [])]
     problems.check()
     if unused := dict.fromkeys(name for record in records for name in record["not_used"]):
@@ -491,12 +489,12 @@ def _settings_of(source: Source, settings: Settings,
         defaults = {**found.settings, "columns": {"flight": flight, **found.mapping(header)}}
         if settings.columns.device:  # the ends may be exchanged
             defaults.pop("read_at", None)
-    own = merged(settings, defaults)
-    own.require_columns(str(source.path), header)
+    complete = merged(settings, defaults)
+    complete.require_columns(str(source.path), header)
     if found is None:
-        return own, None, ""
+        return complete, None, ""
     zone = "" if settings.time_zone else found.zone_caution
-    return own, found.name, ". ".join(filter(None, [found.caution, zone]))
+    return complete, found.name, ". ".join(filter(None, [found.caution, zone]))
 
 
 def _numbered_from(source: Source, first: int, prefix: str) -> Source:
@@ -549,8 +547,8 @@ def _without_cut_rows(source: Source, settings: Settings) -> Source:
 def _links_of(source: Source, settings: Settings, tally: Tally, problems: Problems,
               name: str) -> tuple[pd.DataFrame, int]:
     """Return the links of a file and its readings per row; count repeated and unselected rows."""
-    whole, repeated = without_repetition(source)
-    chosen, others = _only(whole, settings)
+    unique, repeated = without_repetition(source)
+    chosen, others = _only(unique, settings)
     links, per_row = build_links(chosen, settings, tally, problems, name)
     for index, reason, column in ((repeated, "repeats an earlier row exactly", ""), *others):
         tally.count(reason, column, len(index) * per_row,

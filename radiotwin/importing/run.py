@@ -260,7 +260,7 @@ def import_measurements(paths: Path | str | Sequence[Path | str], out: Path | st
 
     Args:
         paths: logs and tables, folders of them, or zip files, see `import_files`.
-        out: folder, see `import_files`; its `import.json` counts what was left out.
+        out: folder, see `import_files`; its `import.json` counts the readings that were left out.
         columns: column of each quantity, such as `{"latitude": "lat", "level": "rsrp"}`; or a TOML
             file with these and all other settings.
         compress: write `measurements.csv.gz` instead of `measurements.csv`.

@@ -210,6 +210,7 @@ class _ErrorsKept(io.RawIOBase):
         self.error: OSError | None = None
 
     def write(self, data: Any) -> int:
+        """Write to the file or, after an error, to memory."""
         data = memoryview(data).cast("B")
         if self.error is None:
             try:
@@ -226,6 +227,7 @@ class _ErrorsKept(io.RawIOBase):
         return len(data)
 
     def readinto(self, buffer: Any) -> int:
+        """Read from the file, overlaid by the data in memory."""
         view = memoryview(buffer).cast("B")
         start = self._position
         stop = max(start, min(start + len(view), self._end))

@@ -226,6 +226,7 @@ def search_shift(scene: Scene, receiver_m: np.ndarray) -> ShiftSearch | None:
     expected = gaussian_filter(built.astype(float), DENSITY_SD_M / cell_m)
 
     def contrast(east_m: float, north_m: float) -> float:
+        """Return the contrast of a translation, see `ShiftSearch`."""
         column = np.rint((receiver_m[:, 0] + east_m - x_m[0]) / cell_m).astype(int)
         row = np.rint((receiver_m[:, 1] + north_m - y_m[0]) / cell_m).astype(int)
         on_map = (column >= 0) & (column < len(x_m)) & (row >= 0) & (row < len(y_m))
@@ -236,6 +237,7 @@ def search_shift(scene: Scene, receiver_m: np.ndarray) -> ShiftSearch | None:
 
     def lowest(centre_m: tuple[float, float], reach_m: float, step_m: float
                ) -> tuple[float, tuple[float, float]]:
+        """Return the lowest contrast on a grid of translations, and its translation [m]."""
         steps_m = np.arange(-reach_m, reach_m + step_m, step_m).tolist()
         shifts = [(centre_m[0] + east_m, centre_m[1] + north_m)
                   for east_m in steps_m for north_m in steps_m]

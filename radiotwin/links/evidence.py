@@ -90,7 +90,7 @@ def _squares_occupied(position_m: np.ndarray, width_m: float) -> int:
 
 
 def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
-    """Return the indices (n, 2) of each link's piece of evidence and place, of these widths."""
+    """Return (n, 2) indices of each link's piece of evidence and place, for given widths [m]."""
     pieces, squares = (np.column_stack([np.floor(end[:, :2] / side_m).astype(np.int64) for end in
                                         (links.receiver_m,
                                          np.nan_to_num(links.device_m[links.device]))])

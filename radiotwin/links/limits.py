@@ -1,9 +1,9 @@
 """Estimate each receiver's limit of detection from its readings; a declared limit may be wrong.
 
-A receiver reports a level y with the probability Φ((y - limit) / width). A link may also be blank
-because it was lost, whatever its level. The likelihood of a limit has two factors: readings, of
-which few lie below the limit, and blanks, whose levels a crude prediction puts below it (Tobit:
-Tobin 1958; p-tobit: Deaton and Irish 1984). The width and the share of lost links are averaged out.
+A receiver reports a level y with the probability Φ((y - limit) / width). A link may also be lost at
+any level. The likelihood of a limit has two factors: the readings, few of which are below it, and
+the blanks, which crude predictions put below it (Tobit: Tobin 1958; p-tobit: Deaton and Irish
+1984). The width and the share of lost links are averaged out.
 
 The crude prediction has one slope over distance and a level for each device and receiver. It needs
 neither a map nor line of sight. Links of devices without a known position have no distance.

@@ -214,11 +214,11 @@ class Measurements(Summarised):
         Raises:
             BadInput: the origin of the present frame is not known.
         """
-        here = self.origin
-        if here is None:
+        old = self.origin
+        if old is None:
             raise BadInput("the origin of the measurements' frame is not known; give it to "
                            "Measurements, or move them")
-        return self.moved(lambda position_m: between_frames(position_m, here, origin), origin)
+        return self.moved(lambda position_m: between_frames(position_m, old, origin), origin)
 
     @classmethod
     def load(cls, path: Path | str, devices_path: Path | str | None = None) -> "Measurements":
@@ -422,7 +422,7 @@ def read_devices(path: Path | str) -> pd.DataFrame:
 
 def _read_devices(path: Path, origin: Origin | None,
                   own: Origin | None) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Read devices, converted from the frame about `own` to that about `origin`, and notes."""
+    """Read devices, convert x and y from the frame about `own` to `origin`, and collect notes."""
     return _devices(path, read_cells(path), origin, own, lambda row: f"row {row + 2}")
 
 

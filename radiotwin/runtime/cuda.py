@@ -158,6 +158,7 @@ def torch_device(wanted: str) -> Device:
 
 
 def _device(wanted: str, work: Literal["tracing", "training"]) -> Device:
+    """Resolve the option `--device` for a kind of work, and log the reason."""
     if wanted not in DEVICES:
         raise BadInput(f"--device {wanted[:60]!r}: allowed are {', '.join(DEVICES)}"
                        + "; --devices names radios" * (work == "tracing"))

@@ -273,6 +273,7 @@ class _Run(Generic[P, R]):
                 self._todo.appendleft(_Todo(half, joined(place), is_half=True))
 
     def _advice(self) -> str:
+        """Return the end of a message about a piece that cannot be run."""
         resources = self._job.resources
         if not resources.memory_bytes:
             return "Run it with fewer workers, or on a machine with more memory"

@@ -355,6 +355,7 @@ def _encode(arrays: dict[str, np.ndarray], content: Any) -> bytes:
 
 
 def _decode(data: bytes) -> Piece:
+    """Decode a part without running code; errors (`_DAMAGE`) mean that it is damaged."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:  # its sizes are claims
         PIECE_BYTES.check(sum(entry.file_size for entry in archive.infolist()), "part")
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):

@@ -92,6 +92,7 @@ class RayPool(Pool):
             raise
 
     def _connect(self, address: str) -> None:
+        """Join a running cluster; BadInput if that fails, or it runs other versions."""
         ray = self._ray
         if ray.is_initialized():
             raise BadInput("--cluster: this process is connected to a Ray cluster already; end "
@@ -118,17 +119,16 @@ class RayPool(Pool):
             for node in nodes}
         for host, answer in asked.items():
             try:
-                there = ray.get(answer, timeout=START_S)
+                found = ray.get(answer, timeout=START_S)
             except Exception as error:  # noqa: BLE001  # of many kinds
                 raise BadInput(f"--cluster {address}: node {host} cannot run radiotwin "
                                f"({_first_line(error)}); install the same version of it there"
                                ) from None
-            different = sorted(set(there) ^ set(versions()))
-            if different:
+            if set(found) ^ set(versions()):
                 raise BadInput(
                     f"--cluster {address}: node {host} has other versions than this machine: "
-                    f"{', '.join(map(_named, sorted(set(there) - set(versions()))))} there, "
-                    f"{', '.join(map(_named, sorted(set(versions()) - set(there))))} here; install "
+                    f"{', '.join(map(_named, sorted(set(found) - set(versions()))))} there, "
+                    f"{', '.join(map(_named, sorted(set(versions()) - set(found))))} here; install "
                     "the same on all, or results would differ")
 
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:

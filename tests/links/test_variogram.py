@@ -67,11 +67,3 @@ def test_a_length_that_trends_take_much_of_is_recovered(length_m, within):
         measured = Variogram.of(place[:, :2], trends, *pairs_of_links(place), np.geomspace(3.0, 140.0, 24))
         found.append(measured.length_m(fields.T.ravel()))
     assert length_m / within < np.exp(np.mean(np.log(found))) < within * length_m
-
-
-def test_white_noise_has_the_least_length():
-    place_m, links, series = tracks(3)
-    place = np.column_stack([place_m, 1e5 * series])
-    measured = Variogram.of(place_m, [Trend.of(links, np.arange(len(series)), series)], *pairs_of_links(place),
-                            np.geomspace(3.0, 140.0, 24))
-    assert measured.length_m(np.random.default_rng(0).normal(size=len(series))) < 6.0
