@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+import trimesh
 
 from radiotwin.closeloop.predict.baselines import grow_trees
 from radiotwin.closeloop.predict.predictor import CombinedPrediction
@@ -18,6 +19,7 @@ from radiotwin.links.measurements import Measurements
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.maps.survey import fly_survey
 from radiotwin.scene import Scene
+from radiotwin.scene.citymap import CityMap
 
 FLIGHTS, SLOTS, RECEIVERS, DEVICES = 6, 60, 2, 5
 RBM = Path(__file__).parents[1] / "scenes" / "rbm"
@@ -157,6 +159,13 @@ def synthetic_links(device_m, device, receiver_m, *, level_db=np.nan, limit_db=-
     ends = Ends(device_names=[f"d{i}" for i in range(len(device_m))], device_m=device_m,
                 anchors=frozenset(range(len(device_m))), flown=Flown.of(columns), **names)
     return Links(columns=columns, ends=ends, world=World(frequency_hz=frequency_hz, city=city, is_gain=is_gain))
+
+
+def city_of_boxes(*bounds_m, ground_m=0.0, **given):
+    """Return the map of boxes from (x, y, z) to (x, y, z) [m], on a square ground of that width around the origin."""
+    ground = [[[-ground_m / 2, -ground_m / 2, -0.2], [ground_m / 2, ground_m / 2, 0.0]]] if ground_m else []
+    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=bounds) for bounds in (*ground, *bounds_m)])
+    return CityMap(mesh.vertices, mesh.faces, **given)
 
 
 @pytest.fixture

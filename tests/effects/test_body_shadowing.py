@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.effects.catalogue.body_shadowing import Body, BodyShadowing
 from radiotwin.effects.params import Estimate
-from radiotwin.scene.citymap import CityMap
+from tests.worlds import city_of_boxes
 
 
 @pytest.fixture
@@ -38,12 +37,6 @@ def test_it_takes_its_depth_in_its_middle_nothing_opposite_and_half_across(links
     assert gain_db.max() <= 0
 
 
-def test_no_direction_gains():
-    arrival = np.random.default_rng(1).normal(size=(10_000, 3))
-    arrival /= np.linalg.norm(arrival, axis=1, keepdims=True)
-    loss_db = Body(depth_db=12.0, azimuth_deg=40.0, elevation_deg=-20.0).loss_db(arrival)
-    assert 0 <= loss_db.min() < 0.01 and 11.99 < loss_db.max() <= 12
-
 
 @pytest.mark.parametrize("width_deg", [60.0, 120.0, 240.0])
 def test_half_is_lost_at_half_its_width(width_deg):
@@ -53,31 +46,19 @@ def test_half_is_lost_at_half_its_width(width_deg):
     np.testing.assert_allclose(loss_db, [10, 5, 5, 0], atol=1e-9)
 
 
-def test_it_is_proposed_where_it_is(links, view):
-    """A pod below the deck to the right of one receiver; the other has none."""
-    off_deg = angle_deg(links, 60.0, -40.0)
+@pytest.mark.parametrize(("width_deg", "share"), [
+    (180, lambda off_deg: (1 + np.cos(np.radians(off_deg))) / 2),
+    (60, lambda off_deg: 2.0 ** -(2 * off_deg / 70) ** 2)])  # 70° wide: the nearest of the trial widths is 60°
+def test_a_pod_below_the_deck_of_one_receiver_is_proposed_with_its_direction_and_width(links, view, width_deg, share):
     rng, mean_db = np.random.default_rng(2), np.full(len(links), -80.0)
-    loss_db = np.where(links.receiver == 1, 10 * (1 + np.cos(np.radians(off_deg))) / 2, 0.0)
+    loss_db = np.where(links.receiver == 1, 10 * share(angle_deg(links, 60.0, -40.0)), 0.0)
     links.level_db[:] = mean_db - loss_db + rng.normal(0, 2.0, len(links))
     (params,) = BodyShadowing().propose(view(links, mean_db, 2.0))
     body = params.receivers[1]
-    assert body.depth_db == pytest.approx(10, abs=2.5)  # less, by the prior: where the search begins
+    assert body.depth_db == pytest.approx(10, abs=2.5)  # less, by the prior
     assert body.azimuth_deg == pytest.approx(60, abs=8) and body.elevation_deg == pytest.approx(-40, abs=12)
-    assert body.width_deg == 180
+    assert body.width_deg == width_deg
     assert 0 not in params.receivers or params.receivers[0].depth_db < 1
-
-
-def test_a_narrow_one_is_proposed_as_narrow(links, view):
-    """A normal curve, 70° wide: of the widths that are searched 60° is the nearest."""
-    off_deg = angle_deg(links, 60.0, -40.0)
-    rng, mean_db = np.random.default_rng(2), np.full(len(links), -80.0)
-    loss_db = np.where(links.receiver == 1, 10 * 2.0 ** -(2 * off_deg / 70)**2, 0.0)
-    links.level_db[:] = mean_db - loss_db + rng.normal(0, 2.0, len(links))
-    (params,) = BodyShadowing().propose(view(links, mean_db, 2.0))
-    body = params.receivers[1]
-    assert body.depth_db == pytest.approx(10, abs=2.5)
-    assert body.azimuth_deg == pytest.approx(60, abs=8) and body.elevation_deg == pytest.approx(-40, abs=12)
-    assert body.width_deg == 60
 
 
 def test_what_was_found_is_reported_for_each_receiver(links):
@@ -106,11 +87,8 @@ def test_a_body_is_found_in_a_flight(open_ground, loop):
 
 def test_over_a_map_each_path_has_the_loss_of_its_own_direction(make_links):
     """A screen hides the device in the north; the wall east of both, 99 m away, is what is heard, from ahead and abeam."""
-    walls = [trimesh.creation.box(extents=extents) for extents in ([60, 2, 80], [2, 800, 80])]
-    for wall, middle in zip(walls, ([0, 50, 40], [100, 0, 40])):
-        wall.apply_translation(middle)
-    mesh = trimesh.util.concatenate(walls)
-    links = make_links([[0.0, 100, 10]], [[0.0, 0, 10]], city=CityMap(mesh.vertices, mesh.faces), heading_deg=np.zeros(1))
+    city = city_of_boxes([[-30, 49, 0], [30, 51, 80]], [[99, -400, 0], [101, 400, 80]])
+    links = make_links([[0.0, 100, 10]], [[0.0, 0, 10]], city=city, heading_deg=np.zeros(1))
     wall_deg = np.degrees(np.arctan2(198, 100))
     for azimuth_deg in (0.0, wall_deg, 180.0):
         body = Body(depth_db=10.0, azimuth_deg=azimuth_deg, width_deg=60.0)

@@ -3,14 +3,13 @@
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.stats import norm
 
 from radiotwin.effects.catalogue.building_entry import BuildingEntry, entry_loss_db
 from radiotwin.propagation.laws.log_distance import LogDistance
-from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.fitting import add_effect
 from radiotwin.twin.model.model import Model
+from tests.worlds import city_of_boxes
 
 
 @pytest.mark.parametrize("ghz, elevation_deg, building, values", [
@@ -32,12 +31,10 @@ def test_the_elevation_counts_to_either_side():
 @pytest.fixture
 def indoors(make_links):
     """A device in the street; 40 receivers inside a block, 40 outside it."""
-    box = trimesh.creation.box(extents=(60, 60, 30))
-    box.apply_translation((100, 0, 15))
     rng = np.random.default_rng(0)
     inside_m = np.column_stack([rng.uniform(75, 125, 40), rng.uniform(-25, 25, 40), rng.uniform(2, 28, 40)])
     outside_m = np.column_stack([rng.uniform(-50, 50, (40, 2)), np.full(40, 40.0)])
-    return make_links([[0.0, 0, 1.5]], np.vstack([inside_m, outside_m]), city=CityMap(box.vertices, box.faces))
+    return make_links([[0.0, 0, 1.5]], np.vstack([inside_m, outside_m]), city=city_of_boxes([[70, -30, 0], [130, 30, 30]]))
 
 
 def test_only_links_that_enter_lose(indoors, view):
@@ -70,15 +67,14 @@ def test_near_a_wall_it_is_a_matter_of_chance(indoors, make_links, view):
 
 def test_loss_and_scatter_are_found(make_links):
     """600 links of a phone: half of them in a block, with 12 dB ± 6 dB, all with 3 dB of noise; the law is told."""
-    box = trimesh.creation.box(extents=(60, 200, 30))
-    box.apply_translation((130, 0, 15))
+    block = city_of_boxes([[100, -100, 0], [160, 100, 30]])
     rng, found = np.random.default_rng(0), []
     for _ in range(3):
         x_m = np.append(rng.uniform(112, 148, 300), rng.uniform(10, 90, 300))
         receiver_m = np.column_stack([x_m, rng.uniform(-80, 80, 600), np.full(600, 1.5)])
         level_db = -40 - 24 * np.log10(np.linalg.norm(receiver_m - [0, 0, 1.5], axis=1)) + rng.normal(0, 3, 600)
         level_db[:300] -= rng.normal(12, 6, 300)
-        links = make_links([[0.0, 0, 1.5]], receiver_m, city=CityMap(box.vertices, box.faces), level_db=level_db)
+        links = make_links([[0.0, 0, 1.5]], receiver_m, city=block, level_db=level_db)
         law = LogDistance().fit(links.select(np.arange(600) >= 300).geometry, level_db[300:], None)
         added = add_effect(Model.build(links, law, 8.0).fit(), BuildingEntry())
         params = added.effects[-1].params

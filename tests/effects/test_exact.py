@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.effects.catalogue.clock_offset import ReceiverClockOffset
 from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
@@ -10,20 +9,16 @@ from radiotwin.effects.catalogue.position_errors import DevicePositionError, Rec
 from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle, only_blocker
 from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance
-from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model import fitting
 from radiotwin.twin.model.fitting import add_effect, along_paths
 from radiotwin.twin.model.model import Model
+from tests.worlds import city_of_boxes
 
 FAR_M, NEAR_M = [-300.0, 300, 60], [60.0, 0, 10]
 
 
 def boxes(*middles_m):
-    meshes = [trimesh.creation.box(extents=[20, 20, 40]) for _ in middles_m]
-    for mesh, middle_m in zip(meshes, middles_m):
-        mesh.apply_translation([*middle_m, 20])
-    mesh = trimesh.util.concatenate(meshes)
-    return CityMap(mesh.vertices, mesh.faces)
+    return city_of_boxes(*([[x - 10, y - 10, 0], [x + 10, y + 10, 40]] for x, y in middles_m))
 
 
 class CountingChannel:
@@ -64,21 +59,13 @@ def test_a_missing_building_is_in_the_map_that_the_channel_predicts_over(links):
     assert len(variation.values) == 6 and len(exactly.with_params(exactly.params, "quick").variation().values) == 7
 
 
-def test_a_moved_anchor_has_the_level_of_its_true_position(links):
-    channel, effect = CountingChannel(), DevicePositionError()
-    exactly = effect.with_params(effect.Params(device=0, move_m=(0.0, 80.0))).exactly()
-    before_m = np.linalg.norm(np.array([NEAR_M, FAR_M]) - [-60, 0, 10], axis=1)
-    after_m = np.linalg.norm(np.array([NEAR_M, FAR_M]) - [-60, 80, 10], axis=1)
-    offset_db = exactly.term(links, channel).offset_db
-    assert offset_db[0] == pytest.approx(20 - 0.1 * (after_m[0] - before_m[0]), abs=0.01)
-    assert abs(offset_db[1]) > 1
-
-
-def test_a_moved_receiver_has_the_level_of_its_true_position(links):
-    channel, effect = CountingChannel(), ReceiverPositionError()
-    exactly = effect.with_params(effect.Params(receiver=0, move_m=(0.0, 60.0, 0.0))).exactly()
-    assert exactly.term(links, channel).offset_db[0] == pytest.approx(
-        20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01)
+@pytest.mark.parametrize(("effect", "params"), [
+    (DevicePositionError(), {"device": 0, "move_m": (0.0, 60.0)}),
+    (ReceiverPositionError(), {"receiver": 0, "move_m": (0.0, 60.0, 0.0)})])
+def test_a_moved_end_has_the_level_of_its_true_position(links, effect, params):
+    exactly = effect.with_params(effect.Params(**params)).exactly()
+    offset_db = exactly.term(links, CountingChannel()).offset_db
+    assert offset_db[0] == pytest.approx(20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01) and abs(offset_db[1]) > 1
     assert exactly.variation().follows_paths
 
 
@@ -86,9 +73,9 @@ def test_at_another_time_a_receiver_is_elsewhere_along_its_way(make_links):
     """Ten metres a second to the north: six seconds later it no longer looks through the building."""
     way_m = [[60.0, 10.0 * slot, 10] for slot in range(12)]
     links = make_links([[-60.0, 0, 10]], way_m, city=boxes((0, 0)), time_s=np.arange(12.0))
-    channel, effect = CountingChannel(), ReceiverClockOffset()
+    effect = ReceiverClockOffset()
     exactly = effect.with_params(effect.Params(receiver=0, offset_s=6.0, speed_m_s=10.0)).exactly()
-    offset_db = exactly.term(links, channel).offset_db
+    offset_db = exactly.term(links, CountingChannel()).offset_db
     assert offset_db[0] == pytest.approx(20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01)
     assert exactly.variation().follows_paths
 
@@ -131,9 +118,7 @@ def found_along_paths(model):
 @pytest.mark.parametrize("seed", range(3))
 def test_a_position_whose_exact_optimum_lies_beside_the_quick_one_is_found(make_links, seed):
     """At the quick optimum the exact levels fit worse, so they were not looked at there."""
-    model = two_answers_model(make_links, seed)
-    found = found_along_paths(model)
-    effect = found.effects[-1]
+    effect = found_along_paths(two_answers_model(make_links, seed)).effects[-1]
     assert effect.is_exact and effect.params.device == 0
     assert effect.params.move_m == pytest.approx(MOVE_M, abs=2.0)
 
@@ -141,9 +126,5 @@ def test_a_position_whose_exact_optimum_lies_beside_the_quick_one_is_found(make_
 def test_paths_of_more_links_than_can_be_followed_are_not(make_links, monkeypatch):
     """The anchor has 700 links: with fewer allowed its position is that of the quick levels."""
     monkeypatch.setattr(fitting, "MAX_FOLLOWED_LINKS", 699)
-    model = two_answers_model(make_links, 0)
-    found = found_along_paths(model)
-    effect = found.effects[-1]
+    effect = found_along_paths(two_answers_model(make_links, 0)).effects[-1]
     assert not effect.is_exact and effect.params.device == 0
-    monkeypatch.setattr(fitting, "MAX_FOLLOWED_LINKS", 700)
-    assert found_along_paths(model).effects[-1].is_exact

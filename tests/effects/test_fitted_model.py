@@ -3,15 +3,14 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.effects.catalogue.lock_loss import LockLoss
 from radiotwin.effects.catalogue.path_strength import WallReflection
 from radiotwin.effects.catalogue.roof_heights import RoofHeights
 from radiotwin.inference.gaussian import LogDistanceLine
 from radiotwin.propagation.laws.log_distance import LogDistance, SegmentedLogDistance
-from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.model import Fit, FittedModel, Model, device_sd_db
+from tests.worlds import city_of_boxes
 
 
 def test_positions_are_sought_without_what_follows_paths_or_many_maps():
@@ -26,10 +25,9 @@ def test_positions_are_sought_without_what_follows_paths_or_many_maps():
 @pytest.mark.parametrize("learnt_in_sight", [True, False])
 def test_a_class_that_nothing_was_learnt_of_has_the_scale_of_the_other(make_links, learnt_in_sight):
     """A fold may hold out all links with line of sight, and a map has points that no flight saw so."""
-    wall = trimesh.creation.box(bounds=[[40, -100, 0], [80, 100, 40]])
     rng = np.random.default_rng(0)
     receiver_m = np.column_stack([rng.uniform(-60, 200, 300), rng.uniform(-80, 80, 300), np.full(300, 45.0)])
-    links = make_links([[0.0, 0, 20.0]], receiver_m, city=CityMap(wall.vertices, wall.faces))
+    links = make_links([[0.0, 0, 20.0]], receiver_m, city=city_of_boxes([[40, -100, 0], [80, 100, 40]]))
     level_db = -60 - 30 * np.log10(links.distance_m / 10) - 15 * ~links.los + rng.normal(0, 3, len(links))
     links = links.with_columns(level_db=level_db)
     learnt = links.los == learnt_in_sight

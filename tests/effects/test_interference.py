@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.effects.catalogue.interference import Interference
-from radiotwin.scene.citymap import CityMap
+from tests.worlds import city_of_boxes
 
 
 def watts(level_db):
@@ -76,9 +75,7 @@ def test_a_floor_that_is_the_same_everywhere_is_no_emitter(open_ground, loop):
 @pytest.fixture
 def walled():
     """A long wall, 60 m high, along the y axis at x = 150 m."""
-    wall = trimesh.creation.box(extents=(4, 600, 60))
-    wall.apply_translation((150, 150, 30))
-    return CityMap(wall.vertices, wall.faces)
+    return city_of_boxes([[148, -150, 0], [152, 450, 60]])
 
 
 def walled_level_db(links, exact=False):

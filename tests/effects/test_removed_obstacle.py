@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.effects.boxes import Box, buildings
 from radiotwin.effects.catalogue.missing_obstacle import MissingObstacle
 from radiotwin.effects.catalogue.removed_obstacle import RemovedObstacle
-from radiotwin.scene.citymap import CityMap
 from tests.scene.test_citymap import clip_interval
+from tests.worlds import city_of_boxes
 
 BOXES = ((-10.0, -10.0, 10.0, 10.0, 20.0), (60.0, -10.0, 80.0, 10.0, 20.0))  # x, y, x, y, height [m]
 DEVICES_M = np.array([[-15.0, 0.0, 1.5], [85.0, 3.0, 1.5]])
@@ -17,9 +16,7 @@ MIN_NATS = 6.0  # for a building to be suspected
 
 
 def city_of(boxes):
-    meshes = [trimesh.creation.box(bounds=[[*box[:2], 0], box[2:]]) for box in boxes]
-    mesh = trimesh.util.concatenate(meshes)
-    return CityMap(mesh.vertices, mesh.faces)
+    return city_of_boxes(*([[*box[:2], 0], box[2:]] for box in boxes))
 
 
 def suspected(make_links, view, true_boxes, seed=0):

@@ -2,20 +2,14 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.effects.catalogue.roof_heights import SAMPLES, roof_crossings
-from radiotwin.scene.citymap import CityMap
+from tests.worlds import city_of_boxes
 
 
 def city():
     """A block of 20 by 40 m, 30 m high, around the origin, and one of 10 by 10 m, 12 m high, 60 m to its east."""
-    ground = trimesh.creation.box(extents=[600, 600, 0.2])
-    ground.apply_translation([0, 0, -0.1])
-    block = trimesh.creation.box(bounds=[[-10, -20, 0], [10, 20, 30]])
-    other = trimesh.creation.box(bounds=[[55, -5, 0], [65, 5, 12]])
-    meshes = trimesh.util.concatenate([ground, block, other])
-    return CityMap(meshes.vertices, meshes.faces)
+    return city_of_boxes([[-10, -20, 0], [10, 20, 30]], [[55, -5, 0], [65, 5, 12]], ground_m=600)
 
 
 def test_a_way_over_two_roofs_crosses_both_at_their_walls():

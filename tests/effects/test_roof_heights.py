@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.closeloop.crossfit import make_bases
+from radiotwin.effects.boxes import buildings
 from radiotwin.effects.catalogue.roof_heights import RoofHeights, surely_off, with_model_error
 from radiotwin.effects.params import QUANTILE_90
 from radiotwin.effects.places import Roof
@@ -12,6 +12,7 @@ from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.fitting import add_effect
 from radiotwin.twin.model.model import Fit, Model
+from tests.worlds import city_of_boxes
 
 CORNERS_M = [(-80.0, -20.0), (-15.0, -15.0), (50.0, -25.0), (-40.0, 60.0)]  # south-western, of blocks of 30 by 30 m
 MAPPED_M = (20.0, 18.0, 22.0, 15.0)
@@ -19,12 +20,8 @@ BEHIND_DB = 22.0
 
 
 def city():
-    ground = trimesh.creation.box(extents=[800, 800, 0.2])
-    ground.apply_translation([0, 0, -0.1])
-    blocks = [trimesh.creation.box(bounds=[[x, y, 0], [x + 30, y + 30, top]])
-              for (x, y), top in zip(CORNERS_M, MAPPED_M, strict=True)]
-    meshes = trimesh.util.concatenate([ground, *blocks])
-    return CityMap(meshes.vertices, meshes.faces)
+    return city_of_boxes(*([[x, y, 0], [x + 30, y + 30, top]] for (x, y), top in zip(CORNERS_M, MAPPED_M, strict=True)),
+                         ground_m=800)
 
 
 def blocked(a_m, b_m, heights_m):
@@ -138,7 +135,8 @@ def test_of_a_block_that_is_gone_nothing_is_said(world):
 def test_only_links_over_a_roof_change_and_by_no_more_than_both_classes_differ(world):
     links = world(MAPPED_M)
     fit, _ = fitted(links)
-    params = RoofHeights.Params(roofs=(Roof(_number((-80.0, -20.0)), -65.0, -5.0, 20.0, 5.0, 1.0),))
+    first = int(np.argmin(np.hypot(*(buildings(city())[1][:, :2] - np.add(CORNERS_M[0], 15.0)).T)))
+    params = RoofHeights.Params(roofs=(Roof(first, -65.0, -5.0, 20.0, 5.0, 1.0),))
     change_db = RoofHeights().with_params(params).term(links, fit.model.level_at).offset_db
     a_m, b_m = links.device_m[links.device], links.receiver_m
     newly = blocked(a_m, b_m, (25.0, *MAPPED_M[1:])) & ~blocked(a_m, b_m, MAPPED_M)
@@ -147,12 +145,6 @@ def test_only_links_over_a_roof_change_and_by_no_more_than_both_classes_differ(w
     assert (change_db[newly] < -3).mean() > 0.9 and change_db[newly].min() > -1.2 * BEHIND_DB
     assert (change_db[far] == 0).all() and change_db.max() <= 0.5
 
-
-def _number(corner_m):
-    from radiotwin.effects.boxes import buildings
-
-    centres_m = buildings(city())[1]
-    return int(np.argmin(np.hypot(*(centres_m[:, :2] - np.add(corner_m, 15.0)).T)))
 
 
 def test_it_needs_a_map_a_frequency_and_the_map_that_it_was_found_on(world, make_links):

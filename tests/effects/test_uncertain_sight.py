@@ -2,26 +2,21 @@
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.stats import norm
 
 from radiotwin.closeloop.crossfit import make_bases
 from radiotwin.effects.catalogue import uncertain_sight
 from radiotwin.effects.catalogue.uncertain_sight import UncertainSight
-from radiotwin.scene.citymap import CityMap
 from radiotwin.twin.model.fitting import add_effect
 from radiotwin.twin.model.model import Model
+from tests.worlds import city_of_boxes
 
 BEHIND_DB = 20.0
 
 
 def city(walls_x_m=(-10.0, 10.0)):
     """A building of 30 m across the way from devices in the south to receivers in the north."""
-    ground = trimesh.creation.box(extents=[600, 600, 0.2])
-    ground.apply_translation([0, 0, -0.1])
-    house = trimesh.creation.box(bounds=[[walls_x_m[0], -10, 0], [walls_x_m[1], 10, 30]])
-    meshes = trimesh.util.concatenate([ground, house])
-    return CityMap(meshes.vertices, meshes.faces)
+    return city_of_boxes([[walls_x_m[0], -10, 0], [walls_x_m[1], 10, 30]], ground_m=600)
 
 
 @pytest.fixture
