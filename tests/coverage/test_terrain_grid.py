@@ -39,6 +39,7 @@ def test_behind_a_rounded_hill_is_a_loss_along_its_profile(build):
     power_dbm = coverage.dataset["received_power_dbm"].values
     distance_m = np.hypot(coverage.grid.x_m + 300, coverage.grid.y_m[:, None])
     loss_db = 30 - power_dbm - 20 * np.log10(4 * np.pi * distance_m * 2e9 / 299_792_458)
+    assert "coverage_probability" not in coverage.dataset and coverage.summary["model"].startswith("paths")
     assert np.isfinite(power_dbm).all() and 25 < loss_db.min() < loss_db.max() < 40
     assert any(each.startswith("100% of the links are behind terrain") for each in coverage.summary["notes"])
 

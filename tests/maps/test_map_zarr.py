@@ -11,22 +11,17 @@ import pytest
 import xarray as xr
 
 from radiotwin.errors import BadInput
-from radiotwin.maps.file import BLOCK_VALUES, MapStream, write_parts
+from radiotwin.maps.file import BLOCK_VALUES, write_parts
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import export_map
-from radiotwin.scene.lattice import Lattice
+from tests.maps.conftest import DTYPES, small_map
 
 zarr = pytest.importorskip("zarr", reason="the package zarr is not installed")
-LATTICE = Lattice.over(0, 40, 0, 20, 20, [50, 60])
 
 
-def example(ground=False) -> RadioMap:
-    gain_db = -np.arange(2 * 2 * 2 * 3, dtype=float).reshape(2, 2, 2, 3)
-    gain_db[1, 0, 1, 2] = np.nan
-    lattice = Lattice(LATTICE.x_m, LATTICE.y_m, LATTICE.z_m, np.full((2, 3), 7.5)) if ground else LATTICE
-    return RadioMap.build(["a", "bé"], lattice, gain_db, gain_db > -10, gain_db * 0 + 3,
-                          {"frequency_hz": 2.4e9, "origin_latitude_deg": 47.5, "origin_longitude_deg": 8.7, "seed": 3,
-                           "noise_floor_db": float("nan"), "bounds_m": np.array([0.0, 40.0]), "source": "tést"})
+def example(ground=False):
+    return small_map(ground, origin_latitude_deg=47.5, origin_longitude_deg=8.7, seed=3, noise_floor_db=float("nan"),
+                     bounds_m=np.array([0.0, 40.0]), source="tést")
 
 
 @pytest.fixture
@@ -66,19 +61,9 @@ def test_others_read_it_with_units_reference_system_and_dask(folder):
     assert float(dataset["gain_db"].sel(device="bé", x=0, y=0, z=50).compute()) == -12
 
 
-def test_a_large_map_is_written_a_block_a_piece(tmp_path):
-    lattice = Lattice(np.arange(0.0, 700.0), np.arange(0.0, 900.0), np.array([50.0]))
-    made = []
-
-    def make(device, part):
-        made.append(part.shape)
-        x_m, y_m, _ = part.positions_m.T
-        gain_db = (-50 - x_m / 100 - y_m / 100).reshape(part.shape)
-        return {"gain_db": gain_db, "los": gain_db > -55, "sigma_db": gain_db * 0 + 3}
-
-    stream = MapStream(["a"], lattice, {}, ("gain_db", "los", "sigma_db"), make)
-    write_parts(stream.header, {"gain_db": np.dtype("f4"), "los": np.dtype(bool), "sigma_db": np.dtype("f4")},
-                stream.blocks(), tmp_path / "map.zarr")
+def test_a_large_map_is_written_a_block_a_piece(tmp_path, large_stream):
+    stream, made = large_stream
+    write_parts(stream.header, DTYPES, stream.blocks(), tmp_path / "map.zarr")
     pieces = [path for path in (tmp_path / "map.zarr" / "gain_db" / "c").rglob("*") if path.is_file()]
     assert len(pieces) == len(made) > 3 and max(map(np.prod, made)) <= BLOCK_VALUES
     xr.testing.assert_identical(RadioMap.load(tmp_path / "map.zarr").dataset, RadioMap.collect(stream).dataset)
@@ -102,7 +87,7 @@ def test_a_run_that_fails_leaves_the_older_map(folder):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_parts(example().header, {"gain_db": np.dtype("f4"), "los": np.dtype(bool), "sigma_db": np.dtype("f4")}, broken(), folder)
+        write_parts(example().header, DTYPES, broken(), folder)
     assert [path.name for path in folder.parent.iterdir()] == ["map.zarr"]
     xr.testing.assert_identical(RadioMap.load(folder).dataset, example().dataset)
 

@@ -9,40 +9,33 @@ from radiotwin.errors import BadInput
 from radiotwin.maps.file import BLOCK_VALUES, MapStream, parts_of, write_blocks
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene.lattice import Lattice
-
-LATTICE = Lattice.over(0, 40, 0, 20, 20, [50, 60])
-
-
-def example() -> RadioMap:
-    gain_db = -np.arange(2 * 2 * 2 * 3, dtype=float).reshape(2, 2, 2, 3)
-    gain_db[1, 0, 1, 2] = np.nan
-    return RadioMap.build(["a", "b"], LATTICE, gain_db, gain_db > -10, attributes={"frequency_hz": 2.4e9})
+from tests.maps.conftest import DTYPES, LATTICE, small_map
 
 
 def test_a_map_comes_back_from_its_file_as_it_was(tmp_path):
-    example().save(tmp_path / "map.nc")
+    small_map().save(tmp_path / "map.nc")
     again = RadioMap.load(tmp_path / "map.nc")
-    xr.testing.assert_identical(again.dataset, example().dataset)
-    assert again.devices == ["a", "b"]
+    xr.testing.assert_identical(again.dataset, small_map().dataset)
+    assert again.devices == ["a", "bé"]
     assert again.los.dtype == bool and again.gain_db.dtype == np.float32
     np.testing.assert_array_equal(again.lattice.positions_m, LATTICE.positions_m)
 
 
 def test_a_map_whose_name_is_in_capitals(tmp_path):
-    example().save(tmp_path / "MAP.NC")
+    small_map().save(tmp_path / "MAP.NC")
     with open_model(tmp_path / "MAP.NC") as radio_map:
-        assert radio_map.devices == ["a", "b"]
+        assert radio_map.devices == ["a", "bé"]
 
 
 def test_values_lie_where_the_lattice_says():
-    radio_map = example()
-    value = radio_map.dataset["gain_db"].sel(device="b", x=40, y=0, z=60).item()
+    radio_map = small_map()
+    value = radio_map.dataset["gain_db"].sel(device="bé", x=40, y=0, z=60).item()
     index = LATTICE.index_of(np.array([[40.0, 0.0, 60.0]]))[0]
     assert value == radio_map.gain_db[1].ravel()[index] == -(12 + index)
 
 
 def test_units_are_in_the_file(tmp_path):
-    example().save(tmp_path / "map.nc")
+    small_map().save(tmp_path / "map.nc")
     with xr.open_dataset(tmp_path / "map.nc", engine="h5netcdf") as dataset:
         assert dataset["gain_db"].attrs["units"] == "dB" and dataset["x"].attrs["units"] == "m"
 
@@ -50,7 +43,7 @@ def test_units_are_in_the_file(tmp_path):
 def test_what_is_not_a_radio_map_is_bad_input(tmp_path):
     with pytest.raises(BadInput, match="does not exist"):
         RadioMap.load(tmp_path / "no.nc")
-    example().save(tmp_path / "map.nc")
+    small_map().save(tmp_path / "map.nc")
     data = (tmp_path / "map.nc").read_bytes()
     (tmp_path / "half.nc").write_bytes(data[: len(data) // 2])
     with pytest.raises(BadInput, match="not a readable NetCDF-4 file"):
@@ -88,7 +81,7 @@ def test_what_is_not_a_radio_map_is_bad_input(tmp_path):
     (lambda d: d.assign_attrs(origin_latitude_deg=1e308), "origin_latitude_deg is not within 90"),
 ])
 def test_a_part_that_is_not_as_it_must_be_is_named(tmp_path, change, message):
-    dataset = change(example().dataset)
+    dataset = change(small_map().dataset)
     for name in dataset.variables:
         dataset[name].encoding = {}
     dataset.to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
@@ -111,21 +104,10 @@ def test_parts_cover_every_position_once_in_order_and_are_small(shape):
     np.testing.assert_array_equal(np.concatenate(seen), index.ravel())
 
 
-def test_a_stream_is_the_map_that_it_collects_to(tmp_path):
-    """A map larger than a block and than what HDF5 stores in pieces of its own choice."""
-    lattice = Lattice(np.arange(0.0, 1100.0), np.arange(0.0, 1000.0), np.array([50.0]))
-    asked = []
-
-    def make(device, part):
-        asked.append(part.shape)
-        x_m, y_m, _ = part.positions_m.T
-        gain_db = (-50 - (3 if device == "b" else 1) * x_m / 100 - y_m / 100).reshape(part.shape)
-        return {"gain_db": gain_db, "los": gain_db > -55, "sigma_db": gain_db * 0 + 3}
-
-    stream = MapStream(["a", "b"], lattice, {"source": "test"}, ("gain_db", "los", "sigma_db"), make)
-    write_blocks(stream.header, {"gain_db": np.dtype("f4"), "los": np.dtype(bool), "sigma_db": np.dtype("f4")},
-                 stream.blocks(), tmp_path / "stream.nc")
-    assert max(np.prod(shape) for shape in asked) <= BLOCK_VALUES
+def test_a_stream_is_the_map_that_it_collects_to(tmp_path, large_stream):
+    stream, made = large_stream
+    write_blocks(stream.header, DTYPES, stream.blocks(), tmp_path / "stream.nc")
+    assert max(np.prod(shape) for shape in made) <= BLOCK_VALUES
     again = RadioMap.load(tmp_path / "stream.nc")
     xr.testing.assert_identical(again.dataset, RadioMap.collect(stream).dataset)
     assert again.dataset["gain_db"].sel(device="b", x=200, y=100, z=50) == -57
