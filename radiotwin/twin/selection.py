@@ -115,11 +115,12 @@ class HeldOut:
         errors = ", ".join(f"{name} {rmse_db:.2f}" for name, rmse_db in self.rmse_db.items())
         text = f"RMSE on anchors' links held out by {self.by} [dB]: {errors}."
         if model not in self.rmse_db:
-            return f"{text} {model} was not tried: it takes too long"
-        if model == self.best:
-            return f"{text} {model} is the simplest that is as good as any of them"
+            return f"{text} {model} was not compared with them"
+        if self.rmse_db[model] == min(self.rmse_db.values()):
+            return f"{text} {model} has the least"
         if model in self.as_good:
-            return f"{text} {model} is as good as any of them"
+            simplest = ", and the simplest such model" if model == self.best else ""
+            return f"{text} {model} is as good as the best{simplest}"
         return (f"{text} {self.best} would be better: {self.rmse_db[self.best]:.2f} dB, where "
                 f"{model} has {self.rmse_db[model]:.2f} dB; take --model {self.best}, or --model "
                 f"{AUTO}")

@@ -1,7 +1,7 @@
-"""Planned flights as files that fly, or that people look at: QGroundControl, KML, GeoJSON, CSV.
+"""Write planned flights for QGroundControl, and as KML, GeoJSON and CSV.
 
-One waypoint a turn, with the time to hover there. Heights are metres above the take-off point,
-which flight controllers keep by their barometer; KML and GeoJSON have them above the scene's datum.
+There is a waypoint at each turn, with the time to hover. Heights are above the take-off point,
+since flight controllers hold them by barometer; in KML and GeoJSON they are above the sea.
 """
 
 import json
@@ -21,20 +21,20 @@ from radiotwin.io.forms import Origin
 # Commands of MAVLink (common.xml), and the frame of altitudes above the take-off point.
 TAKE_OFF, WAYPOINT, RETURN, LAND, CHANGE_SPEED = 22, 16, 20, 21, 178
 RELATIVE, NO_FRAME = 3, 2
-PX4, MULTIROTOR = 12, 2  # of QGroundControl, which sends it to other controllers, too
+PX4, MULTIROTOR = 12, 2  # in QGroundControl, which translates plans for other controllers
 KML = "http://www.opengis.net/kml/2.2"
 
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """The flight of one UAV.
+    """The flight of one UAV as n waypoints.
 
     Attributes:
         name: of the UAV.
-        position_m: (n, 3) waypoints above the datum [m].
-        hold_s: (n,) time to hover at each [s].
-        speed_m_s: between them.
-        start_ground_m: height of the ground at the first one [m].
+        position_m: (n, 3) waypoints; z is above the datum [m].
+        hold_s: (n,) time to hover at each waypoint [s].
+        speed_m_s: speed between waypoints [m/s].
+        start_ground_m: height of the ground at the first waypoint [m].
     """
 
     name: str
@@ -46,13 +46,13 @@ class Route:
     @classmethod
     def along(cls, name: str, track_m: np.ndarray, slot_s: float, speed_m_s: float,
               start_ground_m: float = 0.0) -> "Route":
-        """Return the waypoints of a track.
+        """Reduce a track to waypoints where the UAV turns or hovers.
 
         Args:
             name: of the UAV.
-            track_m: (slots, 3) position in every slot [m]; the same in two of them is a hover.
+            track_m: (slots, 3) position in every slot [m]; the UAV hovers while it stays the same.
             slot_s: duration of a slot [s].
-            speed_m_s: of a move.
+            speed_m_s: speed of a move [m/s].
             start_ground_m: see `Route`.
         """
         moves = np.linalg.norm(np.diff(track_m, axis=0), axis=1) > 0
@@ -66,17 +66,17 @@ class Route:
 
     @property
     def arrival_s(self) -> np.ndarray:
-        """(n,) time of arrival at each waypoint, after take-off [s]."""
+        """Time of arrival at each waypoint (n,), after take-off [s]."""
         legs_m = np.linalg.norm(np.diff(self.position_m, axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(self.hold_s[:-1] + legs_m / self.speed_m_s)])
 
     @property
     def above_start_m(self) -> np.ndarray:
-        """(n,) heights above the take-off point [m]."""
+        """Height of each waypoint (n,) above the take-off point [m]."""
         return self.position_m[:, 2] - self.start_ground_m
 
     def table(self, origin: Origin | None) -> pd.DataFrame:
-        """Return a row for each waypoint; longitude and latitude where the origin is known."""
+        """Return a row for each waypoint, with longitude and latitude if there is an origin."""
         x_m, y_m, z_m = self.position_m.T
         table = pd.DataFrame({
             "uav": self.name, "waypoint": np.arange(len(x_m)), "time_s": self.arrival_s,
@@ -92,10 +92,10 @@ class Route:
 
 
 def write_flight_files(routes: Iterable[Route], origin: Origin | None, folder: Path) -> list[str]:
-    """Write `flights.csv`, and where the origin is known `.plan`, `.kml` and `.geojson`.
+    """Write `flights.csv`; with an origin also `flights.kml`, `.geojson` and a `.plan` a UAV.
 
     Returns:
-        Names of the files.
+        Names of the files written.
     """
     tables = [route.table(origin) for route in routes]
     names = ["flights.csv"]
@@ -149,6 +149,7 @@ def _plan(route: Route, table: pd.DataFrame, origin: Origin) -> dict:
 
 
 def _coordinates(table: pd.DataFrame) -> list[list[float]]:
+    """Return longitude, latitude [degrees] and altitude [m] of each waypoint."""
     return table[["longitude_deg", "latitude_deg", "altitude_m"]].to_numpy().tolist()
 
 

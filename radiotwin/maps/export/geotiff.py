@@ -1,4 +1,4 @@
-"""Radio maps as GeoTIFF: one band for each device and altitude, for GIS programs."""
+"""Write radio maps as GeoTIFF, with a band for each device and altitude, for GIS programs."""
 
 import errno
 import zlib
@@ -17,7 +17,7 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 
 MAX_BANDS = 65_535  # of the format
-_WHOLE_VALUES = 2**24  # of a map whose bands are interleaved pixel by pixel
+_WHOLE_VALUES = 2**24  # up to so many values a map is written whole, bands interleaved by pixel
 GDAL_OPTIONS = {"GTIFF_WRITE_TOWGS84": "NO", "GDAL_CACHEMAX": 2**26}  # the cache in bytes
 
 
@@ -70,9 +70,9 @@ def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
 
 def _write_parts(radio_map: RadioMap | MapStream, path: Path, profile: dict[str, Any],
                  describe: Callable[[Any], None]) -> None:
-    """Write a large map part by part to the disk.
+    """Write a large map to the disk block by block.
 
-    GDAL hides errors of a full disk: what it wrote is read again and compared by its checksums.
+    GDAL hides errors of a full disk, so every block is read again and its checksum compared.
 
     Raises:
         RunFailed: the disk is full or failed.
@@ -102,7 +102,7 @@ def _write_parts(radio_map: RadioMap | MapStream, path: Path, profile: dict[str,
 
 
 def require_rasterio(path: Path) -> Any:
-    """Return the package rasterio, or raise BadInput, which names the file to be written."""
+    """Import rasterio; raise BadInput that names the file to write if it is not installed."""
     return optional_package(
         "rasterio", f"{path}: GeoTIFF is written with the package rasterio, which is not "
                     "installed; install it with `pip install 'radiotwin[gis]'`, or write .nc or "
@@ -119,10 +119,13 @@ def require_origin(scene: Scene, purpose: str) -> Origin:
 
 def georeference(x_m: np.ndarray, y_m: np.ndarray, step_m: float,
                  origin: Origin | None) -> dict[str, Any]:
-    """Return the reference system and the transform of a raster, north up, for rasterio.
+    """Return rasterio's `crs` and `transform` of a raster, north up.
 
-    Middles of its cells are at x (nx,) and y (ny,), ascending [m]. Without an origin coordinates
-    are local, without a system.
+    Args:
+        x_m: (nx,) middles of the cells, ascending [m].
+        y_m: (ny,) likewise [m].
+        step_m: side of a cell [m].
+        origin: of the local frame; None: no reference system, coordinates are local metres.
     """
     import rasterio
 
@@ -132,30 +135,30 @@ def georeference(x_m: np.ndarray, y_m: np.ndarray, step_m: float,
 
 
 def _north_up(block: MapBlock) -> np.ndarray:
-    """Return the gains (bands, rows, columns) of a block [dB], its first row in the north."""
+    """Return the gains (bands, rows, columns) of a block [dB], northern row first."""
     gain_db = block.values["gain_db"]
     values = gain_db.reshape(-1, *gain_db.shape[2:])[:, ::-1]
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
 def _bands(block: MapBlock, levels: int) -> slice:
-    """Return the bands of a block, counted from 0: devices first, then levels."""
+    """Return the bands of a block as indices from 0; levels vary fastest."""
     row, z, _, _ = block.where
     first = row.start * levels + z.start
     return slice(first, first + z.stop - z.start)
 
 
 def _window(block: MapBlock, height: int) -> tuple[slice, slice]:
-    """Return rows and columns of a block in a raster of so many rows, north up."""
+    """Return the rows and columns of a block in a raster with `height` rows, north up."""
     _, _, y, x = block.where
     return slice(height - y.stop, height - y.start), x
 
 
 def cell_size_m(radio_map: RadioMap | MapStream, scene: Scene) -> float:
-    """Return the side of a cell: the lattice's step, or the scene's for a map of one position [m].
+    """Return the side of a map's cells [m]: its lattice's step, or the scene's for one position.
 
     Raises:
-        BadInput: the positions are not equally far apart.
+        BadInput: the positions are not evenly spaced.
     """
     step_m = radio_map.lattice.step_m or scene.config.lattice.step_m
     for axis_m in (radio_map.lattice.x_m, radio_map.lattice.y_m):

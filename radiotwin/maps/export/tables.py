@@ -1,7 +1,6 @@
-"""Radio maps as numbers: NetCDF, Zarr, CSV and NumPy; and losses between nodes for ns-3.
+"""Write radio maps as NetCDF, Zarr, CSV and NumPy, and losses between nodes for ns-3.
 
-The MatrixPropagationLossModel of ns-3 holds one loss for each pair of nodes, and none that changes
-with time [1].
+The MatrixPropagationLossModel of ns-3 has one constant loss for each pair of nodes [1].
 
 [1] ns-3 manual, "Propagation": MatrixPropagationLossModel::SetLoss, SetDefaultLoss.
 """
@@ -23,13 +22,13 @@ from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
 
-MAX_ORIGIN_DIFFERENCE = 1e-6  # [degrees, or metres of altitude] of one place, after rounding
+MAX_ORIGIN_DIFFERENCE = 1e-6  # by rounding, between origins of one place [degrees, or m altitude]
 NODES, LOSSES = "nodes.csv", "losses.csv"
 _POSITION = ["x_m", "y_m", "z_m"]
 
 
 def write_dataset(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
-    """Write NetCDF-4 or Zarr after the CF conventions, with the scene's origin."""
+    """Write NetCDF-4 or Zarr by the CF conventions, with the scene's origin."""
     placed = radio_map.placed(scene.config.origin)
     if isinstance(placed, RadioMap):
         placed.save(path)
@@ -39,7 +38,7 @@ def write_dataset(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
 
 
 def write_csv(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
-    """Write CSV with one row a link; the scene is not used.
+    """Write CSV with a row for each link; the scene is not used.
 
     Columns: device, x_m, y_m, z_m, gain_db (empty: not detected), los, and sigma_db of a learned
     map. Nine digits restore single precision to the bit.
@@ -53,7 +52,7 @@ def write_csv(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None
 
 
 def _rows(block: MapBlock, devices: list[str], lattice: Lattice) -> pd.DataFrame:
-    """Return the links of a block, one a row."""
+    """Return a row for each link of a block."""
     row, z, y, x = block.where
     z_m, y_m, x_m = np.meshgrid(lattice.z_m[z], lattice.y_m[y], lattice.x_m[x], indexing="ij")
     names = np.repeat(np.array(devices[row], dtype=object), z_m.size)
@@ -66,7 +65,7 @@ def _rows(block: MapBlock, devices: list[str], lattice: Lattice) -> pd.DataFrame
 
 
 def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
-    """Write NumPy arrays, which `numpy.load` reads without pickling; the scene is not used.
+    """Write NumPy arrays that `numpy.load` reads without pickle; the scene is not used.
 
     Arrays: gain_db, los and sigma_db (device, z, y, x), device, z_m, y_m, x_m; and ground_m (y, x)
     where z_m is above the ground.
@@ -84,10 +83,13 @@ def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
 
 
 def check_map_place(name: str, attributes: dict[str, Any], scene: Scene) -> None:
-    """Refuse a map of another city, which would get the outlines and the origin of this one.
+    """Check that a map is of a scene's place; else it would get the scene's outlines and origin.
+
+    Warns:
+        The map was made for another version of the scene.
 
     Raises:
-        BadInput: their origins differ.
+        BadInput: map and scene have different origins.
     """
     origin = scene.config.origin
     for key, value in ({} if origin is None else origin.model_dump()).items():
@@ -120,7 +122,7 @@ def write_ns3(devices: pd.DataFrame, points_m: np.ndarray, gain_db: np.ndarray,
         number of pairs.
 
     Raises:
-        BadInput: no gain at all, or a device without a position, or one that is called as a point.
+        BadInput: no gain at all, a device without a position, or with the name of a point.
     """
     names = [f"point{number}" for number in range(len(points_m))]
     unplaced = ~np.isfinite(devices[_POSITION].to_numpy(dtype=float)).all(axis=1)
