@@ -74,7 +74,7 @@ class Session:
         keep_memory()
         scene = Scene.load(self.run.scene)
         truth = read_truth(scene, self.run.truth)
-        truth.require_of(scene)
+        truth.require_made_for(scene)
         # Complain before anything is written.
         mission = make_mission(scene, truth, Known.truth(scene), self.run.assignment)
         check_sizes(self.run, self.learner, mission)

@@ -49,7 +49,7 @@ def learn(seed: int, settings: dict) -> dict:
     run = RunSettings(**_own(RunSettings, values))
     learner = LearnerSettings(**_own(LearnerSettings, values))
     scene, truth = tables.load_world(settings)
-    truth.require_of(scene)
+    truth.require_made_for(scene)
     total = run.real_episodes * run.episodes
     with progress(f"{run.algorithm}, seed {seed}", total=total) as advance:
         outcome = run_algorithm(run, learner, scene, truth, None, False, lambda rows, blocks: None,

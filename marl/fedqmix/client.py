@@ -179,5 +179,5 @@ def _campaign(run: RunSettings, scene: Scene, party: Party) -> Campaign:
         measured = in_scene_frame(read_measurements(party.measurements), scene)
     if measured is None or (scene.folder / "truth.nc").exists():
         truth = read_truth(scene, party.truth)
-        truth.require_of(scene)
+        truth.require_made_for(scene)
     return Campaign(run, scene, truth, measured)

@@ -120,14 +120,14 @@ class CoverageGrid:
         Args:
             x_m: (n,) to the east [m].
             y_m: (n,) to the north [m].
-            city: 3D map with the ground below the receivers, see `with_terrain`.
+            city: 3D map with the ground below the receivers, see `with_ground_as_terrain`.
         """
         bottom_m = city.ground_height_m(x_m, y_m) if self.above_ground else 0.0
         return np.column_stack([x_m, y_m, np.broadcast_to(bottom_m + self.height_m, x_m.shape)])
 
 
 @lru_cache(maxsize=2)  # a map is large
-def with_terrain(city: CityMap) -> CityMap:
+def with_ground_as_terrain(city: CityMap) -> CityMap:
     """Return the map with its ground faces as terrain, unless the ground is flat at the datum."""
     if city.terrain is not None:
         return city
@@ -180,7 +180,7 @@ def read_areas(path: Path | str, scene: Scene) -> list[Area]:
                  shapely.make_valid(shapely.transform(each.area, project))) for each in features]
 
 
-def class_lists(settings: CoverageSettings, bandwidth_hz: float) -> dict[str, tuple[float, ...]]:
+def class_bounds(settings: CoverageSettings, bandwidth_hz: float) -> dict[str, tuple[float, ...]]:
     """Return the lower ends of the classes of each raster, descending.
 
     Args:
@@ -206,7 +206,7 @@ def area_records(dataset: xr.Dataset, grid: CoverageGrid, transmitters: Sequence
         grid: its cells.
         transmitters: the servers, by index.
         settings: threshold, reliability and indoor loss.
-        classes: descending thresholds by raster, see `class_lists`.
+        classes: descending thresholds by raster, see `class_bounds`.
         areas: polygons.
 
     Returns:
@@ -219,17 +219,17 @@ def area_records(dataset: xr.Dataset, grid: CoverageGrid, transmitters: Sequence
     counted = np.ones_like(indoor) if settings.indoor_loss_db is not None else ~indoor
     if not counted.any():
         raise BadInput("every cell is inside a building; give --indoor-loss-db to predict there")
-    records = [_record("extent", dataset, counted, grid, transmitters, settings, classes)]
+    records = [_area_record("extent", dataset, counted, grid, transmitters, settings, classes)]
     for area in areas:
         inside = cells_in(area.outline, grid)
         if not (inside & counted).any():
             reason = "all of its cells are inside buildings" if inside.any() else (
                 "no cell's middle lies in it: it is outside the extent, or smaller than a cell")
             raise BadInput(f"area {area.name!r}: {reason}")
-        records.append(_record(area.name, dataset, inside & counted, grid, transmitters, settings,
-                               classes) | {"outline_m2": float(area.outline.area),
-                                           "cells_left_out_indoors": int((inside & ~counted).sum())}
-                       )
+        record = _area_record(area.name, dataset, inside & counted, grid, transmitters, settings,
+                              classes)
+        records.append(record | {"outline_m2": float(area.outline.area),
+                                 "cells_left_out_indoors": int((inside & ~counted).sum())})
     return records
 
 
@@ -243,9 +243,9 @@ def cells_in(outline: BaseGeometry, grid: CoverageGrid) -> np.ndarray:
     return found
 
 
-def _record(name: str, dataset: xr.Dataset, where: np.ndarray, grid: CoverageGrid,
-            transmitters: Sequence[Transmitter], settings: CoverageSettings,
-            classes: dict[str, tuple[float, ...]]) -> dict[str, Any]:
+def _area_record(name: str, dataset: xr.Dataset, where: np.ndarray, grid: CoverageGrid,
+                 transmitters: Sequence[Transmitter], settings: CoverageSettings,
+                 classes: dict[str, tuple[float, ...]]) -> dict[str, Any]:
     """Compute the shares of one area, given its mask of cells (ny, nx); see `area_records`."""
     cell_m2, n = grid.step_m**2, int(where.sum())
     power_dbm = dataset["received_power_dbm"].values[where]
@@ -254,7 +254,7 @@ def _record(name: str, dataset: xr.Dataset, where: np.ndarray, grid: CoverageGri
     thresholds = sorted({*settings.classes_dbm, settings.threshold_dbm}, reverse=True)
     record: dict[str, Any] = {
         "area": name, "cells": n, "area_m2": n * cell_m2, "step_m": grid.step_m,
-        "received_power_dbm": [_covered(power_dbm, sd_db, level_dbm, settings.reliability)
+        "received_power_dbm": [_covered_shares(power_dbm, sd_db, level_dbm, settings.reliability)
                                for level_dbm in thresholds]}
     for key in ("snr_db", "sinr_db", "rate_bps"):
         values = dataset[key].values[where]
@@ -269,8 +269,8 @@ def _record(name: str, dataset: xr.Dataset, where: np.ndarray, grid: CoverageGri
     return record
 
 
-def _covered(power_dbm: np.ndarray, sd_db: np.ndarray | None, threshold_dbm: float,
-             reliability: float) -> dict[str, float]:
+def _covered_shares(power_dbm: np.ndarray, sd_db: np.ndarray | None, threshold_dbm: float,
+                    reliability: float) -> dict[str, float]:
     """Compute which share of cells reaches a threshold [dBm].
 
     `share` counts cells whose median power does, `share_reliable` cells whose location probability

@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from pyproj import CRS
 
-from radiotwin.coverage.areas import class_lists
+from radiotwin.coverage.areas import class_bounds
 from radiotwin.coverage.run import Coverage
 from radiotwin.errors import BadInput
 from radiotwin.geo import local_crs, to_geographic
@@ -89,7 +89,7 @@ def legend_of(name: str, coverage: Coverage) -> Legend:
         colours = [to_hex(palette[order[row % len(order)]]) for row in range(len(names))]
         return Legend("Best server", (), tuple(names), tuple(colours))
     title, unit, factor, colours_name = _RASTERS[name]
-    lower = class_lists(coverage.settings, coverage.dataset.attrs["bandwidth_hz"])[name]
+    lower = class_bounds(coverage.settings, coverage.dataset.attrs["bandwidth_hz"])[name]
     shown = [f"{each * factor:.4g}".replace("-", "−") for each in lower]
     if name == "coverage_probability":
         title += f", received power ≥ {_text(coverage.settings.threshold_dbm)} dBm"

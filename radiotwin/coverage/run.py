@@ -11,7 +11,13 @@ import xarray as xr
 from scipy.special import ndtri
 
 import radiotwin
-from radiotwin.coverage.areas import Area, CoverageGrid, area_records, class_lists, with_terrain
+from radiotwin.coverage.areas import (
+    Area,
+    CoverageGrid,
+    area_records,
+    class_bounds,
+    with_ground_as_terrain,
+)
 from radiotwin.coverage.radio import (
     Bounds,
     CoverageSettings,
@@ -24,7 +30,7 @@ from radiotwin.coverage.radio import (
 from radiotwin.coverage.sources import (
     GainSource,
     altitude_row,
-    completed,
+    filled_in_from_twin,
     source_of_map,
     source_of_twin,
     source_over,
@@ -109,7 +115,7 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene | Path | str,
     scene, settings = Scene.of(scene), settings or CoverageSettings()
     settings.check()
     chosen = _transmitters(source, scene, transmitters, devices, settings)
-    grid, gains = _prepare(source, scene, chosen, settings)
+    grid, gains = _grid_and_gains(source, scene, chosen, settings)
     bandwidth_hz = settings.bandwidth_hz or scene.config.radio.bandwidth_hz
     noise_figure_db = _noise_figure_db(scene, settings)
     noise_dbm = thermal_noise_dbm(bandwidth_hz) + noise_figure_db
@@ -139,7 +145,8 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
     """
     found = scene_transmitters(scene) if given is None else list(given)
     if isinstance(source, Twin):
-        found = completed(source, twin_transmitters(source, found) if given is None else found)
+        found = filled_in_from_twin(source, twin_transmitters(source, found) if given is None
+                                    else found)
     elif given is None and isinstance(source, RadioMap):
         by_name = {each.name: each for each in found}
         # The map holds the gains, so positions of its devices are not needed.
@@ -163,7 +170,7 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
                                "other transmitters than it was made for; leave it out with "
                                "--devices, or give a twin or a scene")
     if given is not None:
-        found = _outdoors(found, scene)
+        found = _moved_outdoors(found, scene)
     tx_power_dbm = settings.tx_power_dbm
     if isinstance(source, Twin) and not source.has_gains:
         if tx_power_dbm is not None:
@@ -176,7 +183,7 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
     return with_defaults(found, scene, tx_power_dbm, settings.load)
 
 
-def _outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Transmitter]:
+def _moved_outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Transmitter]:
     """Move transmitters that are barely inside a building, within the map's accuracy, outside.
 
     Warns:
@@ -205,8 +212,8 @@ def _outdoors(transmitters: list[Transmitter], scene: Scene) -> list[Transmitter
     return found
 
 
-def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Transmitter],
-             settings: CoverageSettings) -> tuple[CoverageGrid, GainSource]:
+def _grid_and_gains(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Transmitter],
+                    settings: CoverageSettings) -> tuple[CoverageGrid, GainSource]:
     """Return the grid of cells, and the model of the gains there."""
     if isinstance(source, RadioMap):
         for name, value in (("step", settings.step_m), ("extent", settings.extent_m)):
@@ -217,7 +224,7 @@ def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Tra
         level = altitude_row(source, settings.height_m)
         return (CoverageGrid.of_map(source.lattice, level),
                 source_of_map(source, level, transmitters))
-    _refuse_elsewhere(settings.extent_m, scene)
+    _refuse_extent_off_map(settings.extent_m, scene)
     grid = CoverageGrid.over(
         settings.extent_m or scene.config.extent.bounds, settings.step_m or DEFAULT_STEP_M,
         settings.height_m or DEFAULT_HEIGHT_M)
@@ -230,7 +237,7 @@ def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Tra
     return grid, source_over(source, scene, transmitters)
 
 
-def _refuse_elsewhere(extent_m: Bounds | None, scene: Scene) -> None:
+def _refuse_extent_off_map(extent_m: Bounds | None, scene: Scene) -> None:
     """Raise BadInput if an extent (x_min, x_max, y_min, y_max) [m] does not overlap the map."""
     west, east, south, north = scene.config.extent.bounds
     if extent_m is None:
@@ -262,7 +269,7 @@ def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], g
     """Predict all cells in blocks of rows; return the variables (ny, nx) by name."""
     frequencies_hz = sorted({each.frequency_hz or 0.0 for each in transmitters})
     overlap = channel_overlap(np.array(frequencies_hz), bandwidth_hz, settings.aclr_db)
-    shape, ground = grid.shape, with_terrain(scene.city)
+    shape, ground = grid.shape, with_ground_as_terrain(scene.city)
     values = {name: np.full(shape, np.nan, np.float32) for name in (
         "received_power_dbm", "received_power_sd_db", "snr_db", "sinr_db", "rate_bps",
         "coverage_probability")}
@@ -323,7 +330,7 @@ def _some_receivers(dataset: xr.Dataset, grid: CoverageGrid, scene: Scene) -> np
     chosen = outside[::max(1, -(-len(outside) // NOTED_RECEIVERS))]
     y_m, x_m = (axis[rows] for axis, rows in zip((grid.y_m, grid.x_m),
                                                  np.unravel_index(chosen, grid.shape)))
-    return grid.at_height(x_m, y_m, with_terrain(scene.city))
+    return grid.at_height(x_m, y_m, with_ground_as_terrain(scene.city))
 
 
 def _known(position_m: np.ndarray) -> list[float | None]:
@@ -365,4 +372,4 @@ def _summary(dataset: xr.Dataset, transmitters: list[Transmitter], grid: Coverag
                                                  "tilt_deg": each.antenna.tilt_deg})}
             for each in transmitters],
         "areas": area_records(dataset, grid, transmitters, settings,
-                              class_lists(settings, bandwidth_hz), areas)}
+                              class_bounds(settings, bandwidth_hz), areas)}

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from radiotwin.coverage.areas import with_terrain
+from radiotwin.coverage.areas import with_ground_as_terrain
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.display import some
 from radiotwin.errors import BadInput
@@ -62,7 +62,7 @@ def source_over(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -
     Raises:
         BadInput: no such model, or one that is learnt from measurements.
     """
-    kind, city = channel_named(model), with_terrain(scene.city)
+    kind, city = channel_named(model), with_ground_as_terrain(scene.city)
     if kind is ImagePaths:
         source = _source_of_paths(city, transmitters)
     elif issubclass(kind, PublishedLaw):
@@ -296,7 +296,7 @@ def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Trans
             for each in twin.devices if each.located]
 
 
-def completed(twin: Twin, transmitters: Sequence[Transmitter]) -> list[Transmitter]:
+def filled_in_from_twin(twin: Twin, transmitters: Sequence[Transmitter]) -> list[Transmitter]:
     """Fill in radio settings that a transmitter lacks and the twin's device of that name has."""
     radio_of = dict(zip((each.device for each in twin.devices), twin.declared.radios))
     return [replace(each, **{name: getattr(radio_of[each.name], name) for name in (

@@ -110,9 +110,9 @@ class MapStream:
                                    {name: values[name][None] for name in self.variables})
                     advance(1)
 
-    def placed(self, origin: Origin | None) -> "MapStream":
+    def with_origin(self, origin: Origin | None) -> "MapStream":
         """Return the map with the origin of its local frame replaced; None removes it."""
-        return replace(self, attributes=placed_attributes(self.attributes, origin))
+        return replace(self, attributes=attributes_with_origin(self.attributes, origin))
 
     def selected(self, devices: list[str], lattice: Lattice) -> "MapStream":
         """Return the map of the given devices on the given levels of its lattice."""
@@ -157,8 +157,8 @@ def header(devices: list[str], lattice: Lattice, attributes: dict[str, Any] | No
     return dataset
 
 
-def placed_attributes(attributes: dict[Hashable, Any] | dict[str, Any],
-                      origin: Origin | None) -> dict[str, Any]:
+def attributes_with_origin(attributes: dict[Hashable, Any] | dict[str, Any],
+                           origin: Origin | None) -> dict[str, Any]:
     """Replace the origin of the local frame in a map's attributes; None removes it."""
     return {str(name): value for name, value in attributes.items()
             if not str(name).startswith("origin_")} | origin_attributes(origin)
@@ -325,7 +325,7 @@ def axis_problem(dataset: xr.Dataset) -> str | None:
     return None
 
 
-def _value_problem(dataset: xr.Dataset) -> str | None:
+def _values_problem(dataset: xr.Dataset) -> str | None:
     """Check gains, sigmas and lines of sight; return the first fault, or None.
 
     Values are read in parts of whole chunks of the file.
@@ -452,8 +452,8 @@ def open_dataset(path: Path) -> Iterator[xr.Dataset]:
     Raises:
         BadInput: no such file, damaged, or not a radio map.
     """
-    with _opened(path) as opened:
-        dataset = _prepared(path, opened)
+    with _open_unchecked(path) as opened:
+        dataset = _checked_map(path, opened)
         if dataset["los"].dtype != bool:
             dataset["los"] = _as_bool(dataset["los"].variable)
         yield dataset
@@ -465,19 +465,19 @@ def load_dataset(path: Path) -> xr.Dataset:
     Raises:
         BadInput: see `open_dataset`, or the map is too large for the memory.
     """
-    with _opened(path) as opened:
-        dataset = _prepared(path, opened, is_loaded=True)
+    with _open_unchecked(path) as opened:
+        dataset = _checked_map(path, opened, is_loaded=True)
     dataset["los"] = dataset["los"].astype(bool)
     return dataset
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[xr.Dataset]:
+def _open_unchecked(path: Path) -> Iterator[xr.Dataset]:
     """Open a NetCDF or Zarr dataset, after checks that protect the library that reads it."""
     if not path.exists():
         raise BadInput(f"{path} does not exist; {MAKERS} makes a radio map")
     with ExitStack() as stack:
-        with _reported(path):
+        with _errors_as_bad_input(path):
             if is_zarr(path):
                 opened = stack.enter_context(_open_zarr(path))
             else:
@@ -487,9 +487,9 @@ def _opened(path: Path) -> Iterator[xr.Dataset]:
         yield opened
 
 
-def _prepared(path: Path, opened: xr.Dataset, is_loaded: bool = False) -> xr.Dataset:
+def _checked_map(path: Path, opened: xr.Dataset, is_loaded: bool = False) -> xr.Dataset:
     """Check an opened dataset whole; return its radio map without CF attributes and encoding."""
-    with _reported(path):
+    with _errors_as_bad_input(path):
         problem, dataset = form_problem(opened), opened
         if problem is None:
             names = [name for name in (*VARIABLES, *DIMS, GROUND) if name in opened.variables]
@@ -497,14 +497,14 @@ def _prepared(path: Path, opened: xr.Dataset, is_loaded: bool = False) -> xr.Dat
             if is_loaded:
                 MAP_VALUES.check(dataset["gain_db"].size, path)
                 dataset = dataset.load()
-            problem = axis_problem(dataset) or _value_problem(dataset)
+            problem = axis_problem(dataset) or _values_problem(dataset)
     if problem:
         raise BadInput(f"{path} is not a radio map: {problem}; {MAKERS} makes one")
     return without_cf(dataset.drop_encoding())
 
 
 @contextmanager
-def _reported(path: Path) -> Iterator[None]:
+def _errors_as_bad_input(path: Path) -> Iterator[None]:
     """Turn any exception of the reading libraries into BadInput."""
     try:
         yield

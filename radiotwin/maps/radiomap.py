@@ -44,11 +44,11 @@ from radiotwin.maps.file import (
     VARIABLES,
     MapBlock,
     MapStream,
+    attributes_with_origin,
     header,
     load_dataset,
     open_dataset,
     parts_of,
-    placed_attributes,
     write_parts,
 )
 from radiotwin.scene import Scene
@@ -70,7 +70,7 @@ def origin_of(attributes: dict[str, Any]) -> Origin | None:
     return Origin(**found) if {"latitude_deg", "longitude_deg"} <= found.keys() else None
 
 
-class OverDevices(Summarised):
+class LatticeData(Summarised):
     """Base class of datasets with a value for each device and lattice position.
 
     Attributes:
@@ -180,7 +180,7 @@ class OverDevices(Summarised):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MapDifference(OverDevices):
+class MapDifference(LatticeData):
     """Gain of one map minus the gain of another.
 
     If a map has `sigma_db`, its mean gain is subtracted, even below the limit of detection.
@@ -275,7 +275,7 @@ class MapDifference(OverDevices):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RadioMap(OverDevices):
+class RadioMap(LatticeData):
     """Channel gain over a lattice.
 
     Attributes:
@@ -368,7 +368,7 @@ class RadioMap(OverDevices):
         write_parts(self.header, {name: self.dataset[name].dtype for name in self.variables},
                     self.blocks(), path)
 
-    def require_of(self, scene: Scene) -> None:
+    def require_made_for(self, scene: Scene) -> None:
         """Raise BadInput unless the map was made for this version of a scene, with all devices."""
         known = set(self.devices)
         missing = [device.device for device in scene.config.devices if device.device not in known]
@@ -430,10 +430,10 @@ class RadioMap(OverDevices):
                 yield MapBlock(where, {name: array[where].values
                                        for name, array in arrays.items()})
 
-    def placed(self, origin: Origin | None) -> RadioMap:
+    def with_origin(self, origin: Origin | None) -> RadioMap:
         """Return the map with the origin of its local frame replaced; None removes it."""
         dataset = self.dataset.copy()
-        dataset.attrs = placed_attributes(dataset.attrs, origin)
+        dataset.attrs = attributes_with_origin(dataset.attrs, origin)
         return RadioMap(dataset)
 
     def selected(self, devices: list[str], lattice: Lattice) -> RadioMap:

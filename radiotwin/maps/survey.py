@@ -121,7 +121,7 @@ def segmented_truth(scene: Scene | Path | str) -> RadioMap:
         np.array(los), np.array(sigma_db),
         {"source": "segmented", "frequency_hz": scene.config.radio.frequency_hz,
          "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash()}
-    ).placed(scene.config.origin)
+    ).with_origin(scene.config.origin)
 
 
 def read_truth(scene: Scene, truth: str = "traced") -> RadioMap:
@@ -401,5 +401,5 @@ def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: 
     slots = flights * sum(uav.battery // slot_cost + 1 for uav in scene.config.uavs)
     ROWS.check(slots * len(scene.config.devices), f"{path}: {flights} flights, as far as the "
                "batteries of its UAVs go")
-    truth.require_of(scene)
+    truth.require_made_for(scene)
     _require_possible(scene, truth)

@@ -318,7 +318,7 @@ def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, Radio
     elif run.scene is not None and (path := _first(run.scene.folder, *TRUTH_MAPS)):
         found = stack.enter_context(RadioMap.open(path))
         try:
-            found.require_of(run.scene)
+            found.require_made_for(run.scene)
             maps[TRUTH] = found
         except BadInput as error:
             run.notes.append(f"{path} is not shown: {error}.")

@@ -226,7 +226,7 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
     store = open_store(scene, settings)
     finished = _finished(Path(out_path), store.hash, names)
     if finished is not None:
-        placed = finished.placed(scene.config.origin)  # the origin does not change the gains
+        placed = finished.with_origin(scene.config.origin)  # the origin does not change the gains
         if placed.dataset.attrs != finished.dataset.attrs:
             placed.save(out_path)
         return placed
@@ -272,7 +272,7 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
                   "trace_hash": store.hash, **settings.attributes(), **counts, **figures,
                   **library_versions(), "radiotwin_version": version("radiotwin")}
     radio_map = RadioMap.build(names, scene.lattice, gain_db, los, attributes=attributes)
-    radio_map = radio_map.placed(scene.config.origin)
+    radio_map = radio_map.with_origin(scene.config.origin)
     radio_map.save(out_path)
     return radio_map
 

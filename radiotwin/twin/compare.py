@@ -209,7 +209,7 @@ def _check(test: Measurements, scene: Scene, truth: RadioMap | None,
                        f"({', '.join(test.flights[:4])}), so no error can be computed; hold out "
                        "other flights")
     if truth is not None:
-        truth.require_of(scene)
+        truth.require_made_for(scene)
     for name, twin in twins.items():
         if twin.level != test.level_column:
             raise BadInput(f"{name} predicts {twin.level}, the measurements hold "

@@ -356,7 +356,7 @@ class Twin(Summarised):
         if powers_dbm:
             attributes[POWERS] = json.dumps(powers_dbm)
         return MapStream(list(rows), scene.lattice, attributes, ("gain_db", "los", "sigma_db"),
-                         make).placed(scene.config.origin)
+                         make).with_origin(scene.config.origin)
 
     def save(self, folder: Path | str) -> None:
         """Write the twin's folder, whole or not at all; a twin that is in it is replaced.

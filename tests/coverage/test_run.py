@@ -8,7 +8,7 @@ import pytest
 import shapely
 
 from radiotwin.coverage import CoverageSettings, Transmitter, predict_coverage
-from radiotwin.coverage.areas import Area, CoverageGrid, _covered, with_terrain
+from radiotwin.coverage.areas import Area, CoverageGrid, _covered_shares, with_ground_as_terrain
 from radiotwin.errors import BadInput
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import coverage_figures
@@ -195,13 +195,13 @@ def test_an_antenna_points_where_it_is_turned_to(build):
 def test_receivers_stand_on_uneven_ground(build, twin_of):
     scene = build(devices=[("a", 0.0, 0.0, 200.0)], ground_z_m=lambda x, y: 0.1 * (x + 600.0))
     grid = CoverageGrid.over((-100, 100, -100, 100), 50.0, 1.5)
-    receiver_m = grid.receivers_m(slice(0, 4), with_terrain(scene.city))
+    receiver_m = grid.receivers_m(slice(0, 4), with_ground_as_terrain(scene.city))
     np.testing.assert_allclose(receiver_m[:, 2], 0.1 * (receiver_m[:, 0] + 600.0) + 1.5, atol=1e-3)
 
 
 def test_flat_ground_is_not_looked_for(build, house):
     city = build(house(0, 0, 10, 10, 5)).city
-    assert with_terrain(city) is city
+    assert with_ground_as_terrain(city) is city
 
 
 def test_blocks_do_not_change_the_result(build, twin_of, house, monkeypatch):
@@ -317,9 +317,9 @@ def test_without_a_gain_indoors_there_is_nothing_to_take_a_loss_off(build, house
 
 def test_of_a_power_without_a_deviation_nothing_is_certain():
     power_dbm, sd_db = np.array([-70.0, -70.0, np.nan]), np.array([1.0, np.nan, np.nan])
-    found = _covered(power_dbm, sd_db, -85.0, 0.95)
+    found = _covered_shares(power_dbm, sd_db, -85.0, 0.95)
     assert found["share"] == pytest.approx(2 / 3) and found["share_reliable"] == found["mean_probability"] == 0.5
-    assert set(_covered(power_dbm[1:2], sd_db[1:2], -85.0, 0.95)) == {"threshold", "share"}
+    assert set(_covered_shares(power_dbm[1:2], sd_db[1:2], -85.0, 0.95)) == {"threshold", "share"}
 
 
 @pytest.mark.parametrize("width_m", [50.0, 500.0, 499.99999999999994, 5000.0, 123.4])

@@ -18,7 +18,7 @@ from radiotwin.scene.folder import published_scene
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.scene import Scene
 scene = Scene.load(published_scene("rbm"))
-RadioMap.load(scene.folder / "truth.nc").require_of(scene)
+RadioMap.load(scene.folder / "truth.nc").require_made_for(scene)
 print(scene.folder)
 """
 
@@ -28,7 +28,7 @@ def test_in_the_source_tree(name, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     assert published_scene(name).samefile(ROOT / "scenes" / name)
     scene = Scene.load(published_scene(name))
-    RadioMap.load(scene.folder / "truth.nc").require_of(scene)
+    RadioMap.load(scene.folder / "truth.nc").require_made_for(scene)
 
 
 def test_the_working_directory_comes_first(monkeypatch, tmp_path):

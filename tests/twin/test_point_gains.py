@@ -76,7 +76,7 @@ def test_a_map_needs_devices_with_positions_and_its_place(small_scene, tmp_path)
         rt.export_ns3(truth, bare, POINTS_M[:2], tmp_path / "ns3")
     here, there = (placed_at(small_scene, latitude_deg) for latitude_deg in (47.0, 47.1))
     with pytest.raises(rt.BadInput, match="is a map of another place"):
-        gains_at(truth.placed(here.config.origin), there, POINTS_M[:2], ["d0"])
+        gains_at(truth.with_origin(here.config.origin), there, POINTS_M[:2], ["d0"])
 
 
 def placed_at(scene, latitude_deg):

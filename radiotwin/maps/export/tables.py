@@ -29,7 +29,7 @@ _POSITION = ["x_m", "y_m", "z_m"]
 
 def write_dataset(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
     """Write NetCDF-4 or Zarr by the CF conventions, with the scene's origin."""
-    placed = radio_map.placed(scene.config.origin)
+    placed = radio_map.with_origin(scene.config.origin)
     if isinstance(placed, RadioMap):
         placed.save(path)
         return
