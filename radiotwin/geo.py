@@ -72,6 +72,7 @@ def to_geographic(origin: Origin, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.nd
 
 
 def _projection(origin: Origin) -> "Proj":
+    """Return the projection from longitude and latitude [degrees] to the local frame [m]."""
     from pyproj import Proj
 
     return Proj(proj="aeqd", lat_0=origin.latitude_deg, lon_0=origin.longitude_deg, ellps="WGS84")

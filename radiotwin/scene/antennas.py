@@ -215,7 +215,7 @@ def _read_msi(path: Path, text: bytes) -> Pattern:
                                "360) and an attenuation (0 dB or more)")
             known = cut.setdefault(angle % 360, -attenuation)
             if abs(known + attenuation) > _TOLERANCE_DB:
-                raise _contradiction(path, row, f"angle {angle:g}", -known, attenuation)
+                raise _contradiction_error(path, row, f"angle {angle:g}", -known, attenuation)
     for key, cut in cuts.items():
         if len(cut) < 2:
             raise BadInput(f"{path}: has no cut {key}; it needs HORIZONTAL and VERTICAL with an "
@@ -226,8 +226,8 @@ def _read_msi(path: Path, text: bytes) -> Pattern:
     return Pattern(AZIMUTH_DEG, ELEVATION_DEG, gain_dbi + between_cuts(horizontal_db, vertical_db))
 
 
-def _contradiction(path: Path, row: int, direction: str, known_db: float,
-                   given_db: float) -> BadInput:
+def _contradiction_error(path: Path, row: int, direction: str, known_db: float,
+                         given_db: float) -> BadInput:
     """Return the error that two rows of one direction have different gains."""
     return BadInput(f"{path}, row {row}: {direction} has {given_db:g} dB, an earlier row of this "
                     f"direction {known_db:g} dB; rows of one direction (0 and 360 degrees are one) "
@@ -266,8 +266,8 @@ def _read_csv(path: Path, text: bytes) -> Pattern:
     if len(apart):
         row = int(apart[0])
         azimuth, elevation, gain_dbi = numbers.iloc[row]
-        raise _contradiction(path, row + 2, f"azimuth {azimuth:g}, elevation {elevation:g}",
-                             first_dbi[row], gain_dbi)
+        raise _contradiction_error(path, row + 2, f"azimuth {azimuth:g}, elevation {elevation:g}",
+                                   first_dbi[row], gain_dbi)
     numbers = numbers.drop_duplicates(columns[:2])
     across, up = (numbers[name].nunique() for name in columns[:2])
     if across * up != len(numbers) or up < 2:

@@ -208,6 +208,7 @@ class SceneConfig(Table):
 
     @model_validator(mode="after")
     def _consistent(self) -> "SceneConfig":
+        """Check what several tables must agree on: names, frame, lattice, antennas, positions."""
         for kind, names in (("device", [device.device for device in self.devices]),
                             ("uav", [uav.uav for uav in self.uavs])):
             if double := [name for name, count in Counter(names).items() if count > 1]:
@@ -235,6 +236,7 @@ class SceneConfig(Table):
         return self
 
     def _check_in_extent(self, device: DeviceConfig) -> None:
+        """Raise ValueError if a device lies outside the extent."""
         x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
         if not (x_min_m <= device.x_m <= x_max_m and y_min_m <= device.y_m <= y_max_m):
             raise ValueError(
@@ -243,6 +245,7 @@ class SceneConfig(Table):
                 "or widen the extent")
 
     def _check_on_lattice(self, uav: UavConfig, end: str) -> None:
+        """Raise ValueError if the start or terminal of a UAV is not on the lattice."""
         step_m = self.lattice.step_m
         for axis, low, high in (("x", self.extent.x_min_m, self.extent.x_max_m),
                                 ("y", self.extent.y_min_m, self.extent.y_max_m)):

@@ -127,10 +127,10 @@ def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None,
         BadInput: No such file, malformed XML, an element or a mesh that cannot be read, or a file
             outside the folder.
     """
-    declared = _declared(Path(xml_path))
+    declared = _parse_city_xml(Path(xml_path))
     materials = map_materials(declared.shapes, declared.materials, {})[0]
     names = [shape.name.removeprefix("mesh-") for shape in declared.shapes]
-    return list(zip(_meshes(Path(xml_path), declared), materials, names, strict=True))
+    return list(zip(_load_meshes(Path(xml_path), declared), materials, names, strict=True))
 
 
 def read_city(xml_path: Path | str) -> list[CityShape]:
@@ -144,7 +144,7 @@ def read_city(xml_path: Path | str) -> list[CityShape]:
     """
     import trimesh  # slow to load, and not needed for the 3D map
 
-    declared = _declared(Path(xml_path))
+    declared = _parse_city_xml(Path(xml_path))
     materials, problems = map_materials(declared.shapes, declared.materials, {})
     errors = [problem.message for problem in problems if problem.severity == "error"]
     if errors:
@@ -154,10 +154,10 @@ def read_city(xml_path: Path | str) -> list[CityShape]:
              for shape in declared.shapes]
     used = sorted({material for material in materials if material is not None}, key=repr)
     unique = {material: replace(material, name=taken.unique(material.name)) for material in used}
+    meshes = _load_meshes(Path(xml_path), declared)
     return [CityShape(name, trimesh.Trimesh(mesh.vertices, mesh.faces, process=False),
                       unique[material])
-            for name, mesh, material in zip(names, _meshes(Path(xml_path), declared), materials)
-            if material is not None]
+            for name, mesh, material in zip(names, meshes, materials) if material is not None]
 
 
 def mesh_paths(xml_path: Path | str) -> set[Path]:
@@ -166,18 +166,18 @@ def mesh_paths(xml_path: Path | str) -> set[Path]:
     Raises:
         BadInput: No such file, malformed XML, or a mesh outside the folder.
     """
-    return {shape.mesh_path for shape in _declared(Path(xml_path)).shapes
+    return {shape.mesh_path for shape in _parse_city_xml(Path(xml_path)).shapes
             if shape.mesh_path is not None}
 
 
-def _declared(xml_path: Path) -> DeclaredCity:
+def _parse_city_xml(xml_path: Path) -> DeclaredCity:
     """Parse a scene folder's `city.xml`; BadInput if it does not exist."""
     if not os.path.lexists(xml_path):
         raise BadInput(f"{xml_path} does not exist; `radiotwin build-scene` makes a scene folder")
     return read_mitsuba_xml(xml_path, scene_folder=True)
 
 
-def _meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
+def _load_meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
     """Load the meshes of a city, and check that they are triangles near the origin."""
     meshes = []
     for shape, mesh in zip(declared.shapes, load_shapes(declared.shapes, xml_path)):

@@ -45,8 +45,8 @@ def footing(city: CityMap, point_m: np.ndarray) -> Footing | None:
         the position that needs the smallest error of the map, in standard deviations; None if all
         need more than `MAX_SDS`.
     """
-    candidates = (_above(city, point_m, to_ground=True), _above(city, point_m, to_ground=False),
-                  _beside(city, point_m))
+    candidates = (_above_surface(city, point_m, to_ground=True),
+                  _above_surface(city, point_m, to_ground=False), _beside_wall(city, point_m))
     plausible = [one for one in candidates if one is not None and one.sds <= MAX_SDS]
     return min(plausible, key=lambda one: one.sds, default=None)
 
@@ -61,7 +61,7 @@ def moved_outdoors(city: CityMap, points_m: np.ndarray) -> np.ndarray:
     return corrected_m
 
 
-def _above(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | None:
+def _above_surface(city: CityMap, point_m: np.ndarray, to_ground: bool) -> Footing | None:
     """Return the position just above the ground, or the roof; None if that is lower or indoors."""
     x_m, y_m, z_m = point_m.tolist()
     ground_m = float(city.ground_height_m(x_m, y_m))
@@ -86,7 +86,7 @@ def _roof_m(city: CityMap, x_m: float, y_m: float) -> tuple[float, float]:
     return float(above_m[0, 2] - distance_m[0]), HEIGHT_SD_M if np.isnan(sd_m) else sd_m
 
 
-def _beside(city: CityMap, point_m: np.ndarray) -> Footing | None:
+def _beside_wall(city: CityMap, point_m: np.ndarray) -> Footing | None:
     """Return the position just outside the nearest wall; None if that is too far."""
     steps_m = np.arange(0.0, MAX_SDS * WALL_SD_M, STEP_M) + STEP_M
     angle_rad = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)

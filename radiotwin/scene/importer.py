@@ -84,11 +84,11 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
     names, materials = [names[row] for row in kept], [materials[row] for row in kept]
     if not kept:
         if bbox is not None and loaded.bounds is not None:
-            raise _nothing_in(bbox, *loaded.bounds)
+            raise _empty_box_error(bbox, *loaded.bounds)
         problems.append(error(f"{path}: no shape could be read"))
         return ImportedCity([], [], None, np.zeros(0, dtype=bool), problems)
-    surfaces, sense_problems = _outward(Surfaces(meshes), names)
-    names, materials, surfaces, join_problems = _joined(names, materials, surfaces)
+    surfaces, sense_problems = _orient(Surfaces(meshes), names)
+    names, materials, surfaces, join_problems = _join_roofs_to_walls(names, materials, surfaces)
     ground = surfaces.ground_faces()
     problems += sense_problems + join_problems
     if up is None and usual_up == "z":  # a convention only; in glTF, y is up by its specification
@@ -96,7 +96,7 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
     problems += checks.check_units(surfaces) if scale is None else []
     city = ImportedCity(names, materials, surfaces, ground, problems)
     if bbox is not None:
-        city = _cut(city, surfaces, bbox)
+        city = _cut_to_box(city, surfaces, bbox)
     city = _move_to_origin(city)
     assert city.surfaces is not None
     city.problems.extend(checks.check_ground(city.ground, city.surfaces))
@@ -226,7 +226,7 @@ def _load_meshes(path: Path, source: _Source, scale: float, up: str, bbox: Box |
     return loaded
 
 
-def _outward(surfaces: Surfaces, names: Sequence[str]) -> tuple[Surfaces, list[Problem]]:
+def _orient(surfaces: Surfaces, names: Sequence[str]) -> tuple[Surfaces, list[Problem]]:
     """Orient the triangles of each mesh: solids face outwards, sheets upwards."""
     problems = []
     mixed = surfaces.inconsistent_shapes()
@@ -251,8 +251,8 @@ def _outward(surfaces: Surfaces, names: Sequence[str]) -> tuple[Surfaces, list[P
     return surfaces, problems
 
 
-def _joined(names: list[str], materials: list[Material | None], surfaces: Surfaces
-            ) -> tuple[list[str], list[Material | None], Surfaces, list[Problem]]:
+def _join_roofs_to_walls(names: list[str], materials: list[Material | None], surfaces: Surfaces
+                         ) -> tuple[list[str], list[Material | None], Surfaces, list[Problem]]:
     """Join roofs and walls of one material, so that Sionna RT finds the edge between them."""
     pairs = surfaces.seams()
     pairs = pairs[[materials[a] is not None and materials[a] == materials[b] for a, b in pairs]]
@@ -276,7 +276,7 @@ def _joined(names: list[str], materials: list[Material | None], surfaces: Surfac
             Surfaces(buildings), [joined])
 
 
-def _cut(city: ImportedCity, surfaces: Surfaces, bbox: Box) -> ImportedCity:
+def _cut_to_box(city: ImportedCity, surfaces: Surfaces, bbox: Box) -> ImportedCity:
     """Keep the shapes, and the single triangles of the ground, whose bounds reach into the box."""
     low, high = surfaces.face_bounds()
     overlaps = ((low[:, :2] <= bbox[2:]) & (high[:, :2] >= bbox[:2])).all(axis=1)
@@ -289,13 +289,13 @@ def _cut(city: ImportedCity, surfaces: Surfaces, bbox: Box) -> ImportedCity:
     keep = np.where(city.ground, overlaps, np.asarray(reaches)[surfaces.shape])
     shapes = np.unique(surfaces.shape[keep])
     if len(shapes) == 0:
-        raise _nothing_in(bbox, surfaces.vertices.min(axis=0), surfaces.vertices.max(axis=0))
+        raise _empty_box_error(bbox, surfaces.vertices.min(axis=0), surfaces.vertices.max(axis=0))
     return replace(city, names=[city.names[index] for index in shapes],
                    materials=[city.materials[index] for index in shapes],
                    surfaces=Surfaces(surfaces.meshes(keep)), ground=city.ground[keep])
 
 
-def _nothing_in(bbox: Box, low: np.ndarray, high: np.ndarray) -> BadInput:
+def _empty_box_error(bbox: Box, low: np.ndarray, high: np.ndarray) -> BadInput:
     """Return the error that the box holds no shape of a city with these bounds (2,) [m]."""
     return BadInput(f"the part x {bbox[0]:g} to {bbox[2]:g} m, y {bbox[1]:g} to {bbox[3]:g} m "
                     f"is empty; the city lies in x {low[0]:.0f} to {high[0]:.0f} m, y {low[1]:.0f} "

@@ -242,11 +242,11 @@ def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],
     materials = [mapper.material_of(shape) for shape in shapes]
     unused = set(overrides) - mapper.overridden
     if unused and must_use_all:
-        raise _unused(unused, mapper.known)
+        raise _unused_override_error(unused, mapper.known)
     return materials, mapper.all_problems()
 
 
-def _unused(names: Collection[str], known: Iterable[str]) -> BadInput:
+def _unused_override_error(names: Collection[str], known: Iterable[str]) -> BadInput:
     """Return the error that overrides name materials that the city does not use."""
     return BadInput(f"material {min(names)!r} is to be replaced, but the city does not use it; "
                     f"it uses: {', '.join(sorted(known)) or '(none)'}")
@@ -286,7 +286,7 @@ def materials_by_name(names: Sequence[str | None], overrides: Mapping[str, str],
             unknown.append(name or "(no material)")
     unused = set(overrides) - used - {"default"}
     if unused and must_use_all:
-        raise _unused(unused, [name for name in by_name if name])
+        raise _unused_override_error(unused, [name for name in by_name if name])
     found = [] if "default" in overrides or not unknown else [problems.warning(
         f"{len(unknown)} material(s) have no name of an ITU material ({listed(unknown)}): "
         f"{DEFAULT_MATERIAL} was taken. Say what they are with --material NAME=ITU, or of all such "
@@ -444,19 +444,19 @@ class MaterialTable:
         A tag may have several values, separated by `;`: the first one in the table is used.
         """
         for key, known in self.by_tag.items():
-            for value in _values(tags, key):
+            for value in _tag_values(tags, key):
                 if value in known:
                     return itu_material(known[value]), f"{key}={value}"
         return itu_material(self.default), "default"
 
     def unknown(self, tags: Mapping[str, str]) -> str | None:
         """Return the value of `building:material` if it is not in the table, else None."""
-        values = [value for value in _values(tags, MATERIAL_KEY) if value]
+        values = [value for value in _tag_values(tags, MATERIAL_KEY) if value]
         known = self.by_tag.get(MATERIAL_KEY, {})
         return values[0] if values and not any(value in known for value in values) else None
 
 
-def _values(tags: Mapping[str, str], key: str) -> list[str]:
+def _tag_values(tags: Mapping[str, str], key: str) -> list[str]:
     """Return the values of a tag, which `;` separates, in lower case."""
     return [value.strip() for value in tags.get(key, "").lower().split(";")]
 

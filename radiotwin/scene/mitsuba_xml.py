@@ -319,7 +319,7 @@ class _Reader:
 
     def _include(self, node: Node, files: tuple[Path, ...]) -> None:
         """Read the file of an `<include>`; BadInput if files include each other in a loop."""
-        path = self._find(node, node.attributes.get("filename", ""))
+        path = self._find_file(node, node.attributes.get("filename", ""))
         if len(files) > MAX_INCLUDE_DEPTH or path.resolve() in files:
             raise BadInput(f"{node.position}: more than {MAX_INCLUDE_DEPTH} files include each "
                            "other, or one itself; remove the loop")
@@ -349,7 +349,7 @@ class _Reader:
                 DOCUMENT_BYTES.check(self.substituted, f"{node.position}: with its parameters")
             node.attributes[key] = "".join(parts)
 
-    def _find(self, node: Node, name: str) -> Path:
+    def _find_file(self, node: Node, name: str) -> Path:
         """Return the path of a file that an element names; it must lie below the first file's."""
         if len(name) > MAX_NAME:
             raise BadInput(f"{node.position}: {shown(name)} is not the name of a file: it has "
@@ -365,7 +365,7 @@ class _Reader:
         SHAPES.check(len(self.city.shapes) + 1, node.file)
         kind = node.attributes.get("type", "")
         file_name = node.get("string", "filename")
-        mesh_path = None if file_name is None else self._find(node, file_name)
+        mesh_path = None if file_name is None else self._find_file(node, file_name)
         identifier = node.attributes.get("id")
         if identifier is None:
             identifier = mesh_path.stem if mesh_path else f"{kind}_{len(self.city.shapes) + 1}"

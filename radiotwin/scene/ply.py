@@ -185,7 +185,7 @@ def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
         first += element.count
         if len(rows) < element.count:
             raise _truncated(path, element, len(rows))
-        found = _empty(element)
+        found = _containers(element)
         for number, line in enumerate(rows):
             words = line.split()
             try:
@@ -200,7 +200,7 @@ def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
     return columns
 
 
-def _empty(element: _Element) -> dict[str, array | _Lists]:
+def _containers(element: _Element) -> dict[str, array | _Lists]:
     """Return an empty container for each needed property of an element."""
     return {name: array("d") if length_kind is None else _Lists()
             for name, _, length_kind in element.properties if element.is_read(name)}
@@ -272,7 +272,7 @@ def _read_uniform(data: bytes, start: int, order: str, element: _Element
 def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element
                  ) -> tuple[dict, int]:
     """Read the rows of an element one by one; also return the position behind them."""
-    found = _empty(element)
+    found = _containers(element)
     for row in range(element.count):
         try:
             for name, kind, length_kind in element.properties:

@@ -119,15 +119,15 @@ def _buildings_in(column: tuple[float, float], row: tuple[float, float], p: City
                      + p.mean_height_m)
         low = np.maximum(centre - sides / 2, (x0, y0))
         high = np.minimum(centre + sides / 2, (x1, y1))
-        low, high = _trimmed(low, high, keep_free_m, p.clearance_m)
+        low, high = _trim_clear(low, high, keep_free_m, p.clearance_m)
         if np.all(high - low >= p.side_kept_m):
             boxes.append((*low.round(2), *high.round(2),
                           round(float(np.clip(height, p.min_height_m, p.max_height_m)), 2)))
     return boxes
 
 
-def _trimmed(low: np.ndarray, high: np.ndarray, keep_free_m: np.ndarray, clearance_m: float
-             ) -> tuple[np.ndarray, np.ndarray]:
+def _trim_clear(low: np.ndarray, high: np.ndarray, keep_free_m: np.ndarray, clearance_m: float
+                ) -> tuple[np.ndarray, np.ndarray]:
     """Trim a rectangle to be clear of every point, each time at the side that costs least area."""
     for point in keep_free_m:
         near, far = point - clearance_m, point + clearance_m
@@ -213,7 +213,7 @@ PRESETS = {
 
 def preset_config(name: str) -> SceneConfig:
     """Return the `scene.toml` of a preset, a key of `PRESETS`; BadInput if there is none."""
-    preset = _find(name)
+    preset = _preset_named(name)
     (start_x_m, start_y_m), (terminal_x_m, terminal_y_m) = preset.start_m, preset.terminal_m
     return SceneConfig(
         name=name,
@@ -235,7 +235,7 @@ def preset_config(name: str) -> SceneConfig:
 
 def preset_boxes(name: str) -> np.ndarray:
     """Return the buildings (n, 5) of a preset: x_min, y_min, x_max, y_max, height [m]."""
-    preset = _find(name)
+    preset = _preset_named(name)
     return draw_buildings(preset.city, np.array(preset.devices_m, dtype=float), preset.seed)
 
 
@@ -249,7 +249,7 @@ def build_preset(name: str, folder: Path | str) -> None:
     Raises:
         BadInput: No such preset, or the folder cannot be written or holds something else.
     """
-    preset, folder = _find(name), Path(folder)
+    preset, folder = _preset_named(name), Path(folder)
     check_target(folder)
     low, (x_high, y_high) = -100.0, (preset.city.width_m + 100.0, preset.city.depth_m + 100.0)
     ground = trimesh.Trimesh(
@@ -281,7 +281,7 @@ def build_preset_scene(name: str, folder: Path | str, check_only: bool = False) 
                    devices=len(config.devices), uavs=len(config.uavs))
 
 
-def _find(name: str) -> Preset:
+def _preset_named(name: str) -> Preset:
     """Return a preset by its name; BadInput if there is none."""
     if name not in PRESETS:
         raise BadInput(f"preset {name!r} does not exist; allowed are {', '.join(PRESETS)}")

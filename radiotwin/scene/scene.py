@@ -347,6 +347,7 @@ class Scene(Summarised):
         return require_within(self.folder, self.folder / name, str(self.folder / "scene.toml"))
 
     def _pattern(self, name: str) -> Pattern:
+        """Read the antenna pattern of a file in the scene folder."""
         return read_pattern(self._antenna_path(name))
 
     def _check_devices(self) -> None:

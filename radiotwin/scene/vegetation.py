@@ -115,7 +115,7 @@ class Vegetation:
         through_m = np.zeros(len(a_m))
         for height_m in np.unique(self.height_m):
             areas = self.areas[self.height_m == height_m]
-            rows, low_a_m, low_b_m = _below(a_m, b_m, height_m)
+            rows, low_a_m, low_b_m = _cut_to_height(a_m, b_m, height_m)
             tree = shapely.STRtree(areas)
             step = max(1, WORK_AT_ONCE // int(shapely.get_num_coordinates(areas).sum()))
             for start in range(0, len(rows), step):
@@ -187,8 +187,8 @@ def count_meetings(sides: np.ndarray, at_once: int, check: Callable[[int], None]
     return found // 2
 
 
-def _below(a_m: np.ndarray, b_m: np.ndarray,
-           height_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _cut_to_height(a_m: np.ndarray, b_m: np.ndarray,
+                   height_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cut links (a, b) to their parts between z = 0 and a height.
 
     Returns:

@@ -321,7 +321,7 @@ def link_pieces(scene: Scene, settings: SolverSettings,
     return pieces, np.concatenate([np.zeros(0, dtype=int), *batches])
 
 
-class _Solve:
+class _BatchSolver:
     """Base of the callables that solve a batch.
 
     The solver takes seconds to construct: this is done for the first batch. Pickled, the object
@@ -340,7 +340,7 @@ class _Solve:
         return self.__dict__ | {"_city": city, "_solver": None}
 
 
-class SolvePaths(_Solve):
+class SolvePaths(_BatchSolver):
     """Computes the gains of a batch along paths, see `PathGains`, in its tile or the whole city.
 
     The solver of the last tile is kept: consecutive batches may share it.
@@ -366,7 +366,7 @@ class SolvePaths(_Solve):
         return self._solver.gains(piece.device_m, piece.points_m, piece.antennas)
 
 
-class SolveCells(_Solve):
+class SolveCells(_BatchSolver):
     """Computes gains averaged over cells, see `CellGains`; a batch is one altitude."""
 
     def __init__(self, scene: Scene, settings: SolverSettings) -> None:
@@ -450,15 +450,15 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
     total = len(scene.lattice.positions_m)
     if settings.solver == "paths":
         rng = np.random.default_rng(settings.seed)
-        columns = np.sort(rng.choice(total, size=sampled(scene), replace=False))
+        columns = np.sort(rng.choice(total, size=sample_size(scene), replace=False))
         rows = slice(0, len(index))
     else:
-        columns, rows = np.arange(_plane(scene)), slice(0, 1)
+        columns, rows = np.arange(_positions_per_altitude(scene)), slice(0, 1)
     return rows, columns, solve_lattice(scene, settings.finer(FINER), store, index[rows], executor,
                                         columns, "finer", "numerical noise")
 
 
-def sampled(scene: Scene) -> int:
+def sample_size(scene: Scene) -> int:
     """Return the number of positions that `solve_finer` samples."""
     total = len(scene.lattice.positions_m)
     return min(total, max(8, round(0.01 * total)))
@@ -467,7 +467,7 @@ def sampled(scene: Scene) -> int:
 def exchanged_calls(scene: Scene, settings: SolverSettings, devices: int) -> int:
     """Return the maximum number of solver calls in `solve_exchanged`, per antenna of devices."""
     batches = devices * -(-len(scene.lattice.positions_m) // settings.batch_receivers)
-    return min(sampled(scene), max(MIN_EXCHANGED, min(MAX_EXCHANGED, batches // 10)))
+    return min(sample_size(scene), max(MIN_EXCHANGED, min(MAX_EXCHANGED, batches // 10)))
 
 
 def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
@@ -512,7 +512,7 @@ def solve_exchanged(scene: Scene, settings: SolverSettings, store: BatchStore, i
     return columns, gain_db
 
 
-def _plane(scene: Scene) -> int:
+def _positions_per_altitude(scene: Scene) -> int:
     """Return the number of lattice positions at one altitude."""
     return len(scene.lattice.y_m) * len(scene.lattice.x_m)
 
@@ -529,5 +529,5 @@ def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
     label = label or ("batch" if settings.solver == "paths" else "altitude")
     devices = [(f"device-{device:03d}-{label}", scene.device_m[device],
                 scene.device_antennas[device]) for device in index]
-    size = settings.batch_receivers if settings.solver == "paths" else _plane(scene)
+    size = None if settings.solver == "paths" else _positions_per_altitude(scene)
     return link_pieces(scene, settings, devices, points_m, size)

@@ -205,7 +205,8 @@ def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
     with progress("numerical error of a few links", total=len(QUALITIES)) as advance:
         for quality in QUALITIES:
             settings = SolverSettings.of_quality(quality, **others)
-            tried.append(_try(scene, quality, settings, _calls(outdoors_m, index, settings.seed)))
+            calls = _draw_calls(outdoors_m, index, settings.seed)
+            tried.append(_try_quality(scene, quality, settings, calls))
             advance(1)
             if tried[-1].rms_db <= target_db:
                 return tried
@@ -215,8 +216,8 @@ def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
                    f"target, or --quality {tried[-1].quality}")
 
 
-def _calls(points_m: np.ndarray, index: Sequence[int], seed: int
-           ) -> list[tuple[int, np.ndarray]]:
+def _draw_calls(points_m: np.ndarray, index: Sequence[int], seed: int
+                ) -> list[tuple[int, np.ndarray]]:
     """Draw the links of the pilot: (device, points) of each call of the solver."""
     rng = np.random.default_rng([seed, len(points_m), *index])
     devices = np.resize(rng.permutation(index), _CALLS)
@@ -225,11 +226,11 @@ def _calls(points_m: np.ndarray, index: Sequence[int], seed: int
             for device in devices]
 
 
-def _try(scene: Scene, quality: str, settings: SolverSettings,
-         calls: list[tuple[int, np.ndarray]]) -> Rung:
+def _try_quality(scene: Scene, quality: str, settings: SolverSettings,
+                 calls: list[tuple[int, np.ndarray]]) -> Rung:
     """Solve the pilot's links with a quality, and with ten times its rays, and compare them."""
     solved = [kept("pilot", (scene.content_hash(), one.attributes(), *calls),
-                   partial(_solve, scene, one, calls),
+                   partial(_solve_pilot, scene, one, calls),
                    lambda found: ({"found": found}, None), lambda arrays, _: arrays["found"])
               for one in (settings, settings.finer(FINER))]
     coarse, finer = solved[0][:-1], solved[1][:-1]
@@ -244,8 +245,8 @@ def _try(scene: Scene, quality: str, settings: SolverSettings,
                 float(solved[0][-1]))
 
 
-def _solve(scene: Scene, settings: SolverSettings, calls: list[tuple[int, np.ndarray]]
-           ) -> np.ndarray:
+def _solve_pilot(scene: Scene, settings: SolverSettings, calls: list[tuple[int, np.ndarray]]
+                 ) -> np.ndarray:
     """Return the gains of all calls [dB], NaN where not detected, then the seconds a link."""
     solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
     gains, seconds = [], []

@@ -224,7 +224,7 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
     check_target(out_path)
     names = [scene.config.devices[i].device for i in index]
     store = open_store(scene, settings)
-    finished = _finished(Path(out_path), store.hash, names)
+    finished = _finished_map(Path(out_path), store.hash, names)
     if finished is not None:
         placed = finished.with_origin(scene.config.origin)  # the origin does not change the gains
         if placed.dataset.attrs != finished.dataset.attrs:
@@ -248,15 +248,16 @@ def trace_map(scene: Scene | Path | str, settings: SolverSettings | None = None,
     raw_db[raw_db == IMPOSSIBLE_DB] = np.nan
     checked = ~inside & ~impossible
 
-    def chosen(values: np.ndarray) -> np.ndarray:
+    def of_checked(values: np.ndarray) -> np.ndarray:
         return np.broadcast_to(values, raw_db.shape)[checked]
 
     figures: dict[str, float | str] = dict(
-        check_gains(chosen(raw_db), chosen(los), chosen(distance_m), frequency_hz,
-                    settings.solver, settings.combining, chosen(direct_dbi), chosen(peak_dbi)))
+        check_gains(of_checked(raw_db), of_checked(los), of_checked(distance_m), frequency_hz,
+                    settings.solver, settings.combining, of_checked(direct_dbi),
+                    of_checked(peak_dbi)))
     limit_db = scene.config.gain_limit_db
     warn_of_terrain(scene.city, device_m, positions_m, np.isnan(raw_db) & checked)
-    gain_db, counts = _censor(raw_db, inside, impossible, limit_db)
+    gain_db, counts = _censor_gains(raw_db, inside, impossible, limit_db)
     rows, columns, finer_db = solve_finer(scene, settings, store, index, executor)
     outside = ~inside[columns]
     finer_db = detected(finer_db, limit_db)
@@ -317,7 +318,7 @@ def _antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarr
     return direct_dbi, peak_dbi
 
 
-def _finished(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | None:
+def _finished_map(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | None:
     """Load the map at `path` if it is finished, of this trace and these devices; else None."""
     if not path.exists():
         return None
@@ -360,8 +361,8 @@ def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
         "libraries": library_versions()})
 
 
-def _censor(raw_db: np.ndarray, inside: np.ndarray, impossible: np.ndarray, limit_db: float
-            ) -> tuple[np.ndarray, dict[str, int]]:
+def _censor_gains(raw_db: np.ndarray, inside: np.ndarray, impossible: np.ndarray, limit_db: float
+                  ) -> tuple[np.ndarray, dict[str, int]]:
     """Set gains that are not detected to NaN, and count the links by reason."""
     within = np.broadcast_to(inside, raw_db.shape)
     no_path = np.isnan(raw_db) & ~within & ~impossible

@@ -127,7 +127,8 @@ def _load_copy(rt: Any, city: Path | str | Sequence[CityShape]) -> Any:
     """Write a copy of a city, with flat ground as a half space, and load it into Sionna RT."""
     shapes = read_city(city) if isinstance(city, Path | str) else city
     with scratch_folder() as folder:
-        write_city(folder, [_deep(shape) if _is_flat_ground(shape) else shape for shape in shapes])
+        write_city(folder, [_as_half_space(shape) if _is_flat_ground(shape) else shape
+                            for shape in shapes])
         try:
             return rt.load_scene(str(folder / "city.xml"))
         except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OSError,
@@ -143,7 +144,7 @@ def _is_flat_ground(shape: CityShape) -> bool:
     return bool((np.abs(shape.mesh.vertices[:, 2]) < GROUND_M).all())
 
 
-def _deep(ground: CityShape) -> CityShape:
+def _as_half_space(ground: CityShape) -> CityShape:
     """Make the ground so thick that nothing is reflected from its far side: a half space."""
     material = replace(ground.material, name=f"{ground.material.name}-ground",
                        thickness_m=GROUND_DEPTH_M)
@@ -328,7 +329,7 @@ class PathGains:
             return np.array(values, dtype=float).reshape(n, -1)
 
         field = by_link(paths.a[0]) + 1j * by_link(paths.a[1])
-        leaving, arriving = (_directions(by_link(zenith), by_link(azimuth)) for zenith, azimuth in
+        leaving, arriving = (_unit_vectors(by_link(zenith), by_link(azimuth)) for zenith, azimuth in
                              ((paths.theta_t, paths.phi_t), (paths.theta_r, paths.phi_r)))
         counted = self._counted(paths, np.abs(field), np.sum(leaving * arriving, axis=-1))
         # Sionna's coefficients lack the phase of the delay, which is -1 where there is no path
@@ -405,7 +406,7 @@ def power_to_db(power: np.ndarray) -> np.ndarray:
         return np.where(power > 0, 10 * np.log10(power), np.nan)
 
 
-def _directions(zenith_rad: np.ndarray, azimuth_rad: np.ndarray) -> np.ndarray:
+def _unit_vectors(zenith_rad: np.ndarray, azimuth_rad: np.ndarray) -> np.ndarray:
     """Return the unit vectors (..., 3) of zenith and azimuth; the azimuth counts from x to y."""
     return np.stack([np.sin(zenith_rad) * np.cos(azimuth_rad),
                      np.sin(zenith_rad) * np.sin(azimuth_rad), np.cos(zenith_rad)], axis=-1)

@@ -72,7 +72,7 @@ from radiotwin.scene.readers.solids import (
     make_shell_prisms,
 )
 from radiotwin.scene.readers.systems import check_declared_system
-from radiotwin.scene.readers.terrain import Ground, make_ground, stand_on
+from radiotwin.scene.readers.terrain import Ground, make_ground, raise_to_terrain
 from radiotwin.scene.readers.vegetation import make_vegetation, vegetation_fact
 from radiotwin.scene.streets import cut_streets
 from radiotwin.scene.surfaces import Surfaces
@@ -219,10 +219,10 @@ def build_scene_from_map(
             f"{path} holds no buildings (closed ways or multipolygons with the tag building or "
             "building:part; of a table polygons); export an area or a layer that has some",
             *(problem.message for problem in [*found.problems, *left_out])]))
-    features = _within(found.features, options.bbox, path)
+    features = _features_in_box(found.features, options.bbox, path)
     SHAPES.check(len(features), path)
     check_crowding(shapely.bounds([feature.area for feature in features]), path)
-    origin = options.origin or _origin(features, options.bbox)
+    origin = options.origin or _middle_of(features, options.bbox)
     _check_sizes(features, origin, path)
     if height_column is not None:
         check_declared(height_column, [one.tags for one in features], path)
@@ -233,7 +233,7 @@ def build_scene_from_map(
     prisms += bodies
     _check_unit(prisms, found.plan_m, height_column, path)
     problems = (found.problems + left_out + problems + body_problems
-                + _without_height(prisms, features, options.default_height_m, path)
+                + _default_height_problems(prisms, features, options.default_height_m, path)
                 + implausible_heights([(prism.name, prism.height, prism.site or prism.area)
                                        for prism in prisms],
                                       {feature.name: feature.tags for feature in features}))
@@ -248,13 +248,13 @@ def build_scene_from_map(
                          _ground_box(prisms, extent.bounds), GROUND, options.terrain_unit)
     if ground.config is not None:
         origin = origin.model_copy(update={"altitude_m": ground.config.datum_m})
-        prisms = stand_on(prisms, ground)
+        prisms = raise_to_terrain(prisms, ground)
     contacts = find_contacts(prisms)
-    problems += [*_overlaps(prisms, contacts), *ground.problems]
-    city, shape_of = _city(prisms, contacts, ground, materials, problems)
+    problems += [*_overlap_problems(prisms, contacts), *ground.problems]
+    city, shape_of = _assemble_city(prisms, contacts, ground, materials, problems)
     table = _building_table(prisms, shape_of, ground.config is not None)
     counts = Counter(table.drop_duplicates(["building", "height_from"])["height_from"])
-    box_m = _enclosing(around.bounds, extent.bounds)
+    box_m = _enclosing_box(around.bounds, extent.bounds)
     vegetation, unusable = make_vegetation(found.vegetation, origin, box_m)
     city.problems.extend(unusable)
     heights = [f"{height_text(key, height_column)}: {number:,}" for key, number in counts.items()
@@ -267,7 +267,7 @@ def build_scene_from_map(
         ("ground", ground.fact),
         *([("vegetation", vegetation_fact(vegetation))] if vegetation else []),
         ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"),
-        *_not_used(found, features, materials, height_column))
+        *_unused_fact(found, features, materials, height_column))
     provenance = {"source": source_text(source), "seed": str(options.seed),
                   "height_default_m": f"{default_m:g}",
                   "heights_from": ", ".join(f"{key} {number}" for key, number in counts.items())}
@@ -278,8 +278,8 @@ def build_scene_from_map(
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
 
-def _not_used(found: MapFile, features: list[Feature], materials: MaterialTable,
-              declared: HeightColumn | None) -> tuple[tuple[str, str], ...]:
+def _unused_fact(found: MapFile, features: list[Feature], materials: MaterialTable,
+                 declared: HeightColumn | None) -> tuple[tuple[str, str], ...]:
     """Return the report's line on tags, columns and layers that are not used."""
     used = READ_COLUMNS | READ_TAGS | set(materials.by_tag) | (
         {declared.name, declared.ground} if declared else set())
@@ -290,8 +290,8 @@ def _not_used(found: MapFile, features: list[Feature], materials: MaterialTable,
     return (("not used", "; ".join(unused)),) if unused else ()
 
 
-def _without_height(prisms: list[Prism], features: list[Feature], default_height_m: float | None,
-                    path: Path) -> list[Problem]:
+def _default_height_problems(prisms: list[Prism], features: list[Feature],
+                             default_height_m: float | None, path: Path) -> list[Problem]:
     """Return a warning if buildings have the default height, and the user did not give one.
 
     Raises:
@@ -322,7 +322,7 @@ def _check_unit(prisms: list[Prism], plan_m: float, declared: HeightColumn | Non
                        f"--height-column {used[0]}:m")
 
 
-def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
+def _features_in_box(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
     """Return the features that reach into the box; of a 3D model, with all parts of the building.
 
     Raises:
@@ -364,7 +364,7 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
             if one in chosen or (one.shell is not None and one.name in models)]
 
 
-def _origin(features: list[Feature], bbox_deg: Bounds | None) -> Origin:
+def _middle_of(features: list[Feature], bbox_deg: Bounds | None) -> Origin:
     """Return the middle of the box (south, west, north, east) [degrees], or of the buildings."""
     if bbox_deg is None:
         bounds = np.array([feature.area.bounds for feature in features])
@@ -391,7 +391,7 @@ def _bounds_m(prisms: list[Prism], origin: Origin, bbox_deg: Bounds | None) -> B
     return box
 
 
-def _enclosing(one_m: Bounds, other_m: Bounds) -> Bounds:
+def _enclosing_box(one_m: Bounds, other_m: Bounds) -> Bounds:
     """Return the smallest (x_min, x_max, y_min, y_max) around two boxes [m]."""
     return (min(one_m[0], other_m[0]), max(one_m[1], other_m[1]),
             min(one_m[2], other_m[2]), max(one_m[3], other_m[3]))
@@ -419,7 +419,7 @@ def _check_width(width_m: float, max_m: float) -> None:
                        "allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
 
 
-def _overlaps(prisms: list[Prism], contacts: Contacts) -> list[Problem]:
+def _overlap_problems(prisms: list[Prism], contacts: Contacts) -> list[Problem]:
     """Return a warning about buildings that overlap, the largest overlap first."""
     overlaps = sorted(find_overlaps(prisms, contacts), key=lambda overlap: -overlap[2])
     names = [f"{a.name} and {b.name}: {shared_m2:.0f} m²" for a, b, shared_m2 in overlaps]
@@ -434,7 +434,7 @@ def _ground_box(prisms: list[Prism], extent_m: Bounds) -> Bounds:
     return x0, x1, y0, y1
 
 
-def _city(
+def _assemble_city(
     prisms: list[Prism], contacts: Contacts, ground: Ground, table: MaterialTable,
     problems: list[Problem],
 ) -> tuple[ImportedCity, dict[int, str]]:

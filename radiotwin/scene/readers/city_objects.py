@@ -16,7 +16,7 @@ import shapely
 from radiotwin.errors import BadInput
 from radiotwin.io.budgets import SHAPES, VERTICES
 from radiotwin.scene.checks import Problem, listed, warning
-from radiotwin.scene.readers.features import Feature, LeftOut, MapFile, Shell, hidden
+from radiotwin.scene.readers.features import Feature, LeftOut, MapFile, Shell, why_excluded
 from radiotwin.scene.readers.heights import column_name
 from radiotwin.scene.readers.systems import (
     chosen_system,
@@ -89,16 +89,17 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
     built = [one for one in objects if one.kind in BUILT]
     chosen: list[tuple[CityObject, str, list[Geometry]]] = []
     unusable: list[CityObject] = []
-    solid_roots = {_root(one, by_name) for one in built if _choose(one, 1)}
-    with_surfaces = solid_roots | {_root(one, by_name) for one in built if _choose(one, 0)}
-    for one in built:
-        root = _root(one, by_name)
+    rows = [(one, _building_name(one, by_name), _best_geometries(one, 1), _best_geometries(one, 0))
+            for one in built]
+    with_surfaces = {building for _, building, surfaces, _ in rows if surfaces}
+    with_any = with_surfaces | {building for _, building, _, outlines in rows if outlines}
+    for one, building, surfaces, outlines in rows:
         # The outline of a building is not needed if its parts have surfaces
-        geometries = _choose(one, 1) or ([] if root in solid_roots else _choose(one, 0))
+        geometries = surfaces or ([] if building in with_surfaces else outlines)
         if geometries:
-            chosen.append((one, root, geometries))
-        elif root not in with_surfaces and one.name == root or (
-                one.geometries and root not in solid_roots):
+            chosen.append((one, building, geometries))
+        elif building not in with_any and one.name == building or (
+                one.geometries and building not in with_surfaces):
             unusable.append(one)
     SHAPES.check(sum(len(geometries) for _, _, geometries in chosen), path)
     problems = _other_objects(objects)
@@ -113,14 +114,14 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
                          _one_system(path, systems, crs))
     features, left_out = [], [LeftOut(one.name, _NOT_BUILT, None) for one in unusable]
     for feature in _features(chosen, points, by_name):
-        if below := hidden(feature.name, feature.tags, feature.area):
+        if below := why_excluded(feature.name, feature.tags, feature.area):
             left_out.append(below)
         else:
             features.append(feature)
     return MapFile(features, left_out, problems)
 
 
-def _root(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
+def _building_name(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
     """Return the name of the building that an object belongs to.
 
     A group of buildings (CityObjectGroup), which has them as children, does not count.
@@ -135,7 +136,7 @@ def _root(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
     return one.name
 
 
-def _choose(one: CityObject, lowest_lod: int) -> list[Geometry]:
+def _best_geometries(one: CityObject, lowest_lod: int) -> list[Geometry]:
     """Return the geometries of the best level of detail: the highest below 3, else the lowest.
 
     `lowest_lod` 1 selects among surfaces (LoD 1 and more), 0 among outlines.
@@ -214,12 +215,12 @@ def _features(chosen: list[tuple[CityObject, str, list[Geometry]]], points: list
         if geometry.lod < 1:
             features.append(Feature(root, tags, _outline(geometry, known)))
             continue
-        shell = Shell(known, _indices(geometry), ground_m[root])
+        shell = Shell(known, _ring_indices(geometry), ground_m[root])
         features.append(Feature(root, tags, shapely.MultiPoint(known[:, :2]).convex_hull, shell))
     return features
 
 
-def _indices(geometry: Geometry) -> list[list[np.ndarray]]:
+def _ring_indices(geometry: Geometry) -> list[list[np.ndarray]]:
     """Return the rings of each polygon as indices of the geometry's corners."""
     sizes = [len(ring) for polygon in geometry.polygons for ring in polygon]
     rings = iter(np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]))
@@ -229,7 +230,7 @@ def _indices(geometry: Geometry) -> list[list[np.ndarray]]:
 def _outline(geometry: Geometry, known: np.ndarray) -> shapely.MultiPolygon:
     """Return the area of an outline (LoD 0) with corners (n, 3), in degrees."""
     polygons = []
-    for rings in _indices(geometry):
+    for rings in _ring_indices(geometry):
         loops = [known[ring, :2] for ring in rings if len(ring) > 2]
         if loops:
             polygons.append((loops[0], loops[1:]))

@@ -109,6 +109,7 @@ class _Reader:
         self.line = 0
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        """Begin an element: skip it, open an object, or note its geometry or attribute."""
         name = tag.rpartition(":")[2]
         self.tags.append(name)
         depth, self.line = len(self.tags), line
@@ -128,6 +129,7 @@ class _Reader:
             self._content(name, attributes, depth)
 
     def _note_system(self, attributes: dict[str, str]) -> None:
+        """Note a coordinate reference system, and the dimension of positions from here on."""
         system = attributes.get("srsName")
         if system and system not in self.systems and len(self.systems) < _MAX_SYSTEMS:
             self.systems.append(system)
@@ -136,6 +138,7 @@ class _Reader:
             self.dimensions.append((len(self.tags), int(dimension)))
 
     def _open_object(self, name: str, attributes: dict[str, str], depth: int) -> None:
+        """Add an object of the model, as a part of the one that is open."""
         known = attributes.get("gml:id") or f"{name} {len(self.objects) + 1}"
         parent = self.open[-1][1].name if self.open else ""
         made = CityObject(known[:_NAME_LENGTH], name, parent=parent)
@@ -144,6 +147,7 @@ class _Reader:
         self.open.append((depth, made, _Surfaces()))
 
     def _content(self, name: str, attributes: dict[str, str], depth: int) -> None:
+        """Begin an element within an object: level of detail, surface, polygon, or a value."""
         surfaces = self.open[-1][2]
         if found := _LOD.fullmatch(name):
             self.lod = depth, float(found[1]), "Solid" in found[2]
@@ -162,6 +166,7 @@ class _Reader:
             self.text, self.unit = [], attributes.get("uom", "")
 
     def add_text(self, text: str) -> None:
+        """Collect the text of positions or of a value."""
         if self.text is not None:
             self.text.append(text)
             self.text_length += len(text)
@@ -169,6 +174,7 @@ class _Reader:
                 TAG_BYTES.check(self.text_length, f"{self.path}, line {self.line}")
 
     def end(self, tag: str) -> None:
+        """End an element: store its positions, polygon, value or object."""
         name, depth = self.tags[-1], len(self.tags)
         self.tags.pop()
         if self.dimensions and self.dimensions[-1][0] == depth:
@@ -196,6 +202,7 @@ class _Reader:
             made.geometries = surfaces.geometries()
 
     def _end_of_geometry(self, name: str, dimension: int) -> None:
+        """Store positions, a ring, or a polygon with its rings."""
         assert self.rings is not None
         if self.text is not None:
             self._add_numbers("".join(self.text), dimension)
@@ -219,6 +226,7 @@ class _Reader:
             self.rings = None
 
     def _add_numbers(self, text: str, dimension: int) -> None:
+        """Parse a list of positions of 2 or 3 numbers; BadInput if it is another text."""
         try:
             # `coordinates` of GML 2 has `x,y,z x,y,z`
             numbers = [float(word) for word in text.replace(",", " ").split()]

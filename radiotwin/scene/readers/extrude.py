@@ -73,12 +73,12 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
                 mesh = trimesh.Trimesh(vertices + [0, 0, rise_m], faces, process=False)
                 blocks.append(Block(members, prisms[members[0]].material, mesh))
                 continue
-            solid = _union([_solid(prisms[i]) for i in members])
+            solid = _union([_prism_solid(prisms[i]) for i in members])
             if block in cut_by:
-                solid -= _union([_solid(prisms[i], SLOT_M) for i in sorted(cut_by[block])])
+                solid -= _union([_prism_solid(prisms[i], SLOT_M) for i in sorted(cut_by[block])])
             solid = solid.simplify(SIMPLIFY_M)
             if not solid.is_empty():
-                blocks.append(Block(members, prisms[members[0]].material, _mesh(solid)))
+                blocks.append(Block(members, prisms[members[0]].material, _cleaned_mesh(solid)))
     return blocks
 
 
@@ -102,10 +102,10 @@ def _union(solids: list[Manifold]) -> Manifold:
     return Manifold.batch_boolean(solids, OpType.Add)
 
 
-def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
+def _prism_solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     """Return a prism as a solid, with all its faces moved outwards by `wider_m`."""
     if prism.body is not None:
-        solid = _placed(prism)
+        solid = _placed_body(prism)
         return _union([solid.translate(wider_m * corner) for corner in _CORNERS]) if wider_m \
             else solid
     assert isinstance(prism.area, shapely.Polygon)
@@ -113,7 +113,7 @@ def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     return _extruded(area, prism.height.bottom_m - wider_m, prism.height.top_m + wider_m)
 
 
-def _placed(prism: Prism) -> Manifold:
+def _placed_body(prism: Prism) -> Manifold:
     """Return the solid of a prism's body, moved to the prism's top, with walls to its bottom.
 
     On terrain, the bottom of the prism is lower than that of the body in the file.
@@ -154,7 +154,7 @@ def _extruded(area: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
     return solid
 
 
-def _mesh(solid: Manifold) -> trimesh.Trimesh:
+def _cleaned_mesh(solid: Manifold) -> trimesh.Trimesh:
     """Return the mesh of a solid, cleaned unless that would open it.
 
     Cleaning merges coincident corners. Where a solid touches itself along a vertical edge, both

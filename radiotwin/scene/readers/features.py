@@ -153,7 +153,7 @@ def is_building(tags: Mapping[str, str]) -> bool:
     return any(_is_set(tags, key) for key in BUILDING_KEYS)
 
 
-def hidden(name: str, tags: Mapping[str, str], place: BaseGeometry | None) -> LeftOut | None:
+def why_excluded(name: str, tags: Mapping[str, str], place: BaseGeometry | None) -> LeftOut | None:
     """Return why a building is left out (underground, indoors, not standing); None: it is kept."""
     for key in BUILDING_KEYS:
         if tags.get(key, "").strip().lower() in _LIFECYCLE:

@@ -37,8 +37,8 @@ from radiotwin.scene.readers.features import (
     Feature,
     LeftOut,
     MapFile,
-    hidden,
     is_building,
+    why_excluded,
 )
 from radiotwin.scene.readers.heights import ALIASES
 from radiotwin.scene.readers.layers import choose_layers, join_layers
@@ -159,7 +159,7 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
         return shapely.MultiPolygon([part for area in areas for part in shapely.get_parts(area)]
                                     ) if areas else None
     if kind not in ("Polygon", "MultiPolygon"):
-        return _points(coordinates)
+        return _all_positions(coordinates)
     listed = [coordinates] if kind == "Polygon" else coordinates
     try:
         polygons = [[np.array([point[:2] for point in ring], dtype=float) for ring in polygon]
@@ -178,7 +178,7 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
                        "numbers; export the map again") from None
 
 
-def _points(coordinates: Any) -> BaseGeometry | None:
+def _all_positions(coordinates: Any) -> BaseGeometry | None:
     """Return all positions of a geometry that is no area, to locate it; None if impossible."""
     points, waiting = [], [coordinates]
     while waiting:
@@ -236,7 +236,7 @@ def map_file(
         if marked and not is_building(tags):
             continue
         tags = tags if marked else tags | {"building": "yes"}
-        if below := hidden(name, tags, area):
+        if below := why_excluded(name, tags, area):
             left_out.append(below)
         elif area is None or area.geom_type not in _AREAS:
             left_out.append(LeftOut(name, UNREAD if area is None else NO_AREA, area))
@@ -313,8 +313,8 @@ def read_geopackage(path: Path, crs: str | None = None, wanted: Sequence[str] = 
                        for layer in layers}, wanted)
             for layer in chosen:
                 geometry, srs = layers[layer]
-                rows = _rows(path, database, layer, geometry)
-                parts[layer] = map_file(path, rows, chosen_system(path, _system(database, srs),
+                rows = _layer_rows(path, database, layer, geometry)
+                parts[layer] = map_file(path, rows, chosen_system(path, _srs_name(database, srs),
                                                                   crs))
     except (sqlite3.Error, shapely.errors.GEOSException, OverflowError,
             UnicodeDecodeError) as error:  # of a name in a message of SQLite
@@ -345,8 +345,8 @@ def _layers(database: sqlite3.Connection, others: list[str]) -> list[tuple[str, 
     return layers
 
 
-def _rows(path: Path, database: sqlite3.Connection, layer: str,
-          geometry: str) -> Iterator[tuple[str, dict[str, Any], Any]]:
+def _layer_rows(path: Path, database: sqlite3.Connection, layer: str,
+                geometry: str) -> Iterator[tuple[str, dict[str, Any], Any]]:
     """Yield name, columns and geometry of each row of a layer."""
     # The integer primary key is no attribute
     columns = [name for _, name, kind, _, _, key in stored_columns(database, layer)
@@ -358,10 +358,10 @@ def _rows(path: Path, database: sqlite3.Connection, layer: str,
         name = f"{layer} {number}"
         read += sum(len(value) for value in (blob, *values) if isinstance(value, bytes | str))
         FILE_BYTES.check(read, f"{path}, layer {layer}")
-        yield name, dict(zip(columns, values)), _area(blob, f"{path}: {name}")
+        yield name, dict(zip(columns, values)), _package_geometry(blob, f"{path}: {name}")
 
 
-def _area(blob: Any, source: str) -> BaseGeometry | None:
+def _package_geometry(blob: Any, source: str) -> BaseGeometry | None:
     """Return the geometry of a blob [1, section 2.1.3]; None: empty, or not one."""
     if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
         return None
@@ -372,7 +372,7 @@ def _area(blob: Any, source: str) -> BaseGeometry | None:
     return area_of_wkb(blob[8 + 8 * _ENVELOPE_DOUBLES[code]:], source)
 
 
-def _system(database: sqlite3.Connection, number: int) -> str | None:
+def _srs_name(database: sqlite3.Connection, number: int) -> str | None:
     """Return the system of a srs_id: authority and code, or WKT; None: undefined."""
     for known, authority, code, definition in scan(
             database, "gpkg_spatial_ref_sys",
@@ -493,7 +493,7 @@ def area_of_wkb(data: bytes, source: object) -> BaseGeometry | None:
         BadInput: geometries are nested too deep.
         shapely.errors.GEOSException: the data are damaged.
     """
-    if not _kinds(data, source) <= {*_PLANE}:
+    if not _wkb_kinds(data, source) <= {*_PLANE}:
         return None
     area = shapely.from_wkb(data)
     while any(part.geom_type == "GeometryCollection" for part in shapely.get_parts(area)):
@@ -501,7 +501,7 @@ def area_of_wkb(data: bytes, source: object) -> BaseGeometry | None:
     return area if np.isfinite(shapely.get_coordinates(area)).all() else None
 
 
-def _kinds(data: bytes, source: object) -> set[int]:
+def _wkb_kinds(data: bytes, source: object) -> set[int]:
     """Return the kinds (codes of [3]) of a geometry and all geometries nested in it."""
     found: set[int] = set()
     at, waiting = 0, [1]  # geometries that are still to be read, by level of nesting

@@ -241,19 +241,20 @@ def height_of(tags: Mapping[str, str], default_m: float,
             continue
         value_m = _top_m(column, tags)
         if column.name in ROOFLESS and value_m >= 0:
-            value_m += _first(tags, (("roof:height", 1.0), ("roof:levels", LEVEL_M)), unusable)
+            value_m += _first_length_m(tags, (("roof:height", 1.0), ("roof:levels", LEVEL_M)),
+                                       unusable)
         if 0 < value_m <= MAX_HEIGHT_M:
             top_m, source, sd_m = value_m, column.label, column.sd_m
             break
         unusable.append(", ".join(f"{name}={tags[name]}" for name in (column.name, column.ground)
                                   if name))
-    bottom_m = _first(tags, (("min_height", 1.0), ("building:min_level", LEVEL_M)), unusable,
-                      -MAX_HEIGHT_M)
+    bottom_m = _first_length_m(tags, (("min_height", 1.0), ("building:min_level", LEVEL_M)),
+                               unusable, -MAX_HEIGHT_M)
     return Height(max(bottom_m, 0.0), top_m, source, unusable, sd_m)
 
 
-def _first(tags: Mapping[str, str], keys: Iterable[tuple[str, float]], unusable: list[str],
-           lowest_m: float = 0.0) -> float:
+def _first_length_m(tags: Mapping[str, str], keys: Iterable[tuple[str, float]], unusable: list[str],
+                    lowest_m: float = 0.0) -> float:
     """Return the first usable length [m] of tags, given with their units [m]; 0 if there is none.
 
     Others are appended to `unusable`.

@@ -33,8 +33,8 @@ from radiotwin.scene.readers.features import (
     LeftOut,
     MapFile,
     OutlineBudget,
-    hidden,
     is_building,
+    why_excluded,
 )
 from radiotwin.scene.readers.vegetation import TAGS, kind_of
 
@@ -143,7 +143,7 @@ def assemble(elements: OsmElements) -> MapFile:
             continue
         used.update(way for way, role in relation.members if role == "outer" or (
             role != "inner" and not _is_courtyard(elements.ways[way], area, elements)))
-        if below := hidden(f"relation/{number}", tags, area):
+        if below := why_excluded(f"relation/{number}", tags, area):
             left_out.append(below)
         else:
             relations.append(Feature(f"relation/{number}", tags, area))
@@ -151,7 +151,7 @@ def assemble(elements: OsmElements) -> MapFile:
     for number, way in elements.ways.items():
         if number in used or not is_building(way.tags):
             continue
-        if below := hidden(f"way/{number}", way.tags, None):
+        if below := why_excluded(f"way/{number}", way.tags, None):
             left_out.append(replace(below, place=_place(way, elements)))
         elif not way.nodes or not elements.has_positions(way.nodes):
             left_out.append(LeftOut(f"way/{number}", INCOMPLETE, _place(way, elements)))
@@ -347,6 +347,7 @@ class _XmlReader:
         self.subject = ""  # its file and line
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        """Begin an element: a node, way or relation, or a tag, node or member of one."""
         self.depth += 1
         if self.depth == 1 and tag != "osm":
             raise BadInput(f"{self.path}, line {line}: the file begins with <{tag}>, not <osm>; "
@@ -371,6 +372,7 @@ class _XmlReader:
                 "ref": self._integer(attributes, "ref", line) if is_way else None})
 
     def _element(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        """Store a node, or open a way or relation."""
         if tag == "node":
             number = self._integer(attributes, "id", line)
             self.elements.positions[number] = _position(f"{self.path}, line {line}: a node",
@@ -385,12 +387,14 @@ class _XmlReader:
             self.elements.remarked = True
 
     def end(self, tag: str) -> None:
+        """End an element: store a way or relation."""
         self.depth -= 1
         if self.depth == 1 and self.open is not None:
             _add_element(self.elements, self.subject, self.open)
             self.open = None
 
     def _integer(self, attributes: dict[str, str], name: str, line: int) -> int:
+        """Return an attribute that is an integer; BadInput if it is absent or another text."""
         try:
             return int(attributes[name])
         except (KeyError, ValueError):

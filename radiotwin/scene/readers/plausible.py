@@ -78,7 +78,7 @@ def implausible_heights(buildings: Sequence[tuple[str, Height, BaseGeometry]],
             "width, as hardly any building is" if rare.any() else
             f"of {len(tops_m):,} building(s) are taller than {MAX_MEDIAN_M:g} m, more than half, "
             "as in no city")
-    return problems_of(examples, what + _hint(known[int(named[0])][1].source, known, columns))
+    return problems_of(examples, what + _remedy(known[int(named[0])][1].source, known, columns))
 
 
 def _width_m(site: BaseGeometry) -> float:
@@ -88,8 +88,8 @@ def _width_m(site: BaseGeometry) -> float:
     return float(sides_m[:2].min()) if len(sides_m) > 1 else 0.0
 
 
-def _hint(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
-          columns: Mapping[str, Mapping[str, str]]) -> str:
+def _remedy(source: str, known: Sequence[tuple[str, Height, BaseGeometry]],
+            columns: Mapping[str, Mapping[str, str]]) -> str:
     """Return a remedy for a column of implausible heights: what it may hold, and the option."""
     if source == "model":
         return "; are the model's elevations in metres?"

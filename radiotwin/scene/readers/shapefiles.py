@@ -57,7 +57,8 @@ _ERRORS = (struct.error, ValueError, LookupError, TypeError, AttributeError, Ass
            EOFError, OSError, OverflowError, shapely.errors.GEOSException)
 
 
-def _patches_file(path: Path, rows: Iterable[tuple[str, Mapping, Any]], system: str) -> MapFile:
+def _multipatch_buildings(path: Path, rows: Iterable[tuple[str, Mapping, Any]],
+                          system: str) -> MapFile:
     """Return the buildings of multipatches, rows (name, columns, surfaces)."""
     known = find_system(path, system)
     project, unit_m = degrees_from(path, plane_of(known)), vertical_unit_m(known)
@@ -76,7 +77,7 @@ def _patches_file(path: Path, rows: Iterable[tuple[str, Mapping, Any]], system: 
     return city_features(path, objects, ["OGC:CRS84"])
 
 
-def _patch_surfaces(shape: Any) -> list[Polygon]:
+def _multipatch_polygons(shape: Any) -> list[Polygon]:
     """Return the polygons of a multipatch: triangles of strips and fans, rings with their holes."""
     found: list[Polygon] = []
     outline = None  # kind of the last ring that may have holes
@@ -124,12 +125,13 @@ def read_shapefile(path: Path, crs: str | None = None, wanted: Sequence[str] = (
     Raises:
         BadInput: no such file, one of the three missing, cut off or damaged, or too large.
     """
-    layers = _archived(path) if path.suffix.lower() == ".zip" else {path.stem: _beside(path)}
+    layers = (_read_archive(path) if path.suffix.lower() == ".zip"
+              else {path.stem: _read_folder(path)})
     chosen: list[str] = list(layers)
     problems: list[Problem] = []
     others: tuple[str, ...] = ()
     if len(layers) > 1:
-        areas = {name: files for name, files in layers.items() if _kind(files) in _AREAS}
+        areas = {name: files for name, files in layers.items() if _shape_type(files) in _AREAS}
         chosen, problems = choose_layers(
             path, {name: _columns(path, name, files) for name, files in (areas or layers).items()},
             wanted)
@@ -149,13 +151,13 @@ def read_shapefile(path: Path, crs: str | None = None, wanted: Sequence[str] = (
                            "--crs EPSG:25832")
         system = chosen_system(path, _text(files[".prj"]) if ".prj" in files else None, crs)
         assert system is not None
-        is_patch = _kind(files) == MULTIPATCH
-        rows = _rows(path, name, files, _patch_surfaces if is_patch else _area)
-        parts[name] = (_patches_file if is_patch else map_file)(path, rows, system)
+        is_patch = _shape_type(files) == MULTIPATCH
+        rows = _rows(path, name, files, _multipatch_polygons if is_patch else _polygons)
+        parts[name] = (_multipatch_buildings if is_patch else map_file)(path, rows, system)
     return replace(join_layers(path, parts, problems), layers=others)
 
 
-def _kind(files: Mapping[str, bytes]) -> int:
+def _shape_type(files: Mapping[str, bytes]) -> int:
     """Return the type of a Shapefile's shapes [1]; -1 if the file is too short."""
     head = files[".shp"][32:36]
     return int.from_bytes(head, "little") if len(head) == 4 else -1
@@ -174,7 +176,7 @@ def _columns(path: Path, name: str, files: Mapping[str, bytes]) -> list[str]:
                        ) from None
 
 
-def _beside(path: Path) -> dict[str, bytes]:
+def _read_folder(path: Path) -> dict[str, bytes]:
     """Read the files of a Shapefile in a folder: suffix -> content."""
     files = {".shp": read_bytes(path, "Shapefile")}
     size = len(files[".shp"])
@@ -189,7 +191,7 @@ def _beside(path: Path) -> dict[str, bytes]:
     return files
 
 
-def _archived(path: Path) -> dict[str, dict[str, bytes]]:
+def _read_archive(path: Path) -> dict[str, dict[str, bytes]]:
     """Read the Shapefiles in a ZIP archive: name -> suffix -> content."""
     layers: dict[str, dict[str, bytes]] = {}
     names: list[str] = []
@@ -278,7 +280,7 @@ def _check_records(subject: str, data: bytes) -> int:
     return records
 
 
-def _area(shape: Any) -> BaseGeometry | None:
+def _polygons(shape: Any) -> BaseGeometry | None:
     """Return the polygons of a shape: rings oriented as its largest are outlines, others holes.
 
     Outlines run clockwise [1]; some writers reverse all rings.

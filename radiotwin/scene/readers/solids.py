@@ -95,7 +95,7 @@ def make_prisms(
         height_column: column of heights that the user named; None: known ones.
     """
     defects = _Defects()
-    areas = _clean(features, origin, defects)
+    areas = _clean_areas(features, origin, defects)
     wholes = [(feature, area) for feature, area in areas if not feature.is_part]
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
@@ -169,19 +169,19 @@ class _Defects:
                 for problem in problems_of(self.names.get(kind, ()), text, severity)]
 
 
-def _clean(features: Sequence[Feature], origin: Origin, defects: _Defects) -> list[Area]:
+def _clean_areas(features: Sequence[Feature], origin: Origin, defects: _Defects) -> list[Area]:
     """Return the features with their cleaned areas in the local frame, without empty areas."""
     areas = shapely.transform([feature.area for feature in features],
                               lambda points: np.column_stack(to_local(origin, *points.T)))
     return [(feature, kept) for feature, area in zip(features, areas)
-            if (kept := _clean_one(feature, area, defects)) is not None]
+            if (kept := _clean_area(feature, area, defects)) is not None]
 
 
-def _clean_one(feature: Feature, area: BaseGeometry,
-               defects: _Defects) -> shapely.MultiPolygon | None:
+def _clean_area(feature: Feature, area: BaseGeometry,
+                defects: _Defects) -> shapely.MultiPolygon | None:
     """Return the polygons of an area [m], repaired and rounded, without slivers, or None."""
     invalid = not area.is_valid
-    area, shared_m2 = _united(area)
+    area, shared_m2 = _unite_polygons(area)
     if area.area < GRID_M**2:
         defects.add("no area", feature.name)
         return None
@@ -200,7 +200,7 @@ def _clean_one(feature: Feature, area: BaseGeometry,
     return shapely.MultiPolygon(kept) if kept else None
 
 
-def _united(area: BaseGeometry) -> tuple[shapely.MultiPolygon, float]:
+def _unite_polygons(area: BaseGeometry) -> tuple[shapely.MultiPolygon, float]:
     """Return the valid polygons of an area, and the area by which its polygons overlap [m²].
 
     A polygon inside another one is united with it: a courtyard would be a ring of the polygon [1].
@@ -250,7 +250,7 @@ def _resolve_parts(
             owner = min(owners, key=whole_m2.__getitem__)
             parts_of.setdefault(owner, []).append(area)
             building = wholes[owner]
-            feature = _inherit(feature, building[0])
+            feature = _inherit_tags(feature, building[0])
         resolved.append((feature, area, building))
     for index, (feature, area) in enumerate(wholes):
         if index in parts_of:
@@ -266,7 +266,7 @@ def _resolve_parts(
     return resolved
 
 
-def _inherit(part: Feature, whole: Feature) -> Feature:
+def _inherit_tags(part: Feature, whole: Feature) -> Feature:
     """Add the tags of a building to a part of it that lacks them, except those of the bottom."""
     tags = {key: value for key, value in whole.tags.items()
             if key not in ("min_height", "building:min_level")}
@@ -296,7 +296,7 @@ class Contacts:
 def find_contacts(prisms: Sequence[Prism]) -> Contacts:
     """Find prisms that touch or overlap; BadInput if there are too many such pairs."""
     areas: Any = np.array([prism.area for prism in prisms], dtype=object)
-    pairs = _touching(prisms, areas)
+    pairs = _touching_pairs(prisms, areas)
     shared_m2, shared_m = np.zeros(len(pairs)), np.zeros(len(pairs))
     overlapping = 0
     for start in range(0, len(pairs), _PAIRS_AT_ONCE):
@@ -308,7 +308,7 @@ def find_contacts(prisms: Sequence[Prism]) -> Contacts:
     return Contacts(pairs, shared_m2, shared_m)
 
 
-def _touching(prisms: Sequence[Prism], areas: Any) -> np.ndarray:
+def _touching_pairs(prisms: Sequence[Prism], areas: Any) -> np.ndarray:
     """Return the (n, 2) pairs of prisms that touch, the lower index first."""
     bottom_m = np.array([prism.height.bottom_m for prism in prisms])
     top_m = np.array([prism.height.top_m for prism in prisms])

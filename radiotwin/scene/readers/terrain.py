@@ -500,7 +500,7 @@ def _fact(grid: HeightGrid, mesh: GroundMesh, datum_m: float) -> str:
             f"{mesh.max_error_m:.2f} m of the heights (RMS {mesh.rms_error_m:.2f} m)")
 
 
-def stand_on(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
+def raise_to_terrain(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
     """Move buildings up to a terrain; on flat ground they stay.
 
     Heights of OpenStreetMap, and of most 3D city models, count from the lowest point where the

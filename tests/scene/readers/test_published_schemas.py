@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.scene.readers import build_scene
-from radiotwin.scene.readers.features import INDOORS, NOT_THERE, UNDERGROUND, hidden
+from radiotwin.scene.readers.features import INDOORS, NOT_THERE, UNDERGROUND, why_excluded
 from tests.scene.readers import city_models
 from tests.scene.readers.test_height_columns import box
 
@@ -32,7 +32,7 @@ def geojson(tmp_path, rows):
     {"min_height": "-6", "height": "0"}, {"min_height": "-9", "height": "-3"}, {"is_underground": "True"},
     {"max_level": "-1", "min_level": "-3"}, {"relativetoterrain": "entirelyBelowTerrain"}, {"ofl": "1200"}, {"relatievehoogteligging": "-1"}])
 def test_what_lies_below_the_ground(tags):
-    found = hidden("way/1", {"building": "yes"} | tags, None)
+    found = why_excluded("way/1", {"building": "yes"} | tags, None)
     assert found is not None and found.reason == UNDERGROUND and found.name.startswith("way/1: ")
 
 
@@ -46,20 +46,20 @@ def test_what_lies_below_the_ground(tags):
     {"building:levels": "4", "building:levels:underground": "2"}, {"min_height": "-2", "height": "9"},
     {"is_underground": "False"}, {"relativetoterrain": "substantiallyBelowTerrain"}, {"height": "-3"}])
 def test_what_stands_above_the_ground(tags):
-    assert hidden("way/1", {"building": "yes"} | tags, None) is None
+    assert why_excluded("way/1", {"building": "yes"} | tags, None) is None
 
 
 @pytest.mark.parametrize("tags", [{"building": "proposed"}, {"building:part": "Demolished"}])
 def test_what_does_not_stand(tags):
-    found = hidden("way/1", tags | {"height": "9"}, None)
+    found = why_excluded("way/1", tags | {"height": "9"}, None)
     assert found is not None and found.reason == NOT_THERE
-    assert hidden("way/1", {"building": "construction"}, None) is None
+    assert why_excluded("way/1", {"building": "construction"}, None) is None
 
 
 def test_rooms_are_inside_of_buildings():
-    found = hidden("way/1", {"building:part": "yes", "indoor": "room", "level": "2"}, None)
+    found = why_excluded("way/1", {"building:part": "yes", "indoor": "room", "level": "2"}, None)
     assert found is not None and found.reason == INDOORS
-    assert hidden("way/1", {"building": "yes", "indoor": "yes"}, None) is None
+    assert why_excluded("way/1", {"building": "yes", "indoor": "yes"}, None) is None
 
 
 def test_what_lies_below_is_left_out_and_told_and_does_not_replace_what_stands_above(tmp_path, empty_map):
