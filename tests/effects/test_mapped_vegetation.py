@@ -2,25 +2,21 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.closeloop.crossfit import make_bases
 from radiotwin.effects.catalogue.mapped_vegetation import MappedVegetation
-from radiotwin.effects.registry import effect_named
-from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 from radiotwin.twin.model.fitting import add_effect
 from radiotwin.twin.model.model import Model
+from tests.worlds import city_of_boxes
 
 WOOD = [(100.0, 0.0), (220.0, 0.0), (220.0, 300.0), (100.0, 300.0)]
 HEIGHT_M, SPECIFIC_DB_M, MOST_DB = 15.0, 0.2, 1.37 * 2400.0**0.42  # A_m of ITU-R P.833-10 at 2.4 GHz
 
 
 def city(with_wood=True, height_m=HEIGHT_M):
-    ground = trimesh.creation.box(extents=[900, 900, 0.2])
-    ground.apply_translation([150, 150, -0.1])
     declared = [VegetationConfig(name="w", kind="wood", height_m=height_m, rings_m=[WOOD])] if with_wood else []
-    return CityMap(ground.vertices, ground.faces, vegetation=Vegetation.of(declared))
+    return city_of_boxes(ground_m=1200, vegetation=Vegetation.of(declared))
 
 
 def in_wood_m(a_m, b_m, steps=2000):
@@ -74,9 +70,4 @@ def test_it_is_not_looked_for_without_vegetation(world):
     assert "fewer than 60 links" in MappedVegetation().unavailable(world(0, map_=city(height_m=0.5)))
 
 
-def test_it_is_read_again_as_it_was_written():
-    effect = effect_named("mapped_vegetation", "")
-    params = effect.Params(kind="park", specific_attenuation_db_m=0.4, greatest_loss_db=30.0)
-    assert effect.Params.model_validate_json(params.model_dump_json()) == params
-    with pytest.raises(ValueError):
-        effect.Params(kind="hedge")
+

@@ -30,16 +30,26 @@ class KnownLevels(LogDistance):
         return 2
 
 
+def law_db(links):
+    return -22 - 30 * np.log10(links.distance_m)
+
+
 @pytest.fixture
-def flown(make_links):
+def around(make_links):
+    """Make links of some receivers that fly around one device, and the generator of the draw."""
+    def make(receivers, seed, limit_db=LIMIT_DB):
+        rng, receiver = np.random.default_rng(seed), np.repeat(np.arange(receivers), LINKS)
+        receiver_m = np.column_stack([rng.uniform(0, 1500, (len(receiver), 2)), np.full(len(receiver), 40.0)])
+        return make_links([[700.0, 800, 1.5]], receiver_m, limit_db=limit_db, receiver=receiver), rng
+    return make
+
+
+@pytest.fixture
+def flown(around):
     """Links of three receivers of which one, by powers that add, reads noise."""
-    rng = np.random.default_rng(0)
-    receiver = np.repeat(np.arange(RECEIVERS), LINKS)
-    receiver_m = np.column_stack([rng.uniform(0, 1500, (len(receiver), 2)), np.full(len(receiver), 40.0)])
-    links = make_links([[700.0, 800, 1.5]], receiver_m, limit_db=LIMIT_DB, receiver=receiver)
-    level_db = -22 - 30 * np.log10(links.distance_m) + rng.normal(0, 2.5, len(links))
-    noisy = receiver == RAISED
-    level_db[noisy] = 10 * np.log10(10 ** (level_db[noisy] / 10) + 10 ** (FLOOR_DB / 10))
+    links, rng = around(RECEIVERS, 0)
+    floor = np.where(links.receiver == RAISED, 10 ** (FLOOR_DB / 10), 0.0)
+    level_db = 10 * np.log10(10 ** ((law_db(links) + rng.normal(0, 2.5, len(links))) / 10) + floor)
     level_db += rng.normal(0, 0.5, len(links))
     links.level_db[:] = np.where(level_db < LIMIT_DB, np.nan, level_db)
     return links
@@ -57,13 +67,10 @@ def test_only_the_receiver_that_has_one_gets_a_floor(flown, kind):
     assert before.objective - found.objective > 50
 
 
-def test_weak_links_that_scatter_widely_read_no_floor(make_links):
+def test_weak_links_that_scatter_widely_read_no_floor(around):
     """As where walls scatter: half of the shadow that the base expects is not there, and readings go on falling."""
-    rng = np.random.default_rng(2)
-    receiver = np.repeat(np.arange(2), LINKS)
-    receiver_m = np.column_stack([rng.uniform(0, 1500, (len(receiver), 2)), np.full(len(receiver), 40.0)])
-    links = make_links([[700.0, 800, 1.5]], receiver_m, receiver=receiver)
-    expected_db = -22 - 30 * np.log10(links.distance_m)
+    links, rng = around(2, 2, -np.inf)
+    expected_db, receiver = law_db(links), links.receiver
     level_db = np.maximum(expected_db, -90 + rng.normal(0, 12, len(links))) + rng.normal(0, 2.0, len(links))
     links.level_db[:] = np.where(receiver == 1, level_db, expected_db + rng.normal(0, 2.0, len(links)))
     model = Model.build(links, KnownLevels(LogDistanceLine(-20.0, 3.0, 3.0)), 5.0)
@@ -83,15 +90,12 @@ def test_the_usual_floor_is_not_that_of_receivers_that_have_none(make_links, alo
         np.testing.assert_allclose(floors_db, [-90, -91, -92, *[-300 if alone else -91] * 2])
 
 
-def test_receivers_that_gain_nothing_by_a_floor_are_left_without(make_links):
+def test_receivers_that_gain_nothing_by_a_floor_are_left_without(around):
     """Three of six read noise."""
-    rng = np.random.default_rng(1)
-    receiver = np.repeat(np.arange(6), LINKS)
-    receiver_m = np.column_stack([rng.uniform(0, 1500, (len(receiver), 2)), np.full(len(receiver), 40.0)])
-    links = make_links([[700.0, 800, 1.5]], receiver_m, limit_db=LIMIT_DB, receiver=receiver)
-    level_db = -22 - 30 * np.log10(links.distance_m) + rng.normal(0, 2.5, len(links))
-    noise_db = np.where(receiver < 3, FLOOR_DB, -np.inf)
-    level_db = 10 * np.log10(10 ** (level_db / 10) + 10 ** (noise_db / 10))
+    links, rng = around(6, 1)
+    receiver = links.receiver
+    floor = np.where(receiver < 3, 10 ** (FLOOR_DB / 10), 0.0)
+    level_db = 10 * np.log10(10 ** ((law_db(links) + rng.normal(0, 2.5, len(links))) / 10) + floor)
     links.level_db[:] = np.where(level_db < LIMIT_DB, np.nan, level_db)
     model = Model.build(links, KnownLevels(LogDistanceLine(-20.0, 3.0, 3.0)), 5.0)
     fit = add_effect(model.fit(), NoiseFloor())
