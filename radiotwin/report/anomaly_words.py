@@ -1,4 +1,4 @@
-"""Say which groups of links read otherwise than their peers, by how much, and why perhaps."""
+"""Put anomalies into words: which group of links differs from its peers, by how much, and why."""
 
 from collections.abc import Collection, Sequence
 from typing import Any
@@ -43,13 +43,13 @@ RANGES = {"azimuth_deg": "at azimuths", "elevation_deg": "at elevations",
 
 
 def where(report: dict) -> str:
-    """Say which groups of links stand out, and what may be the cause of each; else empty.
+    """Describe the anomalies of a close-loop with their likeliest causes; empty if there are none.
 
     Args:
         report: content of `closeloop.json`.
     """
     anomalies = report.get("anomalies", [])
-    text = [f"{sentence(each, report)} {causes(each, _named(index, report))}"
+    text = [f"{sentence(each, report)} {causes_sentence(each, _named(index, report))}"
             for index, each in enumerate(anomalies[:MAX_SENTENCES])]
     left = len(anomalies) - MAX_SENTENCES
     if left > 0:
@@ -58,17 +58,22 @@ def where(report: dict) -> str:
 
 
 def sentence(anomaly: dict, report: dict) -> str:
-    """Say how a group reads otherwise than its peers: "Device d3 reads 5.6 dB less than …"."""
+    """Compare the links of an anomaly with its peers: "Device d3 reads 5.6 dB less than …"."""
     start, is_plural = group(anomaly, origin_of(report))
     maybe = "" if anomaly["probability"] >= MIN_SURE else "probably "
     over = [OVER[each] for each in anomaly.get("same_over", [])]
     everywhere = f", {join_names(over)}" if over else ""
-    text = f"{maybe}{_otherwise(anomaly, report, is_plural)}{everywhere}"
+    text = f"{maybe}{_predicate(anomaly, report, is_plural)}{everywhere}"
     return f"{start[0].upper()}{start[1:]} {text} ({probability(anomaly['probability'])})."
 
 
-def causes(anomaly: dict, named: Sequence[dict]) -> str:
-    """Name the likeliest causes of a group: "Cause: …" if effects were named that explain it."""
+def causes_sentence(anomaly: dict, named: Sequence[dict]) -> str:
+    """Name the likeliest causes of an anomaly: "Cause: …", or "Its cause is open: …".
+
+    Args:
+        anomaly: entry of `anomalies`.
+        named: entries of `effects` that explain it; none: the cause is open.
+    """
     found = [each for each in anomaly.get("causes", []) if (each["probability"] or 0) >= LIKELY]
     likely = {each["name"] for each in found}
     found = [*(each for each in named if each["name"] not in likely), *found]
@@ -82,12 +87,17 @@ def causes(anomaly: dict, named: Sequence[dict]) -> str:
 
 
 def _named(index: int, report: dict) -> list[dict]:
-    """Return the effects that were named and explain an anomaly."""
+    """Return the effects of a report that explain the anomaly of an index."""
     return [each for each in report["effects"] if index in each.get("anomalies", [])]
 
 
 def cause(name: str, members: Collection[str]) -> str:
-    """Return what a cause is called in a sentence about a group with members of these ends."""
+    """Return a cause in words, in its form for a device or for a receiver.
+
+    Args:
+        name: of the effect.
+        members: ends that the anomaly has members of, such as `device`.
+    """
     if name in (ANOTHER, OTHER):
         return "another cause"
     if name == NONE:
@@ -100,9 +110,9 @@ def cause(name: str, members: Collection[str]) -> str:
 
 
 def group(anomaly: dict, origin: Origin | None = None) -> tuple[str, bool]:
-    """Return a group in words, such as "device d3 on flight f2", and whether it is a plural.
+    """Name the links of an anomaly, such as "device d3 on flight f2", and tell if that is a plural.
 
-    Its place is in latitude and longitude where the origin of the frame is given.
+    A place is in latitude and longitude if the origin of the frame is given, else in metres.
     """
     members = {end: names for end in ENDS if (names := anomaly["members"].get(end))}
     text = ""
@@ -125,7 +135,7 @@ def rows(report: dict) -> list[list[str]]:
     """Return a row of `COLUMNS` for each anomaly."""
     found = []
     for index, each in enumerate(report.get("anomalies", [])):
-        why = causes(each, _named(index, report)).partition(": ")[2].removesuffix(".")
+        why = causes_sentence(each, _named(index, report)).partition(": ")[2].removesuffix(".")
         found.append([
             group(each, origin_of(report))[0], why or "open", statistic(each), size(each),
             interval(each["size"]), probability(each["probability"]), f"{each['links']:,}"])
@@ -133,7 +143,7 @@ def rows(report: dict) -> list[list[str]]:
 
 
 def statistic(anomaly: dict) -> str:
-    """Return what of a group is compared, such as "change of level in the course of time"."""
+    """Return the compared statistic in words, such as "change of level in the course of time"."""
     along = ALONG.get(anomaly.get("along", ""), "")
     return f"{STATISTICS[anomaly['statistic']]} {along}".rstrip()
 
@@ -143,7 +153,7 @@ COLUMNS = ("group", "possible causes", "statistic", "against its peers", "90 % i
 
 
 def seen_from(report: dict) -> str:
-    """Say from how far off a device, receiver or flight would have been said; else empty."""
+    """Give the smallest difference that would have been found on a device, receiver or flight."""
     found = [f"a {each['family']} that is {each['size']:.1f} dB off"
              for each in report.get("seen_from", [])
              if each["family"] in ENDS and each["statistic"] == "level"]
@@ -151,7 +161,7 @@ def seen_from(report: dict) -> str:
 
 
 def seen_rows(report: dict) -> list[list[str]]:
-    """Return a row for each family: the least level, scatter and share of blanks, to be said."""
+    """Return the smallest level, scatter and share of blanks that would be found, by family."""
     sizes: dict[str, dict[str, str]] = {}
     for each in report.get("seen_from", []):
         sizes.setdefault(each["family"], {})[each["statistic"]] = size({"size": each | {
@@ -187,8 +197,8 @@ def interval(found: dict) -> str:
     return f"{signed(low)} to {signed(high)}"
 
 
-def _otherwise(anomaly: dict, report: dict, is_plural: bool) -> str:
-    """Return verb, size and peers: "reads 5.6 dB (5.1 to 6.1) less than the seven others"."""
+def _predicate(anomaly: dict, report: dict, is_plural: bool) -> str:
+    """Return the predicate: "reads 5.6 dB (5.1 to 6.1) less than the seven others"."""
     found, peers = anomaly["size"], _peers(anomaly, report, is_plural)
     value, end = found["value"] or 0.0, "" if is_plural else "s"
     is_less = value < 0
@@ -199,20 +209,21 @@ def _otherwise(anomaly: dict, report: dict, is_plural: bool) -> str:
         low, high = -high, -low
     amount = abs(value)
     if anomaly["statistic"] == "scatter":
-        return f"scatter{end} {amount:.1f} times{_within(low, high)} as much as {peers}"
+        return f"scatter{end} {amount:.1f} times{_in_brackets(low, high)} as much as {peers}"
     if anomaly["statistic"] == "blanks":
         low, high = (None if each is None else 100 * each for each in (low, high))
         blank = "are" if is_plural else "is"
-        return (f"{blank} blank on {100 * amount:.0f} %{_within(low, high, 0)} {more} of "
+        return (f"{blank} blank on {100 * amount:.0f} %{_in_brackets(low, high, 0)} {more} of "
                 f"{'their' if is_plural else 'its'} links than {peers}")
     if anomaly["statistic"] == "curve":
         along = ALONG[anomaly["along"]]
-        return (f"change{end} by {amount:.1f} dB RMS{_within(low, high)} {along}, more than "
+        return (f"change{end} by {amount:.1f} dB RMS{_in_brackets(low, high)} {along}, more than "
                 f"{peers}")
-    return f"read{end} {amount:.1f} dB{_within(low, high)} {more} than {peers}"
+    return f"read{end} {amount:.1f} dB{_in_brackets(low, high)} {more} than {peers}"
 
 
 def _peers(anomaly: dict, report: dict, is_plural: bool) -> str:
+    """Name what an anomaly is compared with, such as "the seven others"."""
     family = anomaly["family"]
     if family in PEERS:
         return PEERS[family].format(its="their" if is_plural else "its")
@@ -225,14 +236,15 @@ def _peers(anomaly: dict, report: dict, is_plural: bool) -> str:
         if others > 0 else f"other {family}s"
 
 
-def _within(low: float | None, high: float | None, digits: int = 1) -> str:
+def _in_brackets(low: float | None, high: float | None, digits: int = 1) -> str:
+    """Return an interval in brackets, with a space before; empty if it is not known."""
     if low is None or high is None:
         return ""
     return f" ({signed(low, digits)} to {signed(high, digits)})"
 
 
 def _ranges(anomaly: dict) -> list[tuple[str, Sequence[float | None]]]:
-    """Return the ranges of a group; those of a place as one."""
+    """Return the ranges that limit an anomaly; x and y together as `place`."""
     ranges = dict(anomaly.get("ranges") or {})
     found = []
     if "x_m" in ranges and "y_m" in ranges:
@@ -241,13 +253,13 @@ def _ranges(anomaly: dict) -> list[tuple[str, Sequence[float | None]]]:
 
 
 def _range(name: str, *ends: Any, origin: Origin | None) -> str:
-    """Return a range in words: "at distances of 100 to 300 m"."""
+    """Put a range into words: "at distances of 100 to 300 m"."""
     if name == "place" and origin:
         west_m, east_m, south_m, north_m = ends
         middle = place_words((west_m + east_m) / 2, (south_m + north_m) / 2, origin)
         return f"at or through {east_m - west_m:.0f} by {north_m - south_m:.0f} m about {middle}"
     if name == "place":
-        west, east, south, north = (_whole(each) for each in ends)
+        west, east, south, north = (_rounded(each) for each in ends)
         return f"at or through x {west} to {east} m, y {south} to {north} m"
     low, high = ends
     if name == "time_s":
@@ -258,28 +270,30 @@ def _range(name: str, *ends: Any, origin: Origin | None) -> str:
     if unit == "°":
         if "azimuth" in name or "heading" in name:
             low, high = (None if each is None else each % 360 for each in (low, high))
-        return f"{start} of {_whole(low)}° to {_whole(high)}°"
+        return f"{start} of {_rounded(low)}° to {_rounded(high)}°"
     if low is None or high is None:
-        beyond = f"up to {_whole(high)}" if low is None else f"from {_whole(low)}"
+        beyond = f"up to {_rounded(high)}" if low is None else f"from {_rounded(low)}"
         return f"{start} {beyond} {unit}"
-    return f"{start} of {_whole(low)} to {_whole(high)} {unit}"
+    return f"{start} of {_rounded(low)} to {_rounded(high)} {unit}"
 
 
 def _times(low: float | None, high: float | None) -> str:
+    """Put a range of times [s] into words; times since 1970 are dates."""
     ends = [None if each is None else
-            moment(each) if DATES_S[0] < each < DATES_S[1] else f"{_whole(each)} s"
+            moment(each) if DATES_S[0] < each < DATES_S[1] else f"{_rounded(each)} s"
             for each in (low, high)]
     words = [f"{word} {each}" for word, each in zip(("from", "to"), ends) if each is not None]
     return " ".join(words)
 
 
 def some_names(names: Sequence[str]) -> str:
-    """Join the first few names, and count the others."""
+    """Join the first `MAX_NAMED` names, and count the others."""
     left = len(names) - MAX_NAMED
     if left <= 1:
         return join_names(list(names))
     return f"{', '.join(names[:MAX_NAMED])} and {left:,} others"
 
 
-def _whole(value: float | None) -> str:
+def _rounded(value: float | None) -> str:
+    """Round a number to an integer."""
     return "–" if value is None else signed(value, 0)

@@ -1,6 +1,6 @@
-"""Collect what the figures of a close-loop draw, and average residuals over bins of a variable.
+"""The data of a close-loop's figures: links, predictions, effects; averages over bins.
 
-The figures read nothing else, so that they do not depend on how the loop fits its models.
+Figures read these objects only, so that they do not depend on how the loop fits its models.
 """
 
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ MIN_LINKS = 6  # of a mean that is drawn
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnLinks(Links):
-    """Links with the devices where a model has them, NaN where it has none, and what is drawn.
+    """Links with devices at the model's positions (NaN: none), and variables to draw over.
 
     Attributes:
         block: (n,) index of the block of links with a common error.
@@ -47,7 +47,7 @@ class DrawnLinks(Links):
         return np.stack([self.device_m[self.device], self.receiver_m], axis=1)
 
     def on_axis(self, name: str, value: np.ndarray) -> tuple[np.ndarray, str]:
-        """Return a variable (n,) as it is drawn, and the label of its axis.
+        """Convert a variable (n,) to the unit of its axis, and return the axis label.
 
         Times count from the first measurement, in days, hours or seconds.
         """
@@ -64,7 +64,7 @@ class DrawnLinks(Links):
 
 @dataclass(frozen=True, eq=False)
 class EffectData:
-    """An effect that was found, and its contribution while all other effects stay as they are.
+    """An effect with the predictions without and with it; all other effects stay.
 
     Attributes:
         found: the effect with its parameters.
@@ -99,20 +99,23 @@ class EffectData:
 
     @property
     def member_kind(self) -> str:
-        """Return `device` or `receiver` where the effect differs between them, else ``""``."""
+        """Return `device` or `receiver` if each of them has parameters, else ``""``."""
         if "devices" in dict(self.found.params):
             return "device"
         return "receiver" if self.found.of_receiver else ""
 
     @property
     def shown(self) -> np.ndarray:
-        """Return the (n,) mask of links to draw: for a receiver those with line of sight."""
+        """Return the (n,) mask of detected links to draw.
+
+        For an effect of receivers these are links with line of sight, if there are enough.
+        """
         detected = np.isfinite(self.residual_db)
         clear = detected & self.links.los
         return clear if self.found.of_receiver and clear.sum() >= MIN_LOS_LINKS else detected
 
     def panels(self) -> list[tuple[str, np.ndarray]]:
-        """Return title and links (indices) of the members that the effect changes most."""
+        """Return a title and row numbers of links for each panel: members that change most."""
         shown, kind = self.shown, self.member_kind
         if not kind:
             return [("all links", np.flatnonzero(shown))]
@@ -127,7 +130,7 @@ class EffectData:
 
 @dataclass(frozen=True, eq=False)
 class LoopData:
-    """A close-loop as its figures draw it.
+    """What the figures of a close-loop draw.
 
     Attributes:
         links: measured links, with the devices where the final model has them.
@@ -153,7 +156,7 @@ class LoopData:
 
 
 def collect(loop: Loop) -> LoopData:
-    """Copy what the figures need out of a close-loop."""
+    """Collect the data of the figures from a close-loop."""
     model = loop.after
     links = _links(model.whole, loop.before.held_out_mean_db)
     before = loop.dependences_before
@@ -171,6 +174,7 @@ def collect(loop: Loop) -> LoopData:
 
 
 def _links(model: Fit, predicted_db: np.ndarray) -> DrawnLinks:
+    """Return the links of a fit; devices that it could not place get NaN."""
     links, device_m = model.links, model.links.device_m.copy()
     device_m[links.device[~model.usable]] = np.nan
     drawn = links.with_devices(device_m).with_los(links.los)
@@ -210,9 +214,9 @@ class BinMeans:
 
 
 def bin_index(value: np.ndarray, count: int) -> np.ndarray:
-    """Return the bin (n,) of each finite value (n,); bins hold about as many values each.
+    """Sort finite values (n,) into bins of about equal counts, and return their bins (n,).
 
-    Where there are at most as many distinct values as bins, each has its own.
+    Up to `count` distinct values have a bin each.
     """
     values = np.unique(value)
     if len(values) <= count:
@@ -223,9 +227,9 @@ def bin_index(value: np.ndarray, count: int) -> np.ndarray:
 
 def bin_means(index: np.ndarray, value: np.ndarray, residual_db: np.ndarray,
               block: np.ndarray) -> BinMeans:
-    """Average residuals of links (n,) over bins of a variable, without those of few links.
+    """Average residuals of links (n,) over bins; bins of fewer than `MIN_LINKS` are left out.
 
-    A block of links with a common error counts as one observation in the standard error.
+    Links of one block have a common error: they count as one observation in the standard error.
     """
     count = np.bincount(index)
     mean = np.bincount(index, weights=residual_db) / np.maximum(count, 1)

@@ -38,7 +38,6 @@ from radiotwin.report.labels import (
     parameter_label,
     parameter_labels,
     save,
-    shorten,
 )
 from radiotwin.report.map_figures import (
     RESIDUAL_LABEL,
@@ -156,7 +155,7 @@ def histogram_figure(effect: EffectData, _: MapBackground) -> Figure:
 
 
 def interval_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw the value of each member that the data determine, with its 90 % interval."""
+    """Draw the parameter of each member with its 90 % interval; undetermined ones are left out."""
     known = {name: each for name, each in effect.parameters.items() if each.determined}
     if not known:
         return variable_figure(effect, background)
@@ -169,7 +168,7 @@ def interval_figure(effect: EffectData, background: MapBackground) -> Figure:
     ax.barh(range(len(chosen)), value, xerr=errors, color=AFTER, alpha=0.75, ecolor=FITTED,
             capsize=2)
     members = [name.partition("[")[2].removesuffix("]") for name, _ in chosen]
-    ax.set_yticks(range(len(chosen)), [shorten(member, 24) for member in members])
+    ax.set_yticks(range(len(chosen)), [plain(member, 24) for member in members])
     ax.axvline(0, color="0.4", linewidth=0.8)
     label = parameter_label(chosen[0][0].partition("[")[0], parameter_labels(effect.found.name))
     ax.set(xlabel=f"{label}, with 90 % interval [{chosen[0][1].unit}]",
@@ -187,9 +186,19 @@ FIGURE_OF_STAGE = {"paths": "histogram", "detection": "intervals", "limit": "int
 
 def _draw_means(ax: Axes, effect: EffectData, rows: np.ndarray, value: np.ndarray,
                 measured_db: np.ndarray, fitted_db: np.ndarray, label: str) -> BinMeans:
-    """Draw links (r,) as dots, their means over a variable, and the means of what is fitted.
+    """Draw measured values of links over a variable: dots, means, and means of the fitted values.
 
-    Variable, measured and fitted levels or residuals are of all links (n,). Returns the last means.
+    Args:
+        ax: axes.
+        effect: whose links they are.
+        rows: (r,) row numbers of the links to draw.
+        value: (n,) variable of all links.
+        measured_db: (n,) levels or residuals [dB].
+        fitted_db: (n,) the same as the model has them [dB].
+        label: of the measured means.
+
+    Returns:
+        Means of the fitted values.
     """
     rows = rows[np.isfinite(value[rows])]
     index = bin_index(value[rows], EFFECT_BINS)
@@ -238,6 +247,7 @@ def _explained_share(value: np.ndarray, contribution_db: np.ndarray) -> float:
 
 
 def _grid(count: int, projection: str | None = None) -> tuple[Figure, list[Axes]]:
+    """Return a figure with panels in rows of three."""
     columns = min(max(count, 1), 3)
     rows = max(-(-count // columns), 1)
     figure = new_figure(max(3.7 * columns, 5.5), 3.4 * rows + 0.6)
@@ -341,9 +351,10 @@ def waterfall_figure(report: dict) -> Figure:
 
 
 def dependence_figure(data: LoopData) -> Figure | None:
-    """Draw the mean held-out residual against the continuous variables that it depends on most.
+    """Draw the mean held-out residual over the continuous variables that it depends on most.
 
-    None where it was tested against none.
+    Returns:
+        the figure; None if the residual was tested against no such variable
     """
     residual_db = [data.links.level_db - predicted for predicted in (data.before_db, data.after_db)]
     known = np.isfinite(residual_db[0]) & np.isfinite(residual_db[1])
@@ -386,6 +397,7 @@ def _draw_curves(ax: Axes, before: BinMeans, after: BinMeans, changed: bool) -> 
 
 def _draw_bar(ax: Axes, position: int, start: float, end: float, colour: str, text: str,
               alpha: float = 1.0) -> None:
+    """Draw a bar between two levels, with a text above."""
     low, high = sorted((start, end))
     ax.bar(position, high - low, bottom=low, width=0.7, color=colour, alpha=alpha, zorder=2)
     ax.annotate(text, (position, high), xytext=(0, 3), textcoords="offset points", ha="center",
@@ -410,6 +422,7 @@ def _draw_lines(ax: Axes, lines: list[tuple[float, str, str]]) -> None:
 
 
 def _change(before: float, after: float) -> str:
+    """Return the change of the RMSE [dB] as a title: "4.25 → 2.46 dB on held-out links …"."""
     text = f"{before:.2f} → {after:.2f} dB on held-out links"
     if not before:
         return text

@@ -11,7 +11,6 @@ from radiotwin.report import anomaly_words
 from radiotwin.report import closeloop_words as words
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (
-    about,
     effect_picture,
     interpolations,
     join_names,
@@ -21,6 +20,7 @@ from radiotwin.report.labels import (
     parameter_labels,
     probability,
     quantity,
+    two_digits,
     variable_label,
 )
 
@@ -76,7 +76,11 @@ def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
 
 
 def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
-    """Collect the variables of `closeloop_*.html` from a report that has been checked.
+    """Collect the variables of `closeloop_*.html`.
+
+    Args:
+        report: content of `closeloop.json`, checked.
+        folder: of the figures.
 
     Raises:
         BadInput: a damaged figure.
@@ -96,7 +100,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
         "detectable": Table(
             ("effect", "would have been named from", "what its size is"),
-            [[name_label(each["name"]), f"{about(each['size'])} {each['unit']}",
+            [[name_label(each["name"]), f"{two_digits(each['size'])} {each['unit']}",
               each["pattern"]] for each in report["detectable"] if each["size"] is not None]),
         "seen_from": Table(("group", "level from", "scatter from", "blanks from"),
                            anomaly_words.seen_rows(report)),
@@ -113,6 +117,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
 
 
 def _cards(report: dict) -> list[tuple[str, str]]:
+    """Return label and value of up to four cards: verdict, RMSE, combined RMSE, intervals."""
     error = report["error"]
     before, after = number(error["before"].get("rmse_db")), number(words.rmse_after_db(error))
     unchanged = before == after and not report["effects"]
@@ -128,7 +133,7 @@ def _cards(report: dict) -> list[tuple[str, str]]:
 
 
 def _effect(effect: dict, folder: Path) -> dict[str, Any]:
-    """Return what the page shows of an effect."""
+    """Return rank, name, evidence, figure and table of parameters of an effect."""
     name, labels = effect["name"], parameter_labels(effect["name"])
     label = name_label(name)
     kind = ("interpolated, not explained" if name in interpolations() else
@@ -143,7 +148,7 @@ def _effect(effect: dict, folder: Path) -> dict[str, Any]:
 
 
 def _evidence(effect: dict) -> str:
-    """Describe the form of an effect, its evidence, and what it may be confused with."""
+    """Describe an effect: form, probability, RMS change of the links, effects that look alike."""
     text = f"{effect['variant'].capitalize()}. " if effect.get("variant") else ""
     if effect.get("probability") is not None:
         text += f"Probability that it is there: {probability(effect['probability'])}. "
@@ -164,7 +169,13 @@ def _evidence(effect: dict) -> str:
 
 
 def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
-    """Return errors before and after for groups of links, and of other models for all links."""
+    """Return the table of errors before and after.
+
+    Args:
+        report: content of `closeloop.json`.
+        kinds: groups with rows: `device`, `receiver`, `flight`, and `los`, which adds all links and
+            the other models.
+    """
     rows: list[list[str]] = []
     others = dict(islice(report["baselines"].items(), MAX_MODELS if "los" in kinds else 0))
     columns = list(dict.fromkeys([*COLUMNS, *(key for each in others.values() for key in each)]))
@@ -196,6 +207,7 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
 
 
 def _candidate_table(candidates: list[dict]) -> Table:
+    """Return the log of trials: step, effect, decision, evidence; what was kept is emphasised."""
     rows = [[c["step"], _with_variant(c), "kept" if c["kept"] else c["reason"],
              probability(c.get("probability")), number(c["heldout_rmse_db"]),
              number(c.get("evidence_nats")), number(c["heldout_nll_gain"])]
@@ -206,12 +218,13 @@ def _candidate_table(candidates: list[dict]) -> Table:
 
 
 def _with_variant(candidate: dict) -> str:
-    """Return the name of a candidate, of which there may be several forms."""
+    """Return the printed name of a candidate with its form: `antenna pattern: sector`."""
     name, variant = name_label(candidate["name"]), candidate.get("variant")
     return f"{name}: {variant}" if variant else name
 
 
 def _facts(report: dict) -> list[str]:
+    """Return the footer: version, base, held-out links, noise of repeated measurements."""
     heldout, floor_db = report["heldout"], report["error"]["noise_floor_db"]
     facts = [f"radiotwin {report.get('radiotwin_version', '')}", f"base {report['base']}",
              f"{heldout['n']:,} links held out by {heldout['by']}"]
@@ -221,6 +234,7 @@ def _facts(report: dict) -> list[str]:
 
 
 def _value(parameter: dict) -> str:
+    """Return the value of a parameter as text, or that the data do not determine it."""
     if words.is_reference(parameter):
         return "0 (reference)"
     known = parameter.get("determined", True)
@@ -228,6 +242,7 @@ def _value(parameter: dict) -> str:
 
 
 def _interval(parameter: dict) -> str:
+    """Return the 90 % interval of a parameter as text; a dash if there is none."""
     low, high = parameter["low"], parameter["high"]
     unknown = None in (low, high) or low == high or not parameter.get("determined", True)
     unit = parameter["unit"]
@@ -235,4 +250,5 @@ def _interval(parameter: dict) -> str:
 
 
 def _p_value(value: float | None) -> str:
+    """Return a p-value with three decimals, at least "< 0.001"."""
     return "–" if value is None else "< 0.001" if value < 0.001 else f"{value:.3f}"

@@ -1,4 +1,4 @@
-"""Say in sentences what a close-loop found, how probable it is and what would have been seen."""
+"""Put the result of a close-loop into sentences: verdict, causes, errors, what would settle it."""
 
 import re
 from collections import Counter
@@ -35,11 +35,11 @@ def closeloop_summary(report: dict) -> str:
 
 
 def summary(report: dict) -> list[str]:
-    """Summarise the result in paragraphs: what was found or where, what speaks for it, advice."""
-    why = {"effect": _effect, "located": _located, "none": _none,
-           "undecided": _undecided}[report["verdict"]](report)
+    """Summarise the result in paragraphs: causes, anomalies, advice; a sure cause comes first."""
+    why = {"effect": _effect_words, "located": _located_words, "none": _nothing_words,
+           "undecided": _undecided_words}[report["verdict"]](report)
     rest = [f"{_side_by_side(each)}." for each in _largest_first(report)
-            if _differ(each["difference_db"])][:1]
+            if _is_significant(each["difference_db"])][:1]
     if _has_interpolation(report):
         rest.append("Interpolation of what remains, which explains nothing, brings the RMSE to "
                     f"{number(report['error']['after']['rmse_db'])} dB.")
@@ -49,7 +49,7 @@ def summary(report: dict) -> list[str]:
 
 
 def verdict(report: dict) -> str:
-    """Return the verdict in a few words, with the names that it is about."""
+    """Return the verdict with the causes or groups it names: "found: receiver drift"."""
     if report["verdict"] == "effect":
         start = "found" if is_sure(report) else "probable"
         return f"{start}: {join_names(cause_names(report))}"
@@ -60,23 +60,25 @@ def verdict(report: dict) -> str:
 
 
 def cause_names(report: dict) -> list[str]:
-    """Return the names of the effects that explain something, with counts.
+    """Return the printed names of the causes that were found, with counts.
 
-    Where two ends never part, the same effect of the other end has an equal claim.
+    A device and a receiver that never part share a cause: "device gain offset or receiver gain
+    offset".
     """
     counts = Counter(" or ".join(name_label(name) for name in (
         each["name"], *(other for other in each.get("indistinguishable_from", [])
                         if other.partition("_")[2] == each["name"].partition("_")[2])))
-        for each in causes(report))
+        for each in found_causes(report))
     return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
 
 
 def objects(report: dict) -> list[str]:
-    """Name what was found, with size and place: "a building that the map lacks, 33 by 38 m …"."""
-    return [_object(each, origin_of(report)) for each in causes(report)]
+    """Describe each cause with size and place: "a building that the map lacks, 33 by 38 m …"."""
+    return [_object_words(each, origin_of(report)) for each in found_causes(report)]
 
 
-def _object(effect: dict, origin: Origin | None) -> str:
+def _object_words(effect: dict, origin: Origin | None) -> str:
+    """Describe one cause: its members or dimensions, direction of an antenna, and place."""
     forms = effects_named(effect["name"])
     form = next((each for each in forms if each.variant == effect.get("variant")), None)
     words = form and form.in_words or name_label(effect["name"])
@@ -107,33 +109,33 @@ def _object(effect: dict, origin: Origin | None) -> str:
 
 
 def _member(parameter: str) -> str:
-    """Return of which member a parameter is: `tilt_deg[uav1]` -> `uav1`."""
+    """Return the member in the name of a parameter: `tilt_deg[uav1]` -> `uav1`."""
     return parameter.partition("[")[2].removesuffix("]")
 
 
 def is_changed(effect: dict, member: str) -> bool:
-    """Return whether an effect changes a member: an offset that may be 0 is none."""
+    """Return whether an effect changes a member: false if its offset's interval includes 0."""
     offset = effect["parameters"].get(f"offset_db[{member}]")
     return offset is None or not (offset["low"] or 0.0) <= 0.0 <= (offset["high"] or 0.0)
 
 
 def is_sure(report: dict) -> bool:
-    """Return whether each cause that was found has a probability of at least `MIN_SURE`.
+    """Return whether every cause that was found has a probability of at least `MIN_SURE`.
 
-    Steps between flights have none.
+    True without a posterior; false if a cause has no probability, such as a step between flights.
     """
     return not report["posterior"] or all(
-        (each.get("probability") or 0.0) >= MIN_SURE for each in causes(report))
+        (each.get("probability") or 0.0) >= MIN_SURE for each in found_causes(report))
 
 
 def rivals(report: dict) -> str:
-    """Say how probable the causes are that were found, and what else the first one may be."""
-    found_causes = causes(report)
-    known = [each for each in found_causes if each.get("probability") is not None]
+    """Give the probabilities of the causes, and the rivals of the first cause with theirs."""
+    explaining = found_causes(report)
+    known = [each for each in explaining if each.get("probability") is not None]
     found = [f"{name_label(each['name'])} {probability(each['probability'])}" for each in known]
     text = f"Probability that it is there: {join_names(found)}. " if found else ""
     first = next((rank for rank, each in enumerate(report["effects"], 1)
-                  if each in found_causes), 0)
+                  if each in explaining), 0)
     # What acts on one flight comes before the steps of which rivals are known.
     step = next((each for each in report["posterior"] if each["step"] == first), None)
     if step is None or report["effects"][first - 1].get("probability") is None:
@@ -147,20 +149,20 @@ def rivals(report: dict) -> str:
     same = report["effects"][first - 1].get("indistinguishable_from", [])
     # A number would say that the data can tell them apart.
     likely = [f"{name_label(name)} (the data cannot tell them apart)" for name in same]
-    likely += [f"{_cause(name)} {probability(share * each)}" for name, each in others.items()
-               if share * each >= LIKELY and name not in same]
+    likely += [f"{_hypothesis_label(name)} {probability(share * each)}"
+               for name, each in others.items() if share * each >= LIKELY and name not in same]
     return text + (f"What else it may be: {join_names(likely[:MAX_NAMED])}." if likely else "")
 
 
 def undetectable(report: dict) -> str:
-    """Say which effects would not have been named at any size that they may have; else empty."""
+    """List the effects that would not have been found at any plausible size; empty if none."""
     names = [name_label(each["name"]) for each in report["detectable"] if each["size"] is None]
     return (f"Not to be seen in a typical form, at any size that they may have: "
             f"{join_names(names)}.") if names else ""
 
 
 def with_quality(report: dict) -> str:
-    """Say the error where each reading's own quality is known, which no map has; else empty."""
+    """Give the RMSE with the quality of each reading as an input, which a map lacks; else empty."""
     known = report["error"].get("after_with_quality")
     if not known:
         return ""
@@ -169,61 +171,60 @@ def with_quality(report: dict) -> str:
 
 
 def side_by_side(report: dict) -> list[str]:
-    """Say by how much receivers differ where both have been, the largest differences first."""
+    """Compare pairs of receivers at common places, a sentence each, largest difference first."""
     return [_side_by_side(each) for each in _largest_first(report)]
 
 
 def drivers(report: dict) -> list[str]:
-    """Return labels of the variables that the residual depends on; if none, that of the base."""
+    """Return labels of the variables that the last residual depends on; if none, the base's."""
     found = report["remaining"]["drivers"] or [
-        each for each in report.get("dependences_before", []) if _counts(each, report)]
+        each for each in report.get("dependences_before", []) if _meets_criteria(each, report)]
     return [variable_label(each["variable"])[0] for each in found[:MAX_NAMED]]
 
 
 def is_reference(parameter: dict) -> bool:
-    """Return whether a parameter is that of the member which the others are compared with.
+    """Return whether a parameter is the fixed 0 dB of the member that others are compared with.
 
-    Others may be known exactly, and 0, such as where a building is that is gone.
+    Parameters in other units may be exactly 0, too, such as a coordinate.
     """
     known = parameter["value"] == parameter["low"] == parameter["high"] == 0
     return known and parameter.get("unit") == "dB"
 
 
-def _criteria(report: dict) -> dict[str, float]:
-    """Return the report's criteria, and today's in place of those that it lacks."""
-    return vars(SelectionCriteria()) | report.get("criteria", {})
-
-
-def _counts(dependence: dict, report: dict) -> bool:
-    """Return whether a dependence meets the report's criteria."""
-    criteria = _criteria(report)
+def _meets_criteria(dependence: dict, report: dict) -> bool:
+    """Return whether a dependence of the residual is significant and large enough to be named."""
+    criteria = vars(SelectionCriteria()) | report.get("criteria", {})
     p_value, effect_db = dependence["p_value"], dependence.get("effect_db")
     return p_value is not None and p_value <= criteria["max_dependence_p_value"] and (
         effect_db is None or effect_db >= criteria["min_dependence_db"])
 
 
-def causes(report: dict) -> list[dict]:
-    """Return the effects that were found and explain something."""
+def found_causes(report: dict) -> list[dict]:
+    """Return the effects that are causes: neither interpolation nor a part of the base."""
     interpolated = interpolations()
     return [each for each in report["effects"]
             if each["name"] not in interpolated and not each.get("is_declared")]
 
 
 def _has_interpolation(report: dict) -> bool:
+    """Return whether the final model interpolates what no cause explains."""
     return not interpolations().isdisjoint(each["name"] for each in report["effects"])
 
 
 def _largest_first(report: dict) -> list[dict]:
+    """Return the comparisons of receivers, largest difference first."""
     return sorted(report.get("receivers_compared", []),
                   key=lambda each: -abs(each["difference_db"]["value"]))
 
 
-def _differ(difference_db: dict) -> bool:
+def _is_significant(difference_db: dict) -> bool:
+    """Return whether two receivers differ by `MIN_DIFFERENCE_DB`, and by their interval surely."""
     surely = not difference_db["low"] <= 0 <= difference_db["high"]
     return surely and abs(difference_db["value"]) >= MIN_DIFFERENCE_DB
 
 
 def _side_by_side(found: dict) -> str:
+    """Compare two receivers at common places: "B reads 2.7 dB (0.4 to 4.9) more than A …"."""
     value, low, high = (found["difference_db"][key] for key in ("value", "low", "high"))
     both = (f"where both were, within metres: {found['pairs']:,} pairs of readings at "
             f"{found['places']:,} places")
@@ -238,18 +239,19 @@ def _side_by_side(found: dict) -> str:
 
 
 def rmse_after_db(error: dict) -> float:
-    """Return the RMSE after [dB], of the links that the RMSE before is of."""
+    """Return the RMSE after [dB] over the links that have a prediction before, too."""
     return (error.get("after_same_links") or error["after"]).get("rmse_db")
 
 
-def _effect(report: dict) -> str:
+def _effect_words(report: dict) -> str:
+    """Say which causes were found, how probable they are, and how far the RMSE falls with them."""
     error = report["error"]
     without_cause = interpolations()
     explained = [each["heldout_rmse_db"] for each in report["candidates"]
                  if each["kept"] and each["name"] not in without_cause]
     interpolated = _has_interpolation(report)
     after = explained[-1] if explained and interpolated else rmse_after_db(error)
-    found = causes(report)
+    found = found_causes(report)
     it = "it" if len(found) == 1 else "them"  # one kind may have been found twice
     known = [each["probability"] for each in found if each.get("probability") is not None]
     start, sure = "Found", ""
@@ -274,26 +276,29 @@ def _effect(report: dict) -> str:
 
 
 def _unnamed_beside(report: dict) -> float | None:
-    """Return how probable it is that something without a name is left; None where it is not."""
+    """Return the probability that an unnamed cause is left; None below `HALF`."""
     found = report["posterior"][-1]["probabilities"] if report["posterior"] else []
     if not found or found[0]["name"] != OTHER:
         return None
     return found[0]["probability"] if (found[0]["probability"] or 0.0) >= HALF else None
 
 
-def _none(report: dict) -> str:
+def _nothing_words(report: dict) -> str:
+    """Say that nothing was found, and from which size on it would have been."""
     return " ".join(filter(None, [
-        f"No group of links stands out, and no cause was found{_of(report, NONE)}.",
-        seen_from(report), _sizes(report)]))
+        "No group of links stands out, and no cause was found"
+        f"{_probability_in_brackets(report, NONE)}.",
+        seen_from(report), _error_split(report)]))
 
 
-def _located(report: dict) -> str:
+def _located_words(report: dict) -> str:
+    """Give the residual of an anomaly without a cause, and what would settle the cause."""
     return " ".join(filter(None, [
-        f"The {_residual(report)}", _not_looked_for(report), _settled_by(report)]))
+        f"The {_residual_words(report)}", _not_looked_for(report), _settled_by(report)]))
 
 
 def _not_looked_for(report: dict) -> str:
-    """Say which effects the data lack something for: one of them may be what is missing."""
+    """List effects that could not be tested because the data lack a column or a map."""
     why: dict[str, list[str]] = {}
     for each in report["candidates"]:
         reason = each["reason"].removeprefix(NOT_LOOKED_FOR)
@@ -306,44 +311,46 @@ def _not_looked_for(report: dict) -> str:
     return f"Not looked for, {'; '.join(parts)}." if parts else ""
 
 
-def _residual(report: dict) -> str:
+def _residual_words(report: dict) -> str:
+    """Give the RMSE of the base's residual, and the variables that it depends on."""
     names = drivers(report)
     depends = f" and depends on {join_names(names)}" if names else ""
     return f"residual is {number(report['error']['before']['rmse_db'])} dB RMSE{depends}."
 
 
-def _undecided(report: dict) -> str:
+def _undecided_words(report: dict) -> str:
+    """Give the likeliest causes where none is probable enough, and what would settle it."""
     step = next(iter(report["posterior"]), None)
     if step is None:
         return "Undecided: no cause was looked for."
     likely, sizes = _likely(step["probabilities"], report), ""
     what = "whether that is real"
     if not report.get("anomalies"):
-        what, sizes = "the cause", _sizes(report)
+        what, sizes = "the cause", _error_split(report)
         none = next((each["probability"] or 0.0 for each in step["probabilities"]
                      if each["name"] == NONE), 0.0)
         if sizes and none >= HALF:
             sizes += " That much at places is not said to be nothing."
     return " ".join(filter(None, [
         f"Undecided: these measurements do not tell {what}.", likely and f"Likeliest: {likely}.",
-        f"The {_residual(report)}", _not_looked_for(report), _settled_by(report), sizes]))
+        f"The {_residual_words(report)}", _not_looked_for(report), _settled_by(report), sizes]))
 
 
 def _settled_by(report: dict) -> str:
-    """Say what would settle which of the likeliest causes is there."""
+    """Say which measurements would decide between the likeliest causes; empty if none is known."""
     step = next(iter(report["posterior"]), None)
     if step is None:
         return ""
     names = [each["name"] for each in step["probabilities"] if (each["probability"] or 0) >= LIKELY]
-    advice = list(filter(None, (_settles(name, step["step"], report) for name in names)))
+    advice = list(filter(None, (_settled_for(name, step["step"], report) for name in names)))
     return f"To settle it: {'; '.join(dict.fromkeys(advice[:2]))}." if advice else ""
 
 
-def _settles(name: str, step: int, report: dict) -> str:
-    """Say what would settle whether an effect is there, and of which device or receiver.
+def _settled_for(name: str, step: int, report: dict) -> str:
+    """Say which measurement would settle whether an effect is there; empty if none is known.
 
-    Of several forms of an effect, such as a device's antenna and a receiver's, that of the ends
-    which it was looked for in. Empty where nothing is known.
+    An effect may have a form for devices and one for receivers: the form of the best candidate of
+    that step counts, and its devices or receivers are named.
     """
     forms = effects_named(name)
     texts = {each.of_receiver: each.settled_by for each in reversed(forms) if each.settled_by}
@@ -367,24 +374,25 @@ def _settles(name: str, step: int, report: dict) -> str:
 
 
 def _likely(probabilities: list[dict], report: dict) -> str:
-    """Name what is likeliest, with probabilities; empty where nothing is likely.
+    """Join the hypotheses of at least `LIKELY` with their probabilities; empty if there are none.
 
-    While a group stands out, it is not said that nothing is missing.
+    "Nothing is missing" is left out beside an anomaly.
     """
     likely = [each for each in probabilities if (each["probability"] or 0) >= LIKELY
               and not (each["name"] == NONE and report.get("anomalies"))]
-    return join_names([f"{_cause(each['name'])} ({probability(each['probability'])})"
+    return join_names([f"{_hypothesis_label(each['name'])} ({probability(each['probability'])})"
                        for each in likely[:MAX_NAMED]])
 
 
-def _of(report: dict, name: str) -> str:
+def _probability_in_brackets(report: dict, name: str) -> str:
+    """Return the probability of a hypothesis in the first step, in brackets; else empty."""
     step = next(iter(report["posterior"]), None)
     found = {each["name"]: each["probability"] for each in step["probabilities"]} if step else {}
     return f" (probability {probability(found[name])})" if name in found else ""
 
 
-def _sizes(report: dict) -> str:
-    """Divide the error of the base between places and single readings; squares add up to it."""
+def _error_split(report: dict) -> str:
+    """Split the base's RMSE into a part by place and a part by reading, whose squares add up."""
     step = next(iter(report["posterior"]), None)
     whole_db = report["error"]["before"]["rmse_db"]
     if step is None or None in (step["rest_db"], step["noise_db"], whole_db):
@@ -399,12 +407,13 @@ def _sizes(report: dict) -> str:
 
 
 def _has_map(report: dict) -> bool:
-    """Return whether a 3D map was given: without one, every link counts as one with sight."""
+    """Return whether a 3D map was given: without one, every link counts as line of sight."""
     hidden = report["error"].get("by_los", {}).get("nlos")
     given = (report.get("inputs") or {}).get("scene") or report["base"] == "raytrace"
     return bool(given or (hidden and hidden["before"]["n"]))
 
 
-def _cause(name: str) -> str:
+def _hypothesis_label(name: str) -> str:
+    """Return the printed name of a hypothesis: an effect, none, or one outside the catalogue."""
     return {NONE: "nothing is missing",
             OTHER: "something that is not in the catalogue"}.get(name, name_label(name))

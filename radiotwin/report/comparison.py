@@ -1,4 +1,4 @@
-"""A comparison of models: its tables, its figures, and its part of a run's page."""
+"""Compare channel models on held-out flights: tables, figures, and their part of a page."""
 
 import json
 import warnings
@@ -86,6 +86,7 @@ class ComparisonRecord(Record):
     @field_validator("scores")
     @classmethod
     def _complete(cls, scores: list[ScoreRecord]) -> list[ScoreRecord]:
+        """Refuse scores unless each model has one row for every class of links."""
         classes = Counter((each.model, each.against, each.positions) for each in scores)
         rows = {(each.model, each.against, each.positions, each.links) for each in scores}
         if len(rows) < len(scores) or any(count != len(CLASSES) for count in classes.values()):
@@ -97,7 +98,7 @@ def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
                      scene: Scene | Path | str, truth: RadioMap | None = None, *,
                      held_out: int = 1, paths: bool = False, also: Sequence[Path | str] = (),
                      seed: int = 0, executor: Executor | None = None) -> Comparison:
-    """Compare all channel models on the last flights, which none of them is fitted to.
+    """Fit all channel models to the first flights, and compare them on the last ones.
 
     Published laws that hold at the scene's frequency are among them, fitted to nothing.
 
@@ -126,9 +127,9 @@ def compare_held_out(measurements: Measurements | pd.DataFrame | Path | str,
 
 def _judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
                ) -> tuple[dict[str, Twin], dict[str, RadioMap]]:
-    """Read twins and radio maps that are to be compared with the models, by their paths.
+    """Read further twins and radio maps for a comparison; their paths are their names.
 
-    Warns where a twin was fitted to one of the held-out flights.
+    Warns if a twin was fitted to one of the held-out flights.
     """
     twins, maps = {}, {}
     for path in paths:
@@ -186,7 +187,7 @@ def read_comparison(path: Path) -> Comparison:
 
 
 def _rows(table: pd.DataFrame) -> list[dict]:
-    """Return the rows of a table for JSON; numbers that are not finite are null."""
+    """Convert a table to rows for JSON; NaN and infinity become null."""
     return [{key: None if isinstance(value, float) and not np.isfinite(value) else value
              for key, value in row.items()} for row in table.to_dict("records")]
 
@@ -214,7 +215,7 @@ def write_comparison_figures(comparison: Comparison, scene: Scene, truth: RadioM
 
 
 def _typical_device(truth: RadioMap, maps: dict[str, RadioMap]) -> str:
-    """Return the device in all maps whose share of line of sight is nearest to the mean."""
+    """Return the device, of those in all maps, whose share of LoS positions is nearest the mean."""
     devices = [name for name in truth.devices
                if all(name in radio_map.devices for radio_map in maps.values())]
     los = np.array([truth.los[truth.devices.index(name)].mean() for name in devices])
@@ -247,7 +248,7 @@ def _scatter_figure(comparison: Comparison, models: list[str]) -> Figure:
 
 
 def _estimates_figure(comparison: Comparison, models: list[str], scene: Scene) -> Figure:
-    """Draw where each model locates the devices; circles contain 90 % of the posterior."""
+    """Draw true and estimated positions of the devices with 90 % circles, a panel a model."""
     extent = scene.config.extent
     ratio = (extent.x_max_m - extent.x_min_m) / (extent.y_max_m - extent.y_min_m)
     figure, axes = panels(1, len(models), 6.4 * min(max(ratio, 0.7), 1.4), 6.4)
@@ -281,14 +282,14 @@ def _estimates_figure(comparison: Comparison, models: list[str], scene: Scene) -
 
 
 def comparison_context(comparison: Comparison, folder: Path) -> dict[str, Any]:
-    """Collect what a run's page shows of a comparison, with the figures of a folder."""
+    """Collect the summary, tables and figures of a comparison for a run's page."""
     pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
     return {"lead": _summary(comparison), "tables": _tables(comparison),
             "figures": [picture for picture in pictures if picture]}
 
 
 def _tables(comparison: Comparison) -> list[tuple[str, Table]]:
-    """Return title and table of the errors on each kind of links, and of the devices' positions."""
+    """Return titles and tables of the errors of levels, and of the devices' positions."""
     columns = ("model", "RMSE", "RMSE LoS", "RMSE NLoS", "MAE", "bias")
     tables = []
     estimated = comparison.scores.query("positions == 'estimated'")
@@ -319,7 +320,7 @@ def _judged(comparison: Comparison) -> pd.DataFrame:
 
 
 def _summary(comparison: Comparison) -> str:
-    """Summarise the result in a sentence; empty without a whole map to compare on."""
+    """Compare twin, log-distance model and the best model in words; empty without a whole map."""
     judged = _judged(comparison)
     if not set(SHOWN) <= set(judged.index):
         return ""

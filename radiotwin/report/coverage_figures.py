@@ -10,7 +10,8 @@ from matplotlib.patches import Patch, Rectangle
 
 from radiotwin.coverage import Coverage
 from radiotwin.coverage.output import Legend, drawn_rasters, file_stem, legend_of
-from radiotwin.report.labels import attribution, new_figure, plain, save
+from radiotwin.display import plain
+from radiotwin.report.labels import attribution, new_figure, save
 from radiotwin.report.map_figures import HeightGrid
 from radiotwin.scene import Scene
 from radiotwin.scene.plot import draw_streets, height_grid
@@ -85,7 +86,7 @@ def _coverage_figure(coverage: Coverage, scene: Scene, name: str, heights: Heigh
 
 def _handles(legend: Legend, classes: np.ndarray, coverage: Coverage,
              with_buildings: bool) -> list[Patch]:
-    """Return a patch for each class with its share of the cells that are not left out."""
+    """Return the legend: a patch for each class with its share of the cells."""
     counts = np.bincount(classes[classes >= 0].astype(int), minlength=len(legend.labels))
     cells = classes.size - coverage.summary["cells_left_out_indoors"]
     shares = counts / max(cells, 1)
@@ -106,7 +107,7 @@ def _handles(legend: Legend, classes: np.ndarray, coverage: Coverage,
 
 
 def _draw_transmitters(ax: Axes, coverage: Coverage) -> None:
-    """Mark transmitters, with their names and, of a directional antenna, its boresight."""
+    """Mark transmitters with their names, and the boresight of directional antennas."""
     x_min, x_max, y_min, y_max = coverage.grid.bounds_m
     length_m = 0.03 * max(x_max - x_min, y_max - y_min)
     for each in coverage.transmitters:
@@ -145,7 +146,7 @@ def _draw_scale_bar(ax: Axes, bounds_m: tuple[float, float, float, float]) -> No
 
 
 def _caption(coverage: Coverage, scene: Scene) -> str:
-    """Return model, receivers, noise and the source of the map, in two lines."""
+    """Return the caption in two lines: model, receivers, noise, credit of the map."""
     facts = coverage.dataset.attrs
     above = "above ground" if coverage.grid.above_ground else "above the datum"
     lines = [f"{plain(facts['model'], 90)}; receivers {facts['height_m']:g} m {above}, cells of "

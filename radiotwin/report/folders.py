@@ -1,4 +1,4 @@
-"""Folders of results: write the tables, figures and page of one, and read any of them for its page.
+"""Result folders: write tables, figures and page into one, and read one for its page.
 
 A radio map is written in any format, also that of another program, or as a picture.
 """
@@ -187,7 +187,7 @@ class PlanningRecord(Record):
 
 @dataclass(eq=False)
 class Run:
-    """Content of a run's folder; None or empty where the folder does not hold it.
+    """Content of a run's folder; None or empty: the folder does not hold it.
 
     Attributes:
         folder: folder of the run.
@@ -264,13 +264,18 @@ def read_run(folder: Path | str, scene: Path | None = None, truth: str | None = 
 
 
 def _first(folder: Path, *names: str) -> Path | None:
-    """Return the first file of the folder (or .zarr), none of which a link may lead elsewhere."""
+    """Return the first of these files (or .zarr folders) that exists.
+
+    Raises:
+        BadInput: a link leads out of the folder.
+    """
     found = next((folder / name for name in names if os.path.isfile(folder / name)
                   or (name.endswith(ZARR) and os.path.isdir(folder / name))), None)
     return None if found is None else require_within(folder, found, str(folder))
 
 
 def _scene(run: Run, given: Path | None, named: str | None) -> Scene | None:
+    """Load the scene that is given, lies in the run's folder, or is named by the run; else None."""
     if given is not None:
         return Scene.load(given)
     found = _first(run.folder, "scene.toml", "scene/scene.toml")
@@ -305,7 +310,7 @@ def _read_maps(run: Run, truth: str | None) -> None:
 
 
 def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, RadioMap | MapStream]:
-    """Return all maps of a run by name; their values are still in their files, or not made."""
+    """Open all maps of a run by name; values are read, or predicted, later."""
     maps: dict[str, RadioMap | MapStream] = {}
     if truth is not None and truth != "segmented":
         given = stack.enter_context(RadioMap.open(truth))
@@ -343,7 +348,7 @@ def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, Radio
 
 
 def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:
-    """Return the UAVs' positions from a planning run, measurements, or a close-loop's links."""
+    """Read the UAVs' positions over time from `flights.csv`, measurements, or held-out links."""
     path = _first(run.folder, "flights.csv")
     if measurements is None and path is not None:
         return read_table(path, TRACK)

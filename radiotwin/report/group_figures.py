@@ -1,9 +1,10 @@
-"""Heat maps of the held-out residual by device, receiver and flight; what stands out is framed."""
+"""Heat maps of the held-out residual by device, receiver and flight; anomalies are framed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -22,7 +23,7 @@ SCATTER_COLOURS = "YlGnBu"
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """Residuals by two ends.
+    """Table of residuals by two ends, such as device and flight.
 
     Attributes:
         ends: of rows and columns, such as `device` and `flight`.
@@ -41,39 +42,28 @@ class Pivot:
 
 def pivot(links: DrawnLinks, residual_db: np.ndarray, ends: tuple[str, str],
           anomalies: Sequence[dict]) -> Pivot:
-    """Return median and scatter of residuals (n,) by two ends.
+    """Compute median and scatter of residuals (n,) [dB] by two ends.
 
-    Of an end with many members those that stand out are shown, and of the others those whose
-    residuals are largest.
+    Up to `MAX_MEMBERS` of an end are kept: members of anomalies first, then large residuals.
     """
-    seen = np.isfinite(residual_db)
+    table = pd.DataFrame({end: links.variables[end].astype(int) for end in ends} | {
+        "residual_db": residual_db}).dropna()
     kept, left_out = [], {}
     for end in ends:
-        names, index = links.names[end], links.variables[end].astype(int)
+        names = links.names[end]
         framed = {name for each in anomalies for name in each["members"].get(end, ())}
-        count = np.bincount(index[seen], minlength=len(names))
-        mean_square = np.bincount(index[seen], weights=residual_db[seen]**2,
-                                  minlength=len(names)) / np.maximum(count, 1)
-        members = np.flatnonzero(count)
-        order = sorted(members, key=lambda each: (names[each] not in framed, -mean_square[each]))
+        mean_square = (table["residual_db"]**2).groupby(table[end]).mean()
+        order = sorted(mean_square.index,
+                       key=lambda each: (names[each] not in framed, -mean_square[each]))
         kept.append(sorted(order[:MAX_MEMBERS]))
-        left_out[end] = len(members) - len(kept[-1])
-    shape = len(kept[0]), len(kept[1])
-    median_db, scatter_db = np.full(shape, np.nan), np.full(shape, np.nan)
-    first, second = (links.variables[end].astype(int) for end in ends)
-    pair = first * len(links.names[ends[1]]) + second
-    rows = np.flatnonzero(seen)
-    rows = rows[np.argsort(pair[rows], kind="stable")]
-    labels, starts = np.unique(pair[rows], return_index=True)
-    groups = dict(zip(labels.tolist(), np.split(rows, starts[1:]), strict=True))
-    for i, row in enumerate(kept[0]):
-        for j, column in enumerate(kept[1]):
-            group = groups.get(row * len(links.names[ends[1]]) + column, ())
-            if len(group) >= MIN_LINKS:
-                values_db = residual_db[group]
-                median_db[i, j] = np.median(values_db)
-                scatter_db[i, j] = MAD_SD * np.median(
-                    np.abs(values_db - median_db[i, j]))
+        left_out[end] = len(order) - len(kept[-1])
+    pairs = table.groupby(list(ends))["residual_db"]
+    deviation_db = (table["residual_db"] - pairs.transform("median")).abs()
+    is_known = pairs.count() >= MIN_LINKS
+    median_db, scatter_db = (
+        each.where(is_known).unstack().reindex(index=kept[0], columns=kept[1]).to_numpy()
+        for each in (pairs.median(),
+                     MAD_SD * deviation_db.groupby([table[end] for end in ends]).median()))
     shown = [[links.names[end][each] for each in members]
              for end, members in zip(ends, kept, strict=True)]
     return Pivot(ends, (shown[0], shown[1]), median_db, scatter_db, left_out)
@@ -115,22 +105,23 @@ def groups_figure(data: LoopData, report: dict) -> Figure:
             _write_numbers(ax, values, low, high)
             for anomaly in anomalies:
                 if anomaly["statistic"] in statistics:
-                    _frame(ax, each, _ends(anomaly), _is_part(anomaly))
+                    _frame(ax, each, _framed_members(anomaly), _is_part(anomaly))
     return figure
 
 
 def _is_part(anomaly: dict) -> bool:
-    """Return whether a group has not all links of its members."""
+    """Return whether an anomaly holds a part of its members' links only."""
     return bool(anomaly.get("ranges")) or anomaly.get("sight", "all") != "all"
 
 
-def _ends(anomaly: dict) -> dict[str, Sequence[str]]:
-    """Return the members of a group, without those of an end that has the same links."""
+def _framed_members(anomaly: dict) -> dict[str, Sequence[str]]:
+    """Return the members of an anomaly by end; of two ends that never part, the family's."""
     members, family = anomaly["members"], anomaly["family"]
     return {family: members[family]} if family in members else members
 
 
 def _label(ax: Axes, found: Pivot, column: int) -> None:
+    """Label the rows and columns of a heat map, and count the members that are not shown."""
     rows, columns = found.names
     crowded = len(columns) * max(map(len, columns)) > 40
     ax.set_xticks(range(len(columns)), [_cut(name, 14) for name in columns],
@@ -146,7 +137,7 @@ def _label(ax: Axes, found: Pivot, column: int) -> None:
 
 
 def _write_numbers(ax: Axes, values: np.ndarray, low: float, high: float) -> None:
-    """Write the number of each cell into it, white on the dark ends of the colours."""
+    """Write each cell's value into it, in white on dark colours."""
     if values.shape[1] > MAX_NUMBERS:
         return
     for (row, column), value in np.ndenumerate(values):
@@ -158,9 +149,9 @@ def _write_numbers(ax: Axes, values: np.ndarray, low: float, high: float) -> Non
 
 
 def _frame(ax: Axes, found: Pivot, members: dict[str, Sequence[str]], is_part: bool) -> None:
-    """Frame the cells of a group, dashed where it is a part of their links.
+    """Frame the cells of an anomaly, dashed if it holds a part of their links only.
 
-    A group of an end that the panel lacks is not in it.
+    Nothing is drawn if the panel lacks one of its ends.
     """
     if not members or not set(members) <= set(found.ends):
         return
@@ -168,7 +159,7 @@ def _frame(ax: Axes, found: Pivot, members: dict[str, Sequence[str]], is_part: b
     for end, names in zip(found.ends, found.names, strict=True):
         chosen = members.get(end)
         at = [place for place, name in enumerate(names) if chosen is None or name in chosen]
-        spans.append(_runs(at))
+        spans.append(_consecutive(at))
     for top, bottom in spans[0]:
         for left, right in spans[1]:
             ax.add_patch(Rectangle((left - 0.5, top - 0.5), right - left + 1, bottom - top + 1,
@@ -184,7 +175,7 @@ def _cut(name: str, most: int) -> str:
     return plain(name)
 
 
-def _runs(places: list[int]) -> list[tuple[int, int]]:
+def _consecutive(places: list[int]) -> list[tuple[int, int]]:
     """Return first and last of each run of consecutive places: [0, 1, 4] -> [(0, 1), (4, 4)]."""
     runs: list[tuple[int, int]] = []
     for place in places:

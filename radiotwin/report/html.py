@@ -59,8 +59,7 @@ class Picture:
     """A figure of a page with its heading and its description.
 
     Attributes:
-        panels: what each of its panels shows, which are side by side and equally wide; of a figure
-            of one panel: empty.
+        panels: labels of its panels, equally wide and side by side; empty: it has one panel.
     """
 
     title: str
@@ -71,7 +70,7 @@ class Picture:
 
 def read_picture(folder: Path, name: str, title: str, text: str = "",
                  panels: Sequence[str] = ()) -> Picture | None:
-    """Read a PNG file to be put into a page; None where the folder does not hold it.
+    """Read a PNG file of a folder for a page; None if the folder lacks it.
 
     Raises:
         BadInput: it leads out of the folder, is not PNG, or is too large.
@@ -112,7 +111,7 @@ def _source(package: str, name: str) -> Markup:
 
 
 def _policy(style: Markup, scripts: Sequence[Markup]) -> str:
-    """Return the content security policy of a page with one style and scripts."""
+    """Return a content security policy that allows this style and these scripts by their hashes."""
     def hashes(sources: Sequence[Markup]) -> str:
         digests = [hashlib.sha256(source.encode()).digest() for source in sources]
         return " ".join(f"'sha256-{base64.b64encode(each).decode()}'" for each in digests) \
@@ -126,6 +125,7 @@ def _policy(style: Markup, scripts: Sequence[Markup]) -> str:
 
 @cache
 def _environment() -> Environment:
+    """Return the Jinja environment: everything is escaped, missing variables are errors."""
     environment = Environment(
         loader=PackageLoader("radiotwin.report"), autoescape=True, undefined=StrictUndefined,
         finalize=_final, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
@@ -136,13 +136,14 @@ def _environment() -> Environment:
 
 
 def _final(value: object) -> object:
-    """Return what a template prints: any text that is not of this package, readable and short."""
+    """Make a printed value readable and short, unless it is markup or a figure of this package."""
     if isinstance(value, Markup | PictureData):
         return value
     return shown(str(value))
 
 
 def _cell(value: object) -> str:
+    """Return a table cell: a float with two decimals, NaN as a dash."""
     if isinstance(value, float):
         return "–" if value != value else f"{value:.2f}".replace("-", "−")
     return str(value)

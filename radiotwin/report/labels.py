@@ -1,4 +1,4 @@
-"""The look that all pages and figures share: printed names and numbers, colours, canvas, file."""
+"""The common look of pages and figures: printed names and numbers, colours, canvas, PNG files."""
 
 import io
 import re
@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from radiotwin.display import plain
 from radiotwin.effects.registry import LAST_RESORTS, catalogue, effects_named
 from radiotwin.geo import to_geographic
 from radiotwin.io.files import atomic_file
@@ -77,19 +76,19 @@ def source_label(radio_map: RadioMap) -> str:
 
 
 def interpolations() -> frozenset[str]:
-    """Return the names of what fits a residual without a cause."""
+    """Return the names of effects that interpolate the residual and explain nothing."""
     found = (each.name for each in (*catalogue(), *LAST_RESORTS)
              if not each.is_cause and not each.is_declared)
     return frozenset({SHADOWING, *found})
 
 
 def effect_picture(rank: int, name: str) -> str:
-    """Return the file name of an effect's figure; no name of an effect makes another path of it."""
+    """Return the file name of an effect's figure, in safe characters."""
     return f"effect_{rank}_{re.sub(r'[^A-Za-z0-9_.-]', '_', name)[:100]}.png"
 
 
 def variable_label(name: str) -> tuple[str, str]:
-    """Return the label and the unit of a variable; without an entry, both from its name."""
+    """Return label and unit of a variable, from its name if it is not in `VARIABLES`."""
     if name in VARIABLES:
         return VARIABLES[name]
     stem, unit = _split_unit(name)
@@ -97,7 +96,7 @@ def variable_label(name: str) -> tuple[str, str]:
 
 
 def parameter_labels(effect: str) -> dict[str, str]:
-    """Return the labels of parameters of an effect of that name, where they have their own."""
+    """Return `PARAMETERS` with the labels that an effect declares for its own parameters."""
     return PARAMETERS | {name: label for each in reversed(effects_named(effect))
                          for name, label in each.parameter_labels.items()}
 
@@ -135,39 +134,39 @@ def number(value: float | None) -> str:
     return "0.00" if text == "-0.00" else text.replace("-", "−")
 
 
-def small(value: float | None) -> str:
-    """Return the number of a parameter, which is not rounded to nothing however small it is."""
+def parameter_number(value: float | None) -> str:
+    """Return the number of a parameter; a small one keeps two digits, not 0.00."""
     if value is None or not 0 < abs(value) < 0.005:
         return number(value)
     return f"{value:.2g}".replace("-", "−")
 
 
 def quantity(value: float | None, unit: str) -> str:
-    """Return the number of a parameter, or a date where it is one in seconds since 1970."""
+    """Return the number of a parameter; seconds since 1970 become a date."""
     if value is not None and unit == "s" and DATES_S[0] < value < DATES_S[1]:
         return moment(value)
-    return small(value)
+    return parameter_number(value)
 
 
-def about(value: float) -> str:
-    """Return a number of which two digits are known: 110 for 106.2."""
+def two_digits(value: float) -> str:
+    """Round a number to two digits: 110 for 106.2."""
     return f"{float(f'{value:.2g}'):,.10g}"
 
 
 def signed(value: float, digits: int = 1) -> str:
-    """Return a number with a few digits; one that is rounded to 0 has no sign."""
+    """Return a number with this many decimals; 0 has no sign."""
     text = f"{value:,.{digits}f}"
     return text.removeprefix("-") if not float(text.replace(",", "")) else text.replace("-", "−")
 
 
 def origin_of(report: dict) -> Origin | None:
-    """Return the origin of the local frame of a `closeloop.json`; None where it is not known."""
+    """Return the origin of the local frame in a `closeloop.json`; None if it has none."""
     origin = (report.get("inputs") or {}).get("origin")
     return Origin(**origin) if origin else None
 
 
 def place_words(x_m: float, y_m: float, origin: Origin | None) -> str:
-    """Return a place in latitude and longitude, in metres where the origin is not known."""
+    """Return a place as latitude and longitude, or as x and y [m] if the origin is not known."""
     if origin is None:
         return f"x {signed(x_m, 0)} m, y {signed(y_m, 0)} m"
     longitude_deg, latitude_deg = (float(each) for each in to_geographic(origin, x_m, y_m))
@@ -176,19 +175,20 @@ def place_words(x_m: float, y_m: float, origin: Origin | None) -> str:
 
 
 def attribution(scene: Scene) -> str:
-    """Return the credit that the map a scene was built from asks for; empty if none is known."""
+    """Return the credit that a scene's map requires (OpenStreetMap); else empty."""
     source = scene.config.provenance.get("source", "").lower()
     return CREDIT if source.endswith((".osm", ".osm.pbf")) else ""
 
 
 def probability(value: float | None) -> str:
-    """Return a probability as a page shows it; none is ever 0 or 1."""
+    """Return a probability with two decimals, between "< 0.01" and "> 0.99"."""
     if value is None:
         return "–"
     return "> 0.99" if value > 0.99 else "< 0.01" if value < 0.01 else f"{value:.2f}"
 
 
 def _split_unit(name: str) -> tuple[str, str]:
+    """Split a name into stem and unit by its suffix: `time_s` -> `time`, `s`."""
     for suffix, unit in SUFFIXES.items():
         if name.endswith(suffix) and name != suffix:
             return name.removesuffix(suffix), unit
@@ -214,7 +214,3 @@ def hide_spines(ax: Axes) -> None:
     """Draw the axes on two sides only."""
     ax.spines[["top", "right"]].set_visible(False)
 
-
-def shorten(text: str, max_length: int = 14) -> str:
-    """Cut a name so that it fits under an axis."""
-    return plain(text, max_length)

@@ -25,7 +25,7 @@ from radiotwin.display import (
 )
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report.closeloop_data import DrawnLinks, EffectData, LoopData
-from radiotwin.report.closeloop_words import causes, is_changed
+from radiotwin.report.closeloop_words import found_causes, is_changed
 from radiotwin.report.labels import (
     FOUND,
     MODELS,
@@ -33,7 +33,6 @@ from radiotwin.report.labels import (
     name_label,
     new_figure,
     save,
-    shorten,
     source_label,
 )
 from radiotwin.scene import Scene
@@ -66,7 +65,7 @@ RESIDUAL_LABEL = "measured − predicted [dB]"
 
 
 def _lowest(radio_map: RadioMap) -> str:
-    """Return the lowest altitude of a map for a title."""
+    """Return the lowest altitude of a map as text: "40 m above the ground"."""
     lattice = radio_map.lattice
     return f"{lattice.z_m[0]:g} m" + (" above the ground" if lattice.above == "ground" else "")
 
@@ -87,7 +86,7 @@ def write_picture(radio_map: RadioMap, scene: Scene, path: Path | str,
 
 
 def _radio_map_figure(radio_map: RadioMap, scene: Scene, devices: Sequence[TwinDevice]) -> Figure:
-    """Draw the level of each of `MAX_PANELS` devices at the lowest altitude, a panel for each."""
+    """Draw the level of up to `MAX_PANELS` devices at the lowest altitude, a panel for each."""
     names = radio_map.devices[:MAX_PANELS]
     radio_map = radio_map.thinned(max(-(-max(radio_map.lattice.shape[1:]) // MAX_CELLS), 1))
     level_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values
@@ -206,13 +205,14 @@ def _draw_map(ax: Axes, level_db: np.ndarray, radio_map: RadioMap, scene: Scene,
 
 
 def _mark_device(ax: Axes, position_m: np.ndarray | None, size: float) -> None:
+    """Mark the declared position of a device (x, y, …) [m]; None: nothing is drawn."""
     if position_m is not None:
         ax.plot(*position_m[:2], "^", color="white", markeredgecolor="black", markersize=size,
                 label="device, declared")
 
 
 def _mark_twin_device(ax: Axes, device: TwinDevice) -> None:
-    """Mark a device where a twin has it, with the circle of an estimated position."""
+    """Mark a twin's device: an anchor, or an estimate with its 90 % circle."""
     position_m = np.array([device.x_m, device.y_m])
     if device.role == "anchor":
         _mark_device(ax, position_m, 8)
@@ -226,7 +226,7 @@ def _mark_twin_device(ax: Axes, device: TwinDevice) -> None:
 
 
 class MapBackground:
-    """The ground that the panels of a map share.
+    """Map under the panels of a figure: buildings, streets, and the ends that do not move.
 
     Args:
         links: measured links.
@@ -251,21 +251,21 @@ class MapBackground:
 
     @property
     def cell_m(self) -> float:
-        """Return a round side of a map cell [m]."""
+        """Return the side of a map cell, a round number [m]."""
         x_min, x_max, y_min, y_max = self.bounds
         wanted = max(max(x_max - x_min, y_max - y_min) / CELLS, MIN_CELL_M)
         power = 10.0 ** np.floor(np.log10(wanted))
         return float(next(step * power for step in ROUND_STEPS if step * power >= 0.95 * wanted))
 
     def panel_height(self, width_in: float) -> float:
-        """Return the height of a panel of a width, both in inches."""
+        """Return the height of a panel in the map's proportions [inches]."""
         x_min, x_max, y_min, y_max = self.bounds
         return width_in * min(max((y_max - y_min) / max(x_max - x_min, 1.0), 0.4), 1.3)
 
     def frame(self, positions_m: np.ndarray) -> tuple[float, float, float, float]:
-        """Return x_min, x_max, y_min, y_max [m] of a part, in the map's proportions.
+        """Return x_min, x_max, y_min, y_max [m] of a part that shows positions (n, 2) [m].
 
-        It shows positions (n, 2) [m].
+        It has the map's proportions.
         """
         x_min, x_max, y_min, y_max = self.bounds
         if not len(positions_m):
@@ -296,11 +296,11 @@ class MapBackground:
                            edgecolors="black", linewidths=0.8, zorder=4, label=label)
             for name, (x_m, y_m, _) in zip(names, position_m) if len(names) <= MAX_NAMES else ():
                 if x_min < x_m < x_max and y_min < y_m < y_max:
-                    ax.annotate(shorten(name), (x_m, y_m), (0, 6), textcoords="offset points",
+                    ax.annotate(plain(name, 14), (x_m, y_m), (0, 6), textcoords="offset points",
                                 ha="center", fontsize=8, zorder=5, path_effects=HALO)
 
     def panels(self, count: int) -> list[Axes]:
-        """Return the axes of a new figure: that of each panel, with its legend, is as wide."""
+        """Make a figure of equally wide panels with the map, and return their axes."""
         figure = new_figure(PANEL_IN * count, self.panel_height(PANEL_IN - 0.7) + 1.7)
         parts = figure.subfigures(1, count, squeeze=False)[0]
         axes = [part.add_subplot() for part in parts]
@@ -309,7 +309,7 @@ class MapBackground:
         return axes
 
     def cell_means(self, value_db: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Average values of links (n,) [dB], NaN left out, by the cell of their moving end.
+        """Average the known values of links (n,) [dB] over the map cell of their moving end.
 
         Returns:
             edges of the cells in x and in y [m], and (ny, nx) means [dB]; NaN where a cell has
@@ -326,7 +326,7 @@ class MapBackground:
         return edges[0], edges[1], mean_db.T
 
     def _fixed_ends(self) -> list[tuple[str, str, str, list[str], np.ndarray]]:
-        """Return marker, colour, label, names, positions of the kinds of ends that do not move."""
+        """Return marker, colour, label, names and positions [m] of the fixed ends, by kind."""
         links = self.links
         if not self.receivers_move:
             return [("s", "black", "receiver", [], np.unique(links.receiver_m.round(), axis=0))]
@@ -340,7 +340,7 @@ class MapBackground:
 
 
 def mark(ax: Axes, effect: EffectData) -> None:
-    """Draw an effect that has a position, with its name; others are left out."""
+    """Draw the place of an effect with its name; an effect without a place is left out."""
     found = effect.mark
     if found is None:
         return
@@ -377,7 +377,7 @@ def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:
 
 
 def residual_map_figure(data: LoopData, background: MapBackground, report: dict) -> Figure:
-    """Draw the mean held-out residual over the positions of the moving end, before and after.
+    """Draw the mean held-out residual by the moving end's position, before and after.
 
     Args:
         data: of the loop.
@@ -406,6 +406,7 @@ def residual_map_figure(data: LoopData, background: MapBackground, report: dict)
 
 
 def _frame_places(ax: Axes, anomalies: Sequence[dict]) -> None:
+    """Frame the rectangles of anomalies of the family `place`, dashed."""
     label: str | None = "links at or through it stand out"
     for each in anomalies:
         if each["family"] == "place":
@@ -417,10 +418,11 @@ def _frame_places(ax: Axes, anomalies: Sequence[dict]) -> None:
 
 
 def _ring_devices(ax: Axes, links: DrawnLinks, report: dict) -> None:
-    """Ring the devices that stand out, or that something was found of."""
+    """Ring the devices of anomalies and of causes."""
     named = {name for each in report.get("anomalies", [])
              for name in each["members"].get("device", ())}
-    named |= {place["device"] for effect in causes(report) for place in effect.get("places", [])
+    named |= {place["device"] for effect in found_causes(report)
+              for place in effect.get("places", [])
               if place.get("device") and is_changed(effect, place["device"])}
     ringed_m = links.device_m[[name in named for name in links.device_names]]
     if len(ringed_m):
@@ -458,7 +460,7 @@ def level_map_figure(data: LoopData, background: MapBackground) -> Figure | None
 
 
 def contribution_map_figure(contribution_db: np.ndarray, background: MapBackground) -> Figure:
-    """Draw what an effect changes links by, (n,) [dB], over the positions of the moving end."""
+    """Draw an effect's contribution to the levels (n,) [dB] by the moving end's position."""
     (ax,) = background.panels(1)
     grid = background.cell_means(contribution_db)
     range_db = residual_range_db(grid[2])
@@ -468,7 +470,10 @@ def contribution_map_figure(contribution_db: np.ndarray, background: MapBackgrou
 
 
 def affected_links_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw the links that an effect changes, coloured by their residual without and with it."""
+    """Draw the links that an effect changes as lines in the colour of their residual.
+
+    Left without the effect, right with it.
+    """
     links = effect.links
     changed = np.abs(effect.contribution_db) > MIN_CONTRIBUTION_DB
     rows = np.flatnonzero(changed & np.isfinite(links.level_db))
@@ -499,14 +504,14 @@ def affected_links_figure(effect: EffectData, background: MapBackground) -> Figu
 
 def _draw_cells(ax: Axes, grid: tuple[np.ndarray, np.ndarray, np.ndarray], colours: str,
                 low: float, high: float, label: str) -> None:
-    """Draw means over cells, as `MapBackground.cell_means` returns them, and the legends."""
+    """Draw the result of `MapBackground.cell_means` in colour, and the legends."""
     image = ax.pcolormesh(*grid, cmap=colours, vmin=low, vmax=high, zorder=2, alpha=0.9,
                           linewidth=0, rasterized=True)
     _draw_legends(ax, image, label)
 
 
 def _draw_legends(ax: Axes, coloured: ScalarMappable, label: str) -> None:
-    """Draw the legends of a panel below it: colours, and marks."""
+    """Draw colour bar and legend of marks below a panel."""
     part = ax.figure
     part.colorbar(coloured, ax=ax, location="bottom", shrink=0.85, extend="both", label=label)
     part.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2,

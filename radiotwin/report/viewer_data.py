@@ -18,7 +18,7 @@ from radiotwin.io.forms import MAX_POSITION_M
 from radiotwin.links.view import moving_end
 from radiotwin.maps.radiomap import RadioMap
 from radiotwin.propagation.paths.powers import paths_with_points
-from radiotwin.report.closeloop_words import causes
+from radiotwin.report.closeloop_words import found_causes
 from radiotwin.report.folders import TRUTH, Run
 from radiotwin.report.labels import name_label
 from radiotwin.report.map_figures import RESIDUAL_LABEL, tx_powers_dbm
@@ -222,7 +222,7 @@ def found_layer(run: Run) -> list[dict]:
     Causes that belong to a device, such as its antenna, are no objects.
     """
     found = []
-    for effect in causes(run.closeloop or {"effects": []}):
+    for effect in found_causes(run.closeloop or {"effects": []}):
         height_m = (effect["parameters"].get("height_m") or {}).get("value") or 0.0
         for place in effect.get("places", []):
             if not place.get("device"):

@@ -4,7 +4,6 @@ import pytest
 
 from radiotwin.display import plain
 from radiotwin.io.texts import MAX_TEXT, percent, shortly, shown, shown_data
-from radiotwin.report.labels import shorten
 
 
 @pytest.mark.parametrize("text, expected", [
@@ -39,4 +38,4 @@ def test_numbers_have_three_digits_or_all_before_the_point(value, text):
 
 def test_names_in_figures_are_no_formulas_and_short():
     assert plain(r"a $\frac{$ b") == r"a \$\frac{\$ b" and plain("a\nb\x1b") == r"a b\x1b"
-    assert len(plain("x" * 10**6)) == 100 and shorten("a name that is long") == "a name that i…"
+    assert len(plain("x" * 10**6)) == 100 and plain("a name that is long", 14) == "a name that i…"

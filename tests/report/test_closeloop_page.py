@@ -12,12 +12,7 @@ from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
 from radiotwin.report.closeloop_words import closeloop_summary, drivers, rivals
 from radiotwin.report.labels import (
-    about,
-    join_names,
-    number,
-    parameter_label,
-    small,
-    variable_label,
+    parameter_number,
 )
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
@@ -138,11 +133,7 @@ def test_what_an_effect_may_be_taken_for_is_said(tmp_path):
 @pytest.mark.parametrize("value, text", [(0.0, "0.00"), (0.003, "0.003"), (-0.00214, "−0.0021"), (0.07, "0.07"),
                                          (-6.5, "−6.50"), (12345.6, "12,346"), (3, "3"), (None, "–")])
 def test_no_parameter_is_rounded_to_nothing(value, text):
-    assert small(value) == text
-
-
-def test_an_error_of_almost_nothing_is_0_without_a_sign():
-    assert [number(value) for value in (0.0004, -0.0004, 0.0, -0.0051)] == ["0.00", "0.00", "0.00", "−0.0051"]
+    assert parameter_number(value) == text
 
 
 def test_only_a_level_of_0_db_is_what_others_are_compared_with(tmp_path):
@@ -344,30 +335,12 @@ def test_a_figure_outside_the_folder_is_not_read(tmp_path):
         page(stranger, folder)
 
 
-def test_the_two_probabilities_of_one_effect_are_told_apart(tmp_path):
-    text = page(report("undecided"), tmp_path)
-    assert "probability by itself" in text and "competes with others" in text and "sum to 1" in text
-
-
-def test_what_remains_is_said_to_be_that_before_it_is_interpolated(tmp_path):
-    before = "With the named effects, and before anything was interpolated, the residual depends on:"
-    assert before in page(report("located"), tmp_path) and before not in page(report(), tmp_path)
-
-
 def test_an_effect_that_no_size_would_have_shown_is_no_row(tmp_path):
     unseen = {"name": "episode", "size": None, "unit": "dB", "pattern": "over 10 % of the time"}
     text = page(report(detectable=[*report()["detectable"], unseen]), tmp_path)
     assert "Not to be seen in a typical form, at any size that they may have: episode." in text and "– dB" not in text
     text = page(report(detectable=[unseen]), tmp_path)
     assert "may have: episode." in text and "would have been named from" not in text
-
-
-def test_names_in_words():
-    assert parameter_label("share") == "share that belongs to places"  # its unit is "of the variance"
-    assert parameter_label("tilt_deg[uav1]") == "tilt (uav1)" and parameter_label("odd_thing_db") == "odd thing"
-    assert variable_label("time_in_flight_s") == ("time in flight", "s")
-    assert variable_label("odd_length_m") == ("odd length", "m")
-    assert join_names(["a", "b", "a", "c"]) == "a, b and c"
 
 
 def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
@@ -379,10 +352,6 @@ def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
     assert "<dt>all that was learnt together, RMSE</dt><dd>1.90 dB</dd>" in text
     error["combined"] = SCORES  # of a file that was written before
     assert "in its 90 % intervals" not in page(report(prediction=prediction, error=error), tmp_path)
-
-
-def test_a_size_that_searches_found_by_doubling_has_two_digits():
-    assert [about(size) for size in (106.2, 9.24, 0.0123, 1060.0)] == ["110", "9.2", "0.012", "1,100"]
 
 
 def test_times_since_1970_are_dates_and_no_other_quantity_is(tmp_path):

@@ -4,9 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.maps.radiomap import RadioMap
 from radiotwin.report import Run, read_run, write_report
-from radiotwin.scene.citymap import CityMap
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin.model.model import FittedModel
 
@@ -164,33 +162,6 @@ def test_names_from_a_file_are_never_run(opened, tmp_path):
     page = opened(tmp_path / "page.html")
     assert page.title() == f"radiotwin: {tmp_path.name}" and page.locator("img").count() == 0
     assert name in page.inner_text("table"), "it is shown as it is"
-
-
-def test_a_city_like_munich_is_small_and_quick(opened, run, tmp_path):
-    # 3,300 houses of 12 triangles on 1.4 km², as many as Sionna RT's Munich has, and twelve devices on 3 x 71 x 71.
-    side = np.linspace(0, 1400, 58)[:-1]
-    x_m, y_m = (axis.ravel() for axis in np.meshgrid(side, side))
-    corner = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)])
-    size_m = np.column_stack([np.full((len(x_m), 2), 17.0), 8 + (x_m * 7 + y_m * 13) % 25])
-    vertices_m = np.column_stack([x_m, y_m, 0 * x_m])[:, None] + corner * size_m[:, None]
-    faces = np.array([(0, 1, 3), (0, 3, 2), (4, 5, 7), (4, 7, 6), (0, 1, 5), (0, 5, 4), (2, 3, 7), (2, 7, 6),
-                      (0, 2, 6), (0, 6, 4), (1, 3, 7), (1, 7, 5)])
-    extent = {"x_min_m": 0.0, "x_max_m": 1400.0, "y_min_m": 0.0, "y_max_m": 1400.0}
-    config = run.scene.config
-    scene = type(run.scene)(run.scene.folder, config.model_copy(update={
-        "extent": config.extent.model_copy(update=extent),
-        "lattice": config.lattice.model_copy(update={"altitudes_m": [35.0, 40.0, 45.0]})}))
-    scene.__dict__["city"] = CityMap(vertices_m.reshape(-1, 3),
-                                     (8 * np.arange(len(x_m))[:, None, None] + faces).reshape(-1, 3))
-    names = [f"d{n}" for n in range(12)]
-    level_db = -60 - 50 * np.random.default_rng(0).random((12, *scene.lattice.shape))
-    radio_map = RadioMap.build(names, scene.lattice, level_db, level_db > -90, sigma_db=np.ones_like(level_db))
-    large = Run(tmp_path, scene=scene, maps={"truth": radio_map, "twin": radio_map}, tracks=run.tracks)
-    write_report(large, tmp_path / "page.html")
-    assert (tmp_path / "page.html").stat().st_size < 15e6
-    page = opened(tmp_path / "page.html")
-    # 3 to 5 seconds on two busy cores without a graphics card (1.7 seconds of computing); tests share theirs.
-    assert float(page.evaluate("document.body.dataset.readyMs")) < 60_000
 
 
 def test_keys_turn_and_zoom_and_print_has_the_picture(opened, path):
