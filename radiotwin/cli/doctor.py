@@ -15,7 +15,7 @@ from rich.console import Console
 from radiotwin.errors import MissingPackage
 from radiotwin.runtime import cuda, llvm
 from radiotwin.runtime.cuda import FREE_SPACE_GAIN_DB, TrialFailed, trace_trial_link
-from radiotwin.runtime.processes import usable_cores
+from radiotwin.runtime.processes import free_memory_bytes, usable_cores
 
 GIB = 2**30
 MIN_MEMORY_GIB = 4  # twice what tracing scenes/rbm takes (docs/results/tracer.md)
@@ -87,32 +87,19 @@ def print_diagnosis(diagnosis: Diagnosis, console: Console) -> None:
 def _check_machine(diagnosis: Diagnosis) -> Rows:
     """List cores, memory and free disk; add cautions if there is little."""
     cores = usable_cores()
-    memory_gib = _memory_gib()
-    disk_gib = shutil.disk_usage(Path.cwd()).free / GIB
-    if memory_gib is not None and memory_gib < MIN_MEMORY_GIB:
-        diagnosis.cautions.append(f"{memory_gib:.1f} GiB of memory: tracing a city takes up to "
-                                  f"{MIN_MEMORY_GIB} GiB")
+    memory_bytes, disk_gib = free_memory_bytes(), shutil.disk_usage(Path.cwd()).free / GIB
+    if memory_bytes is not None and memory_bytes < MIN_MEMORY_GIB * GIB:
+        diagnosis.cautions.append(f"{memory_bytes / GIB:.1f} GiB of memory free: tracing a city "
+                                  f"takes up to {MIN_MEMORY_GIB} GiB")
     if disk_gib < MIN_DISK_GIB:
         diagnosis.cautions.append(f"{disk_gib:.1f} GiB of disk free here: have {MIN_DISK_GIB} GiB "
                                   "before you trace cities")
     return [
         ("cores", str(cores)),
-        ("memory", "unknown" if memory_gib is None else f"{memory_gib:.1f} GiB"),
+        ("free memory",
+         "unknown" if memory_bytes is None else f"{memory_bytes / GIB:.1f} GiB"),
         ("free disk here", f"{disk_gib:.1f} GiB"),
     ]
-
-
-def _memory_gib() -> float | None:
-    """Return the memory of the machine or the limit of its container [GiB]; None if unknown."""
-    try:
-        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):  # Windows
-        return None
-    try:
-        memory = min(memory, int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    except (OSError, ValueError):  # no container, or "max"
-        pass
-    return memory / GIB
 
 
 def _check_gpu() -> Rows:

@@ -92,7 +92,7 @@ def legend_of(name: str, coverage: Coverage) -> Legend:
     lower = class_bounds(coverage.settings, coverage.dataset.attrs["bandwidth_hz"])[name]
     shown = [f"{each * factor:.4g}".replace("-", "−") for each in lower]
     if name == "coverage_probability":
-        title += f", received power ≥ {_text(coverage.settings.threshold_dbm)} dBm"
+        title += f", received power ≥ {coverage.settings.threshold_dbm:g} dBm".replace("-", "−")
     shades = colormaps[colours_name](np.linspace(0.95, 0.05, len(lower)))
     return Legend(title, lower, (*(f"≥ {each} {unit}" for each in shown), f"< {shown[-1]} {unit}"),
                   (*map(to_hex, shades), BELOW_COLOUR))
@@ -113,10 +113,6 @@ def file_stem(name: str) -> str:
     for ending in ("_dbm", "_db", "_bps"):
         name = name.removesuffix(ending)
     return name
-
-
-def _text(value: float) -> str:
-    return f"{value:g}".replace("-", "−")
 
 
 LEGEND_ROWS = 24  # at most so many servers in a legend

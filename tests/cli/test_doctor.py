@@ -72,7 +72,7 @@ def test_missing_packages(untraced, monkeypatch):
 
 
 def test_little_memory_and_disk_is_said_but_stops_nothing(untraced, monkeypatch):
-    monkeypatch.setattr(doctor, "_memory_gib", lambda: 1.5)
+    monkeypatch.setattr(doctor, "free_memory_bytes", lambda: 3 * 2**29)
     monkeypatch.setattr(doctor, "MIN_DISK_GIB", 10**9)
     diagnosis = doctor.diagnose()
     assert diagnosis.healthy
