@@ -1,6 +1,6 @@
 """Types of effect parameters: values with units, bounds, intervals, and their search space."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
@@ -66,9 +66,8 @@ def quantity(default: Any, *, unit: str, low: float, high: float, step: float,
         prior_sd: standard deviation of a normal prior around the default; None: flat prior.
         description: one line, for the report.
     """
-    extra: dict[str, Any] = {"unit": unit, "step": step, "prior_sd": prior_sd, "low": low,
-                             "high": high}
-    return Field(default, ge=low, le=high, description=description, json_schema_extra=extra)
+    return Field(default, ge=low, le=high, description=description, json_schema_extra={
+        "unit": unit, "step": step, "prior_sd": prior_sd, "low": low, "high": high})
 
 
 @dataclass(frozen=True)
@@ -230,6 +229,13 @@ class Variation:
     follows_paths: bool = False
     is_rough: bool = False
     starts: Sequence[np.ndarray] = ()
+
+    def parameters(self, units: Mapping[str, str], params_sd: np.ndarray) -> dict[str, Parameter]:
+        """Return the reported parameters, by name, from units by name and their sds (r,)."""
+        return {name: Parameter.normal(value, sd, unit, Allowed(low, high))
+                for (name, unit), value, sd, low, high in zip(
+                    units.items(), self.values.tolist(), params_sd, self.low.tolist(),
+                    self.high.tolist(), strict=True)}
 
     @property
     def resolution_sd(self) -> np.ndarray:

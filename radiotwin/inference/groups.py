@@ -98,7 +98,7 @@ class LastingErrors:
         self._part, self._of_part = _pairs(lasting, units.passing[rows])
         self._size = np.bincount(self._part)
         self._parts = np.bincount(self._of_part)
-        self._several = self._parts >= MIN_ALIKE
+
 
     def sd(self, values: np.ndarray) -> float:
         """Estimate the standard deviation between lasting units of values (r,).
@@ -107,15 +107,15 @@ class LastingErrors:
         of their passing units explains. By medians, so that a group that stands out does not
         inflate it.
         """
-        several, parts = self._several, self._parts
-        if several.sum() < LEAST[1]:
+        divided, parts = self._parts >= MIN_ALIKE, self._parts
+        if divided.sum() < LEAST[1]:
             return 0.0
         mean = np.bincount(self._part, values) / self._size
         middle = np.bincount(self._of_part, mean) / parts
-        used = several[self._of_part]
+        used = divided[self._of_part]
         freedom = np.sqrt(1 - 1 / parts[self._of_part[used]])
         within = MAD_SD * np.median(np.abs(mean - middle[self._of_part])[used] / freedom)
-        between = robust_sd(middle[several]) ** 2 - within**2 * np.mean(1 / parts[several])
+        between = robust_sd(middle[divided]) ** 2 - within**2 * np.mean(1 / parts[divided])
         return float(np.sqrt(np.maximum(between, 0.0)))
 
 
@@ -220,21 +220,20 @@ def _with_error(value: np.ndarray, step: np.ndarray, influence: np.ndarray, grou
     count = groups.count
     number = np.bincount(groups.group, minlength=count)
     filled = np.bincount(groups.passing, minlength=len(groups.of_passing)) > 0
-    several = np.bincount(groups.of_passing, filled, count)
+    units = np.bincount(groups.of_passing, filled, count)
     unit_influence = np.bincount(groups.passing, influence, len(groups.of_passing))
     squares = np.bincount(groups.of_passing, unit_influence**2, count)
-    sandwich = step * np.sqrt(squares * several / np.maximum(several - 1, 1))
+    sandwich = step * np.sqrt(squares * units / np.maximum(units - 1, 1))
     share = np.bincount(groups.lasting, minlength=len(groups.of_lasting)).astype(float)
     effective = np.maximum(
         number**2 / np.maximum(np.bincount(groups.of_lasting, share**2, count), 1), 1.0)
     independent = step * np.sqrt(np.bincount(groups.group, influence**2, count))
     least = BIN_LEAST if is_bin else LEAST
-    enough = (number >= least[0]) & (several >= least[1]) & (effective >= least[2])
+    enough = (number >= least[0]) & (units >= least[1]) & (effective >= least[2])
     if is_bin and enough.any():
         ratio = sandwich[enough] / np.maximum(independent[enough], TINY)
-        usual = independent * np.sqrt(np.average(ratio**2, weights=several[enough]))
-        sandwich = np.sqrt((several * sandwich**2 + PEER_WEIGHT * usual**2)
-                           / (several + PEER_WEIGHT))
+        usual = independent * np.sqrt(np.average(ratio**2, weights=units[enough]))
+        sandwich = np.sqrt((units * sandwich**2 + PEER_WEIGHT * usual**2) / (units + PEER_WEIGHT))
     error = independent if lasting_sd is None else np.hypot(
         sandwich, lasting_sd / np.sqrt(effective))
     return Statistic(np.where(enough, value, np.nan), np.where(enough, error, np.nan))

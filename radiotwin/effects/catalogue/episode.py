@@ -278,7 +278,9 @@ def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, we
         if nats[start, end] > (-np.inf if best is None else best.nats):
             likely = nats > nats[start, end] - INTERVAL_NATS
             starts, stops = np.flatnonzero(likely[:, end]), np.flatnonzero(likely[start])
-            last_s = np.r_[-np.inf, np.maximum.accumulate(_last_s(cell, time_s, len(ends_s)))]
+            last_s = np.full(len(ends_s), -np.inf)  # time of the last reading in each cell
+            np.maximum.at(last_s, cell, time_s)
+            last_s = np.r_[-np.inf, np.maximum.accumulate(last_s)]
             # It began after the last reading before it, and ended before the next one after it.
             best = _Window(
                 float(nats[start, end]), float(ends_s[start]), float(last_s[end]),
@@ -291,12 +293,6 @@ def _sums(cell: np.ndarray, value: np.ndarray, cells: int) -> np.ndarray:
     """Compute cumulative sums (cells + 1,) of values (n,) over their cells."""
     return np.r_[0.0, np.cumsum(np.bincount(cell, weights=value, minlength=cells))]
 
-
-def _last_s(cell: np.ndarray, time_s: np.ndarray, cells: int) -> np.ndarray:
-    """Find the last time (cells,) in each cell [s]; -inf in an empty one."""
-    last_s = np.full(cells, -np.inf)
-    np.maximum.at(last_s, cell, time_s)
-    return last_s
 
 
 def _most_members_agree(links: Links, value_db: np.ndarray, weight: np.ndarray, known: np.ndarray,

@@ -64,20 +64,18 @@ class _GainOffset(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        index = self._index(view.links)
-        members = frequent_labels(index, MIN_LINKS)
-        if len(members) < 2:  # a fold may have fewer than all links
-            return []
-        return self._of_members(view, sorted(set(members) & set(view.in_group(index))))
+        if len(frequent_labels(self._index(view.links), MIN_LINKS)) < 2:
+            return []  # a fold may have fewer than all links
+        return self._of_members(view, view.in_group(self._index(view.links)))
 
     @override
     def propose_like(self, view: ResidualView) -> list[Params]:
-        members = frequent_labels(self._index(view.links), MIN_LINKS)
-        return self._of_members(view, sorted(set(members) & set(self.params.members)))
+        return self._of_members(view, self.params.members)
 
-    def _of_members(self, view: ResidualView, members: list[int]) -> list[Params]:
-        """Propose offsets of these members, with the sd of their mean residuals as the spread."""
+    def _of_members(self, view: ResidualView, among: list[int]) -> list[Params]:
+        """Propose offsets of members with enough links, with the sd of their mean residuals."""
         index = self._index(view.links)
+        members = [member for member in frequent_labels(index, MIN_LINKS) if member in among]
         if not members:
             return []
         offsets_db = [np.average(view.residual_db[index == member],

@@ -17,14 +17,7 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import squares_about_mean, subsample
 from radiotwin.effects.base import GainEffect, ResidualView
-from radiotwin.effects.params import (
-    Allowed,
-    EffectParams,
-    Estimate,
-    Metres,
-    Parameter,
-    Variation,
-)
+from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter, Variation
 from radiotwin.links import Links
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import permittivity
@@ -123,11 +116,7 @@ class GroundReflection(GainEffect):
     @override
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         units = {"strength": "of medium dry ground", "roughness_m": "m", "ground_m": "m"}
-        of = self.variation()
-        return {name: Parameter.normal(getattr(self.params, name), sd, unit,
-                                       Allowed(float(low), float(high)))
-                for (name, unit), sd, low, high in zip(units.items(), estimate.params_sd, of.low,
-                                                       of.high, strict=True)}
+        return self.variation().parameters(units, estimate.params_sd)
 
 
 def _bounces(links: Links) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -14,15 +14,7 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import NEPERS, add_power, subsample
 from radiotwin.effects.base import LevelAt, ReceiverEffect, ResidualView, Term
-from radiotwin.effects.params import (
-    Allowed,
-    Decibels,
-    EffectParams,
-    Estimate,
-    Metres,
-    Parameter,
-    Variation,
-)
+from radiotwin.effects.params import Decibels, EffectParams, Estimate, Metres, Parameter, Variation
 from radiotwin.effects.places import Mark
 from radiotwin.links import Links
 from radiotwin.links.declared import NOTHING
@@ -143,11 +135,8 @@ class Interference(ReceiverEffect):
     def parameters(self, links: Links, estimate: Estimate) -> dict[str, Parameter]:
         level = ("over_a_device_db", "dB") if self.params.through_channel else (
             f"level_at_{REFERENCE_M:.0f}_m", links.level_unit)
-        names, units = ("x_m", "y_m", level[0]), ("m", "m", level[1])
-        of = self.variation()
-        return {name: Parameter.normal(value, sd, unit, Allowed(float(low), float(high)))
-                for name, value, sd, unit, low, high in zip(
-                    names, of.values.tolist(), estimate.params_sd, units, of.low, of.high)}
+        units = {"x_m": "m", "y_m": "m", level[0]: level[1]}
+        return self.variation().parameters(units, estimate.params_sd)
 
 
 def _reading_m(links: Links) -> np.ndarray:

@@ -57,20 +57,6 @@ STEP_DB, MAX_CHANGE_DB = 1.0, 6.0  # the same for a drop
 MAX_DROP_DB = 80.0  # dynamic range of a good receiver
 
 
-@dataclass(frozen=True, eq=False)
-class _Drops:
-    """Random drops of one receiver's level.
-
-    Attributes:
-        share: share of instants with a drop.
-        drop_db: drop [dB].
-        nats: (n,) log-likelihood gain of each reading.
-    """
-
-    share: float
-    drop_db: float
-    nats: np.ndarray
-
 
 @dataclass(frozen=True, eq=False)
 class _States:
@@ -93,8 +79,9 @@ class _States:
     nats: np.ndarray
 
 
-def _find_drops(view: ResidualView, receiver: int, rows: np.ndarray) -> _Drops | None:
-    """Find random drops in the readings (rows) of a receiver; None if there are none."""
+def _find_drops(view: ResidualView, receiver: int,
+                rows: np.ndarray) -> tuple[_States, np.ndarray] | None:
+    """Find random drops in the readings (rows) of a receiver, and each one's gain [nats]."""
     compared_db, _ = compared_where_possible_db(view)
     rest_db, instant = compared_db[rows], _instants(view.links, rows)
     states = max((_two_states(rest_db, instant, drop_db) for drop_db in FIRST_DROPS_DB),
@@ -113,7 +100,7 @@ def _find_drops(view: ResidualView, receiver: int, rows: np.ndarray) -> _Drops |
     if len(others) and ((compared_db[others] < low_db).mean()
                         > MAX_OTHERS * (rest_db < low_db).mean()):
         return None
-    return _Drops(states.share, states.drop_db, nats)
+    return states, nats
 
 
 def _instants(links: Links, rows: np.ndarray) -> np.ndarray:
@@ -206,8 +193,8 @@ class LockLoss(DetectionEffect):
                 blank[receiver] = probability
             heard = rows[np.isfinite(links.level_db[rows])]
             found = _find_drops(view, receiver, heard) if len(heard) >= MIN_LINKS else None
-            if found is not None and _most_devices_gain(links.device[heard], found.nats):
-                shares[receiver], drops_db[receiver] = found.share, found.drop_db
+            if found is not None and _most_devices_gain(links.device[heard], found[1]):
+                shares[receiver], drops_db[receiver] = found[0].share, found[0].drop_db
         proposed = [self.Params(receivers=blank)] if blank else []
         if shares:
             proposed.append(self.Params(receivers=shares, drops_db=drops_db))

@@ -147,8 +147,8 @@ def _boxes(city: CityMap) -> dict[int, Box]:
     middle_m, size_m = 0.5 * (low_m + high_m), high_m - low_m
     found = {}
     for building in np.unique(label[~city.on_ground]).tolist():
-        (x_m, y_m, _), (length_m, width_m, _) = middle_m[building].tolist(), size_m[
-            building].tolist()
+        (x_m, y_m, _), (length_m, width_m, _) = (values_m[building].tolist()
+                                                 for values_m in (middle_m, size_m))
         found[building] = Box(x_m, y_m, length_m, width_m, BOTTOMLESS_M, 0.0)
     return found
 

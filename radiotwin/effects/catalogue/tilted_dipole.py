@@ -104,7 +104,9 @@ class TiltedDipole(BodyFrameEffect):
 def _best_dipole(view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
     """Find the dipole of a grid that fits best along straight lines; None if the gain is low."""
     links = view.links.select(rows)
-    ray, residual_db, weight = -_unit(links.offset_m), view.residual_db[rows], view.weight[rows]
+    length_m = np.linalg.norm(links.offset_m, axis=1, keepdims=True)
+    ray = -(links.offset_m / np.maximum(length_m, 1e-9))
+    residual_db, weight = view.residual_db[rows], view.weight[rows]
 
     def after(tilt: float, azimuth: float) -> float:
         gain = dipole_gain(ray, _axis(links.receiver_axes, tilt, azimuth))
@@ -148,7 +150,3 @@ def _axis(axes: np.ndarray, tilt_deg: float, azimuth_deg: float) -> np.ndarray:
     in_body = np.array([np.sin(tilt) * np.sin(lean), np.sin(tilt) * np.cos(lean), np.cos(tilt)])
     return np.einsum("i,nij->nj", in_body, axes)
 
-
-def _unit(offset_m: np.ndarray) -> np.ndarray:
-    """Normalise vectors (n, 3)."""
-    return offset_m / np.maximum(np.linalg.norm(offset_m, axis=1, keepdims=True), 1e-9)
