@@ -155,12 +155,19 @@ def gltf(**changes):
     return document
 
 
-def test_strips_and_fans(tmp_path):
-    for mode, faces in ((4, [[0, 1, 2]]), (5, [[0, 1, 2]]), (6, [[0, 1, 2]])):
-        (tmp_path / "a.gltf").write_text(json.dumps(gltf(meshes__0__primitives__0__mode=mode)))
-        (part,) = read_model(tmp_path / "a.gltf")
-        assert part.mesh.faces.tolist() == faces
-        assert part.mesh.vertices.tolist() == [[0, 0, 0], [9, 0, 0], [0, 9, 0]]
+CORNERS = [[0, 0, 0], [9, 0, 0], [0, 9, 0], [9, 9, 0], [5, 20, 0], [0, 20, 0]]
+
+
+@pytest.mark.parametrize(("mode", "faces"), [(4, [[0, 1, 2], [3, 4, 5]]), (5, [[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5]]),
+                                             (6, [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])])
+def test_triangles_strips_and_fans(tmp_path, mode, faces):
+    data = base64.b64encode(np.array(CORNERS, "<f4").tobytes()).decode()
+    (tmp_path / "a.gltf").write_text(json.dumps(gltf(
+        meshes__0__primitives__0__mode=mode, accessors__0__count=6, bufferViews__0__byteLength=72,
+        buffers__0={"byteLength": 72, "uri": f"data:application/octet-stream;base64,{data}"})))
+    (part,) = read_model(tmp_path / "a.gltf")
+    assert [sorted(face) for face in part.mesh.faces.tolist()] == [sorted(face) for face in faces]
+    assert part.mesh.vertices.tolist() == CORNERS
 
 
 BAD_GLTF = {
@@ -171,10 +178,9 @@ BAD_GLTF = {
     "scenes__0__nodes__0": (-1, "is no index of nodes"), "nodes__0__mesh": (7, "not a readable glTF"),
     "nodes__0__matrix": ([1, 2], "not a readable glTF"), "nodes__0__scale": ([1e300, 1, 1], "finite|from the origin"),
     "buffers__0__uri": ("http://127.0.0.1/a.bin", "is no file beside it"), "nodes": (7, "nodes is no list"),
-    "buffers__0__uri__": (None, ""), "extensionsRequired": (["KHR_draco_mesh_compression"], "compressed .KHR_draco"),
+    "extensionsRequired": (["KHR_draco_mesh_compression"], "compressed .KHR_draco"),
     "meshes__0__primitives__0__mode": (1, "holds no triangles"), "meshes": ([], "not a readable glTF"),
 }
-del BAD_GLTF["buffers__0__uri__"]
 
 
 @pytest.mark.parametrize("path", BAD_GLTF)

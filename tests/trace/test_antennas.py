@@ -1,7 +1,5 @@
 """Antennas that a scene declares, in the gains that are traced."""
 
-import shutil
-
 import numpy as np
 import pytest
 
@@ -19,10 +17,9 @@ DIPOLE = "azimuth_deg,elevation_deg,gain_dbi\n" + "\n".join(f"{a},{e},{2 - abs(e
 
 
 @pytest.fixture
-def with_antennas(small_scene, tmp_path):
+def with_antennas(own_scene):
     """`preset:small`: d0 has a sector antenna that looks east and 5 degrees up, the UAVs have dipoles."""
-    folder = tmp_path / "scene"
-    shutil.copytree(small_scene.folder, folder, ignore=shutil.ignore_patterns("cache"))
+    folder = own_scene.folder
     (folder / "antennas").mkdir()
     (folder / "antennas" / "sector.csv").write_text(SECTOR)
     (folder / "antennas" / "dipole.csv").write_text(DIPOLE)

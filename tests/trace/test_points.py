@@ -41,11 +41,6 @@ def test_bad_points_name_row_and_column(tmp_path, text, message):
     assert str(path) in str(error.value)
 
 
-def test_missing_file_is_bad_input(tmp_path):
-    with pytest.raises(BadInput, match="does not exist"):
-        read_points(tmp_path / "none.csv")
-
-
 def test_each_link_has_a_gain_or_a_reason(small_scene, law, tmp_path):
     lattice_m = small_scene.lattice.positions_m[::9]
     low_m = np.column_stack([lattice_m[:, :2], np.full(len(lattice_m), 2.0)])

@@ -11,6 +11,12 @@ from radiotwin.scene.readers.gis_files import read_json_map
 from radiotwin.scene.readers.osm import assemble, read_osm_pbf, read_osm_xml, stitch
 
 
+def features(tmp_path, text):
+    """The buildings of a file in OpenStreetMap's XML, by name."""
+    (tmp_path / "a.osm").write_text(text)
+    return {one.name: one for one in assemble(read_osm_xml(tmp_path / "a.osm")).features}
+
+
 @pytest.mark.parametrize(("chains", "rings"), [
     ([[1, 2, 3, 1]], 1), ([[1, 2, 3], [1, 4, 3]], 1), ([[1, 2], [3, 2], [3, 4, 1]], 1),
     ([[1, 2, 3, 1], [5, 6], [6, 7, 5]], 2), ([], 0), ([[1, 2, 1]], 0)])
@@ -54,10 +60,8 @@ def relation(role, way_tags="", relation_tags='<tag k="type" v="multipolygon"/>'
 
 
 def test_old_multipolygons_have_their_tags_at_the_outer_way(tmp_path):
-    path = tmp_path / "a.osm"
-    path.write_text(relation("outer", '<tag k="building" v="yes"/><tag k="height" v="7"/>'))
-    (feature,) = assemble(read_osm_xml(path)).features
-    assert feature.name == "relation/1" and feature.tags["height"] == "7"
+    found = features(tmp_path, relation("outer", '<tag k="building" v="yes"/><tag k="height" v="7"/>'))
+    assert list(found) == ["relation/1"] and found["relation/1"].tags["height"] == "7"
 
 
 def test_a_relation_without_its_ways_is_cut(tmp_path):
@@ -114,11 +118,9 @@ def test_rings_without_a_role_are_courtyards_by_where_they_lie(tmp_path, roles, 
     tower = '<tag k="building" v="tower"/>'
     ways = "".join(way + (tower if number == 2 else "") + "</way>" for number, (_, way) in enumerate(rings, 1))
     members = "".join(f'<member type="way" ref="{number}" role="{role}"/>' for number, role in enumerate(roles, 1))
-    path = tmp_path / "a.osm"
-    path.write_text("<osm>" + "".join(nodes for nodes, _ in rings) + ways + f'<relation id="9">{members}<tag k="type" '
-                    'v="multipolygon"/><tag k="building" v="yes"/></relation></osm>')
-    found = {one.name: one.area.area for one in assemble(read_osm_xml(path)).features}
-    assert found["relation/9"] == pytest.approx(area)
+    found = features(tmp_path, "<osm>" + "".join(nodes for nodes, _ in rings) + ways + f'<relation id="9">{members}'
+                     '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/></relation></osm>')
+    assert found["relation/9"].area.area == pytest.approx(area)
     assert ("way/2" in found) == (roles[1] != "outer")
 
 
@@ -127,11 +129,9 @@ def test_ways_of_one_ring_without_roles(tmp_path):
     halves = ('<way id="1"><nd ref="10"/><nd ref="11"/><nd ref="12"/></way>'
               '<way id="2"><nd ref="12"/><nd ref="13"/><nd ref="10"/></way>')
     members = '<member type="way" ref="1" role="outer"/><member type="way" ref="2" role=""/>'
-    path = tmp_path / "a.osm"
-    path.write_text(f'<osm>{nodes}{halves}<relation id="9">{members}<tag k="type" v="multipolygon"/>'
-                    '<tag k="building" v="yes"/></relation></osm>')
-    (one,) = assemble(read_osm_xml(path)).features
-    assert one.area.area == pytest.approx(100)
+    found = features(tmp_path, f'<osm>{nodes}{halves}<relation id="9">{members}<tag k="type" v="multipolygon"/>'
+                     '<tag k="building" v="yes"/></relation></osm>')
+    assert [one.area.area for one in found.values()] == [pytest.approx(100)]
 
 
 def overpass(geometry):
@@ -166,11 +166,11 @@ def test_places_in_xml_as_overpass_answers(tmp_path):
     relation, shed = overpass(True)
     members = "".join(f'<member type="way" ref="{one["ref"]}" role="{one["role"]}">' + places(one).replace("ref", "x")
                       + "</member>" for one in relation["members"])
-    (tmp_path / "a.osm").write_text(
-        f'<osm><way id="4">{places(shed)}<tag k="building" v="shed"/></way><relation id="7"><bounds/>{members}'
+    found = features(
+        tmp_path, f'<osm><way id="4">{places(shed)}<tag k="building" v="shed"/></way><relation id="7"><bounds/>{members}'
         '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/></relation></osm>')
-    found = {one.name: one.area.area for one in assemble(read_osm_xml(tmp_path / "a.osm")).features}
-    assert found == {"relation/7": pytest.approx(81 - 9), "way/4": pytest.approx(40)}
+    assert {name: one.area.area for name, one in found.items()} == {
+        "relation/7": pytest.approx(81 - 9), "way/4": pytest.approx(40)}
 
 
 @pytest.mark.parametrize(("elements", "message"), [
@@ -199,9 +199,8 @@ def test_geojson_under_other_endings(tmp_path, name, text):
 def test_ways_that_overpass_gives_twice_keep_their_tags(tmp_path):
     """As of `out body; >; out skel qt;`, which the page of Overpass proposes."""
     nodes, way = ring(1, 0, 10)
-    text = f'<osm>{way}<tag k="building" v="yes"/><tag k="height" v="7"/></way>{nodes}{way}</way></osm>'
-    (tmp_path / "a.osm").write_text(text)
-    (one,) = assemble(read_osm_xml(tmp_path / "a.osm")).features
+    (one,) = features(
+        tmp_path, f'<osm>{way}<tag k="building" v="yes"/><tag k="height" v="7"/></way>{nodes}{way}</way></osm>').values()
     assert one.tags["height"] == "7" and one.area.area == pytest.approx(100)
     elements = overpass(False)
     elements.append({key: value for key, value in elements[-2].items() if key != "tags"})  # the shed
