@@ -214,7 +214,7 @@ def _material_table(report: BuildReport) -> Table:
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """How to read a city model or a map, and what to add to it.
+    """Options for reading a city model or a map, and for what is added to it.
 
     Attributes have the names and meanings of the arguments of `radiotwin.build_scene`. `scale` and
     `up` are for city models only, those from `default_height_m` on for maps only.
@@ -242,7 +242,7 @@ class BuildOptions:
     layers: tuple[str, ...] = ()
 
     def check(self) -> None:
-        """Raise BadInput for an impossible value of those that maps and city models share."""
+        """Raise BadInput for an impossible value; options for maps only are checked by readers."""
         if self.scale is not None and not 0 < self.scale < float("inf"):
             raise BadInput(f"scale {self.scale:g} is not possible; give a positive factor (feet: "
                            "0.3048)")
@@ -324,7 +324,7 @@ def build_scene(source: Path | str, out_folder: Path | str, options: BuildOption
 
 @dataclass(frozen=True)
 class Declared:
-    """What a scene declares besides its geometry.
+    """Declarations of a scene besides its geometry.
 
     Attributes:
         source: Source of the city.

@@ -346,7 +346,7 @@ def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def is_closed(faces: np.ndarray) -> bool:
     """Return whether a surface of triangles (f, 3) is closed and consistently oriented.
 
-    It is if its triangles run along every edge as often in one direction as in the other.
+    Then the triangles run along every edge as often in one direction as in the other.
     """
     forward, backward = _edges(faces)
     return len(forward) > 0 and bool((forward == backward).all())

@@ -216,11 +216,17 @@ def _spread_out(positions: np.ndarray, count: int) -> set[int]:
 
 def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: CityMap | None,
                ground: CityMap | None = None) -> list[UavConfig]:
-    """Place UAVs at the free lattice position nearest to the middle, at one altitude each.
+    """Place UAVs, one altitude after another, at the free lattice position nearest to the middle.
 
     They end where they start. The battery has 80 % of the moves along two sides of the extent, at
-    least 20. `buildings` is a map without ground, None: there are none. `ground` is a map without
-    buildings that altitudes count from, None: they count from the datum.
+    least 20.
+
+    Args:
+        count: Number of UAVs.
+        extent: Extent of the lattice.
+        lattice: Step and altitudes.
+        buildings: Map without ground; None: there are no buildings.
+        ground: Map without buildings that altitudes count from; None: they count from the datum.
 
     Raises:
         BadInput: No lattice position is free at an altitude.

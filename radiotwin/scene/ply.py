@@ -176,7 +176,7 @@ def _truncated(path: Path, element: _Element, row: int) -> BadInput:
 
 
 def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
-    """Return (element, property) -> values of an ASCII file's data, of those that are needed."""
+    """Return (element, property) -> values of an ASCII file's data, needed properties only."""
     lines = [line for line in _lines(data) if line.strip()]
     columns: dict[tuple[str, str], array | _Lists] = {}
     first = 0
@@ -230,7 +230,7 @@ def _read_words(words: list[str], element: _Element, found: dict) -> None:
 
 def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list[_Element]
                  ) -> dict:
-    """Return (element, property) -> values of a binary file's data, of those that are needed."""
+    """Return (element, property) -> values of a binary file's data, needed properties only."""
     columns: dict[tuple[str, str], np.ndarray | array | _Lists] = {}
     for element in elements:
         found, start = (_read_uniform(data, start, order, element)

@@ -128,8 +128,8 @@ def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None
         pool.close()
     for piece, (gain_db, *_) in zip(chosen, found):
         store.put(piece, gain_db, [], 0.0)
-    # The first one compiles kernels.
-    walls_s, seconds = np.array([each[1:3] for each in found[1:] or found] or [(0.0, 0.0)]).T
+    # The first batch also compiles kernels
+    walls_s, seconds = np.array([times[1:3] for times in found[1:] or found] or [(0.0, 0.0)]).T
     busy = float(walls_s.sum() / max(seconds.sum(), 1e-9)) if count else 1.0
     return TracePlan(
         links=sum(map(len, pieces)), batches=len(pieces),
@@ -137,7 +137,7 @@ def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None
         start_s=max(taken_s - walls_s.sum(), 0.0) / busy, batch_s=float(np.median(seconds)),
         batch_p90_s=float(np.quantile(seconds, 0.9)),
         busy=busy,
-        peak_bytes=max((each[3] for each in found), default=0),
+        peak_bytes=max((memory_bytes for *_, memory_bytes in found), default=0),
         memory_bytes=job.resources.memory_bytes, workers=workers,
         exchanged=exchanged_calls(scene, settings, len(index)) if settings.solver == "paths"
         else 0)

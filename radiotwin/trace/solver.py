@@ -28,7 +28,7 @@ from radiotwin.runtime import llvm
 from radiotwin.runtime.cuda import Device
 from radiotwin.runtime.processes import allowed_cores
 from radiotwin.scene.antennas import Antenna
-from radiotwin.scene.citymap import GROUND_M
+from radiotwin.scene.citymap import GROUND_M, SKIN_M
 from radiotwin.scene.folder import CityShape, read_city, write_city
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.materials import permittivity, ranges_text
@@ -42,7 +42,6 @@ GROUND_DEPTH_M = 1000.0  # thickness of the ground: as a half space, since its m
 _VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 # Delays are single precision, with a unit roundoff of 6e-8, and sums of up to five segments.
 _LENGTH_TOLERANCE = 1e-6  # relative
-_SAME_POINT_M = 0.01  # closer points are one; as for surfaces of the 3D map
 # Dr.Jit keeps freed memory for the next call. Releasing it after every call takes 40 % of the time
 # for allocations; never releasing it may use ever more memory.
 _CALLS_BETWEEN_FLUSHES = 10
@@ -224,7 +223,7 @@ def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: n
         second = first + shift
         apart_m = np.abs(point_m[:, link[first], path[first]]
                          - point_m[:, link[second], path[second]])
-        same = apart_m.max(axis=(0, 2)) <= _SAME_POINT_M
+        same = apart_m.max(axis=(0, 2)) <= SKIN_M  # as close as surfaces that count as one
         first, second = first[same], second[same]
         stronger = strength[link[first], path[first]] >= strength[link[second], path[second]]
         weaker = np.where(stronger, second, first)

@@ -195,9 +195,9 @@ def _below_ground(tags: Mapping[str, str]) -> str:
 
 def is_below_zero(tags: Mapping[str, str], key: str) -> bool:
     """Return whether all levels in a tag, such as `-2;-1` or `-2--1`, are below zero."""
-    found = [_LEVEL_RANGE.fullmatch(part) for part in tags.get(key, "").split(";")]
-    ends = [float(end) for each in found if each for end in each.groups() if end]
-    return all(found) and max(ends) < 0
+    ranges = [_LEVEL_RANGE.fullmatch(part) for part in tags.get(key, "").split(";")]
+    levels = [float(level) for found in ranges if found for level in found.groups() if level]
+    return all(ranges) and max(levels) < 0
 
 
 def _is_set(tags: Mapping[str, str], key: str) -> bool:

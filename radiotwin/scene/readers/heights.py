@@ -197,7 +197,7 @@ def parse_length_m(text: str) -> float:
         return number(found[1])
     if found := _FEET.fullmatch(text):
         feet, inches = number(found[1]), number(found[2] or "0")
-        length_m = abs(feet) * 0.3048 + inches * 0.0254
+        length_m = abs(feet) * FOOT_M + inches * 0.0254
         return math.copysign(length_m, feet)
     return math.nan
 

@@ -52,10 +52,10 @@ def download_osm(
                        f"server, {MAX_AREA_KM2:g} km² are allowed; make --bbox smaller, or "
                        "download an extract (.osm.pbf)")
     box = ",".join(f"{value:.7f}" for value in bbox_deg)
-    wanted = [*(f'["{key}"]' for key in BUILDING_KEYS),
-              *(f'["{key}"="{value}"]' for key, value in TAGS),
-              f'["highway"~"^({"|".join(STREETS)})$"]']
-    selectors = "".join(f"{kind}{each}({box});" for kind in ("way", "relation") for each in wanted)
+    filters = [*(f'["{key}"]' for key in BUILDING_KEYS),
+               *(f'["{key}"="{value}"]' for key, value in TAGS),
+               f'["highway"~"^({"|".join(STREETS)})$"]']
+    selectors = "".join(f"{kind}{tag}({box});" for kind in ("way", "relation") for tag in filters)
     query = f"[out:xml][timeout:{TIMEOUT_S}];({selectors});(._;>;);out body;"
     request = urllib.request.Request(
         server, urllib.parse.urlencode({"data": query}).encode(),

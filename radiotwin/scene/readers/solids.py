@@ -96,11 +96,11 @@ def make_prisms(
     """
     defects = _Defects()
     areas = _clean_areas(features, origin, defects)
-    wholes = [(feature, area) for feature, area in areas if not feature.is_part]
+    buildings = [(feature, area) for feature, area in areas if not feature.is_part]
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
     lowest_m: dict[str, float] = {}  # by building
-    for feature, area, (building, site) in _resolve_parts(wholes, parts, defects):
+    for feature, area, (building, site) in _resolve_parts(buildings, parts, defects):
         height = height_of(feature.tags, default_height_m, height_column)
         if is_below_zero(feature.tags, "layer") or is_below_zero(feature.tags, "level"):
             defects.add("layer", feature.name)
@@ -144,8 +144,9 @@ class _Defects:
         "material": ("warning", "building(s) have a building:material that is not in the table; "
                                 "the default was taken. Name it in --material-table or with "
                                 "--material NAME=ITU"),
-        "rest": ("warning", f"outline(s) are covered to less than {MIN_COVERED_SHARE:.0%} by their "
-                            "parts: the rest keeps the outline's own height"),
+        "uncovered": ("warning", "outline(s) are covered to less than "
+                                 f"{MIN_COVERED_SHARE:.0%} by their parts: the rest keeps the "
+                                 "outline's own height"),
         "layer": ("warning", "building(s) have a layer or level below zero, and a height or "
                              "storeys, which count from the ground: built"),
         "no parts": ("warning", "building(s) have parts (has_parts) that the file does not hold: "
@@ -229,15 +230,16 @@ def _touches_itself(polygon: shapely.Polygon) -> bool:
 
 
 def _resolve_parts(
-    wholes: list[Area], parts: list[Area], defects: _Defects
+    buildings: list[Area], parts: list[Area], defects: _Defects
 ) -> list[tuple[Feature, shapely.MultiPolygon, Area]]:
-    """Return parts with inherited tags, and buildings without the areas of their parts.
+    """Assign parts to buildings: parts inherit tags, buildings lose the areas of their parts.
 
-    The third entry is the building, with its area, that a part belongs to: the smallest one around
-    it, or the part itself if there is none.
+    Returns:
+        Parts, then buildings: feature, area, and the building with its full area. The building of a
+        part is the smallest one around it; the part itself if there is none.
     """
-    tree, found = shapely.STRtree([area for _, area in wholes]), 0
-    whole_m2 = [area.area for _, area in wholes]
+    tree, found = shapely.STRtree([area for _, area in buildings]), 0
+    building_m2 = [area.area for _, area in buildings]
     parts_of: dict[int, list[shapely.MultiPolygon]] = {}
     resolved = []
     for feature, area in parts:
@@ -247,28 +249,28 @@ def _resolve_parts(
         PART_PAIRS.check(found, "the map")
         building = feature, area
         if owners:
-            owner = min(owners, key=whole_m2.__getitem__)
+            owner = min(owners, key=building_m2.__getitem__)
             parts_of.setdefault(owner, []).append(area)
-            building = wholes[owner]
+            building = buildings[owner]
             feature = _inherit_tags(feature, building[0])
         resolved.append((feature, area, building))
-    for index, (feature, area) in enumerate(wholes):
+    for index, (feature, area) in enumerate(buildings):
         if index in parts_of:
-            rest = _polygons(area.difference(shapely.union_all(parts_of[index])))
-            if rest.area <= (1 - MIN_COVERED_SHARE) * area.area:
+            uncovered = _polygons(area.difference(shapely.union_all(parts_of[index])))
+            if uncovered.area <= (1 - MIN_COVERED_SHARE) * area.area:
                 continue
-            defects.add("rest", feature.name)
-            area = shapely.MultiPolygon([polygon for polygon in rest.geoms
+            defects.add("uncovered", feature.name)
+            area = shapely.MultiPolygon([polygon for polygon in uncovered.geoms
                                          if polygon.area >= SLIVER_AREA_M2])
         elif feature.tags.get("has_parts", "").lower() in ("true", "1"):
             defects.add("no parts", feature.name)
-        resolved.append((feature, area, wholes[index]))
+        resolved.append((feature, area, buildings[index]))
     return resolved
 
 
-def _inherit_tags(part: Feature, whole: Feature) -> Feature:
-    """Add the tags of a building to a part of it that lacks them, except those of the bottom."""
-    tags = {key: value for key, value in whole.tags.items()
+def _inherit_tags(part: Feature, building: Feature) -> Feature:
+    """Add the tags of a building to a part of it, except its bottom, and heights the part has."""
+    tags = {key: value for key, value in building.tags.items()
             if key not in ("min_height", "building:min_level")}
     known = [column.name for column in KNOWN]
     row = next((row for row, name in enumerate(known) if name in part.tags), None)

@@ -50,7 +50,7 @@ MIN_SPACING_M = 1.0  # of the grid
 MARGIN_PIXELS = 2  # around the grid, for the interpolation at its border
 HEIGHTS_M = (-500.0, 9_000.0)  # of land; other values mean "no data"
 MIN_KNOWN = 0.5  # least share of the nodes that the raster has a height for
-_FEET = dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048) | dict.fromkeys(
+_FEET = dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M) | dict.fromkeys(
     ("us survey foot", "us survey feet", "us_survey_foot", "us_survey_feet", "us-ft", "ftus",
      "foot_us"), 1200 / 3937)
 _METRES = ("", "m", "metre", "metres", "meter", "meters")

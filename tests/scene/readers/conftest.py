@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,27 @@ TOWN = Path(__file__).with_name("town.osm")
 def town_osm():
     """A map made by hand with all the defects of real extracts."""
     return TOWN
+
+
+def ring(points_m):
+    """A closed ring in degrees, of points in metres east and north of 8.5°, 47.4°."""
+    points = [[8.5 + x_m / 75_300, 47.4 + y_m / 111_190] for x_m, y_m in points_m]
+    return [*points, points[0]]
+
+
+def box(x_m, y_m=0.0, width_m=20.0, depth_m=12.0):
+    return ring([(x_m, y_m), (x_m + width_m, y_m), (x_m + width_m, y_m + depth_m), (x_m, y_m + depth_m)])
+
+
+def polygon(outline, properties):
+    return {"type": "Feature", "properties": properties, "geometry": {"type": "Polygon", "coordinates": [outline]}}
+
+
+def write_geojson(path, rows, **more):
+    """Write outlines with their columns, (ring, properties) each."""
+    features = [polygon(outline, properties) for outline, properties in rows]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features} | more))
+    return path
 
 
 class Map:

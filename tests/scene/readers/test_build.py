@@ -14,6 +14,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.scene.readers.build import map_name, map_suffix
+from tests.scene.readers.conftest import write_geojson
 
 TOWN = Path(__file__).with_name("town.osm")
 
@@ -154,10 +155,8 @@ def test_too_far_apart(tmp_path, empty_map):
 
 def test_a_ring_of_three_points_is_no_building(tmp_path):
     square = [[8.7, 47.5], [8.7003, 47.5], [8.7003, 47.5002], [8.7, 47.5002], [8.7, 47.5]]
-    features = [{"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-                for ring in (square, [[8.7, 47.5]] * 3, square[:2] + square[:1])]
-    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out")
+    rings = (square, [[8.7, 47.5]] * 3, square[:2] + square[:1])
+    report = build_scene_from_map(write_geojson(tmp_path / "a.geojson", [(ring, {}) for ring in rings]), tmp_path / "out")
     assert dict(report.facts)["buildings"] == "1 in 1 blocks"
     assert "2 building(s) have no area" in report.problems[0].message
 

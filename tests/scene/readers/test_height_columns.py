@@ -1,7 +1,5 @@
 """Heights from columns: what is known by name, what is declared, and that nothing is guessed silently."""
 
-import json
-
 import pandas as pd
 import pytest
 
@@ -9,17 +7,12 @@ from radiotwin.errors import BadInput
 from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.readers import build_scene_from_map
 from radiotwin.scene.readers.heights import HeightColumn, declared_column, full_names, height_of
-
-
-def box(x_m):
-    points = [[8.5 + (x_m + x) / 75_300, 47.4 + y / 111_190] for x, y in ((0, 0), (20, 0), (20, 12), (0, 12))]
-    return {"type": "Polygon", "coordinates": [[*points, points[0]]]}
+from tests.scene.readers.conftest import box, write_geojson
 
 
 def build(tmp_path, rows, **options):
-    features = [{"type": "Feature", "properties": row, "geometry": box(100 * number)} for number, row in enumerate(rows)]
-    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out", BuildOptions(**options))
+    path = write_geojson(tmp_path / "a.geojson", [(box(100 * number), row) for number, row in enumerate(rows)])
+    report = build_scene_from_map(path, tmp_path / "out", BuildOptions(**options))
     table = pd.read_csv(tmp_path / "out" / "buildings.csv", keep_default_na=False)
     return report, list(zip(table["top_m"], table["height_from"]))
 

@@ -1,6 +1,5 @@
 """Maps that are made to read other files, or to take all time and memory: one message each."""
 
-import json
 import math
 import sqlite3
 
@@ -15,22 +14,11 @@ from radiotwin.scene.materials import Names
 from radiotwin.scene.readers import build_scene_from_map, overpass
 from radiotwin.scene.readers.gis_files import _other_tags, read_geopackage
 from radiotwin.scene.readers.osm import stitch
-
-
-def ring(points_m):
-    points = [[8.5 + x / 75_300, 47.4 + y / 111_190] for x, y in points_m]
-    return [*points, points[0]]
-
-
-def box(x, y, width=20.0, depth=12.0):
-    return ring([(x, y), (x + width, y), (x + width, y + depth), (x, y + depth)])
+from tests.scene.readers.conftest import box, ring, write_geojson
 
 
 def check(tmp_path, *rings, **more):
-    features = [{"type": "Feature", "properties": {"building": "yes"},
-                 "geometry": {"type": "Polygon", "coordinates": [each]}} for each in rings]
-    path = tmp_path / "a.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": features} | more))
+    path = write_geojson(tmp_path / "a.geojson", [(outline, {"building": "yes"}) for outline in rings], **more)
     return build_scene_from_map(path, tmp_path / "out", check_only=True)
 
 

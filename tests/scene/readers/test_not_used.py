@@ -14,21 +14,19 @@ import pytest
 import shapely
 
 from radiotwin.scene.readers import build_scene
-from tests.scene.readers import city_models
-from tests.scene.readers.conftest import Map
-from tests.scene.readers.test_height_columns import box
+from tests.scene.readers import city_models, conftest
+from tests.scene.readers.conftest import Map, box, polygon
 
 VALUES = (7, -3.5, "text", True)
-SQUARE = shapely.Polygon(box(0)["coordinates"][0])
+SQUARE = shapely.Polygon(box(0))
 
 
 def write_geojson(path, columns):
-    feature = {"type": "Feature", "properties": {"height": 9} | columns, "geometry": box(0)}
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    conftest.write_geojson(path, [(box(0), {"height": 9} | columns)])
 
 
 def write_lines(path, columns):
-    path.write_text(json.dumps({"type": "Feature", "properties": {"height": 9} | columns, "geometry": box(0)}))
+    path.write_text(json.dumps(polygon(box(0), {"height": 9} | columns)))
 
 
 def write_table(path, columns):
@@ -55,7 +53,7 @@ def write_osm(path, columns):
 
 
 def write_overpass(path, columns):
-    places = [{"lon": lon, "lat": lat} for lon, lat in box(0)["coordinates"][0]]
+    places = [{"lon": lon, "lat": lat} for lon, lat in box(0)]
     path.write_text(json.dumps({"elements": [{"type": "way", "id": 1, "geometry": places, "tags": {
         "building": "yes", "height": "9"} | {name: str(value) for name, value in columns.items()}}]}))
 

@@ -8,7 +8,7 @@ import pytest
 from radiotwin.scene.readers import build_scene
 from radiotwin.scene.readers.features import INDOORS, NOT_THERE, UNDERGROUND, why_excluded
 from tests.scene.readers import city_models
-from tests.scene.readers.test_height_columns import box
+from tests.scene.readers.conftest import box, write_geojson
 
 
 def built(tmp_path, source):
@@ -20,9 +20,7 @@ def built(tmp_path, source):
 
 
 def geojson(tmp_path, rows):
-    features = [{"type": "Feature", "properties": row, "geometry": box(x_m)} for x_m, row in rows]
-    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
-    return tmp_path / "a.geojson"
+    return write_geojson(tmp_path / "a.geojson", [(box(x_m), row) for x_m, row in rows])
 
 
 @pytest.mark.parametrize("tags", [
