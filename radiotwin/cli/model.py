@@ -216,8 +216,8 @@ def close_loop(
     scene: OptionalScene = None,
     devices: DeviceTable = None,
     base: Annotated[str, typer.Option(
-        help="Model whose residual is explained: twin, raytrace, log-distance; auto: the best of "
-             "them.")] = "auto",
+        help="Model whose residual is explained: twin, log-distance, or raytrace, which follows "
+             "paths over the 3D map; auto: the best of them.")] = "auto",
     hold_out: Annotated[str, typer.Option(
         help="Unit of cross-validation: flight, block, quadrant, device; auto: flight if there are "
              "enough, else block.")] = "auto",

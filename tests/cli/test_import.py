@@ -129,18 +129,13 @@ def test_many_columns_of_levels_by_options(run, tmp_path):
     (GOOD.replace("rsrp", "rssi"), "", ["data.csv", "column 'rsrp'", "missing", "rssi"]),
     (GOOD, "--level-unit bel", ["level_unit", "bel", "dBm"]),
     (GOOD, "--time-zone Europe/Atlantis", ["time_zone 'Europe/Atlantis' is unknown", "Europe/Berlin"]),
-    (GOOD.replace("12:00:01", "02:30:00"), "", ["row 3", "column time", "happened twice"]),
     (GOOD.replace("-99", "weak"), "", ["row 3", "column rsrp", "'weak'"]),
-    (GOOD.replace("48.2", "1000"), "", ["row 3", "column lat", "1000", "-90 to 90"]),
-    ("", "", ["data.csv is empty"]),
-    ("a,b\n", "", ["has no rows"]),
     (None, "", ["data.csv does not exist"]),
     (GOOD, "--columns nowhere.toml", ["nowhere.toml does not exist"]),
     (GOOD, "--columns time", ["time does not exist", "latitude=lat"]),
     (GOOD, "--origin here", ["--origin 'here'", "LATITUDE,LONGITUDE"]),
     (GOOD, "--origin 91,0", ["--origin", "latitude_deg", "91"]),
     (GOOD, "--average mode", ["average", "mode", "median"]),
-    (GOOD, "--devices data.csv", ["data.csv", "row 3, column cell", "occurs twice"]),
     (GOOD, "-o data.csv", ["data.csv is a file"]),
 ])
 def test_bad_input_is_one_message_and_no_folder(run, tmp_path, text, change, parts):
@@ -153,30 +148,12 @@ def test_bad_input_is_one_message_and_no_folder(run, tmp_path, text, change, par
     assert {path.name for path in tmp_path.iterdir()} <= {"data.csv"}
 
 
-def test_an_undeclared_unit_shows_the_values(run, tmp_path):
-    (tmp_path / "data.csv").write_text(GOOD)
-    done = run(WORDS.replace("--level-unit dBm", ""), tmp_path)
-    assert done.returncode == 2 and "level_unit is not given; allowed are dBm, mW and W" in done.stderr
-    assert "from -99 to -80" in done.stderr and not (tmp_path / "out").exists()
-
-
-def test_polygons(run, tmp_path):
-    ring = [[[11, 48], [12, 48], [12, 49], [11, 48]]]
-    (tmp_path / "data.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [
-        {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": ring}, "properties": {"rsrp": -80}}]}))
-    done = run(WORDS.replace("data.csv", "data.geojson"), tmp_path)
-    assert done.returncode == 2 and "feature 1 is Polygon; allowed are points" in done.stderr
-    assert not (tmp_path / "out").exists() and "Traceback" not in done.stderr
-
-
 LOCAL = "--columns level=l,device=d,x=x,y=y --level-unit dBm --length-unit m -o out"
 
 
 @pytest.mark.parametrize(("text", "options", "message"), [
     ("d,x,y,l,h\na,0,0,-80,1e300\n", LOCAL.replace("y=y", "y=y,heading=h"), "row 2, column h: '1e300' is out of range"),
     ("d,x,y,l\n\x1b[2Ja,0,0,-80\n", LOCAL, r"column d: '\x1b[2Ja' is no name"),
-    ("d,x,y,l\na,1e300,0,-80\n", LOCAL, "1e+297 km from the origin"),
-    ("d,x,y,l\na,1e300,0,-80\n", LOCAL + " --crs EPSG:32633", "far outside of the area of"),
     (f"d,x,y,l\nb,{'9' * 6000},0,-80\n", LOCAL, "is not a number"),
     ("d,x,y,l\na,0,0,-80\n", LOCAL.replace("out", "n" * 300), "cannot write"),
     ("d,x,y,l\na,0,0,-80\n", LOCAL + " --devices " + "n" * 300 + ".csv", "cannot be read"),
