@@ -365,7 +365,8 @@ def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:
     lines = text.split("\n")
     width_m, height_m = 6 * point_m * max(map(len, lines)), 12 * point_m * len(lines)
     ends_m = np.concatenate([np.zeros((0, 2)), *(
-        each.get_offsets() for each in ax.collections if isinstance(each, PathCollection))])
+        each.get_offsets() for each in ax.collections
+        if isinstance(each, PathCollection) and not str(each.get_label()).startswith("_"))])
     across_m, up_m = (ends_m - position_m[:2]).T
     level = (side * across_m > 0) & (side * across_m < width_m + 20 * point_m)
     above, below = ((level & (sign * up_m > 0) & (sign * up_m < height_m + 20 * point_m)).sum()
