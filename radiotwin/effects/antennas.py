@@ -59,13 +59,13 @@ def vary_patterns(effect: Effect, end: str) -> Variation:
     steps, low, high = (np.tile([field[key] for field in fields.values()], members)
                         for key in ("step", "low", "high"))
 
-    def changed(numbers: np.ndarray) -> Any:
+    def with_numbers(numbers: np.ndarray) -> Any:
         rows = np.reshape(numbers, (members, -1)).tolist()
         return effect.changed(**{end: {
             member: pattern.model_copy(update=dict(zip(fields, row, strict=True)))
             for (member, pattern), row in zip(patterns.items(), rows, strict=True)}})
 
-    return Variation(values.ravel(), steps, low, high, changed,
+    return Variation(values.ravel(), steps, low, high, with_numbers,
                      list(np.arange(values.size).reshape(members, -1)))
 
 

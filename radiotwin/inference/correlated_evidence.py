@@ -147,11 +147,11 @@ class CorrelatedEvidence:
         share = 1.0 - 1.0 / (1.0 + np.exp(start[1]) * self.spectrum)
         unit = 1.0 / np.sqrt(0.5 * np.array([len(z), max(float(share @ share), 1.0)]))
 
-        def negative(scaled: np.ndarray) -> tuple[float, np.ndarray]:
+        def negative_log_evidence(scaled: np.ndarray) -> tuple[float, np.ndarray]:
             value, slope = self.at(z, columns, prior_sd, scaled * unit)
             return -value, -slope * unit
 
-        found = minimize(negative, start / unit, jac=True, method="L-BFGS-B",
+        found = minimize(negative_log_evidence, start / unit, jac=True, method="L-BFGS-B",
                          bounds=list(zip(*(BOUNDS / unit), strict=True)), options=PRECISION)
         return -float(found.fun), found.x * unit
 

@@ -155,7 +155,7 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
     limit = limits_of(limit_db, len(level_db))[~detected] - y_mid
     prior_loss, prior_sd = (10.0 * x_scale * value for value in EXPONENT_PRIOR)
 
-    def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
+    def negative_log_posterior(theta: np.ndarray) -> tuple[float, np.ndarray]:
         level, slope, log_sd = theta
         h = np.exp(-log_sd)
         z, z_below = h * (v - level - slope * u), h * (limit - level - slope * u_below)
@@ -172,8 +172,8 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
     log_floor = np.log(MIN_SD_DB)
     start = np.array([0.0, slope, max(np.log(np.std(v - slope * u) + 1e-9), log_floor)])
     bounds = [(None, None), (None, None), (log_floor, None)]
-    level, slope, log_sd = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds,
-                                    options={"ftol": 1e-14, "gtol": 1e-8}).x
+    level, slope, log_sd = minimize(negative_log_posterior, start, jac=True, method="L-BFGS-B",
+                                    bounds=bounds, options={"ftol": 1e-14, "gtol": 1e-8}).x
     slope_db = slope / x_scale
     return LogDistanceLine(float(y_mid + level - slope_db * x_mid), float(-slope_db / 10.0),
                            float(np.exp(log_sd)))
@@ -192,14 +192,14 @@ def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.nda
         prior_sd_db: standard deviation of that prior [dB].
     """
 
-    def objective(shift_db: float) -> float:
+    def negative_log_posterior(shift_db: float) -> float:
         mean_db = line.mean_db(log_distance) + shift_db
         nll = gaussian_nll(level_db, mean_db, np.asarray(line.sd_db), limit_db).sum()
         return nll + 0.5 * ((shift_db - prior_db) / prior_sd_db) ** 2
 
     reach_db = 10.0 * prior_sd_db
-    shift_db = minimize_scalar(objective, bounds=(prior_db - reach_db, prior_db + reach_db),
-                               method="bounded").x
+    bounds = (prior_db - reach_db, prior_db + reach_db)
+    shift_db = minimize_scalar(negative_log_posterior, bounds=bounds, method="bounded").x
     return LogDistanceLine(line.intercept_db + float(shift_db), line.exponent, line.sd_db)
 
 
@@ -215,8 +215,9 @@ def fit_sd_db(level_db: np.ndarray, mean_db: np.ndarray, limit_db: Limit) -> flo
         standard deviation [dB], from MIN_SD_DB to MAX_SD_DB.
     """
 
-    def objective(log_sd: float) -> float:
+    def negative_log_likelihood(log_sd: float) -> float:
         return gaussian_nll(level_db, mean_db, np.exp(log_sd), limit_db).sum()
 
     bounds = (np.log(MIN_SD_DB), np.log(MAX_SD_DB))
-    return float(np.exp(minimize_scalar(objective, bounds=bounds, method="bounded").x))
+    log_sd = minimize_scalar(negative_log_likelihood, bounds=bounds, method="bounded").x
+    return float(np.exp(log_sd))

@@ -328,15 +328,15 @@ def combine_parts(parts: list[PeerComparison]) -> PeerComparison:
     share = weight / np.where(total > 0, total, 1.0)
     missing = ~known.any(axis=0)
 
-    def joined(values: list[np.ndarray], power: int) -> np.ndarray:
+    def combined(values: list[np.ndarray], power: int) -> np.ndarray:
         filled = np.where(known, np.array(values), 0.0)
         summed = np.sum(share**power * filled**power, axis=0) ** (1 / power)
         return np.where(missing, np.nan, summed)
 
     size = np.where(missing, np.nan, np.sum(share * np.where(known, sizes, 0.0), axis=0))
-    return PeerComparison(size, joined([each.error for each in parts], 2),
-                          joined([each.spread for each in parts], 2),
-                          joined([each.dof for each in parts], 1))
+    return PeerComparison(size, combined([each.error for each in parts], 2),
+                          combined([each.spread for each in parts], 2),
+                          combined([each.dof for each in parts], 1))
 
 
 def median_polish(values: np.ndarray, labels: list[np.ndarray]) -> np.ndarray:

@@ -120,7 +120,7 @@ def test_without_a_frequency_it_is_not_looked_for(make_links):
     assert GroundReflection().unavailable(make_links([[0.0, 0, 1.5]], ends(3)[1])) is None
 
 
-@pytest.mark.seconds
+@pytest.mark.slow
 def test_a_world_of_two_rays_is_named(open_ground, loop):
     """Of another soil than the one that is fitted, and heights that are 5 cm wrong."""
     world = open_ground.fly(20)

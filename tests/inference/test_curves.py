@@ -19,7 +19,7 @@ def drawn(rng, count, moves_db):
 
 
 @pytest.mark.parametrize("count", [2, 8])
-def test_a_cycle_that_no_bin_shows_is_seen_in_all_together(count):
+def test_a_cycle_that_no_single_bin_shows_is_found(count):
     rng, found, sizes = np.random.default_rng(0), [], []
     for _ in range(60):
         curve = compare_curves(*drawn(rng, count, 2.5), PRIOR_DB, "all")
@@ -31,7 +31,7 @@ def test_a_cycle_that_no_bin_shows_is_seen_in_all_together(count):
     assert np.median(sizes) == pytest.approx(2.5, rel=0.15)
 
 
-def test_curves_that_all_move_alike_are_peers():
+def test_curves_that_all_vary_alike_do_not_stand_out():
     rng = np.random.default_rng(1)
     curve = np.repeat(np.arange(6), BINS)
     most = [np.nanmax(compare_curves(Statistic(rng.normal(size=len(curve)), np.full(len(curve), 0.2)), curve,

@@ -57,7 +57,7 @@ def test_values_that_remember_depend_on_nothing_by_chance(level):
 @pytest.mark.seconds
 @pytest.mark.parametrize("level", [wandering, lambda rng: np.repeat(rng.permutation(SERIES) % 2.0, LENGTH)])
 def test_a_dependence_is_found(level):
-    assert (p_values(level, 20, depends=1.5) <= 0.02).mean() > 0.8
+    assert (p_values(level, 12, depends=1.5) <= 0.02).mean() > 0.8
 
 
 def test_no_p_value_is_0():

@@ -57,7 +57,7 @@ def test_scores_of_peers_are_as_large_as_chance_makes_them():
     assert np.std(scores) == pytest.approx(1.0, abs=0.2)
 
 
-def test_one_that_is_off_does_not_widen_the_spread_that_it_is_judged_by():
+def test_an_outlier_does_not_widen_the_spread_that_it_is_compared_with():
     value = np.array([0.1, -0.2, 0.0, 0.2, -0.1, -6.0, 0.1, 0.05])
     found = compare_with_peers(Statistic(value, np.full(8, 0.1)), 0.3, 40.0)
     assert found.spread[5] < 0.35 and found.size[5] == pytest.approx(-6.05, abs=0.1)
@@ -82,14 +82,14 @@ def test_two_parts_of_the_data_are_weighted_by_precision():
     assert both.size[1] == sure.size[1]
 
 
-def test_a_polish_takes_off_both_ends_and_leaves_their_pair():
+def test_a_median_polish_removes_both_ends_and_leaves_their_pair():
     one, other = (each.ravel() for each in np.mgrid[:5, :6])
     pair_db = np.where((one == 2) & (other == 3), 4.0, 0.0)
     left = median_polish(3.0 * one - 2.0 * other + pair_db, [one, other])
     assert left == pytest.approx(pair_db, abs=1e-6)
 
 
-def test_what_groups_share_in_a_unit_does_not_count_as_theirs():
+def test_errors_that_groups_share_in_a_unit_are_subtracted():
     rng = np.random.default_rng(4)
     unit = np.tile(np.arange(40), 3)
     label = np.repeat(np.arange(3), 40)

@@ -21,7 +21,7 @@ def test_independent_errors_are_weighted_by_their_precision():
     np.testing.assert_allclose(weights.mean(axis=0), [0.8, 0.2], atol=0.01)  # 1/1 : 1/4
 
 
-def test_each_regime_gets_what_is_best_there():
+def test_each_end_of_the_share_gets_the_prediction_that_is_best_there():
     rng = np.random.default_rng(2)
     share = rng.random(5000)
     error = rng.normal(0, 1, (5000, 2)) * np.column_stack([0.2 + 5 * share, 5.2 - 5 * share])

@@ -148,11 +148,11 @@ class BuildingEntry(GainEffect):
 
     def _chance(self, links: Links) -> np.ndarray:
         """Compute the probability (n,) that exactly one end is inside a building; cached."""
-        def derive() -> np.ndarray:
+        def chance_of_entry() -> np.ndarray:
             city = city_of(links, self.name)
             device = city.inside(links.device_m)[links.device]
             receiver = city.inside(links.receiver_m).astype(float)
             measured = links.receiver >= 0  # the others are points of a map, known exactly
             receiver[measured] = chance_inside(city, links.receiver_m[measured])
             return np.where(links.los, 0.0, np.where(device, 1 - receiver, receiver))
-        return self.of_links.get(links, None, derive)
+        return self.of_links.get(links, None, chance_of_entry)

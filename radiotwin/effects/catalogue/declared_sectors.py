@@ -408,15 +408,15 @@ class _Readings(NamedTuple):
     def best_shape(self, offset_deg: float, own_turns: dict[int, OwnTurn]
                    ) -> tuple[float, SectorPattern]:
         """Find the pattern of the grid with the highest gain over a constant level [nats]."""
-        def tried(width: float, back_db: float, tilt: float, height: float
-                  ) -> tuple[float, SectorPattern]:
+        def rate_shape(width: float, back_db: float, tilt: float, height: float
+                       ) -> tuple[float, SectorPattern]:
             shape = SectorPattern(beamwidth_deg=width, front_to_back_db=back_db, tilt_deg=tilt,
                                   vertical_beamwidth_deg=height)
             turned = _turned(self.view.links, self.devices, shape, offset_deg, own_turns)
             return self.nats({device: rays.offset_db(turned[device])
                               for device, (_, _, rays) in self.parts.items()}), shape
 
-        best, shape = max((tried(*numbers, *vertical) for vertical in VERTICALS_DEG
+        best, shape = max((rate_shape(*numbers, *vertical) for vertical in VERTICALS_DEG
                            for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
                           key=lambda pair: pair[0])
         flat_db = {device: np.zeros(len(rows)) for device, (rows, _, _) in self.parts.items()}

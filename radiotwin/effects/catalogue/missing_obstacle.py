@@ -227,10 +227,10 @@ class MissingObstacle(GainEffect):
 
     def _shadow_db(self, links: Links, level_at: LevelAt, by_class: bool) -> np.ndarray:
         """Compute the gain (n,), below 0, of links in a full shadow, see `Params.by_class` [dB]."""
-        def derive() -> np.ndarray:
+        def shadow_db() -> np.ndarray:
             hidden = links.with_los(np.zeros(len(links), bool))
             return level_at(hidden, not by_class) - level_at(links, not by_class)
-        return self.of_links.get(links, (level_at, by_class), derive)
+        return self.of_links.get(links, (level_at, by_class), shadow_db)
 
     @override
     def exactly(self) -> Effect:
@@ -248,7 +248,7 @@ class MissingObstacle(GainEffect):
         varied = self.with_params(params, "known_paths" if along_paths else "quick")
         count = len(params.box) + (not along_paths)
 
-        def of(numbers: np.ndarray) -> Effect:
+        def with_numbers(numbers: np.ndarray) -> Effect:
             values = [*numbers.tolist(), params.scattered_db][:len(params.box) + 1]
             return varied.changed(box=Box(*values[:-1]), scattered_db=values[-1])
 
@@ -258,7 +258,7 @@ class MissingObstacle(GainEffect):
         return Variation(
             values, np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0])[:count],
             np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0])[:count],
-            np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0])[:count], of,
+            np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0])[:count], with_numbers,
             is_rough=along_paths, starts=turned if along_paths else ())
 
     @override

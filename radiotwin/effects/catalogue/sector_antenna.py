@@ -121,15 +121,15 @@ def _best_pattern(view: ResidualView, rows: np.ndarray,
         level_db = weight @ (residual_db - offset_db) / max(weight.sum(), 1e-12)
         return float(view.gain_nats(rows, offset_db + level_db).sum())
 
-    def tried(azimuth: float, width: float, back_db: float, tilt: float = 0.0,
-              height: float = 360.0) -> tuple[float, SectorPattern]:
+    def rate_pattern(azimuth: float, width: float, back_db: float, tilt: float = 0.0,
+                     height: float = 360.0) -> tuple[float, SectorPattern]:
         pattern = SectorPattern(azimuth_deg=azimuth, beamwidth_deg=width, front_to_back_db=back_db,
                                 tilt_deg=tilt, vertical_beamwidth_deg=height)
         return nats(rays.offset_db(pattern)), pattern
 
     # Of equal gains the pattern with the largest numbers is taken.
-    flat = max((tried(*numbers)[0], numbers)
+    flat = max((rate_pattern(*numbers)[0], numbers)
                for numbers in product(AZIMUTHS_DEG, BEAMWIDTHS_DEG, FRONT_TO_BACK_DB))[1]
-    vertical = max((tried(*flat, *numbers)[0], numbers) for numbers in VERTICALS_DEG)[1]
-    best, pattern = tried(*flat, *vertical)
+    vertical = max((rate_pattern(*flat, *numbers)[0], numbers) for numbers in VERTICALS_DEG)[1]
+    best, pattern = rate_pattern(*flat, *vertical)
     return pattern, best - nats(np.zeros(len(rows)))

@@ -108,11 +108,11 @@ def _best_dipole(view: ResidualView, rows: np.ndarray) -> DipoleParams | None:
     ray = -(links.offset_m / np.maximum(length_m, 1e-9))
     residual_db, weight = view.residual_db[rows], view.weight[rows]
 
-    def after(tilt: float, azimuth: float) -> float:
+    def squares_left(tilt: float, azimuth: float) -> float:
         gain = dipole_gain(ray, _axis(links.receiver_axes, tilt, azimuth))
         return squares_about_mean(residual_db - 10 * np.log10(gain), weight)
 
-    best, tilt, azimuth = min((after(tilt, azimuth), tilt, azimuth)
+    best, tilt, azimuth = min((squares_left(tilt, azimuth), tilt, azimuth)
                               for tilt in TILTS_DEG for azimuth in AZIMUTHS_DEG)
     if 0.5 * (squares_about_mean(residual_db, weight) - best) > MIN_NATS:
         return DipoleParams(tilt_deg=tilt, lean_azimuth_deg=azimuth)

@@ -82,10 +82,10 @@ class UncertainSight(GainEffect):
 
     def _chance(self, links: Links) -> np.ndarray:
         """Compute the probability (n,) of line of sight of each link; cached."""
-        def derive() -> np.ndarray:
+        def share_of_maps() -> np.ndarray:
             city = city_of(links, self.name)
             seen = links.los.astype(float)
             for seed in range(MAPS):
                 seen += links.with_city(perturbed_map(city, WALL_SD_M, HEIGHT_SD_M, seed)).los
             return seen / (MAPS + 1)
-        return self.of_links.get(links, None, derive)
+        return self.of_links.get(links, None, share_of_maps)
