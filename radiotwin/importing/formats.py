@@ -168,7 +168,8 @@ class Format:
         result = {}
         for quantity, entries in self.columns.items():
             for entry in (entries,) if isinstance(entries, str) else entries:
-                columns = {name: _found(_plain(name), actual) for name in columns_of(entry, ())}
+                columns = {name: _matching_column(_plain(name), actual)
+                           for name in columns_of(entry, ())}
                 if all(columns.values()):
                     for name, found in columns.items():
                         entry = entry.replace(name, found)
@@ -182,7 +183,7 @@ def _plain(name: str) -> str:
     return re.sub(r"(\s*(\(text\)|\[\d+\]))+$", "", name.strip().lower())
 
 
-def _found(name: str, actual: Mapping[str, str]) -> str:
+def _matching_column(name: str, actual: Mapping[str, str]) -> str:
     """Return the column of a plain name, in which `*` is any text; `""` if there is none."""
     if "*" not in name:
         return actual.get(name, "")
@@ -190,7 +191,7 @@ def _found(name: str, actual: Mapping[str, str]) -> str:
     return next((actual[each] for each in reversed(list(actual)) if pattern.fullmatch(each)), "")
 
 
-def _place_in(payload: str) -> dict[str, str | tuple[str, ...]]:
+def _node_position_columns(payload: str) -> dict[str, str | tuple[str, ...]]:
     """Return the mapping of a node's position, for the usual names in decoded payloads."""
     return {quantity: tuple(f"{payload}{each}" for short in (long, *others)
                             for each in ((f"*{short}",) if short == long else
@@ -251,7 +252,7 @@ def _lora(name: str, title: str, source: str, payload: str, place: str,
     signature = (str(columns["level"]), gateway, node)
     return (
         Format(f"{name}-mapper", f"{title}, of a node that sends its position (JSON lines)",
-               {**columns, "device": gateway, "receiver": node, **_place_in(payload),
+               {**columns, "device": gateway, "receiver": node, **_node_position_columns(payload),
                 **{f"device_{each}": entry for each, entry in places.items()}},
                signature, _LEVEL, source, {**settings, "read_at": "device"}, caution=_MAPPER,
                needs=("latitude", "longitude")),
@@ -405,7 +406,7 @@ SCANNER = (
 FORMATS: tuple[Format, ...] = (*PHONE, *DRIVE_TEST, *LORA, *SCANNER)
 
 
-def expected(formats: Iterable[Format], columns: Collection[str] = ()) -> Expected:
+def expected(formats: Iterable[Format], columns: Collection[str]) -> Expected:
     """Return the columns that a file of some formats, or with declared columns, may have."""
     formats = list(formats)
     signatures = [frozenset(name.lower() for name in each.signature) for each in formats]

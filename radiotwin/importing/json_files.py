@@ -17,7 +17,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.geo import ALLOWED, reference_system
-from radiotwin.importing.log_files import Lines, LogFile
+from radiotwin.importing.log_files import HEAD_BYTES, Lines, LogFile
 from radiotwin.importing.source import BadRows, Source
 from radiotwin.io.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, NESTING, ROWS
 from radiotwin.io.cells import cell_text, listed
@@ -27,7 +27,6 @@ _MAX_NUMBERED = 16  # longest list whose values become columns, such as coordina
 _PLACE = ("longitude", "latitude", "altitude")
 BEFORE = "before"
 """Column of the text before the object of a line, such as a topic of MQTT."""
-_HEAD_BYTES = 2**16  # in which the kind of JSON is recognised
 _SEPARATOR = "\x1e"  # before each record of RFC 8142
 
 
@@ -56,7 +55,7 @@ class _Table:
     def add(self, record: dict[str, Any], number: int, where: str) -> None:
         """Add the rows of a record."""
         if record.get("type") == "Feature" and "geometry" in record:
-            record = _point(record, where)
+            record = _point_record(record, where)
         for row, is_reception in self._rows(record, ""):
             if not is_reception:
                 self._without.append(len(self.rows))
@@ -197,7 +196,7 @@ def _read(file: LogFile, used: Collection[str], chosen: str | None, crs: str | N
 def _has_lines(file: LogFile) -> bool:
     """Return whether a file has JSON lines: its first line is a complete object."""
     with file.open() as content:
-        head = content.read(_HEAD_BYTES).decode("utf-8-sig", "replace")
+        head = content.read(HEAD_BYTES).decode("utf-8-sig", "replace")
     lines = [line for line in (each.strip().lstrip(_SEPARATOR).rstrip(",")
                                for each in head.splitlines()) if line]
     if lines and not lines[0].startswith(("{", "[")) and starts_json(lines[0]):
@@ -262,7 +261,7 @@ def _add_document(file: LogFile, table: _Table,
                 table.crs = str((value["crs"].get("properties") or {}).get("name"))
             is_map, value = True, features
         elif isinstance(value, dict):
-            value = _of_columns(value) or [value]
+            value = _records_of_columns(value) or [value]
         elif (isinstance(value, list) and value and all(isinstance(row, list) for row in value)
               and all(isinstance(name, str) for name in value[0])):  # a header and rows
             value = [dict(zip(value[0], row)) for row in value[1:]]
@@ -277,7 +276,7 @@ def _add_document(file: LogFile, table: _Table,
             try:
                 if not isinstance(record, dict):
                     raise BadInput(f"{where} is {cell_text(record)}; allowed are objects")
-                row = _point(record, where) if is_map else record
+                row = _point_record(record, where) if is_map else record
             except BadInput as error:
                 if bad_rows is None:
                     raise
@@ -309,7 +308,7 @@ def _documents(file: LogFile) -> Iterator[Any]:
         yield value
 
 
-def _of_columns(value: dict[str, Any]) -> list[dict[str, Any]] | None:
+def _records_of_columns(value: dict[str, Any]) -> list[dict[str, Any]] | None:
     """Convert an object with a list or an object for each column to records; None if it is none.
 
     pandas writes `{"a": {"0": 1, "1": 2}}`, `{"a": [1, 2]}` and `{"columns": …, "data": …}`.
@@ -329,7 +328,7 @@ def _of_columns(value: dict[str, Any]) -> list[dict[str, Any]] | None:
     return [dict(zip(value, row)) for row in zip(*columns)]
 
 
-def _point(feature: dict[str, Any], where: str) -> dict[str, Any]:
+def _point_record(feature: dict[str, Any], where: str) -> dict[str, Any]:
     """Return the properties and coordinates of a GeoJSON feature (RFC 7946, 3.1.1)."""
     geometry = feature.get("geometry")
     kind = geometry.get("type") if isinstance(geometry, dict) else None

@@ -20,7 +20,8 @@ JSON = (".json", ".jsonl", ".ndjson", ".geojson", ".geojsonl")
 TEXTS = (".csv", ".tsv", ".txt", ".log", *JSON)
 BINARIES = (".parquet", ".xlsx")
 _WHAT = f"log ({', '.join((*TEXTS, *BINARIES))}), folder or .zip"
-_BLOCK_BYTES = 2**20
+BLOCK_BYTES = 2**20  # that are read at once
+HEAD_BYTES = 2**16  # in which the kind of a text is recognised
 _DIRECTORY_BYTES = 4 * 2**20  # of a zip's list of files, which takes ten times that in memory
 _END, _END_64 = b"PK\x05\x06", b"PK\x06\x07"  # APPNOTE.TXT 6.3.10, 4.3.16 and 4.3.15
 
@@ -62,7 +63,7 @@ class LogFile:
         """Read a text in UTF-8; BadInput if it is none, or too large."""
         with self.open() as file:
             data = bytearray()
-            while block := file.read(_BLOCK_BYTES):  # a single read would allocate the limit
+            while block := file.read(BLOCK_BYTES):  # a single read would allocate the limit
                 data += block
                 budget.check(len(data), self)
         return decode_text(bytes(data), self)

@@ -113,7 +113,7 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
                                                      latitude=degrees[:, 1])
 
 
-def _numbered(names: pd.Series, since_s: np.ndarray) -> pd.Series:
+def _numbered_names(names: pd.Series, since_s: np.ndarray) -> pd.Series:
     """Rename repeated names (n,) to `NAME@1`, … in the order of time."""
     order = np.lexsort((np.arange(len(names)), np.nan_to_num(since_s, nan=-np.inf)))
     number = names.iloc[order].groupby(names.iloc[order]).cumcount() + 1
@@ -121,7 +121,7 @@ def _numbered(names: pd.Series, since_s: np.ndarray) -> pd.Series:
     return names.mask(repeated, names + "@" + number.reindex(names.index).astype(str))
 
 
-def _at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -> pd.DataFrame:
+def _names_by_time(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -> pd.DataFrame:
     """Rename the device of each link to `NAME@…`, by its position in the table at that time.
 
     A device without a position at a time keeps its name.
@@ -130,7 +130,7 @@ def _at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -
         return links
     place_of = pd.Series(table.index, index=table.index)
     owner = place_of.str.replace(r"@\d+$", "", regex=True)
-    # `_numbered` makes several names with a number; a single such name is the device's own.
+    # `_numbered_names` makes several names with a number; a single such name is the device's own.
     is_numbered = owner.duplicated(keep=False) & ~owner.isin(place_of)
     owner = owner.where(is_numbered, place_of).to_numpy()
     names = links["device"].to_numpy(dtype=object, copy=True)
@@ -153,7 +153,7 @@ def _at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) -
     return links.assign(device=names)
 
 
-def _place_names(source: Source, links: pd.DataFrame, device_m: np.ndarray,
+def _names_by_place(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                 place_m: float) -> np.ndarray:
     """Rename devices that have several positions in the log to `NAME@1`, `NAME@2`, ….
 
@@ -213,18 +213,18 @@ def _read_sites(path: str, key: str, settings: Settings, names: Collection[str])
     period: dict[str, np.ndarray] = {}
     unique = sites.names
     if "since" in sites.values:
-        period = _period(source, sites, settings)
-        unique = _numbered(unique, period[SINCE])
+        period = _periods(source, sites, settings)
+        unique = _numbered_names(unique, period[SINCE])
     sites.refuse(key, unique.duplicated(), f"occurs twice; every {key} has one row")
     notes = [*source.notes, *sites.notes,
-             *unmatched_notes(path, sites.names, names, key, "the log")]
+             *unmatched_notes(path, sites.names, names, key)]
     values = to_geographic(sites.values.drop(columns=["since", "until"], errors="ignore"),
                            settings.crs).assign(**period)
     return replace(sites, values=values.set_axis(pd.Index(unique, dtype=object)),
                    notes=tuple(notes))
 
 
-def _period(source: Source, sites: SiteTable, settings: Settings) -> dict[str, np.ndarray]:
+def _periods(source: Source, sites: SiteTable, settings: Settings) -> dict[str, np.ndarray]:
     """Read the start and end of the time at each position [s]; NaN: not given."""
     since_s = seconds(source, sites.columns["since"], ISO, settings.time_zone)
     until_s = np.full(len(source), np.nan)
@@ -275,10 +275,10 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
              for name, path in (("receiver", settings.receivers), ("device", settings.devices))
              if path is not None}
     tables = {name: sites[name].values if name in sites else None for name in NAMED}
-    links = _at_times(source, links, tables["device"])
+    links = _names_by_time(source, links, tables["device"])
     receivers = _positions(links, "", tables["receiver"], links["receiver"], settings.crs)
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
-    no_fix = _without_fix(receivers, links["receiver"])
+    no_fix = _placeholder_fixes(receivers, links["receiver"])
     for place, rows in no_fix.items():
         tally.count(f"no fix: a receiver that moves elsewhere stays at {place}", "", len(rows),
                     source.where(links.index[rows[0]]))
@@ -292,7 +292,7 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     notes += _far_notes(source, links, receivers, devices, sites)
     del receivers, devices  # as much memory as the links themselves
     if settings.place_m:
-        links = links.assign(device=_place_names(source, links, device_m, settings.place_m))
+        links = links.assign(device=_names_by_place(source, links, device_m, settings.place_m))
     keep = ~_are_glitches(links, receiver_m)
     links = tally.drop(links, ~keep, f"position {FAR_M / 1000:.0f} km from all others, or one "
                                      f"that takes {FAST_M_S:.0f} m/s to and fro", "", source.where)
@@ -309,13 +309,13 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
         tally.count(f"no position of receiver {name}", "", len(rows), source.where(rows.index[0]))
     if unknown.any():
         links, device_m = links[~unknown], device_m[~unknown]
-    links, declared_as, more = _by_carrier(links)
+    links, declared_as, more = _split_by_band(links)
     table = _device_table(source, links, device_m, tables["device"], declared_as,
                           max(MOVING_M, 2 * (settings.place_m or 0.0)))
     return PositionedLinks(links, table, device_m, origin, [*notes, *more])
 
 
-def _without_fix(receivers: pd.DataFrame, names: pd.Series) -> dict[str, np.ndarray]:
+def _placeholder_fixes(receivers: pd.DataFrame, names: pd.Series) -> dict[str, np.ndarray]:
     """Find placeholder positions that a program wrote in place of a missing fix.
 
     Such a position repeats to the last digit, far from all others of a moving receiver.
@@ -366,7 +366,7 @@ def _far_notes(source: Source, links: pd.DataFrame, receivers: pd.DataFrame,
                      lambda row: f"{path}: device {names[row]!r}", "the middle of the receivers")
 
 
-def _by_carrier(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list[str]]:
+def _split_by_band(links: pd.DataFrame) -> tuple[pd.DataFrame, dict[str, str], list[str]]:
     """Split devices that are read on carriers of several bands into one device for each band.
 
     Their levels and antennas differ. Channels of one band, between which a device hops, stay one.
@@ -488,7 +488,7 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                   moving_m: float) -> pd.DataFrame:
     """Make the table `devices.csv` of the links' devices; BadInput if a device moves.
 
-    `declared_as` maps names that `_by_carrier` made to the names in the table of devices.
+    `declared_as` maps names that `_split_by_band` made to the names in the table of devices.
     """
     by_device = pd.DataFrame(device_m, columns=["x_m", "y_m", "z_m"], index=links.index).groupby(
         links["device"].to_numpy(), sort=False)

@@ -20,6 +20,8 @@ from radiotwin.errors import BadInput, optional_package
 from radiotwin.importing.json_files import read_json_log, starts_json
 from radiotwin.importing.log_files import (
     BINARIES,
+    BLOCK_BYTES,
+    HEAD_BYTES,
     JSON,
     TEXTS,
     LogFile,
@@ -34,11 +36,9 @@ from radiotwin.io.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, FILE_BYTES
 from radiotwin.io.cells import RaggedRows, listed, read_cells
 
 _MAX_ROWS = 1_048_576  # of a sheet, by the format
-_BLOCK_BYTES = 2**20
 _PICTURES = ("xl/media/", "xl/embeddings/")
 _DOCTYPES = tuple("<!DOCTYPE".encode(name) for name in ("utf-8", "utf-16-le", "utf-16-be",
                                                         "utf-32-le", "utf-32-be"))
-_HEAD_BYTES = 2**16  # that contain the first line
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _check(file: LogFile) -> None:
         for entry in entries:
             last, is_named_xml = b"", entry.filename.lower().endswith((".xml", ".rels"))
             with open_member(archive, entry.filename, file) as content:
-                while block := content.read(_BLOCK_BYTES):
+                while block := content.read(BLOCK_BYTES):
                     # Entities can stand for any amount of text; UTF-16 would hide them.
                     text = last + block
                     if any(each in text for each in _DOCTYPES) or is_named_xml and b"\0" in block:
@@ -269,7 +269,7 @@ def _read_text(file: LogFile, settings: Settings, expected: Expected,
 
 
 def _first_line(file: LogFile) -> str:
-    """Return the first line that is not blank, at most its first `_HEAD_BYTES`."""
+    """Return the first line that is not blank, at most its first `HEAD_BYTES`."""
     with file.open() as content:
-        head = content.read(_HEAD_BYTES).decode("latin-1").removeprefix("\u00ef\u00bb\u00bf")
+        head = content.read(HEAD_BYTES).decode("latin-1").removeprefix("\u00ef\u00bb\u00bf")
     return next((line for line in map(str.strip, head.splitlines()) if line), "")

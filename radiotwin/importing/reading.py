@@ -92,7 +92,7 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
     with problems.noted():
         source.require({name: spec for name, spec in columns.items()
                         if spec not in (BY_DAY, BY_POSITION)})
-    shared = _shared(source, columns, settings, problems)
+    shared = _shared_columns(source, columns, settings, problems)
     if "time_s" in shared and len(shared) and not problems:
         ends = [name for name in ("device", "receiver") if name in shared]
         shared["time_s"], note = past_midnights(
@@ -149,7 +149,7 @@ def _from_file_name(source: Source, name: str, spec: str, file_name: str) -> str
     return spec.replace(FILE_DATE, dates.pop())
 
 
-def _shared(source: Source, columns: dict[str, str], settings: Settings,
+def _shared_columns(source: Source, columns: dict[str, str], settings: Settings,
             problems: Problems) -> pd.DataFrame:
     """Read the columns that belong to all levels of a row: times, positions, names."""
     shared = pd.DataFrame(index=source.table.index)
@@ -214,21 +214,21 @@ def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, set
     for name in NAMES:
         if name in links:
             links = tally.drop(links, links[name] == "", f"no {name}",
-                               _spec(settings, level, name), source.where)
+                               _column_name(settings, level, name), source.where)
     for prefix in ("", "device_"):
         if {prefix + name for name in MAX_DEGREES} <= set(links):
             for name in MAX_DEGREES:
-                links = _without_no_degrees(source, links, prefix, name,
-                                            _spec(settings, level, prefix + name), tally)
+                links = _drop_impossible_degrees(source, links, prefix, name,
+                                            _column_name(settings, level, prefix + name), tally)
             no_fix = (links[prefix + "latitude"] == 0) & (links[prefix + "longitude"] == 0)
             reason = f"{prefix}latitude, longitude 0, 0 (no fix)".replace("_", " ")
-            links = tally.drop(links, no_fix, reason, _spec(settings, level, prefix + "latitude"),
-                               source.where)
+            links = tally.drop(links, no_fix, reason,
+                               _column_name(settings, level, prefix + "latitude"), source.where)
         for name in HEIGHTS:
             column = prefix + name.removesuffix("_m")
             if column in links:
                 links = tally.drop(links, height_placeholders(links[column].to_numpy()),
-                                   "impossible height", _spec(settings, level, column),
+                                   "impossible height", _column_name(settings, level, column),
                                    source.where)
     return links
 
@@ -338,13 +338,13 @@ def _match(pattern: str, name: str) -> str | None:
     return name[len(before):len(name) - len(after)] if fits else None
 
 
-def _spec(settings: Settings, level: LevelColumn, name: str) -> str:
+def _column_name(settings: Settings, level: LevelColumn, name: str) -> str:
     """Return the column of a quantity, for messages."""
     key = name.removeprefix("device_") if "device" in level.own else name
     return level.own.get(key) or getattr(settings.columns, name, None) or name
 
 
-def _without_no_degrees(source: Source, links: pd.DataFrame, prefix: str, name: str, spec: str,
+def _drop_impossible_degrees(source: Source, links: pd.DataFrame, prefix: str, name: str, spec: str,
                         tally: Tally) -> pd.DataFrame:
     """Drop links with an impossible latitude or longitude; BadInput if there are many."""
     limit = MAX_DEGREES[name]
@@ -409,15 +409,15 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
         bad_rows.prefix = f"{file.name}: " * (len(files) > 1)
         with problems.noted():
             source = read_source(file, settings, may_be, bad_rows)
-            file_settings, format_name, caution = _settings_of(source, settings, by_default)
-            source = _numbered_from(source, rows, bad_rows.prefix)
+            file_settings, format_name, caution = _settings_for(source, settings, by_default)
+            source = _renumbered(source, rows, bad_rows.prefix)
             wheres.append((rows, source.where))
             rows += len(source)
             ROWS.check(rows, "all files")
-            source = _without_cut_rows(source, file_settings)
+            source = _drop_truncated_rows(source, file_settings)
             count = len(source) + sum(number for _, number, _ in source.left_out)
             on_progress("links")
-            links, per_row = _links_of(source, file_settings, tally, problems, name)
+            links, per_row = _file_links(source, file_settings, tally, problems, name)
             if not per_row:
                 continue
             for reason, number, place in source.left_out:
@@ -472,7 +472,7 @@ def _declared_columns(settings: Settings) -> set[str]:
     return names
 
 
-def _settings_of(source: Source, settings: Settings,
+def _settings_for(source: Source, settings: Settings,
                  flight: str) -> tuple[Settings, str | None, str]:
     """Complete the settings by those of the file's format; return also its name and caution."""
     header = list(map(str, source.table))
@@ -497,7 +497,7 @@ def _settings_of(source: Source, settings: Settings,
     return complete, found.name, ". ".join(filter(None, [found.caution, zone]))
 
 
-def _numbered_from(source: Source, first: int, prefix: str) -> Source:
+def _renumbered(source: Source, first: int, prefix: str) -> Source:
     """Renumber the rows of a file from `first`, and put a prefix before their places."""
     where = source.where
     table = source.table.set_axis(pd.RangeIndex(first, first + len(source)))
@@ -507,7 +507,7 @@ def _numbered_from(source: Source, first: int, prefix: str) -> Source:
                                   for reason, number, place in source.left_out))
 
 
-def _without_cut_rows(source: Source, settings: Settings) -> Source:
+def _drop_truncated_rows(source: Source, settings: Settings) -> Source:
     """Drop rows that lack used columns; BadInput if there are many.
 
     Programs omit empty last cells. A row of a length of its own that ends with a used column may
@@ -544,11 +544,11 @@ def _without_cut_rows(source: Source, settings: Settings) -> Source:
     return replace(whole, left_out=(*source.left_out, (reason, len(cut), source.where(first))))
 
 
-def _links_of(source: Source, settings: Settings, tally: Tally, problems: Problems,
+def _file_links(source: Source, settings: Settings, tally: Tally, problems: Problems,
               name: str) -> tuple[pd.DataFrame, int]:
     """Return the links of a file and its readings per row; count repeated and unselected rows."""
     unique, repeated = without_repetition(source)
-    chosen, others = _only(unique, settings)
+    chosen, others = _selected_rows(unique, settings)
     links, per_row = build_links(chosen, settings, tally, problems, name)
     for index, reason, column in ((repeated, "repeats an earlier row exactly", ""), *others):
         tally.count(reason, column, len(index) * per_row,
@@ -556,7 +556,8 @@ def _links_of(source: Source, settings: Settings, tally: Tally, problems: Proble
     return links, per_row
 
 
-def _only(source: Source, settings: Settings) -> tuple[Source, list[tuple[list[int], str, str]]]:
+def _selected_rows(source: Source, settings: Settings
+                   ) -> tuple[Source, list[tuple[list[int], str, str]]]:
     """Select rows by the setting `only`; return also indices, reason and column of the others."""
     left_out = []
     for spec, values in settings.only.items():

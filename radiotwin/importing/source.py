@@ -23,7 +23,7 @@ from radiotwin.links.site_table import dms_degrees
 
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
-_ROWS_AT_ONCE = 1_000_000  # that are converted at once
+ROWS_AT_ONCE = 1_000_000  # that are converted at once
 _TEMPLATE = re.compile(r"\{([^{}]+)\}")
 _SHOWN = 20  # errors in a message
 _FEW, _FEW_SHARE = 20, 0.1  # number and share of damaged rows in a file that is otherwise right
@@ -177,8 +177,8 @@ class Source:
         else:
             numbers = np.full(len(cells), np.nan)
             wrong = np.zeros(len(cells), dtype=bool)
-            for start in range(0, len(cells), _ROWS_AT_ONCE):
-                rows = slice(start, start + _ROWS_AT_ONCE)
+            for start in range(0, len(cells), ROWS_AT_ONCE):
+                rows = slice(start, start + ROWS_AT_ONCE)
                 text = as_text(cells.iloc[rows])
                 numbers[rows] = as_numbers(text)
                 quantity = purpose.removeprefix("device_")

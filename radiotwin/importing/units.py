@@ -7,6 +7,7 @@ be at two places at once.
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import timedelta
 from zoneinfo import ZoneInfo, available_timezones
 
 import numpy as np
@@ -14,7 +15,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Settings
-from radiotwin.importing.source import Source, constants_of
+from radiotwin.importing.source import ROWS_AT_ONCE, Source, constants_of
 from radiotwin.io.cells import EMPTY, as_numbers, as_text, cell_text
 from radiotwin.links.links import ELSEWHERE_M
 from radiotwin.links.site_table import METRES
@@ -33,7 +34,6 @@ _DATES = re.compile("%[YymbBdjDFcxsGUVWuw]")
 BACK_S, HALF_DAY_S, DAY_S = 3600.0, 43_200.0, 86_400.0
 MAX_STEPS_BACK = 5  # more are no midnights, but unsorted rows
 YEARS = (1900, 2200)  # of plausible times; milliseconds that are read as seconds are later
-_ROWS_AT_ONCE = 1_000_000  # that are converted at once
 _MAX_DAYS = 100_000  # since 1899; the year 2173
 SECONDS_PER_YEAR = 31_556_952  # Gregorian mean
 UTC_OFFSET = r"[Tt ]\d\d(?::?\d\d){0,2}(?:\.\d+)? ?(?:[Zz]|[+-]\d\d(?::?\d\d)?)$"
@@ -127,8 +127,9 @@ def past_midnights(source: Source, spec: str, time_s: np.ndarray,
     is_fixed = spec not in source.table and any(
         re.search(r"\d", constant) for constant in constants_of(spec))
     if not is_fixed or by_s < HALF_DAY_S:
-        return time_s, (f"{place}: the clock goes back by {_clock(by_s)} ({len(back)} times in the "
-                        "file); are the date, the hour and %p of the later rows right?")
+        return time_s, (f"{place}: the clock goes back by {timedelta(seconds=int(by_s))} "
+                        f"({len(back)} times in the file); are the date, the hour and %p of the "
+                        "later rows right?")
     days = np.zeros(len(time_s))
     days[back] = 1
     return time_s + DAY_S * np.cumsum(days), (
@@ -136,15 +137,11 @@ def past_midnights(source: Source, spec: str, time_s: np.ndarray,
         "the file): the rows from there on count as the next day")
 
 
-def _clock(duration_s: float) -> str:
-    return f"{int(duration_s // 3600)}:{int(duration_s // 60 % 60):02}:{int(duration_s % 60):02}"
-
-
 def calendar_days(time_s: np.ndarray, zone: str | None) -> np.ndarray:
     """Convert times (n,) [s] to dates such as `2022-04-25` in an IANA time zone (None: UTC)."""
     days = np.empty(len(time_s), dtype=object)
-    for start in range(0, len(time_s), _ROWS_AT_ONCE):
-        rows = slice(start, start + _ROWS_AT_ONCE)
+    for start in range(0, len(time_s), ROWS_AT_ONCE):
+        rows = slice(start, start + ROWS_AT_ONCE)
         stamp = pd.Series(pd.to_datetime(time_s[rows], unit="s", utc=True))
         day = stamp.dt.tz_convert(zone or "UTC").dt.strftime("%Y-%m-%d").fillna("")
         number, names = pd.factorize(day)  # one object for each day

@@ -138,7 +138,7 @@ def atomic_folder(path: Path | str, names: Collection[str] | None = None) -> Ite
     """
     path = Path(path)
     with (_parent_of(path), _reported(path, only_disk=True),
-          _temporary_folder(_beside(path)) as temporary):
+          _temporary_folder(_temporaries_place(path)) as temporary):
         try:
             yield temporary
         except (BadInput, RunFailed) as error:  # of a file in it, by the name that it will have
@@ -164,7 +164,7 @@ def require_folder(path: Path | str, names: Collection[str], mark: str | None = 
         RunFailed: the disk is full.
     """
     path = Path(path)
-    place = _beside(path)
+    place = _temporaries_place(path)
     try:
         held = sorted(name for name in os.listdir(path)
                       if not _TEMPORARY.fullmatch(name) and name != ".DS_Store")
@@ -356,7 +356,7 @@ def _is_one_of(name: str, patterns: Collection[str]) -> bool:
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def _beside(path: Path) -> Path:
+def _temporaries_place(path: Path) -> Path:
     """Return a path in the folder for temporaries of the folder `path`: its parent, or itself.
 
     A working folder, a link, a mount point (a container's volume), and a folder in a
@@ -377,7 +377,7 @@ def _beside(path: Path) -> Path:
 
 def _swap(new: Path, path: Path, names: Collection[str] | None) -> None:
     """Replace the folder `path`, or the `names` in it, by the content of `new`; all or nothing."""
-    inside = _beside(path) != path
+    inside = _temporaries_place(path) != path
     with deferred(), _locked(path if inside else path.parent):  # another process may, too
         if not inside:
             try:

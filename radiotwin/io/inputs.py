@@ -175,9 +175,9 @@ def decode_text(data: bytes, path: object) -> str:
                        "UTF-8") from None
 
 
-def read_json(path: Path | str, what: str = "JSON file") -> Any:
+def read_json(path: Path | str) -> Any:
     """Read a JSON document; NaN and infinity are refused. BadInput: see `parse_json`."""
-    return parse_json(read_text(path, what), path)
+    return parse_json(read_text(path, "JSON file"), path)
 
 
 def parse_json(text: str, source: object, allow_nan: bool = False) -> Any:

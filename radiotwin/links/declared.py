@@ -157,7 +157,7 @@ class Declared:
             added_db += self.receiver_antenna.gain_dbi(-ray_m)
         return added_db
 
-    def anew(self, radios: dict[int, Radio]) -> Declared:
+    def with_radios(self, radios: dict[int, Radio]) -> Declared:
         """Return a copy with newly declared values of some devices.
 
         Args:

@@ -6,6 +6,8 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.links.correlation import (
+    MAX_Z,
+    MIN_STEP_M,
     correlation_length_m,
     median_step_m,
     moving_end_m,
@@ -77,7 +79,7 @@ def evidence_width_m(links: Links, wanted_m: float, places: int = MIN_PLACES) ->
     It is `wanted_m`, reduced until the moving end occupies at least `places` squares, but not below
     the median step between its positions.
     """
-    position_m, least_m = moving_end_m(links), max(median_step_m(links), 0.1)
+    position_m, least_m = moving_end_m(links), max(median_step_m(links), MIN_STEP_M)
     width_m = max(wanted_m, least_m)
     while width_m > least_m and _squares_occupied(position_m, width_m) < places:
         width_m = max(NARROWER * width_m, least_m)
@@ -100,17 +102,16 @@ def _pieces(links: Links, width_m: float, place_m: float) -> np.ndarray:
                             for keys in (pieces, squares)])
 
 
-def design_effect(block: np.ndarray, z: np.ndarray, max_z: float = 4.0) -> float:
+def design_effect(block: np.ndarray, z: np.ndarray) -> float:
     """Return the design effect: how many links count as one (Kish 1965, 'Survey sampling', 5.4).
 
     It is the variance of block means over that of independent links, at least 1.
 
     Args:
         block: (n,) index of each link's block.
-        z: (n,) residuals, divided by their scale.
-        max_z: residuals are clipped to this.
+        z: (n,) residuals, divided by their scale; they are clipped to `MAX_Z`.
     """
-    z = np.clip(z, -max_z, max_z)
+    z = np.clip(z, -MAX_Z, MAX_Z)
     size = np.bincount(block)
     mean = np.bincount(block, weights=z) / np.maximum(size, 1)
     between = (size * (mean - z.mean()) ** 2).sum() / max((size > 0).sum(), 1)

@@ -554,12 +554,12 @@ class Links:
         return links.with_ends(device_m=device_m, device_names=names, anchors=anchors,
                                declared=self.declared.of_devices(radio), reads=reads)
 
-    def located(self, device_m: np.ndarray) -> Links:
+    def with_located_devices(self, device_m: np.ndarray) -> Links:
         """Place the devices at (k, 3) [m], and drop the links of those at NaN."""
         rows = np.isfinite(device_m).all(axis=1)[self.device]
         return self.with_devices(np.nan_to_num(device_m)).select(rows)
 
-    def since(self, first_s: float) -> Links:
+    def with_first_time(self, first_s: float) -> Links:
         """Return a copy with another time of the first measurement [s], see `Flown`."""
         return self.with_ends(flown=replace(self.ends.flown, first_s=first_s))
 

@@ -171,16 +171,15 @@ def distances_m(place_deg: np.ndarray, middle_deg: np.ndarray) -> np.ndarray:
     return np.where(np.abs(place_deg[:, 0]) > MAX_DEGREES["latitude"], np.inf, apart_m)
 
 
-def unmatched_notes(path: Path | str, names: Iterable[str], read: Collection[str], end: str,
-                    what: str) -> list[str]:
-    """Note names that only a table of sites has, and names that only the readings have.
+def unmatched_notes(path: Path | str, names: Iterable[str], read: Collection[str], end: str
+                    ) -> list[str]:
+    """Note names that only a table of sites has, and names that only the log has.
 
     Args:
         path: of the table.
         names: in the table.
-        read: names in the readings.
+        read: names in the log.
         end: `device` or `receiver`.
-        what: the readings are called in the note, such as `the log`.
     """
     idle = list(dict.fromkeys(name for name in names if name not in read))
     lacking = sorted(set(read) - set(names))
@@ -189,11 +188,11 @@ def unmatched_notes(path: Path | str, names: Iterable[str], read: Collection[str
         loose = {_loosely(name): name for name in lacking}
         pairs = [f"{name} ({loose[_loosely(name)]} there)" for name in idle
                  if _loosely(name) in loose]
-        notes.append(f"{file}: {len(idle)} of {len(set(names)):,} names occur in no row of {what}: "
-                     f"{some(pairs or idle)}"
+        notes.append(f"{file}: {len(idle)} of {len(set(names)):,} names occur in no row of the "
+                     f"log: {some(pairs or idle)}"
                      + ("; names are compared letter by letter: make them equal" if pairs else ""))
     if lacking and idle:
-        notes.append(f"{file}: {len(lacking)} of {len(read):,} {end}s of {what} are not in it: "
+        notes.append(f"{file}: {len(lacking)} of {len(read):,} {end}s of the log are not in it: "
                      f"{some(lacking)}")
     return notes
 

@@ -100,16 +100,16 @@ def output(quiet: bool, as_json: bool) -> Iterator[None]:
     finally:
         console.quiet, progress.silent = before
         if done and as_json:
-            document = json.dumps(_plain(collected), indent=1, allow_nan=False, default=str)
+            document = json.dumps(_json_value(collected), indent=1, allow_nan=False, default=str)
             sys.stdout.write(document + "\n")
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     """Convert a value for JSON: NaN and infinity to null, numpy's numbers to Python's."""
     if isinstance(value, dict):
-        return {str(name): _plain(each) for name, each in value.items()}
+        return {str(name): _json_value(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
+        return [_json_value(each) for each in value]
     if hasattr(value, "item") and not isinstance(value, str):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
@@ -164,7 +164,7 @@ def exit_status(work: Callable[[], Any], kept: str | Callable[[], str]) -> int:
             signals.end()
         status, message = done if isinstance(done, int) else 0, ""
     except BaseException as error:  # noqa: BLE001  # the one place that knows what to say
-        status, message = _explained(error, kept if isinstance(kept, str) else kept())
+        status, message = _status_and_message(error, kept if isinstance(kept, str) else kept())
     finally:
         signals.end()
         sys.stdout = before
@@ -179,7 +179,7 @@ def exit_status(work: Callable[[], Any], kept: str | Callable[[], str]) -> int:
     return status
 
 
-def _explained(error: BaseException, kept: str) -> tuple[int, str]:
+def _status_and_message(error: BaseException, kept: str) -> tuple[int, str]:
     """Return the exit status and the message for an exception."""
     if isinstance(error, SystemExit) and not error.code:
         return 0, ""
@@ -199,14 +199,14 @@ def _explained(error: BaseException, kept: str) -> tuple[int, str]:
             return NOBODY_READS, ""
         return 1, f"standard output cannot be written: {error.__cause__}; send it elsewhere"
     if isinstance(error, MemoryError):
-        return 1, (f"out of memory while running {_command()}{_said(error)}; use a smaller input, "
-                   "fewer processes, or a machine with more memory")
+        return 1, (f"out of memory while running {_command()}{_first_line(error)}; use a smaller "
+                   "input, fewer processes, or a machine with more memory")
     if isinstance(error, OSError) and _folder_is_gone():
         return 2, "the working folder does not exist any more; change to another one"
     if isinstance(error, OSError) and error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
         return 2, (f"{str(error.filename)[:60]}… cannot be a path ({error.strerror}); give the "
                    "path of a file or folder that exists")
-    return 1, _mistake(error)
+    return 1, _unexpected(error)
 
 
 def _usage(error: Any) -> str:
@@ -219,9 +219,10 @@ def _usage(error: Any) -> str:
     return f"{message.rstrip('.')}; {command} --help shows what is allowed"
 
 
-def _mistake(error: BaseException) -> str:
+def _unexpected(error: BaseException) -> str:
     """Save the traceback of an unexpected error, and return a message that names its file."""
-    said = f"unexpected error while running {_command()}: {type(error).__name__}{_said(error)}"
+    name = type(error).__name__
+    said = f"unexpected error while running {_command()}: {name}{_first_line(error)}"
     try:
         handle, path = tempfile.mkstemp(prefix="radiotwin-error-", suffix=".txt")
         with open(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
@@ -233,7 +234,7 @@ def _mistake(error: BaseException) -> str:
     return f"{said}; this is a mistake in radiotwin: please report it with {path}"
 
 
-def _said(error: BaseException) -> str:
+def _first_line(error: BaseException) -> str:
     """Return the first line of an error's message, after a colon."""
     try:
         lines = str(error).strip().splitlines()

@@ -38,7 +38,7 @@ from radiotwin.runtime.jobs import (
     R,
     Resources,
     Worker,
-    begin,
+    begin_worker,
     run_piece,
     thread_variables,
 )
@@ -155,7 +155,7 @@ class Executor:
         if not workers:
             return False
         self._has_workers = True
-        self._say_once(_said(job, workers, self._pool))
+        self._say_once(_workers_text(job, workers, self._pool))
         _Run(job, todo, cache, advance).on(workers)
         return True
 
@@ -203,7 +203,7 @@ class _Run(Generic[P, R]):
                 for future in done:
                     worker, one = running.pop(future)
                     idle.append(worker)
-                    self._take(future, worker, one)
+                    self._collect(future, worker, one)
                 for worker, _ in running.values():
                     worker.check()
         except BaseException:  # also a signal: the running pieces are not needed any more
@@ -211,7 +211,7 @@ class _Run(Generic[P, R]):
                 worker.close()
             raise
 
-    def _take(self, future: "Future[Outcome]", worker: Worker, one: "_Todo[P]") -> None:
+    def _collect(self, future: "Future[Outcome]", worker: Worker, one: "_Todo[P]") -> None:
         """Store a result; retry the piece if its worker died; else raise the function's error."""
         error = future.exception()
         if error is None:
@@ -220,7 +220,7 @@ class _Run(Generic[P, R]):
         death = worker.death(error)
         if death is None:
             raise worker.raised(error)
-        self._again(one, death)
+        self._retry(one, death)
 
     def _finish(self, one: "_Todo[P]", outcome: Outcome) -> None:
         self._cache.put(one.piece, outcome.result, outcome.messages, outcome.seconds)
@@ -240,7 +240,7 @@ class _Run(Generic[P, R]):
                 name, level, text = record
                 logging.getLogger(name).log(level, "%s", text)
 
-    def _again(self, one: "_Todo[P]", death: Death) -> None:
+    def _retry(self, one: "_Todo[P]", death: Death) -> None:
         """Retry a piece after its worker died: as a whole, then in halves; else raise RunFailed."""
         one.deaths += 1
         if not death.memory and one.deaths <= RETRIES:
@@ -292,7 +292,7 @@ def _pickled(job: Job) -> bytes:
                         f"({error}); run it with one worker") from None
 
 
-def _said(job: Job, workers: Sequence[Worker], pool: Pool) -> str:
+def _workers_text(job: Job, workers: Sequence[Worker], pool: Pool) -> str:
     """Return the message about the number and size of a job's workers."""
     resources = job.resources
     parts = ["1 core" if resources.cores == 1 else f"{resources.cores} cores"]
@@ -383,7 +383,7 @@ def start_process(environment: dict[str, str]) -> tuple[Any, "Future[int]"]:
     with kept_from_children():
         resource_tracker.ensure_running()
         pool = loky.ProcessPoolExecutor(1, env=environment | _NO_LEAK_CHECK)
-        return pool, pool.submit(begin, os.getpid())
+        return pool, pool.submit(begin_worker, os.getpid())
 
 
 class _LocalWorker(Worker):

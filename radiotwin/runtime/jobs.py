@@ -130,7 +130,7 @@ def run_piece(piece: Any, function: bytes | None = None) -> Outcome:
     return _of_this_process.run(piece, function)
 
 
-def begin(parent: int) -> int:
+def begin_worker(parent: int) -> int:
     """Initialise a worker process, which ends with its parent; return its process id."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; the parent ends
     die_with_parent(parent)

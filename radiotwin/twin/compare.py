@@ -265,7 +265,7 @@ def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
     if (row >= 0).any():
         links = twin.links(measurements.receiver_m[row >= 0], row[row >= 0], scene)
         radios = radios_of(measurements.devices, measurements.patterns, scene)
-        declared = twin.declared.anew(
+        declared = twin.declared.with_radios(
             {row: radio for row, radio in zip(row_of_device, radios) if row >= 0})
         if antenna_of_uavs(scene, list(measurements.table["receiver"]))[0] is None:
             declared = replace(declared, receiver_antenna=None)

@@ -136,7 +136,7 @@ def best_dof(links: Links, channel: ChannelModel, device_m: np.ndarray) -> float
 def _image_paths(links: Links, law: Twin, device_m: np.ndarray) -> ImagePaths:
     """Return the channel, its diffuse power fitted to links of devices that have a position."""
     channel = ImagePaths(law.channel)
-    located = links.located(device_m)
+    located = links.with_located_devices(device_m)
     declared, antenna_db = located.declared, declared_antenna_db(located)
     fed_db = 0.0 if declared.adds_nothing else declared.fed_db[located.device]
     return channel.fit_diffuse(*located.gains(fed_db), antenna_db)
@@ -184,7 +184,7 @@ def fit_over_wrong_map(links: Links, scene: Scene, seed: int, start: Twin | None
 
 def _shift(links: Links, seed: int) -> Shift:
     """Return the shift of the map, from the anchors' links."""
-    known = links.located(links.device_m)
+    known = links.with_located_devices(links.device_m)
     if not len(known):
         return NO_SHIFT
     informative = drop_uninformative(*known.gains())
@@ -236,7 +236,7 @@ def _calibrated(devices: list[TwinDevice], links: Links) -> list[TwinDevice]:
 
 def _found(links: Links, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
     """Return the errors of a map that is not shifted any more, from devices that are not lost."""
-    known = links.located(reliable_m(devices, LOST_M))
+    known = links.with_located_devices(reliable_m(devices, LOST_M))
     informative = drop_uninformative(*known.gains())
     error, diffuse = estimate_other_errors(*informative, seed)
     return replace(error, shift_m=shift_m), diffuse
@@ -245,7 +245,7 @@ def _found(links: Links, devices: list[TwinDevice], shift_m: Shift, seed: int) -
 def _channel(links: Links, devices: list[TwinDevice], found: Found, seed: int) -> PathKriging:
     """Fit the channel to all devices that are located; kriging alone to those that are lost."""
     lost = tuple(np.flatnonzero(~np.isfinite(reliable_m(devices, LOST_M)).all(axis=1)).tolist())
-    known = links.located(reliable_m(devices))
+    known = links.with_located_devices(reliable_m(devices))
     data = *known.gains(PathKriging(found).declared_db(known)), seed
     inputs = PathKriging, *data, str(found[0].state()), found[1], lost
     return kept("channel", inputs, lambda: PathKriging(found, lost).fit(*data), PathKriging.state,

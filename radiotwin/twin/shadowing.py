@@ -67,8 +67,8 @@ class MapErrors:
             seed: of the selection of links.
         """
         located = np.array([each.located for each in twin.devices])
-        some = links.select(_sampled(links.device, located[links.device]
-                                     & np.isfinite(links.level_db), seed)).located(twin.device_m)
+        rows = _sampled(links.device, located[links.device] & np.isfinite(links.level_db), seed)
+        some = links.select(rows).with_located_devices(twin.device_m)
         if not len(some):
             return cls()
         predicted = twin.predict(some)

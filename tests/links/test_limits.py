@@ -82,8 +82,8 @@ def test_a_declared_limit_that_readings_allow_stays_to_the_bit(seed, given):
 def test_a_limit_far_below_all_readings_stands_for_none(seed, given):
     links = fly(seed, **given)
     limits_db, notes = estimated(links, -250.0)
-    assert notes[0].startswith("the declared limit of detection, -250 dB (sensitivity_dbm less tx_power_dbm of scene.toml; the "
-                               "default, if nobody set it), is not used: but for odd ones, the weakest")
+    assert notes[0].startswith("the declared limit of detection, -250 dB (sensitivity_dbm less tx_power_dbm in scene.toml), is "
+                               "not used: but for odd ones, the weakest")
     used_db = re.search(r"links are blank\. Used instead: (-[\d.]+) ± [\d.]+ dB for r0; ", notes[0])
     assert float(used_db[1]) == pytest.approx(limits_db[0], abs=0.06)
     np.testing.assert_array_equal(limits_db, estimated(links)[0])

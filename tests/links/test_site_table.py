@@ -166,8 +166,8 @@ def test_a_place_somewhat_far_away_is_said():
 
 def test_names_that_nobody_has_are_said():
     idle, lacking = unmatched_notes("s.csv", ["262-1-100", "13828122", "a", "x"], {"262-01-100", "13828122.0", "a"},
-                                    "device", "the log")
+                                    "device")
     assert idle == ("s.csv: 3 of 4 names occur in no row of the log: 262-1-100 (262-01-100 there), 13828122 (13828122.0 "
                     "there); names are compared letter by letter: make them equal")
     assert lacking == "s.csv: 2 of 3 devices of the log are not in it: 13828122.0, 262-01-100"
-    assert not unmatched_notes("s.csv", ["a"], {"a", "b"}, "device", "the log")
+    assert not unmatched_notes("s.csv", ["a"], {"a", "b"}, "device")

@@ -299,13 +299,13 @@ def read_rosbag(path: Path, topic: str | None = None) -> Fixes:
             rows = topics.setdefault(message.topic, array("d"))
             try:
                 fix = decode[message.is_ros1](message.data, FIX)
-                rows.extend(_row(fix, message.time_ns))
+                rows.extend(_fix_row(fix, message.time_ns))
             except Exception as error:  # rosbags has its own, and those of struct and numpy
                 raise BadInput(f"{part}: a message of {message.topic[:60]!r} cannot be decoded "
                                f"({str(error)[:100]}); fetch it again") from None
             ROWS.check(len(rows) / _COLUMNS, part)
             ENTRIES.check(len(topics), part)
-    columns = np.array(_chosen(path, topics, topic)).reshape(-1, _COLUMNS).T
+    columns = np.array(_rows_of_topic(path, topics, topic)).reshape(-1, _COLUMNS).T
     return make_fixes(path, columns[0], dict(zip(("latitude", "longitude", "altitude"),
                                                  columns[1:])),
                       (f"{path.name}: altitudes are above the WGS84 ellipsoid, as NavSatFix has "
@@ -334,7 +334,7 @@ def _parts(path: Path) -> list[Path]:
     return [path]
 
 
-def _row(fix: Any, time_ns: int) -> tuple[float, float, float, float]:
+def _fix_row(fix: Any, time_ns: int) -> tuple[float, float, float, float]:
     """Return time [s], latitude, longitude [deg] and altitude [m]; NaN latitude without a fix."""
     stamp = fix.header.stamp
     time_s = stamp.sec + stamp.nanosec / 1e9 or time_ns / 1e9
@@ -342,7 +342,8 @@ def _row(fix: Any, time_ns: int) -> tuple[float, float, float, float]:
     return time_s, fix.latitude if is_known else np.nan, fix.longitude, fix.altitude
 
 
-def _chosen(path: Path, topics: dict[str, "array[float]"], topic: str | None) -> "array[float]":
+def _rows_of_topic(path: Path, topics: dict[str, "array[float]"], topic: str | None
+                   ) -> "array[float]":
     """Return the rows of the declared topic, or of the only one."""
     if topic is None and len(topics) == 1:
         return next(iter(topics.values()))

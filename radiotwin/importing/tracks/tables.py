@@ -113,25 +113,26 @@ def _times(source: Source, header: list[str], track: TrackFile,
     """Read the times (n,) [s since 1970 UTC]; return also the names of their columns."""
     zone = track.time_zone or zone
     if spec := track.columns.get("time"):
-        time_s = seconds(source, spec, track.time_format or _form(source, spec), zone or "UTC")
-        return _finer(source, header, time_s), spec
+        time_format = track.time_format or _time_format(source, spec)
+        time_s = seconds(source, spec, time_format, zone or "UTC")
+        return _with_milliseconds(source, header, time_s), spec
     if "time_s" in header:
         return seconds(source, "time_s", "epoch s", "UTC"), "time_s"
     spec = _find(header, "time", "utc")
     if spec is not None:
         time_s = seconds(source, spec, track.time_format or ISO, "UTC")
-        return _finer(source, header, time_s), spec
+        return _with_milliseconds(source, header, time_s), spec
     day, hour = _find(header, "day"), _find(header, "hour")
     if day is not None and hour is not None and hour != day:
         is_utc = "utc" in (_split(day)[1], _split(hour)[1])
         return _day_and_hour(source, day, hour, "UTC" if is_utc else zone), f"{day} and {hour}"
     spec = str(_find(header, "time") or day)
     is_local = _split(spec)[1] == "local"
-    form = track.time_format or _form(source, spec)
-    return seconds(source, spec, form, zone or (None if is_local else "UTC")), spec
+    time_format = track.time_format or _time_format(source, spec)
+    return seconds(source, spec, time_format, zone or (None if is_local else "UTC")), spec
 
 
-def _form(source: Source, spec: str) -> str:
+def _time_format(source: Source, spec: str) -> str:
     """Return the format of a column of times; for numbers it follows from their size."""
     numbers = as_numbers(as_text(source.cells(spec, "time")))
     known = numbers[np.isfinite(numbers)]
@@ -146,7 +147,7 @@ def _form(source: Source, spec: str) -> str:
                    "with --track-time-format 'epoch s' or 'epoch ms'")
 
 
-def _finer(source: Source, header: list[str], time_s: np.ndarray) -> np.ndarray:
+def _with_milliseconds(source: Source, header: list[str], time_s: np.ndarray) -> np.ndarray:
     """Refine times of whole seconds by a column of milliseconds since the start, if there is one.
 
     The seconds are truncated, so the start is the latest that any row gives.

@@ -146,7 +146,7 @@ def fit_elsewhere(model: FittedModel, own: Links, positions_m: np.ndarray) -> Fi
     # Effects count devices as the model does, so the candidates come after those that it knows.
     every = own.select(np.tile(np.arange(n), cells)).of_devices(
         known + np.repeat(np.arange(cells), n), np.vstack([model.device_m, candidates_m]),
-        [f"device {i}" for i in range(known + cells)], frozenset()).since(model.first_s)
+        [f"device {i}" for i in range(known + cells)], frozenset()).with_first_time(model.first_s)
     return model.on_links(every)
 
 
