@@ -215,19 +215,19 @@ def _with_left_out_corners(triangles: np.ndarray, ends: Sequence[int]) -> np.nda
     Neighbouring faces still have these corners: without such triangles a closed surface would open.
     """
     n = ends[-1]
-    if len(triangles) == n + 2 * len(ends) - 4 or len(triangles) == 0:
+    if len(triangles) == n + 2 * len(ends) - 4 or len(triangles) == 0:  # every corner is used
         return triangles
     start, end = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
     edges, back = set((start * n + end).tolist()), (end * n + start).tolist()
     border = edges.difference(back)
-    ahead: dict[int, int] = {}  # corner -> the next one along its ring
+    ahead: dict[int, int] = {}  # corner -> the next one along its ring, as the triangles turn
     for first, last in zip((0, *ends[:-1]), ends):
         ring = list(range(first, last))
         forth = dict(zip(ring, ring[1:] + ring[:1]))
         known = sum((a * n + b in border) - (b * n + a in border) for a, b in forth.items())
         ahead |= forth if known >= 0 else {b: a for a, b in forth.items()}
     added = []
-    for edge in border:
+    for edge in border:  # from a straight to b: a fan at a over the corners between them
         a, b = divmod(edge, n)
         corner = ahead[a]
         while corner != b and corner != a:

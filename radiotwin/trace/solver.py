@@ -204,7 +204,7 @@ def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: n
     direct = exists & ~used.any(axis=0)
     keep = exists & ~direct
     straightest = np.where(direct, cos_turn, np.inf).argmin(axis=1) if direct.any() else 0
-    links = np.flatnonzero(direct.any(axis=1))
+    links = np.flatnonzero(direct.any(axis=1))  # of their direct paths the straightest stays
     keep[links, np.broadcast_to(straightest, len(direct))[links]] = True
 
     link, path = np.nonzero(exists & ~direct)
@@ -214,6 +214,7 @@ def distinct_paths(interactions: np.ndarray, vertices_m: np.ndarray, length_m: n
     order = np.lexsort((-strength[link, path], length, kind, link))
     link, path, kind, length = link[order], path[order], kind[order], length[order]
     point_m = np.where(used[..., None], vertices_m, 0.0)
+    # Sorted by length: duplicates are neighbours, or a few places apart
     for shift in range(1, len(link)):
         near = ((link[shift:] == link[:-shift]) & (kind[shift:] == kind[:-shift])
                 & (length[shift:] - length[:-shift] <= _LENGTH_TOLERANCE * length[shift:]))

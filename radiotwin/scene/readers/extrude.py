@@ -134,12 +134,13 @@ def _extruded(area: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
     points, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])
     roof: np.ndarray = mapbox_earcut.triangulate_float64(points, ends).reshape(-1, 3)
     corner = np.arange(len(points))
-    corner[ends - 1] = [0, *ends[:-1]]  # a ring's last point is its first
-    used, roof = np.unique(corner[roof], return_inverse=True)  # none in the middle of a wall
+    corner[ends - 1] = [0, *ends[:-1]]  # a ring's last point repeats its first
+    used, roof = np.unique(corner[roof], return_inverse=True)  # drops points on straight walls
     points, roof, n = points[used], roof.reshape(-1, 3), len(used)
     (ax, ay), (bx, by) = ((points[roof[:, side]] - points[roof[:, 0]]).T for side in (1, 2))
     if (ax * by - ay * bx).sum() < 0:
         roof = roof[:, ::-1]
+    # A wall stands on each edge that only one triangle of the roof has
     start, end = roof[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
     outer = ~np.isin(start * n + end, end * n + start)
     start, end = start[outer], end[outer]
